@@ -321,7 +321,7 @@ def _excesses(ctx: Context, x: _Joint) -> Iterator[tuple[float, float, float, fl
     dq = factor * x.dq
     low, high = x.reach(said if factor == 1.0 else x.integral(dq), lag)
     path = x.integral(np.abs(dq))
-    for seconds in (1.25 * lag, 4 * lag, 10 * lag):
+    for seconds in (1.25 * lag, 4 * lag, 10 * lag, 25 * lag):
         starts, ends = x.windows(seconds, 0.5 * lag)
         if not len(ends):
             continue

@@ -54,6 +54,166 @@ def in_contact(ctx: Context) -> Outcome:
     return outcome.pressed(abs(tau), limit, at_least=True)
 
 
+def _felt(ctx: Context, begin: float, end: float, window: float) -> list[tuple[float, float]]:
+    """(time, median size of tau_est) of consecutive windows; one without states is left out."""
+    found = []
+    for at in np.arange(begin, end - window + 1e-9, window):
+        tau = np.abs(ctx.states.tau[ctx.states.between(float(at), float(at) + window), 0])
+        tau = tau[np.isfinite(tau)]
+        if len(tau) >= 3:
+            found.append((float(at), median(tau)))
+    return found
+
+
+@check("DEX1-FORCE-10")
+def lasts(ctx: Context) -> Outcome:
+    """How far the force of a long grip rises and falls while the command stays the same."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    window = ctx.tolerance("window_s")
+    worst: tuple[float, float, float, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        touched = _touched(ctx, begin, end)
+        if touched is None:
+            continue
+        felt = _felt(ctx, touched + ctx.tolerance("contact_s"), end, window)
+        settled = touched + ctx.tolerance("settle_s")
+        usual = [tau for at, tau in felt if at >= settled][:3]
+        if len(usual) < 3 or median(np.array(usual)) < ctx.tolerance("min_tau_nm"):
+            continue
+        # a driver may lower its effort at first, but no force may grow
+        held, least = median(np.array(usual)), felt[0][1]
+        for at, tau in felt:
+            least = max(min(least, tau), ctx.tolerance("min_tau_nm"))
+            for was, change in ((least, tau / least - 1.0), (held, 1.0 - tau / held)):
+                counts = was == least or at >= settled
+                if counts and (worst is None or change > worst[0]):
+                    worst = change, at, tau, was, begin
+    if worst is None:
+        return ctx.skipped("it did not press on the object for long enough")
+    change, at, tau, was, begin = worst
+    text = f"tau_est of {tau:.2f} N m {at - begin:.1f} s after the command, where it was {was:.2f}"
+    if change <= ctx.tolerance("max_change_part"):
+        return ctx.passed(f"{change:.0%}", text, change_part=change)
+    place = ctx.at(ctx.states.topic, at, at + window)
+    return ctx.failed(f"{tau:.2f} N m", text, place, change_part=change)
+
+
+def _touched(ctx: Context, begin: float, end: float) -> float | None:
+    """When a gripper came to where it stands at the end, s; None without states."""
+    rows = ctx.states.between(begin, end)
+    t, q = ctx.states.t[rows], ctx.states.q[rows, 0]
+    good = np.isfinite(q)
+    t, q = t[good], q[good]
+    if len(q) < 10:
+        return None
+    last = median(q[t >= end - 0.5]) if (t >= end - 0.5).any() else float(q[-1])
+    there = np.abs(q - last) <= ctx.tolerance("near_stroke")
+    return float(t[np.argmax(there)]) if there.any() else None
+
+
+@check("DEX1-FORCE-11")
+def soft_grips(ctx: Context) -> Outcome:
+    """The least tau_est of grips with little stiffness."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = _soft(ctx)
+    if not found:
+        return ctx.skipped("no state during grips with little stiffness")
+    _, tau, asked, kp, begin, end = min(found, key=lambda f: f[1])
+    text = (
+        f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, where kp times the distance is "
+        f"{asked:.2f} N m"
+    )
+    limit = ctx.tolerance("min_tau_nm")
+    if tau >= limit:
+        met = ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
+        return met.pressed(tau, limit, at_least=True)
+    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
+    return outcome.pressed(tau, limit, at_least=True)
+
+
+def _soft(ctx: Context) -> list[tuple[float, float, float, float, float, float]]:
+    """(part, tau_est, torque asked for, kp, begin, end) of the end of each soft grip."""
+    found = []
+    for phase in ctx.phases("soft-grip"):
+        begin, end = ctx.span(phase)
+        begin = max(begin, end - 0.3)
+        rows = ctx.states.between(begin, end)
+        asked = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        tau, q = np.abs(ctx.states.tau[rows, 0]), ctx.states.q[rows, 0]
+        if not asked.any() or not (np.isfinite(tau) & np.isfinite(q)).any():
+            continue
+        kp = median(ctx.commands.kp[asked, 0])
+        wanted = kp * (median(q) - median(ctx.commands.q[asked, 0]))
+        if wanted >= ctx.tolerance("min_asked_nm"):
+            felt = median(tau)
+            found.append((felt / wanted, felt, wanted, kp, begin, end))
+    return found
+
+
+@check("DEX1-FORCE-12")
+def in_proportion(ctx: Context) -> Outcome:
+    """The force of soft grips, compared with that of a stiff one, in parts of what is asked for."""
+    soft = _soft(ctx)
+    if not soft:
+        return ctx.skipped("no grips with little stiffness")
+    stiff = []
+    for phase in ctx.phases("grip"):
+        begin, end = ctx.span(phase)
+        begin = max(begin, end - 0.5)
+        rows = ctx.states.between(begin, end)
+        asked = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        if asked.any() and len(ctx.states.t[rows]):
+            away = median(ctx.states.q[rows, 0]) - median(ctx.commands.q[asked, 0])
+            wanted = median(ctx.commands.kp[asked, 0]) * away
+            if wanted >= ctx.tolerance("min_asked_nm"):
+                stiff.append(median(np.abs(ctx.states.tau[rows, 0])) / wanted)
+    if not stiff:
+        return ctx.skipped("no grip with the client's stiffness")
+    usual, part = min(stiff), ctx.tolerance("max_change_part")
+    if abs(usual - 1.0) > part:
+        return ctx.absent("this gripper has a force of its own")
+    worst = max(soft, key=lambda f: abs(f[0] - 1.0))
+    ratio, tau, torque, kp, begin, end = worst
+    text = (
+        f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, where kp times the distance is "
+        f"{torque:.2f} N m; with the client's kp it is {usual:.0%} of that"
+    )
+    if abs(ratio - 1.0) <= part:
+        return ctx.passed(f"{ratio:.0%}", text, part=ratio)
+    return ctx.failed(f"{ratio:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=ratio)
+
+
+@check("DEX1-FORCE-13")
+def zero(ctx: Context) -> Outcome:
+    """The median of tau_est while nothing is driven in the free."""
+    if ctx.recording.stimulus is None:
+        return ctx.skipped("the recording does not say what was between the fingers")
+    states, asked = ctx.states, ctx.commands.t
+    quiet = ctx.recording.model.command_timeout + 0.5
+    rows = np.searchsorted(asked, states.t, "right") - 1
+    ages: Floats = np.full(len(states.t), np.inf)
+    if len(asked):
+        ages = np.where(rows >= 0, states.t - asked[np.maximum(rows, 0)], np.inf)
+    q, tau = states.q[:, 0], states.tau[:, 0]
+    ends = ctx.tolerance("clear_stroke")
+    low = (ctx.joints[0].q_min if ctx.object_at is None else ctx.object_at) + ends
+    with np.errstate(invalid="ignore"):
+        free = np.isfinite(tau) & (q > low) & (q < ctx.joints[0].q_max - ends)
+    free &= ages > quiet
+    if int(free.sum()) < 50:
+        return ctx.skipped("it was never undriven in the free")
+    level = median(tau[free])
+    text = f"tau_est of {level:.3f} N m while nothing was driven"
+    limit = ctx.tolerance("max_tau_nm")
+    if abs(level) <= limit:
+        return ctx.passed(f"{level:.3f} N m", text, tau_nm=level).pressed(abs(level), limit)
+    place = ctx.at(states.topic, float(states.t[free][0]))
+    return ctx.failed(f"{level:.2f} N m", text, place, tau_nm=level).pressed(abs(level), limit)
+
+
 def _ranges(t: Floats, begins: Floats, ends: Floats, side: Literal["left", "right"]) -> Ranges:
     """Rows of t in each interval: the first, and the first after it, shape (n, 2)."""
     return np.column_stack([np.searchsorted(t, begins), np.searchsorted(t, ends, side)])

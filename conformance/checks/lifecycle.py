@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.safety import arrival
+from dexkit.conformance.checks.safety import arrival, away_first
 from dexkit.conformance.measure import Measure
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.hand import JointMode
@@ -86,6 +86,9 @@ def restarted_service(ctx: Context) -> Outcome:
         least = min(waited, end - begin)
         outcome = outcome.timed(least, ctx.tolerance("max_wait_s"))
         return outcome.if_late(waited - ctx.tolerance("max_wait_s"))
+    wrong = away_first(ctx, phase, "after a restart of its service")
+    if wrong is not None:
+        return wrong
     outcome = arrival(ctx, "after a restart of its service")
     if not outcome.met:
         return outcome
@@ -128,17 +131,60 @@ def shutdown(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-05", "DEX3-LIFE-05")
 def last_state(ctx: Context) -> Outcome:
-    """The mode of the last state before the service ended."""
+    """The mode of the last state before the service ended, and where the hand was found after it.
+
+    A last state that shows it driven may have been measured before the brake. Then it counts
+    whether a hand that was moving went on.
+    """
     begin, end = ctx.span(ctx.phases()[-1])
-    modes = ctx.states.mode[ctx.states.between(begin - 0.2, end)]
+    rows = ctx.states.between(begin - 0.2, end)
+    modes = ctx.states.mode[rows]
     modes = modes[np.isfinite(modes).all(axis=1)]
     status = MotorCodec(ctx.recording.dialect).status(modes.astype(np.intp))
     if len(status) < 2 or not (status[0] == JointMode.FOC).all():
         return ctx.absent("the mode of this hand does not show whether it is driven")
+    went = _went_on(ctx, begin, end)
+    if went is not None and went[0] > went[1]:
+        rad, limit, joint = went
+        text = ctx.named(
+            f"it went on by {rad:.2f} rad after its last command, across the restart", joint
+        )
+        place = ctx.at(ctx.states.topic, begin, end)
+        outcome = ctx.failed("goes on", text, place, motion_rad=rad).about(joint)
+        return outcome.placed(rad, limit)
     if not status[-1].any():
         return ctx.passed("brakes", "its last state shows that it is not driven any more")
-    return ctx.failed(
-        "driven",
-        f"its last state has mode {int(status[-1].max())}: driven",
-        ctx.at(ctx.states.topic, float(ctx.states.t[ctx.states.between(begin - 0.2, end)][-1])),
+    if went is not None:
+        text = f"it was moving, and was found {went[0]:.2f} rad further on"
+        return ctx.passed("stops", text, motion_rad=went[0]).placed(went[0], went[1])
+    return ctx.absent(
+        "its last state shows it driven, but may have been measured before it braked; it was not "
+        "moving then"
     )
+
+
+def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int] | None:
+    """How far a joint that moved when its service was stopped went on until it started again, rad,
+    how far it may have, and the joint; None if none moved, or had room to go on.
+    """
+    later = ctx.states.between(end - 0.1, end + 1.0)
+    after = ctx.states.q[later][ctx.states.t[later] > begin + 0.25]
+    worst: tuple[float, float, int] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        before = ctx.states.between(begin - 0.2, begin)
+        t, q = ctx.states.t[before], ctx.states.q[before, joint]
+        if len(q) < 2 or not len(after) or not np.isfinite(q).all():
+            continue
+        speed = float(q[-1] - q[0]) / max(float(t[-1] - t[0]), 1e-3)
+        if abs(speed) < ctx.tolerance("min_speed_stroke", joint):
+            continue
+        way = 1 if speed > 0 else -1
+        braked = ctx.recording.model.command_timeout + ctx.tolerance("grace_s")
+        limit = abs(speed) * braked + ctx.tolerance("max_jump_stroke", joint)
+        room = spec.q_max - float(q[-1]) if way > 0 else float(q[-1]) - spec.q_min
+        if room < limit + 0.1 * spec.stroke:
+            continue
+        rad = (float(after[0, joint]) - float(q[-1])) * way
+        if worst is None or rad / limit > worst[0] / worst[1]:
+            worst = rad, limit, joint
+    return worst

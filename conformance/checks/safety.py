@@ -250,7 +250,7 @@ def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
         begin, end = ctx.span(phase)
         sent = good[good <= end]
         last = float(sent[-1]) if len(sent) else begin
-        found.append((max(last, begin) if last <= begin + 0.05 else last, end))
+        found.append((last, end))
     return found
 
 
@@ -307,7 +307,17 @@ def brakes(ctx: Context) -> Outcome:
             measures.append(stop)
         pressed = float(np.median(np.abs(before)))
         if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_at is not None:
-            still = float(np.median(np.abs(states.tau[late, 0])))
+            still = _presses(ctx, last + timeout, end)
+            usual = float(np.median(states.tau[states.between(last - 0.2, last), 0]))
+            back = _opposes(ctx, last + timeout, end, usual)
+            if back is not None:
+                return ctx.failed(
+                    f"{back[1]:.2f} N m",
+                    f"pressed with {pressed:.2f} N m at the last command, and drove the other way "
+                    f"with {back[1]:.2f} N m after the time-out",
+                    ctx.at(states.topic, back[0], end),
+                    tau_nm=back[1],
+                ).pressed(back[1], ctx.tolerance("max_back_nm"))
             if still > ctx.tolerance("max_tau_part") * pressed:
                 return ctx.failed(
                     f"{still:.2f} N m",
@@ -332,6 +342,35 @@ def brakes(ctx: Context) -> Outcome:
         )
     figure = "stops" if "motion_rad" in values else "lets go" if values else "says so"
     return ctx.passed(figure, "; ".join(proofs), **values).resting_on(*measures)
+
+
+def _presses(ctx: Context, since: float, end: float) -> float:
+    """The largest size of tau_est in any piece of a braked stretch: torque must not come back."""
+    begin = min(since + ctx.tolerance("release_s"), end - 0.1)
+    return max((size for _, size in _pieces(ctx, begin, end)), key=abs, default=0.0)
+
+
+def _opposes(ctx: Context, since: float, end: float, before: float) -> tuple[float, float] | None:
+    """When, and with which torque, a hand that pressed drives the other way while it brakes."""
+    for at, _ in _pieces(ctx, since, end):
+        tau = ctx.states.tau[ctx.states.between(at, at + _PIECE_S), 0]
+        back = -float(np.median(tau)) * (1 if before > 0 else -1)
+        if back > ctx.tolerance("max_back_nm"):
+            return at, back
+    return None
+
+
+_PIECE_S = 0.1
+
+
+def _pieces(ctx: Context, begin: float, end: float) -> list[tuple[float, float]]:
+    """(time, median size of tau_est) of the consecutive pieces of a stretch."""
+    found = []
+    for at in np.arange(begin, end - 0.99 * _PIECE_S, _PIECE_S):
+        tau = ctx.states.tau[ctx.states.between(float(at), float(at) + _PIECE_S), 0]
+        if len(tau) >= 3 and np.isfinite(tau).all():
+            found.append((float(at), float(np.median(np.abs(tau)))))
+    return found
 
 
 def stopped(t: Floats, q: Floats, last: float, still: float, limit: float) -> Measure:
@@ -422,11 +461,36 @@ def resumes(ctx: Context) -> Outcome:
             .timed(after, limit)
             .if_late(after - limit)
         )
+    for phase in judged:
+        wrong = away_first(ctx, phase, "after a pause of commands")
+        if wrong is not None:
+            return wrong
     outcome = arrival(ctx, "after a pause of commands")
     if outcome.met and slowest is not None:
         span = slowest[1].begin, slowest[1].end
         return outcome.timed(slowest[0], limit, span=span)
     return outcome
+
+
+def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
+    """The failure of a hand that first goes away from the first goal after a pause, or pulls away
+    from it.
+    """
+    for step in steps_of(ctx, phase):
+        limit = ctx.tolerance("max_away_stroke", step.joint)
+        if abs(step.size) < limit:
+            continue
+        way = 1 if step.size > 0 else -1
+        # before it obeys; what it does near its goal is for other requirements
+        near = np.flatnonzero((step.q - step.target) * way > -0.5 * abs(step.size))
+        course = step.q[: int(near[0]) + 1] if len(near) else step.q
+        away = float(np.max((step.start - course) * way))
+        if away > limit:
+            text = f"{when}, {step}, but it first went {away:.2f} rad the other way"
+            place = ctx.at(ctx.states.topic, step.begin, step.end)
+            outcome = ctx.failed(f"{away:.2f} rad away", text, place, away_rad=away)
+            return outcome.about(step.joint).placed(away, limit)
+    return None
 
 
 def arrival(ctx: Context, when: str) -> Outcome:

@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
 OWN_RULE = (
@@ -55,6 +56,11 @@ def _goals(ctx: Context, joint: int) -> _Goals:
         low[driven], high[driven] = -np.inf, np.inf
         limp = (commands.kp[finite, joint] <= 0) & ~driven
         low[limp], high[limp] = np.inf, -np.inf
+    # a service that was started again has no goal
+    starts = np.asarray([ctx.span(p)[1] for p in ctx.phases("shutdown")], dtype=np.float64)
+    rows = np.searchsorted(t, starts)
+    t = np.insert(t, rows, starts)
+    low, high = np.insert(low, rows, np.inf), np.insert(high, rows, -np.inf)
     changed = np.ones(len(t), dtype=np.bool_)
     changed[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
     return _Goals(t[changed], low[changed], high[changed])
@@ -243,3 +249,38 @@ def _in_force(goals: _Goals, origin: float, cells: int) -> tuple[Floats, Floats]
     np.minimum.at(low, at[known], goals.low[known])
     np.maximum.at(high, at[known], goals.high[known])
     return low, high
+
+
+@check("DEX1-START-03")
+def starts_idle(ctx: Context) -> Outcome:
+    """Motion and force between the first state of a started service and the first command."""
+    worst: tuple[float, float] = (0.0, 0.0)
+    most = 0.0
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        first = ctx.commands.t[(ctx.commands.t >= begin) & (ctx.commands.t < end)]
+        rows = ctx.states.between(begin, float(first[0]) if len(first) else end)
+        t, q, tau = ctx.states.t[rows], ctx.states.q[rows, 0], ctx.states.tau[rows, 0]
+        good = np.isfinite(q) & np.isfinite(tau)
+        t, q, tau = t[good], q[good], tau[good]
+        if len(t) < 5:
+            continue
+        away = np.abs(q - q[0])
+        worst = max(worst, (float(away.max()), float(t[int(np.argmax(away))])))
+        # what a motor lets go of, it may still have had in its hand at first
+        for x in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1):
+            at = float(x)
+            piece = np.abs(tau[(t >= at) & (t < at + 0.1)])
+            most = max(most, median(piece) if len(piece) >= 3 else 0.0)
+            if most > ctx.tolerance("max_tau_nm"):
+                text = f"tau_est of {most:.2f} N m before the first command after a start"
+                place = ctx.at(ctx.states.topic, at)
+                outcome = ctx.failed(f"{most:.2f} N m", text, place, tau_nm=most)
+                return outcome.pressed(most, ctx.tolerance("max_tau_nm"))
+    rad, when = worst
+    limit = ctx.tolerance("max_motion_stroke")
+    text = f"moved by {rad:.3f} rad before the first command after a start"
+    if rad > limit:
+        outcome = ctx.failed(f"{rad:.2f} rad", text, ctx.at(ctx.states.topic, when), motion_rad=rad)
+        return outcome.placed(rad, limit).if_late(STROKE_S * rad / ctx.joints[0].stroke)
+    return ctx.passed(f"{rad:.3f} rad", text, motion_rad=rad).placed(rad, limit)

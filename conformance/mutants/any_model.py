@@ -333,7 +333,11 @@ class EmptyNowAndThen(Service):
 # a hand that obeys the other side's topic does not obey its own
 @wrong_hand(
     ("DEX1-SIDE-01", "DEX3-SIDE-01"),
-    also=("DEX1-MOVE-01", "DEX3-JOINT-01"),
+    also=(
+        "DEX1-MOVE-01",
+        "DEX3-JOINT-01",
+        "DEX1-FIELD-05",
+    ),
     sides=BOTH,
 )
 class Swapped(Service):
@@ -343,7 +347,13 @@ class Swapped(Service):
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
 
 
-@wrong_hand(("DEX1-MOVE-06", "DEX3-MOVE-06"), also=("DEX1-CMD-01",))
+@wrong_hand(
+    ("DEX1-MOVE-06", "DEX3-MOVE-06"),
+    also=(
+        "DEX1-CMD-01",
+        "DEX1-WDOG-03",
+    ),
+)
 @wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-SAFE-09"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
@@ -410,7 +420,7 @@ class HomesAtTheStart(_Moves):
         super().live(dt)
 
 
-@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), whole=True)
+@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), also=("DEX1-START-03",), whole=True)
 class HomesWhenRestarted(_Moves):
     """Moves by a tenth of its range after a restart of its service, before any command."""
 
@@ -477,7 +487,7 @@ class SnapsAtFirst(_Snaps):
         return not self.restarted
 
 
-@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"), whole=True)
+@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"), also=("DEX1-LIFE-03",), whole=True)
 class SnapsWhenRestarted(_Snaps):
     """After a restart of its service, first goes to the other end for a quarter of a second."""
 
@@ -526,7 +536,16 @@ class BadCommandsStopBoth(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), sides=BOTH, whole=True)
+@wrong_hand(
+    ("DEX1-SIDE-02", "DEX3-SIDE-02"),
+    also=(
+        "DEX1-FORCE-06",
+        "DEX1-GAIN-04",
+        "DEX1-WDOG-03",
+    ),
+    sides=BOTH,
+    whole=True,
+)
 class OneWatchdogForBoth(Service):
     """Drops the commands to one hand while the other has got none for a second."""
 
@@ -541,7 +560,15 @@ class OneWatchdogForBoth(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-ABUSE-01", "DEX3-ABUSE-01"), also=("DEX1-TRACK-02", "DEX1-FORCE-09"))
+@wrong_hand(
+    ("DEX1-ABUSE-01", "DEX3-ABUSE-01"),
+    also=(
+        "DEX1-TRACK-02",
+        "DEX1-FORCE-09",
+        "DEX1-GAIN-04",
+        "DEX1-GAIN-05",
+    ),
+)
 class WeakAfterNan(Service):
     """Uses a quarter of the stiffness since it has got a command that is not finite."""
 
@@ -897,7 +924,13 @@ class BoundToOneClient(Service):
             super().receive(topic, payload, client)
 
 
-@wrong_hand(("DEX1-LIFE-03", "DEX3-LIFE-03"))
+@wrong_hand(
+    ("DEX1-LIFE-03", "DEX3-LIFE-03"),
+    also=(
+        "DEX1-FORCE-06",
+        "DEX1-GAIN-03",
+    ),
+)
 class DeafAfterRestart(Service):
     """After a restart, it gets no commands from clients that were there before."""
 
@@ -950,10 +983,11 @@ class LeavesItsName(Service):
 
 @wrong_hand(("DEX1-LIFE-05", "DEX3-LIFE-05"))
 class LeavesItDriven(Service):
-    """Ends without braking."""
+    """Ends without braking, and took the time-out with it."""
 
     def brake(self) -> None:
-        pass
+        for hand in self.hands.values():  # type: ignore[attr-defined]
+            hand.timeout = math.inf
 
 
 # --------------------------------------------------------------------------------- tracking
@@ -962,7 +996,11 @@ class LeavesItDriven(Service):
 # it drops single commands
 @wrong_hand(
     ("DEX1-TRACK-01", "DEX3-TRACK-01"),
-    also=("DEX1-CMD-01", "DEX3-CMD-01"),
+    also=(
+        "DEX1-CMD-01",
+        "DEX3-CMD-01",
+        "DEX1-WDOG-03",
+    ),
 )
 class WaitsForRest(Service):
     """Obeys a new goal only when the goal has not changed for 0.1 s."""

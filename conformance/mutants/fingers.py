@@ -569,7 +569,7 @@ class TwoGrades(FingerService):
 # --------------------------------------------------------------------------------- mode byte
 
 
-@wrong_hand("DEX3-MODE-02", also=("DEX3-LIFE-05",))
+@wrong_hand("DEX3-MODE-02")
 class AlwaysDriven(FingerService):
     """Publishes that its motors are driven, whatever their state."""
 

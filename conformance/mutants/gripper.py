@@ -11,6 +11,7 @@ from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import LEFT, wrong_hand
+from dexkit.conformance.virtual import TopicDevice
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from dexkit.messages import message_type
@@ -196,7 +197,13 @@ class ShiftsForAWhile(_Fields):
         return {**fields, "q": fields["q"] + off, "ddq": 0.0}
 
 
-@wrong_hand("DEX1-FIELD-18", also=("DEX1-TRACK-02",))
+@wrong_hand(
+    "DEX1-FIELD-18",
+    also=(
+        "DEX1-TRACK-02",
+        "DEX1-SIDE-02",
+    ),
+)
 class GoesThroughTheObject(_Fields):
     """In contact lets the published q, and dq with it, go on to the command."""
 
@@ -241,7 +248,7 @@ class OtherRobotsMode(_Filled):
     member, value = "mode", 0x0A
 
 
-@wrong_hand("DEX1-FIELD-05", also=("DEX1-LIFE-05",))
+@wrong_hand("DEX1-FIELD-05")
 class AlwaysDriven(_Filled):
     """Publishes mode 1, driven, all the time."""
 
@@ -359,7 +366,7 @@ class _Hunts(ReferenceHand):
         return super().motor_torque() + shake
 
 
-@wrong_hand("DEX1-MOVE-03", whole=True)
+@wrong_hand("DEX1-MOVE-03", also=("DEX1-FORCE-10",), whole=True)
 class Hunts(ReferenceService):
     """Oscillates about its goal."""
 
@@ -421,7 +428,7 @@ class _Creeps(ReferenceHand):
         return 0.5 * (wanted - self.dq) + friction
 
 
-@wrong_hand("DEX1-MOVE-07")
+@wrong_hand("DEX1-MOVE-07", also=("DEX1-FORCE-06",))
 class Creeps(ReferenceService):
     """Moves the last 3 mm to its goal slowly."""
 
@@ -457,7 +464,15 @@ class _IgnoresGains(ReferenceHand):
         return super().accept(Motor(q=motor.q))
 
 
-@wrong_hand("DEX1-GAIN-01", also=("DEX1-SAFE-05", "DEX1-GAIN-02"), whole=True)
+@wrong_hand(
+    "DEX1-GAIN-01",
+    also=(
+        "DEX1-SAFE-05",
+        "DEX1-GAIN-02",
+        "DEX1-FORCE-12",
+    ),
+    whole=True,
+)
 class IgnoresGains(ReferenceService):
     """Moves to q with any gains."""
 
@@ -546,7 +561,7 @@ class SignedForce(_Fields):
         return {**fields, "tau_est": self.hands[side].tau}
 
 
-@wrong_hand("DEX1-FORCE-06")
+@wrong_hand("DEX1-FORCE-06", also=("DEX1-FORCE-10",))
 class FeelsLate(_Fields):
     """Reports the force of a contact only when it has lasted for 0.9 s."""
 
@@ -562,7 +577,13 @@ class FeelsLate(_Fields):
         return fields if late else {**fields, "tau_est": 0.0}
 
 
-@wrong_hand("DEX1-FORCE-07")
+@wrong_hand(
+    "DEX1-FORCE-07",
+    also=(
+        "DEX1-FORCE-13",
+        "DEX1-START-03",
+    ),
+)
 class ForceBeforeCommands(_Fields):
     """Reports a force until it gets its first command."""
 
@@ -592,7 +613,7 @@ class _Saturates(ReferenceHand):
         return replace(accepted, kp=min(accepted.kp, 2.0))
 
 
-@wrong_hand("DEX1-FORCE-09")
+@wrong_hand("DEX1-FORCE-09", also=("DEX1-GAIN-05",))
 class StiffnessSaturates(ReferenceService):
     """Has a kp of 2 N m/rad at most."""
 
@@ -683,15 +704,20 @@ class _BrakesOnce(ReferenceHand):
         return self.now - self.braked < 2.0
 
 
-# its second time-out comes in the stimulus of that requirement
-@wrong_hand("DEX1-WDOG-04")
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
 class BrakesOnce(ReferenceService):
     """Brakes at the first time-out and at none after it."""
 
     hand = _BrakesOnce
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+@wrong_hand(
+    "DEX1-WDOG-01",
+    also=(
+        "DEX1-FIELD-05",
+        "DEX1-WDOG-04",
+    ),
+)
 class NoWatchdogWhenRestarted(ReferenceService):
     """Follows the last command for ever after a restart of its service."""
 
@@ -756,8 +782,237 @@ class _Latches(ReferenceHand):
         return self.tripped or super().braking
 
 
-@wrong_hand("DEX1-WDOG-03")
+@wrong_hand("DEX1-WDOG-03", also=("DEX1-FORCE-06",))
 class LatchesTheBrake(ReferenceService):
     """Brakes after a silence and never releases."""
 
     hand = _Latches
+
+
+# ------------------------------------------------------- for long, softly, and after a silence
+
+
+class _Tires(ReferenceHand):
+    """Loses force while the same command presses."""
+
+    seconds = 0.0
+    begins, ends, rest = 2.0, 3.0, 0.5
+
+    def motor_torque(self) -> float:
+        part = (self.seconds - self.begins) / (self.ends - self.begins)
+        return super().motor_torque() * (1.0 - (1.0 - self.rest) * min(max(part, 0.0), 1.0))
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        self.seconds = self.seconds + dt if self.contact() > 0.0 and not self.braking else 0.0
+
+
+@wrong_hand("DEX1-FORCE-10", also=("DEX1-FORCE-09",))
+class GripFades(ReferenceService):
+    """Presses with half of the force after three seconds of contact."""
+
+    hand = _Tires
+
+
+class _Winds(ReferenceHand):
+    seconds = 0.0
+
+    def motor_torque(self) -> float:
+        tau = super().motor_torque() * (1.0 + 0.5 * min(self.seconds, 2.0))
+        return min(max(tau, -self.tau_max), self.tau_max)
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        self.seconds = self.seconds + dt if self.contact() > 0.0 and not self.braking else 0.0
+
+
+@wrong_hand("DEX1-FORCE-10")
+class GripGrows(ReferenceService):
+    """Presses harder and harder, up to twice what was commanded."""
+
+    hand = _Winds
+
+
+class _Sleepy(ReferenceHand):
+    seconds = 0.0
+    last: Motor | None = None
+
+    def command(self, motor: Motor) -> None:
+        if self.last is None or motor.q != self.last.q or motor.kp != self.last.kp:
+            self.seconds = 0.0
+        self.last = motor
+        super().command(motor)
+
+    def motor_torque(self) -> float:
+        return 0.0 if self.seconds > 3.0 and self.touch is None else super().motor_torque()
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        self.seconds += dt
+
+
+@wrong_hand("DEX1-HOLD-01")
+class SleepsWhileHeld(ReferenceService):
+    """Switches its motor off when the goal has been the same for three seconds."""
+
+    hand = _Sleepy
+
+
+class _SoftInTheFree(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return replace(accepted, kp=min(accepted.kp, 2.5)) if self.touch is None else accepted
+
+
+@wrong_hand("DEX1-GAIN-05")
+class StiffnessSaturatesInTheFree(ReferenceService):
+    """Has a kp of 2.5 N m/rad at most where nothing is between the jaws."""
+
+    hand = _SoftInTheFree
+
+
+class _LeastStiffness(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        limp = accepted.kp < 1.0 and self.touch is None
+        return replace(accepted, kp=0.0) if limp else accepted
+
+
+@wrong_hand("DEX1-GAIN-04")
+class SoftIsLimp(ReferenceService):
+    """Takes a kp below 1 N m/rad for none, where nothing is between the jaws."""
+
+    hand = _LeastStiffness
+
+
+class _SoftGripIsLimp(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        limp = accepted.kp < 1.0 and self.touch is not None
+        return replace(accepted, kp=0.1 * accepted.kp) if limp else accepted
+
+
+@wrong_hand("DEX1-FORCE-11")
+class SoftGripIsLimp(ReferenceService):
+    """Scales a kp below 1 N m/rad down, in the hand with an object."""
+
+    hand = _SoftGripIsLimp
+
+
+class _WholeStiffness(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        if not 1.0 < accepted.kp < 3.0:
+            return accepted
+        return replace(accepted, kp=math.floor(accepted.kp))
+
+
+@wrong_hand("DEX1-FORCE-12")
+class WholeStiffness(ReferenceService):
+    """Rounds a kp between 1 and 3 N m/rad down to a whole number."""
+
+    hand = _WholeStiffness
+
+
+@wrong_hand("DEX1-FORCE-13")
+class OffsetOfTheForce(_Fields):
+    """Has an offset of 0.15 N m on tau_est."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return {**fields, "tau_est": fields["tau_est"] + 0.15}
+
+
+@wrong_hand("DEX1-START-03")
+class KeepsItsGoal(ReferenceService):
+    """Puts the last command of the service before it in force when it starts."""
+
+    kept: dict[Side, Motor]
+
+    def brake(self) -> None:
+        self.kept = {side: hand.goal for side, hand in self.hands.items() if hand.goal}
+        super().brake()
+
+    def take_over(self, before: TopicDevice) -> None:
+        super().take_over(before)
+        assert isinstance(before, KeepsItsGoal)
+        self.kept = before.kept
+
+    def begin(self, now: float) -> None:
+        super().begin(now)
+        for side, motor in self.kept.items():
+            self.hands[side].command(motor)
+
+
+class _Wraps(ReferenceHand):
+    wraps = 3.0
+
+    @property
+    def braking(self) -> bool:
+        if self.goal is None:
+            return True
+        return (self.now - self.heard) % self.wraps > self.timeout
+
+
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+class WatchdogWraps(ReferenceService):
+    """Releases the brake for a second every three seconds: its counter wraps."""
+
+    hand = _Wraps
+
+
+class _LetsGo(ReferenceHand):
+    pressed = False
+
+    def motor_torque(self) -> float:
+        since = self.now - self.heard - self.timeout
+        if self.goal is not None and self.pressed and 0.0 < since < 0.4:
+            return 0.4
+        return super().motor_torque()
+
+    def step(self, dt: float) -> None:
+        if not self.braking:
+            self.pressed = self.contact() > 0.0
+        super().step(dt)
+
+
+@wrong_hand("DEX1-WDOG-01")
+class LetsGoAtTheTimeOut(ReferenceService):
+    """Opens a little after the time-out where it pressed on an object."""
+
+    hand = _LetsGo
+
+
+class _OldGoalFirst(ReferenceHand):
+    old: Motor | None = None
+    until = -math.inf
+
+    def command(self, motor: Motor) -> None:
+        if not math.isfinite(motor.q):
+            return
+        if self.goal is not None and self.braking:
+            self.old, self.until = self.goal, self.now + 0.3
+        super().command(self.old if self.old and self.now < self.until else motor)
+
+
+@wrong_hand("DEX1-WDOG-03")
+class OldGoalFirst(ReferenceService):
+    """Carries out the command from before a silence for 0.3 s when the next ones come."""
+
+    hand = _OldGoalFirst
+
+
+@wrong_hand("DEX1-STILL-01", also=("DEX1-SAFE-01",))
+class TakesTheOtherSides(ReferenceService):
+    """Of commands that come at once it now and then gives the left hand the right one's."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.turns = 0
+
+    def command(self, side: Side, motor: Motor) -> None:
+        super().command(side, motor)
+        left = self.hands.get(Side.LEFT)
+        if side is Side.RIGHT and left is not None and left.heard == left.now:
+            self.turns += 1
+            if self.turns % 50 == 0:
+                super().command(Side.LEFT, motor)

@@ -64,7 +64,14 @@ class DeadBand(_DeadBand, ReferenceService):
     band = 0.14 / 5.4
 
 
-@wrong_hand("DEX1-OPER-01", also=("DEX1-OPER-02", "DEX1-FORCE-09"))
+@wrong_hand(
+    "DEX1-OPER-01",
+    also=(
+        "DEX1-OPER-02",
+        "DEX1-FORCE-09",
+        "DEX1-GAIN-05",
+    ),
+)
 class SaturatingGain(ReferenceService):
     """Takes no kp above 2: with the client's small lead it has 40 % of the force."""
 
@@ -91,7 +98,7 @@ class _Coarse(_PerJoint):
         return round(q / grid) * grid
 
 
-@wrong_hand("DEX1-OPER-04")
+@wrong_hand("DEX1-OPER-04", also=("DEX1-FORCE-12",))
 class CoarseTargets(_Coarse, ReferenceService):
     """Moves to the nearest of 19 positions."""
 

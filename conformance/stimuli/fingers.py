@@ -290,6 +290,11 @@ class FingerScript(HandScript):
             "recover", self._other_place(), most=1.5, after=self._bad_phases_since_recovery
         )
 
+    def _before_shutdown(self) -> Steps:
+        """Move: what was commanded last must not be in force after the restart."""
+        yield from self._to("center", OPEN)
+        yield from self._drive("drive", self.plan.sides, {}, guard=False)
+
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)
         yield from self._drive("drive", self.plan.sides, {}, guard=False)

@@ -22,18 +22,23 @@ single         commands that are sent once
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
-squeeze        close on the object, if there is one, by xr_teleoperate's lead
+grip           close on the object, if there is one, by xr_teleoperate's lead: equal commands for
+               long, 30 a second; meanwhile the other side is held in the free, and pushed by a
+               torque at first and at last (nudge)
+squeeze        the same, by half as much again
+soft-grip      grips of less stiffness
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
-silence        ... the commands stop for two command time-outs
-rejected       only commands that are not finite, to each side alone
-resume         a step after the silence
+silence        ... the commands stop for longer than counters of 8 bits last
+rejected       only commands that are not finite
+resume         a step after the silence, also away from where the hand was going
+soft           a step of less stiffness
 operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.stimuli.operator`
 two-writers    a second client commands another place, and goes
 company        a second client commands the same: steps of each side alone, and of both in
                opposite directions
 restart        the client goes away, another comes, and makes such steps; each kind of bad
                commands again
-shutdown       the service is stopped and started again
+shutdown       the service is stopped and started again while the hand grips or moves
 restarted      no commands
 service-       such steps after that; silence again
 restart
@@ -43,11 +48,12 @@ restart
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
+from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
 
@@ -57,6 +63,23 @@ __all__ = ["GripperScript"]
 LEAD = 0.18 / 5.4
 _PUSH = (0.25, 1.0)
 """Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
+_NEARLY = 0.15
+"""Part of the stroke to which a free hand is closed before it is driven open."""
+_BACK = 0.13
+"""Part of the stroke by which a free hand is commanded back after a restart of its service."""
+_GRIP, _LONG_GRIP = 3.0, 30.0
+"""Seconds of equal commands between two pushes; those of a thorough run."""
+_SILENCE, _LONG_SILENCE = 4.2, 67.0
+"""Seconds without a command: longer than counters of 8 bits in steps of 10 ms last; in a thorough
+run, than those of 16 bits in milliseconds."""
+_CAMERA_HZ = 30.0
+"""Commands a second of a client that sends one for each picture of a camera."""
+_NUDGE, _NUDGE_SECONDS = 0.6, 0.3
+"""A torque that pushes a hand that is held by kp, N m, and for how long, s."""
+_SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6))
+"""kp, N m/rad, and how far they are commanded into the object, rad: some 0.5 N m each."""
+_SOFTEST, _SOFT_STEP = 0.8, 0.3
+"""kp, N m/rad, and size, in parts of the stroke, of a soft step."""
 _PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
@@ -77,6 +100,8 @@ class GripperScript(HandScript):
         self._gains_used = plan.dialect.gains_are_used
         self._gainless = False
         """Whether commands have no gains: clients of a dialect that does not use them send none."""
+        self._grip: dict[Side, Motors] = {}
+        """What a side gets instead of its goal; nothing at all if empty."""
 
     def _provoke(self) -> Steps:
         sides = self.plan.sides
@@ -144,6 +169,15 @@ class GripperScript(HandScript):
     def _motors(self, side: Side, pose: Pose) -> Motors:
         return (Motor(q=pose[0], kp=0.0, kd=0.0) if self._gainless else Motor(q=pose[0]),)
 
+    def _command(self, motors: Mapping[Side, Motors] | None = None) -> Steps:
+        """Every side holds its goal, but for those named and those that grip."""
+        if not self._grip:
+            yield from super()._command(motors)
+            return
+        chosen = {**self._grip, **(motors or {})}
+        every = {s: chosen[s] if s in chosen else self._motors(s, q) for s, q in self._goal.items()}
+        yield from self._send(self._codec.encode({s: m for s, m in every.items() if m}))
+
     # -- phases -----------------------------------------------------------------------------
 
     def _steps(self, side: Side) -> Steps:
@@ -167,11 +201,11 @@ class GripperScript(HandScript):
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
         sides = self.plan.sides
-        yield from self._hold(0.2)
+        yield from self._hold(0.1)
         if name == "nan":
             for side in sides:
                 kinds = [{side: (m,)} for m in self._not_finite(side)]
-                yield from self._bad_commands(name, (side,), kinds, max(0.1, 1.2 / len(kinds)))
+                yield from self._bad_commands(name, (side,), kinds, max(0.08, 1.2 / len(kinds)))
         elif name == "out-of-range":
             places = (1000.0, -1000.0, 1.3 * self._stroke, -0.3 * self._stroke)
             far = [dict.fromkeys(sides, (Motor(q=q),)) for q in places]
@@ -242,14 +276,56 @@ class GripperScript(HandScript):
             "recover", self._other_place(), after=self._bad_phases_since_recovery
         )
 
+    def _before_shutdown(self) -> Steps:
+        """Grip and move: what was commanded last must not be in force after the restart."""
+        sides = self.plan.sides
+        pressing = [s for s in sides if s in self.plan.objects]
+        free = [s for s in sides if s not in pressing]
+        self._grip = dict(self._squeeze(pressing))
+        if free:
+            nearly = dict.fromkeys(free, (_NEARLY * self._stroke,))
+            yield from self._turn("center", nearly, least=0.5, stand=self._standing)
+        if free and self._gains_used:
+            yield from self._drive(free, 0.16)
+        elif pressing:
+            yield from self._hold(0.5)
+
+    def _not_restarted(self) -> Steps:
+        self._grip = {}
+        if self.plan.phases & {"silence", "rejected"}:
+            yield from self._silent_again()
+
+    def _after_shutdown(self) -> dict[Side, Pose]:
+        self._grip = {}
+        places = self._other_place()
+        for s in self.plan.sides:
+            if s not in self.plan.objects and s in self._obs.q:
+                # back from where it was going, but not to the end
+                back = self._obs.q[s][0] - _BACK * self._stroke
+                places[s] = (max(back, self._low(s)),)
+        return places
+
     def _silent_again(self) -> Steps:
         if not self._gains_used:
             return
         sides = self.plan.sides
+        if "push" in self.plan.phases:
+            yield from self._pushes(sides, ("push",))
         yield from self._everyone("center", {s: (self._low(s),) for s in sides})
         pressing = [s for s in sides if s in self.plan.objects]
-        yield from self._drive([s for s in sides if s not in pressing], self._squeeze(pressing))
-        yield from self._silence("silence", self._model.command_timeout + 0.6)
+        self._grip = dict(self._squeeze(pressing))
+        yield from self._drive([s for s in sides if s not in pressing], 0.16)
+        first, *rest = sides
+        if rest and not self._codec.shared and "rejected" in self.plan.phases:
+            silent = self._begin("silence", (first,))
+            rejected = self._begin("rejected", rest)
+            self._grip = {first: (), **dict.fromkeys(rest, (Motor(q=math.inf),))}
+            yield from self._hold(self._model.command_timeout + 0.6)
+            self._end(silent)
+            self._end(rejected)
+        else:
+            yield from self._silence("silence", self._model.command_timeout + 0.6)
+        self._grip = {}
         yield from self._everyone("resume", self._other_place())
 
     def _undriven(self) -> Steps:
@@ -266,10 +342,11 @@ class GripperScript(HandScript):
             yield from self._pushes(sides)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
-    def _pushes(self, sides: Sequence[Side]) -> Steps:
+    def _pushes(self, sides: Sequence[Side], names: Sequence[str] = ("pull", "push")) -> Steps:
         """Close and open by a torque alone, which grows until the hand moves."""
         self._report("a torque without a position gain: the hand must move with it")
-        for name, way, end in (("pull", -1, 0.0), ("push", 1, self._stroke)):
+        for name in names:
+            way, end = (-1, 0.0) if name == "pull" else (1, self._stroke)
             phase = self._begin(name, sides, targets={s: {0: end} for s in sides})
             torque = dict.fromkeys(sides, _PUSH[0])
             while self._elapsed(phase) < _PUSH_SECONDS:
@@ -290,54 +367,173 @@ class GripperScript(HandScript):
         return {s: (Motor(q=self.plan.objects[s] - depth),) for s in sides}
 
     def _squeeze_and_silence(self) -> Steps:
-        sides = self.plan.sides
+        sides, phases = self.plan.sides, self.plan.phases
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
         if free:
-            nearly_closed = dict.fromkeys(free, (0.15 * self._stroke,))
+            nearly_closed = dict.fromkeys(free, (_NEARLY * self._stroke,))
             yield from self._everyone("center", {**self._goal, **nearly_closed})
-        squeeze = self._squeeze(pressing)
+        if phases & {"grip", "nudge"}:
+            yield from self._hold_long(pressing, free)
         if pressing:
             self._report("squeezing the object")
-            beyond = {s: {0: motors[0].q} for s, motors in squeeze.items()}
+            self._grip = dict(self._squeeze(pressing))
+            beyond = {s: {0: motors[0].q} for s, motors in self._grip.items()}
             phase = self._begin("squeeze", pressing, targets=beyond)
-            yield from self._hold(1.5, squeeze)
+            yield from self._hold(1.0)
             self._end(phase)
-        if not self.plan.phases & {"silence", "resume", "rejected"}:
-            return
-        if free and self._gains_used:
-            yield from self._drive(free, squeeze)
-        self._report("... silence: after a second the hand must brake")
-        yield from self._silence("silence", 2 * self._model.command_timeout + 0.1)
-        yield from self._everyone("resume", self._other_place())
+        if phases & {"silence", "resume", "rejected"}:
+            yield from self._silences(pressing, free)
+        elif phases & {"soft", "soft-grip"}:
+            yield from self._soft_grips(pressing, {})
+            self._grip = {}
+            yield from self._soft_step(sides)
+
+    def _hold_long(self, pressing: Sequence[Side], free: Sequence[Side]) -> Steps:
+        """Equal commands for long: a grip by the client's lead, and a hand held in the free.
+
+        They come at the rate of a camera, so that one command to the wrong side would be in force
+        long enough to show. A torque pushes the free hand at first and at last.
+        """
+        self._report("the same commands for long: they must stay in force")
+        lead = LEAD * self._stroke
+        self._grip = {s: (Motor(q=max(self.plan.objects[s] - lead, 0.0)),) for s in pressing}
+        period, self._period_ns = self._period_ns, round(1e9 / _CAMERA_HZ)
+        beyond = {s: {0: motors[0].q} for s, motors in self._grip.items()}
+        gripping = [self._begin("grip", pressing, targets=beyond)] if pressing else []
+        pushed = {s: (replace(self._motors(s, self._goal[s])[0], tau=_NUDGE),) for s in free}
+        nudged = free and self._gains_used
+        yield from self._hold(_NUDGE_SECONDS)
+        for seconds in (_LONG_GRIP if self._patient else _GRIP, 0.1):
+            if nudged:
+                phase = self._begin("nudge", free)
+                yield from self._hold(_NUDGE_SECONDS, pushed)
+                self._end(phase)
+            yield from self._hold(seconds)
+        for phase in gripping:
+            self._end(phase)
+        self._period_ns = period
+
+    def _silences(self, pressing: Sequence[Side], free: Sequence[Side]) -> Steps:
+        """No commands for long: to each side alone where they have topics of their own."""
+        sides = self.plan.sides
+        timeout = self._model.command_timeout
+        long = _LONG_SILENCE if self._patient else _SILENCE
+        first = free[0] if free else sides[0]
+        rest = [s for s in sides if s != first]
+        alone = bool(rest) and not self._codec.shared and "rejected" in self.plan.phases
+        if not alone:
+            yield from self._soft_grips(pressing, {})
+            self._grip = dict(self._squeeze(pressing))
+            if free and self._gains_used:
+                yield from self._drive(free, 0.16)
+            self._report("... silence: after a second the hand must brake")
+            yield from self._silence("silence", long)
+            self._grip = {}
+            yield from self._everyone("resume", self._other_place())
+            yield from self._soft_step(sides)
+        else:
+            self._grip.pop(first, None)
+            if self._gains_used:
+                if not free:
+                    yield from self._turn("center", {first: (self._low(first),)}, least=0.5)
+                yield from self._drive((first,), 0.16)
+            self._report(f"... silence on the {first} side: after a second it must brake")
+            yield from self._silent_beside(first, [s for s in rest if s in pressing], long)
+            # away from where it was going before the silence
+            yield from self._turn("resume", {first: (_NEARLY * self._stroke,)}, least=0.6)
+            if self._gains_used:
+                low = {s: (self._low(s),) for s in (first,) if s in pressing}
+                if low:
+                    yield from self._turn("center", low, least=0.5)
+                gain = self._model.client_gains[1]
+                yield from self._drive([s for s in sides if s not in self._grip], 0.07, kd=gain)
+            self._report("... silence on both sides, and broken commands to one: both must brake")
+            yield from self._silent_and_rejected(first, rest, timeout)
+            self._grip = {}
+            yield from self._everyone("resume", self._other_place())
         yield from self._bad_at_once({s: (self._not_finite(s)[-1],) for s in sides})
-        if len(sides) > 1 and not self._codec.shared and "rejected" in self.plan.phases:
-            for side, bad in zip(sides, (math.nan, math.inf), strict=True):
-                yield from self._silent_alone(side, (Motor(q=bad),))
 
-    def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
-        """No command to one side but rejected ones, while it moves and the other is commanded."""
-        self._report(f"no good commands to the {side} hand alone: it must brake")
-        if self._gains_used:
-            yield from self._everyone("center", {side: (self._low(side),)})
-            yield from self._drive((side,), {})
-        yield from self._silence_alone("rejected", side, {side: rejected})
-        yield from self._everyone("resume", self._other_place())
+    def _silent_beside(self, side: Side, pressing: Sequence[Side], seconds: float) -> Steps:
+        """No command to one side, while the others grip softly, hold, and make a step."""
+        phase = self._begin("silence", (side,))
+        self._grip[side] = ()
+        yield from self._soft_grips(pressing, {})
+        yield from self._hold(max(0.3, seconds - 3.8))
+        grip, self._grip = self._grip, {side: ()}
+        beside = self._beside_others((side,), ASIDE_SECONDS)
+        yield from self._hold(0.8)
+        for ended in beside:
+            self._end(ended)
+        self._grip = {**grip, **self._squeeze(pressing)}
+        while self._elapsed(phase) < seconds:
+            yield from self._command()
+        self._end(phase)
+        del self._grip[side]
 
-    def _drive(self, sides: Sequence[Side], others: Mapping[Side, Motors]) -> Steps:
-        """Open at a steady low speed by velocity feedback alone, whatever the friction."""
+    def _silent_and_rejected(self, first: Side, rest: Sequence[Side], timeout: float) -> Steps:
+        """No commands, then only rejected ones to one side; the others stay silent longer."""
+        both, long = self._begin("silence", (first,)), self._begin("silence", rest)
+        self._grip = dict.fromkeys((first, *rest), ())
+        yield from self._hold(timeout + 0.4)
+        self._end(both)
+        # they must not wake it, either
+        rejected = self._begin("rejected", (first,))
+        self._grip[first] = (Motor(q=math.nan),)
+        yield from self._hold(0.9 * timeout)
+        self._end(rejected)
+        del self._grip[first]
+        yield from self._turn("resume", {first: self._other_place()[first]}, least=0.6)
+        yield from self._soft_step((first,))
+        beside = self._beside_others(rest, ASIDE_SECONDS)
+        yield from self._hold(0.6)
+        for ended in (*beside, long):
+            self._end(ended)
+
+    def _soft_grips(self, pressing: Sequence[Side], others: Mapping[Side, Motors]) -> Steps:
+        """Grips of less stiffness than the client's."""
+        if not self._gains_used or "soft-grip" not in self.plan.phases or not pressing:
+            return
+        for kp, depth in _SOFT_GRIPS:
+            soft = {s: (Motor(q=max(self.plan.objects[s] - depth, 0.0), kp=kp),) for s in pressing}
+            beyond = {s: {0: motors[0].q} for s, motors in soft.items()}
+            phase = self._begin("soft-grip", pressing, targets=beyond)
+            self._grip.update(soft)
+            yield from self._hold(0.75, others)
+            self._end(phase)
+
+    def _soft_step(self, sides: Sequence[Side]) -> Steps:
+        """A step in the free with the least stiffness."""
+        if not self._gains_used or "soft" not in self.plan.phases:
+            return
+        goals = {s: self._aside(s, _SOFT_STEP) for s in sides}
+        phase = self._begin("soft", sides, targets={s: {0: q} for s, (q,) in goals.items()})
+        yield from self._hold(0.8, {s: (Motor(q=q, kp=_SOFTEST),) for s, (q,) in goals.items()})
+        self._end(phase)
+        self._goal.update(goals)
+
+    def _drive(self, sides: Sequence[Side], part: float, kd: float = 0.5) -> Steps:
+        """Open at a steady low speed by velocity feedback alone, whatever the friction.
+
+        :param part: of the stroke in a second: far from the stop even after a whole time-out.
+        """
         self._report("slow motion, and then ...")
+        if not sides:
+            return
         phase = self._begin("drive", sides)
-        slow = 0.16 * self._stroke  # rad/s: far from the stop even after a whole time-out
+        slow = part * self._stroke
         wanted = dict.fromkeys(sides, slow)
+        # by q, as dq may be wrong: over as many commands as are visible as motion
+        seen: deque[tuple[int, Mapping[Side, float]]] = deque(maxlen=8)
         while self._elapsed(phase) < 0.8:
+            here = {s: self._obs.q[s][0] for s in sides if s in self._obs.q}
+            seen.append((self._obs.now_ns, here))
+            then, before = seen[0]
+            seconds = max((self._obs.now_ns - then) / 1e9, 1e-3)
             for s in sides:
-                if self._obs.dq.get(s, (0.0,))[0] < slow:
-                    wanted[s] = min(wanted[s] * 1.02, 10 * slow)
+                if (here.get(s, 0.0) - before.get(s, 0.0)) / seconds < slow:
+                    wanted[s] = min(wanted[s] * 1.03, 20 * slow)
             yield from self._command(
-                {
-                    **others,
-                    **{s: (Motor(self._goal[s][0], wanted[s], kp=0.0, kd=0.5),) for s in sides},
-                }
+                {s: (Motor(self._goal[s][0], wanted[s], kp=0.0, kd=kd),) for s in sides}
             )
         self._end(phase)

@@ -39,7 +39,7 @@ PATIENCE = 6.0
 """Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
 FLOOD = 500
 """Commands of a burst."""
-LOADS = ((400.0, 2.0, 1), (2500.0, 1.0, 10))
+LOADS = ((400.0, 1.5, 1), (2500.0, 1.0, 10))
 """Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation
 sends, the second what Unitree's C++ example sends (docs/sources/unitree-dex.md#b1)."""
 ASIDE = 0.15
@@ -69,6 +69,8 @@ class HandScript(Script[Side]):
         self._joints = {s: joints_of(plan.dialect, s) for s in Side}
         self._strokes = {s: [j.stroke for j in joints] for s, joints in self._joints.items()}
         self._held: tuple[dict[Side, Pose], Payloads] = ({}, [])
+        self._patient = False
+        """Whether to wait for what takes a minute: once in a thorough run."""
         self._echoed = False
         """Whether a second client sends each command as well."""
         self._period_ns = round(1e9 / self._model.command_rate)
@@ -89,6 +91,7 @@ class HandScript(Script[Side]):
         for done in range(self.plan.rounds):
             if self.plan.rounds > 1:
                 self._report(f"round {done + 1} of {self.plan.rounds}")
+            self._patient = self.plan.rounds > 1 and done == 0
             yield from self._provoke()
         if OPERATOR in self.plan.phases:
             yield from operate(self)
@@ -122,6 +125,18 @@ class HandScript(Script[Side]):
     @abstractmethod
     def _silent_again(self) -> Steps:
         """Missing commands once more, after a restart of the service."""
+
+    def _before_shutdown(self) -> Steps:
+        """What the hand does when its service is stopped."""
+        yield from ()
+
+    def _not_restarted(self) -> Steps:
+        """What follows where the kit cannot restart the service."""
+        yield from ()
+
+    def _after_shutdown(self) -> dict[Side, Pose]:
+        """Where the hand is commanded to after a restart of its service."""
+        return self._other_place()
 
     @abstractmethod
     def _home(self, side: Side) -> Pose:
@@ -540,11 +555,13 @@ class HandScript(Script[Side]):
     def _service_restart(self) -> Steps:
         """End the service and start it again, where the kit can."""
         self._report("the service is stopped and started again")
+        yield from self._before_shutdown()
         phase = self._begin("shutdown", self.plan.sides)
         yield from self._do(StopService())
         if not self._obs.stopped:
             self.phases.remove(phase)
             self._report("the kit has not started the service, so it does not restart it")
+            yield from self._not_restarted()
             return
         phase.observed = dict(self._obs.stopped)
         yield from self._do(StartService())
@@ -552,7 +569,7 @@ class HandScript(Script[Side]):
         self._next_ns = self._obs.now_ns
         # longer than a state may take, so that it must come without a command
         yield from self._silence("restarted", 1.3)
-        yield from self._everyone("service-restart", self._other_place(), most=4.0)
+        yield from self._everyone("service-restart", self._after_shutdown(), most=4.0)
         yield from self._in_turn("service-restart")
         if "silence" in self.plan.phases:
             yield from self._silent_again()

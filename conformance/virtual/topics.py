@@ -30,6 +30,8 @@ __all__ = ["ORIGIN_NS", "log_time_ns", "run_virtual"]
 
 ORIGIN_NS = 1_700_000_000_000_000_000
 """The recording's clock when the virtual one is at 0."""
+_STARTS_S = 2.0
+"""Seconds that a service takes to start."""
 _RIVAL = 1000
 """The second client's number."""
 
@@ -107,8 +109,11 @@ class _Player:
             self._take(self._service.end())
             self._stopped = {"exit_s": self._service.exit_s, "gone_s": self._service.gone_s}
         elif isinstance(action, StartService):
-            self.now += 0.5
             plan, before = self._plan, self._service
+            # what the old service has left driven goes on meanwhile
+            for _ in range(round(_STARTS_S / before.tick)):
+                self.now += before.tick
+                before.live(before.tick)
             self._service = self._service_class(plan.dialect, plan.sides, plan.objects)
             self._service.take_over(before)
             self._service.begin(self.now)
