@@ -157,7 +157,7 @@ class BurstsWithGoodStamps(Service):
         return super().end()
 
 
-@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
+@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"), also=("DEX1-FIELD-16",))
 class Bursts(BurstsWithGoodStamps):
     """Publishes states in bursts of ten."""
 
@@ -509,7 +509,7 @@ class DropsEverySecond(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-CMD-01", "DEX3-CMD-01"))
+@wrong_hand(("DEX1-CMD-01", "DEX3-CMD-01"), also=("DEX1-WDOG-04",))
 class OneBehind(Service):
     """Obeys each command when the next one arrives."""
 
@@ -740,7 +740,13 @@ class StopsInABurst(Service):
 
 @wrong_hand(
     ("DEX1-SAFE-08", "DEX3-SAFE-09"),
-    also=("DEX1-SAFE-09", "DEX3-SAFE-10", "DEX1-RATE-03", "DEX3-RATE-03"),
+    also=(
+        "DEX1-SAFE-09",
+        "DEX3-SAFE-10",
+        "DEX1-RATE-03",
+        "DEX3-RATE-03",
+        "DEX1-RATE-04",
+    ),
 )
 class GivesUpOnTwo(Service):
     """Ends when a second client commands it, and is restarted 0.4 s later."""

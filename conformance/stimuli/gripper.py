@@ -475,12 +475,12 @@ class GripperScript(HandScript):
         """No commands, then only rejected ones to one side; the others stay silent longer."""
         both, long = self._begin("silence", (first,)), self._begin("silence", rest)
         self._grip = dict.fromkeys((first, *rest), ())
-        yield from self._hold(timeout + 0.4)
+        yield from self._hold(timeout + 0.6)
         self._end(both)
         # they must not wake it, either
         rejected = self._begin("rejected", (first,))
         self._grip[first] = (Motor(q=math.nan),)
-        yield from self._hold(0.9 * timeout)
+        yield from self._hold(0.8 * timeout)
         self._end(rejected)
         del self._grip[first]
         yield from self._turn("resume", {first: self._other_place()[first]}, least=0.6)
