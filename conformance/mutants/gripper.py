@@ -203,6 +203,7 @@ class ShiftsForAWhile(_Fields):
         "DEX1-TRACK-02",
         "DEX1-SIDE-02",
     ),
+    whole=True,
 )
 class GoesThroughTheObject(_Fields):
     """In contact lets the published q, and dq with it, go on to the command."""
@@ -753,7 +754,7 @@ class _Sleeps(ReferenceHand):
             super().command(motor)
 
 
-@wrong_hand("DEX1-WDOG-03")
+@wrong_hand("DEX1-WDOG-03", whole=True)
 class SleepsAfterSilence(ReferenceService):
     """Ignores commands for a while after a silence."""
 

@@ -63,6 +63,8 @@ __all__ = ["GripperScript"]
 LEAD = 0.18 / 5.4
 _PUSH = (0.25, 1.0)
 """Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
+_LATE = {"grip", "nudge", "squeeze", "soft-grip", "soft", "silence", "resume", "rejected"}
+"""Phases that come one after the other, as each begins where the one before it ends."""
 _NEARLY = 0.15
 """Part of the stroke to which a free hand is closed before it is driven open."""
 _BACK = 0.13
@@ -135,7 +137,7 @@ class GripperScript(HandScript):
             yield from self._old_stamps()
         if "late-joiner" in self.plan.phases:
             yield from self._late_joiner()
-        if self.plan.phases & {"squeeze", "silence", "resume", "rejected"}:
+        if self.plan.phases & _LATE:
             yield from self._squeeze_and_silence()
 
     # -- places -----------------------------------------------------------------------------

@@ -107,7 +107,7 @@ class HandScript(Script[Side]):
             if "nan" in self.plan.phases:
                 yield from self._again()
         yield from self._hold(0.2)
-        if self.plan.phases & {"shutdown", "service-restart"}:
+        if self.plan.phases & {"shutdown", "restarted", "service-restart"}:
             yield from self._service_restart()
 
     @abstractmethod
