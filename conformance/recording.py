@@ -161,6 +161,7 @@ class Recording:
     :param stimulus: the phases of the stimulus, or None in a recording that no live run made.
     :param usb: what was transferred on USB, where the kit did that.
     :param run: the run record; empty in a recording that no live run made.
+    :param low_rate: the states on the low-rate topics, where there are any.
     """
 
     dialect: Dialect
@@ -174,6 +175,7 @@ class Recording:
     notes: Sequence[str] = ()
     usb: UsbRecording | None = None
     run: Mapping[str, str] = field(default_factory=dict)
+    low_rate: Mapping[Subject, States] = field(default_factory=dict)
 
     layer = "dds"
     """Which layer's requirements it is judged by."""
@@ -210,8 +212,11 @@ class Recording:
             )
         # the other side is decoded as well: checks of independence compare both
         topics = {t for s in Side for t in chosen.topics(s)} & present
-        samples = trace.load(sorted(topics), decode=True) if topics else {}
-        times = [s.log_time_ns for s in samples.values() if len(s)]
+        slow = {s: chosen.low_rate_topic.format(side=s) for s in Side}
+        slow = {s: topic for s, topic in slow.items() if topic in present}
+        wanted = sorted({*topics, *slow.values()})
+        samples = trace.load(wanted, decode=True) if topics else {}
+        times = [s.log_time_ns for topic, s in samples.items() if topic in topics and len(s)]
         marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
         usb = _usb(trace)
         if usb is not None:
@@ -264,6 +269,9 @@ class Recording:
             notes=notes,
             usb=usb.since(origin) if usb is not None else None,
             run=trace.metadata.get(RUN, {}),
+            low_rate={
+                s: _states(codec, s, samples.get(topic), origin, topic) for s, topic in slow.items()
+            },
         )
 
     @property
@@ -365,8 +373,10 @@ def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
     return np.asarray((times - origin) / 1e9, dtype=np.float64)
 
 
-def _states(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> States:
-    topic = codec.dialect.topics(side)[1]
+def _states(
+    codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int, topic: str = ""
+) -> States:
+    topic = topic or codec.dialect.topics(side)[1]
     if samples is None or samples.type_name != codec.dialect.state_type:
         t, none = np.empty(0), np.empty((0, codec.joints))
         return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)

@@ -5,8 +5,8 @@ missing evidence, and takes every limit from its requirement's tolerances, so th
 models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.motion`,
 :mod:`~.force`, :mod:`~.drive`, :mod:`~.safety`, :mod:`~.uncommanded`, :mod:`~.lifecycle`,
-:mod:`~.tracking`, :mod:`~.fingers` for hands of several joints, and :mod:`~.client` for the
-client that drives them.
+:mod:`~.tracking`, :mod:`~.fingers` and :mod:`~.each_joint` for hands of several joints, and
+:mod:`~.client` for the client that drives them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = [
 
 _HAND = (
     *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "drive"),
-    *("safety", "lifecycle", "tracking", "fingers", "operator", "uncommanded"),
+    *("safety", "lifecycle", "tracking", "fingers", "each_joint", "operator", "uncommanded"),
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),

@@ -17,7 +17,7 @@ from dexkit.conformance.checks.safety import arrival, stays, stopped
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
-from dexkit.models import HandModel, JointRoles, model
+from dexkit.models import HandModel, JointRoles, ModeByte, model
 
 _SLOTS = 12  # of a PressSensorState_
 
@@ -141,30 +141,6 @@ def no_value(ctx: Context) -> Outcome:
     if elements == count * _SLOTS:
         return outcome.because("No slot is marked: those without a sensor hold a number, too.")
     return outcome
-
-
-@check("DEX3-SENS-04")
-def touch(ctx: Context) -> Outcome:
-    """Pressure before and while squeezing."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    phase = ctx.phases()[-1]
-    begin, end = ctx.span(phase)
-    count = int(_packets(ctx).max(initial=0))
-    if not count:
-        return ctx.absent("the states hold no sensor packets")
-    before, during = ctx.states.between(begin - 0.2, begin), ctx.states.between(end - 0.3, end)
-    rises = []
-    for packet in range(count):
-        free, held = _pressure(ctx, packet, before), _pressure(ctx, packet, during)
-        if not len(free) or not len(held):
-            return ctx.skipped("no state before or while it squeezed")
-        rises.append(float((np.median(held, axis=0) - np.median(free, axis=0)).max()))
-    touched = [i for i, rise in enumerate(rises) if rise > 0]
-    text = f"pressure rises in {len(touched)} of {count} packets while squeezing"
-    if len(touched) >= ctx.tolerance("min_packets"):
-        return ctx.passed(f"{len(touched)} packets", text, packets=len(touched))
-    return ctx.failed("no touch", text, ctx.at(ctx.states.topic, begin, end))
 
 
 @check("DEX3-IMU-01")
@@ -463,34 +439,57 @@ class _Silence:
     :param last: the last command that was neither empty nor not finite.
     :param late: the time-out after that, with grace.
     :param driven: the phase in which joints were set in motion just before, if any were.
+    :param guarded: whether each joint has time-out protection.
     """
 
     last: float
     late: float
     end: float
     driven: Phase | None
+    guarded: NDArray[np.bool_]
 
 
-def _silences(ctx: Context) -> list[_Silence]:
+def protected(ctx: Context, at: float) -> NDArray[np.bool_]:
+    """Whether each joint has time-out protection by the last good command until ``at``."""
+    commands = ctx.commands
+    good = np.isfinite(commands.q).all(axis=1) & np.isfinite(commands.mode).all(axis=1)
+    rows = np.flatnonzero(good & (commands.t <= at))
+    if not len(rows) or ctx.recording.dialect.mode_byte is not ModeByte.RIS:
+        return np.zeros(len(ctx.joints), dtype=np.bool_)
+    return np.asarray(commands.mode[rows[-1]].astype(np.intp) >> 7 & 1, dtype=np.bool_)
+
+
+def _silences(ctx: Context, *names: str) -> list[_Silence]:
     """The phases without commands."""
     good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
     found = []
-    for phase in ctx.phases():
+    for phase in (p for name in names for p in ctx.phases(name)):
         begin, end = ctx.span(phase)
         sent = good[good <= end]
         last = min(float(sent[-1]), begin + 0.05) if len(sent) else begin
         late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
         drives = [p for name in ("drive", "guard-drive") for p in ctx.phases(name)]
         just = [p for p in drives if 0 <= phase.begin_ns - p.end_ns < 1e8]
-        found.append(_Silence(last, late, end, just[0] if just else None))
+        guarded = protected(ctx, last)
+        found.append(_Silence(last, late, end, just[0] if just else None, guarded))
     return found
 
 
-def _stops(ctx: Context, joints: Sequence[int]) -> Outcome:
-    """Fail if joints that move when commands end still move after the time-out."""
-    outcomes = [_stops_in(ctx, joints, s) for s in _silences(ctx) if s.driven is not None]
-    if not outcomes:
+def _stops(ctx: Context, joints: Sequence[int], *, guarded: bool) -> Outcome:
+    """Fail if joints that move when commands end still move after the time-out.
+
+    :param guarded: whether joints with time-out protection are judged, or those without.
+    """
+    driven = [s for s in _silences(ctx, "silence", "guard") if s.driven is not None]
+    if not driven:
         return ctx.skipped("this hand held an object when the commands stopped")
+    outcomes = [
+        _stops_in(ctx, mine, s)
+        for s in driven
+        if (mine := [j for j in joints if s.guarded[j] == guarded])
+    ]
+    if not outcomes:
+        return ctx.skipped("no joint that moved when the commands stopped was to be judged")
     failed = [o for o in outcomes if o.met is False]
     passed = [o for o in outcomes if o.met]
     return (failed or passed or outcomes)[0]
@@ -524,9 +523,9 @@ def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome
             motion_rad=rad,
         )
         return outcome.about(joint).resting_on(stop)
-    if before.min() < ctx.requirement.tolerance("min_travel_stroke"):
+    if before.max() < ctx.requirement.tolerance("min_travel_stroke"):
         return ctx.skipped(
-            "not every joint that was set in motion still moved when the commands stopped: "
+            "no joint that was set in motion still moved when the commands stopped: "
             "a braked joint cannot be distinguished from one at rest"
         )
     met = ctx.passed("stops", f"moving, then still ({rad:.3f} rad)", motion_rad=rad)
@@ -535,37 +534,49 @@ def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome
 
 @check("DEX3-WDOG-01")
 def nothing_left_moving(ctx: Context) -> Outcome:
-    """Motion after the time-out of joints driven by a velocity, without protection."""
-    return _stops(ctx, _roles(ctx).driven)
+    """Motion after the time-out of joints driven by a velocity or torque, without protection."""
+    return _stops(ctx, _roles(ctx).driven, guarded=False)
 
 
 @check("DEX3-GUARD-01")
 def brakes(ctx: Context) -> Outcome:
     """Motion after the time-out of protected joints, driven by velocity or to a position."""
-    return _stops(ctx, (*_roles(ctx).driven, *_roles(ctx).slow))
+    return _stops(ctx, (*_roles(ctx).driven, *_roles(ctx).slow), guarded=True)
 
 
 @check("DEX3-GUARD-02")
 def reports_trip(ctx: Context) -> Outcome:
-    """Bit 7 of the state's mode byte before and after the time-out."""
-    (silence,) = _silences(ctx)
-    last, late, end = silence.last, silence.late, silence.end
-    before = _modes(ctx, ctx.states.between(last - 0.2, last + 0.5)) >> 7
-    after = _modes(ctx, ctx.states.between(late, end)) >> 7
-    if not len(before) or not len(after):
-        return ctx.skipped("no state in the silence")
-    if before.any():
-        return ctx.failed(
-            "too early", "bit 7 is set while commands arrive", ctx.at(ctx.states.topic, last)
-        )
-    if not after.all():
-        joint = int(np.argmin(after.all(axis=0)))
-        return ctx.failed(
-            "not set",
-            ctx.named("bit 7 is not set after the time-out", joint),
-            ctx.at(ctx.states.topic, late, end),
-        ).about(joint)
-    return ctx.passed("set", "bit 7 is set in every motor after the time-out, and not before")
+    """Bit 7 of the state's mode byte of each joint before and after the time-out."""
+    silences = _silences(ctx, "guard")
+    for silence in silences:
+        last, late, end = silence.last, silence.late, silence.end
+        # protection is on for a while before: repeated commands must keep it from tripping
+        begins = [ctx.span(p)[0] for n in ("squeeze", "guarded") for p in ctx.phases(n)]
+        since = max((b for b in begins if last - 5.0 < b < last), default=last - 0.2)
+        before = _modes(ctx, ctx.states.between(since, last + 0.5)) >> 7
+        after = _modes(ctx, ctx.states.between(late, end)) >> 7
+        if not len(before) or not len(after):
+            return ctx.skipped("no state in the silence")
+        if before.any():
+            joint = int(np.argmax(before.any(axis=0)))
+            return ctx.failed(
+                "too early",
+                ctx.named("bit 7 is set while commands arrive", joint),
+                ctx.at(ctx.states.topic, since, last),
+            ).about(joint)
+        wrong = (after != silence.guarded).any(axis=0)
+        if wrong.any():
+            joint = int(np.argmax(wrong))
+            seen = "not always set" if silence.guarded[joint] else "set without protection"
+            return ctx.failed(
+                "not set" if silence.guarded[joint] else "set",
+                ctx.named(f"bit 7 is {seen} after the time-out", joint),
+                ctx.at(ctx.states.topic, late, end),
+            ).about(joint)
+    if not any(s.end - s.late >= ctx.tolerance("stays_s") - 0.2 for s in silences):
+        return ctx.skipped("no silence with protection was long enough")
+    count = sum(int(s.guarded.sum()) for s in silences)
+    return ctx.passed("set", f"bit 7 is set in {count} protected motors, and in no other")
 
 
 @check("DEX3-GUARD-03")
@@ -583,47 +594,74 @@ def clears(ctx: Context) -> Outcome:
 @check("DEX3-HOLD-01")
 def holds(ctx: Context) -> Outcome:
     """Grip force and motion to a position go on after commands end, without protection."""
-    outcomes = [_holds_in(ctx, silence) for silence in _silences(ctx)]
+    outcomes = [_holds_in(ctx, silence) for silence in _silences(ctx, "silence", "guard")]
+    if not outcomes:
+        return ctx.skipped("no pause of commands")
     failed = [o for o in outcomes if o.met is False]
     passed = [o for o in outcomes if o.met]
     return (failed or passed or outcomes)[0]
 
 
+_AT_LAST = 1.0  # s at the end of a silence
+
+
 def _holds_in(ctx: Context, silence: _Silence) -> Outcome:
-    last, late, end = silence.last, silence.late, silence.end
     if ctx.object_at is not None and silence.driven is None:
-        before = np.abs(ctx.states.tau[ctx.states.between(last - 0.2, last)])
-        after = np.abs(ctx.states.tau[ctx.states.between(late, end)])
-        if not len(before) or not len(after):
-            return ctx.skipped("no state in the silence")
-        pressed, still = float(np.median(before, 0).max()), float(np.median(after, 0).max())
-        if pressed < ctx.tolerance("min_tau_nm"):
-            return ctx.skipped("the hand did not press on its object when the commands stopped")
-        text = f"pressed with {pressed:.2f} N m, and with {still:.2f} N m after the time-out"
-        if still >= ctx.tolerance("min_tau_part") * pressed:
-            return ctx.passed("grips on", text, tau_nm=still)
-        return ctx.failed("lets go", text, ctx.at(ctx.states.topic, late, end), tau_nm=still)
+        return _grips_on(ctx, silence)
+    late, end = silence.late, silence.end
     target = silence.driven.targets.get(ctx.side) if silence.driven is not None else None
-    if not target:
+    slow = [j for j in _roles(ctx).slow if not silence.guarded[j]]
+    if not target or not slow:
         return ctx.skipped("no joint was on its way when the commands stopped")
-    rows = ctx.states.between(late, late + 0.05)
-    if not len(ctx.states.q[rows]):
-        return ctx.skipped("no state in the silence")
-    here = np.median(ctx.states.q[rows], axis=0)
-    slow = _roles(ctx).slow
-    moved = _moved(ctx, slow, late, end)
+    # in the beginning, and where the silence is long at its end as well
     least = ctx.requirement.tolerance("min_travel_stroke")
-    for i, joint in enumerate(slow):
-        left = abs(target[joint] - float(here[joint])) / ctx.joints[joint].stroke
-        if left < 2 * least:
-            return ctx.skipped("the hand had arrived before the time-out")
-        if not moved[i] >= least:
-            return ctx.failed(
-                "stops",
-                ctx.named("stopped on its way after the time-out", joint),
-                ctx.at(ctx.states.topic, late, end),
-            ).about(joint)
+    spans = [(late, min(end, late + _AT_LAST), least)]
+    if end - late > 2 * _AT_LAST:
+        spans.append((end - _AT_LAST, end, 0.5 * least))  # it is nearer to its goal by then
+    for a, b, least in spans:
+        rows = ctx.states.between(a, a + 0.05)
+        if not len(ctx.states.q[rows]):
+            return ctx.skipped("no state in the silence")
+        here = np.median(ctx.states.q[rows], axis=0)
+        moved = _moved(ctx, slow, a, b)
+        for i, joint in enumerate(slow):
+            left = abs(target[joint] - float(here[joint])) / ctx.joints[joint].stroke
+            if left < 4 * least:
+                if a == late:
+                    return ctx.skipped("the hand had arrived before the time-out")
+                continue
+            if not moved[i] >= least * (b - a) / _AT_LAST:
+                return ctx.failed(
+                    "stops",
+                    ctx.named(f"stopped on its way {a - silence.last:.1f} s after the last", joint)
+                    + " command",
+                    ctx.at(ctx.states.topic, a, b),
+                ).about(joint)
     return ctx.passed("goes on", "went on to its position after the time-out")
+
+
+def _grips_on(ctx: Context, silence: _Silence) -> Outcome:
+    last, late, end = silence.last, silence.late, silence.end
+    before = np.abs(ctx.states.tau[ctx.states.between(last - 0.2, last)])
+    spans = [(late, min(end, late + _AT_LAST)), (max(late, end - _AT_LAST), end)]
+    later = [np.abs(ctx.states.tau[ctx.states.between(a, b)]) for a, b in spans]
+    if not len(before) or not all(map(len, later)):
+        return ctx.skipped("no state in the silence")
+    pressed = np.where(silence.guarded, 0.0, np.median(before, axis=0))
+    pressing = np.flatnonzero(pressed >= ctx.tolerance("min_tau_nm"))
+    if not len(pressing):
+        return ctx.skipped("no joint without protection pressed when the commands stopped")
+    still = np.min([np.median(tau, axis=0) for tau in later], axis=0)
+    joint = int(pressing[np.argmin(still[pressing] / pressed[pressing])])
+    text = ctx.named(
+        f"pressed with {pressed[joint]:.2f} N m, and after the time-out with {still[joint]:.2f} "
+        "N m",
+        joint,
+    )
+    if still[joint] >= ctx.tolerance("min_tau_part") * pressed[joint]:
+        return ctx.passed("grips on", text, tau_nm=float(still[joint]))
+    place = ctx.at(ctx.states.topic, late, end)
+    return ctx.failed("lets go", text, place, tau_nm=float(still[joint])).about(joint)
 
 
 # ------------------------------------------------------------------------------------- safety

@@ -511,9 +511,19 @@ def not_driven(ctx: Context, how: str) -> Outcome:
     # joints that are at q already show nothing
     limit = [2 * ctx.tolerance("max_motion_stroke", s.joint) for s in given]
     away = [s for s, least in zip(given, limit, strict=True) if abs(s.size) > least]
-    found = [(float(np.max((s.q - s.start) * np.sign(s.size))), s) for s in away]
-    if not found:
+    if not away:
         return ctx.skipped("the hand was already at the q that must have no effect")
+    # a weight pulls a joint the same way whatever q is: with q on either side, both must count
+    ways: dict[tuple[int, bool], tuple[float, Step]] = {}
+    for s in away:
+        towards = float(np.max((s.q - s.start) * np.sign(s.size)))
+        key = s.joint, s.size > 0
+        if key not in ways or towards > ways[key][0]:
+            ways[key] = towards, s
+    found = [
+        min((ways[joint, way] for way in (True, False) if (joint, way) in ways), key=lambda f: f[0])
+        for joint in dict.fromkeys(joint for joint, _ in ways)
+    ]
     towards, step = max(found, key=lambda f: f[0] / f[1].stroke)
     towards = max(0.0, towards)
     most = ctx.tolerance("max_motion_stroke", step.joint)
@@ -646,8 +656,12 @@ def velocity_drives(ctx: Context) -> Outcome:
     """Motion by a commanded velocity without a position gain."""
     far: tuple[float, float, int] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
-        rows = ctx.states.between(*ctx.span(phase))
+        begin, end = ctx.span(phase)
+        rows = ctx.states.between(begin, end)
+        given = ctx.commands.dq[(ctx.commands.t >= begin) & (ctx.commands.t <= end)]
         for joint, way in _driven(ctx):
+            if len(given) and not given[:, joint].any():
+                continue  # it is driven by a torque this time
             q = ctx.states.q[rows, joint]
             if len(q) < 2 or not np.isfinite(q).all():
                 continue

@@ -81,10 +81,13 @@ def unharmed(ctx: Context, what: str) -> Outcome:
     return Outcome(None).resting_on(*measures)
 
 
-def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
+def moves(
+    ctx: Context, what: str, joints: Sequence[int] | None = None, sags: Floats | None = None
+) -> Outcome:
     """Failed if a joint moves during the phase; otherwise passed, with how far.
 
     :param joints: those that must not move; None for all.
+    :param sags: how far each joint may move by its weight, rad; None for not at all.
     """
     far: tuple[float, float, int] = (0.0, 0.0, 0)
     for phase in ctx.phases():
@@ -107,6 +110,8 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
                 ).about(joint)
             i = int(np.argmax(column))
             most = float(column[i])
+            if sags is not None:
+                most = max(0.0, most - float(sags[joint]))
             if most > ctx.tolerance("max_motion_stroke", joint):
                 return (
                     ctx.failed(
@@ -128,9 +133,11 @@ def moves(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outco
     ).placed(most, ctx.tolerance("max_motion_stroke", joint))
 
 
-def stays(ctx: Context, what: str, joints: Sequence[int] | None = None) -> Outcome:
+def stays(
+    ctx: Context, what: str, joints: Sequence[int] | None = None, sags: Floats | None = None
+) -> Outcome:
     """Check that no joint :func:`moves`, then that the hand is :func:`unharmed`."""
-    still = moves(ctx, what, joints)
+    still = moves(ctx, what, joints, sags)
     if still.met is False:
         return still
     after = unharmed(ctx, what)
@@ -526,7 +533,31 @@ def long(ctx: Context) -> Outcome:
 @check("DEX1-SAFE-05", "DEX3-SAFE-06")
 def negative_gains(ctx: Context) -> Outcome:
     """Commands with negative kp and kd."""
-    return stays(ctx, "commands with negative gains")
+    return stays(ctx, "commands with negative gains", sags=_sags(ctx))
+
+
+_SAGS_AGAIN = 1.5  # times the way that a limp joint sagged, for another pose
+
+
+def _sags(ctx: Context) -> Floats | None:
+    """How far each joint may sag while it is limp, rad: it did so with zero gains, whatever q was.
+
+    None where the stimulus does not tell that from motion towards q.
+    """
+    moved = []
+    for phase in ctx.phases("limp"):
+        begin, end = ctx.span(phase)
+        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+        q = ctx.states.q[ctx.states.between(begin, end)]
+        if len(before) and len(q):
+            moved.append(q[-1] - np.median(before, axis=0))
+    if len(moved) < 2:
+        return None
+    # towards one q and then towards one on the other side
+    low, high = np.min(moved, axis=0), np.max(moved, axis=0)
+    slack = np.array([ctx.tolerance("max_motion_stroke", j) for j in range(len(ctx.joints))])
+    one_way = (low > -slack) | (high < slack)
+    return np.where(one_way, _SAGS_AGAIN * np.maximum(np.abs(low), np.abs(high)), 0.0)
 
 
 @check("DEX1-SAFE-06", "DEX3-SAFE-07")

@@ -18,7 +18,18 @@ from dexkit.hand import Floats
 
 OWN_RULE = (
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "foreign", "burst"),
-    *("two-writers", "limp", "lock", "push", "pull", "drive", "silence", "rejected"),
+    *(
+        "two-writers",
+        "limp",
+        "lock",
+        "mixed",
+        "status",
+        "push",
+        "pull",
+        "drive",
+        "silence",
+        "rejected",
+    ),
     *("guard-drive", "guard", "guard-latch", "guard-clear"),
 )
 """Stimuli during which other requirements say what may move."""

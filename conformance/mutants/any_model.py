@@ -259,7 +259,7 @@ class FreezesOnce(Service):
     ("DEX1-FRESH-03", "DEX3-FRESH-03"),
     also=(
         *("DEX1-FIELD-06", "DEX1-FIELD-16", "DEX1-FIELD-17", "DEX1-MOVE-06"),
-        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-16", "DEX3-MOVE-06"),
+        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-16", "DEX3-MOVE-06", "DEX5-FIELD-17"),
     ),
     whole=True,
 )

@@ -8,6 +8,7 @@ make other requirements fail: it oscillates less, and comes to rest more slowly.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -42,6 +43,21 @@ class LowRateIsFull(Dex3Service):
     """Publishes the low-rate copy at the rate of the state."""
 
     low_period = Dex3Service.period
+
+
+@wrong_hand("DEX3-TOPIC-04", brief=True)
+class OldLowRate(Dex3Service):
+    """Copies states to the low-rate topic that are 0.3 s old."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.queue: deque[list[Sample]] = deque()
+
+    def low_rate(self, samples: list[Sample]) -> list[Sample]:
+        new = super().low_rate(samples)
+        self.queue.append(new)
+        old = self.queue.popleft() if len(self.queue) > 6 else self.queue[0]
+        return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
 class _Zero(FingerHand):
@@ -291,6 +307,45 @@ class Numb(FingerService):
         return np.where(felt == 30000.0, felt, 0.0)
 
 
+@wrong_hand("DEX3-SENS-04", sides=BOTH)
+class CrossedCables(Dex3Service):
+    """Publishes the index finger's pressures as the middle finger's, and the other way round."""
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        return super().pressures(hand)[[0, 1, 4, 5, 2, 3, 6, 7, 8]]
+
+
+@wrong_hand("DEX3-SENS-07", also=("DEX3-SENS-03",), sides=BOTH)
+class SaturatesToNothing(FingerService):
+    """Publishes a pressure at the end of the converter's range as a slot without a sensor."""
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        felt = super().pressures(hand)
+        return np.where(felt > 5000.0, 30000.0, felt)
+
+
+@wrong_hand("DEX3-SENS-08", sides=BOTH)
+class SlowFoam(Dex3Service):
+    """Its pressures fall with a time constant of 2 s."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.felt: dict[Side, tuple[float, Floats]] = {}
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        felt = super().pressures(hand)
+        at, before = self.felt.get(hand.side, (self.now, felt))
+        left = before * math.exp((at - self.now) / 2.0)
+        felt = np.where(felt == 30000.0, felt, np.maximum(felt, left))
+        self.felt[hand.side] = self.now, felt
+        return felt
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.version += 1
+
+
 @wrong_hand("DEX3-IMU-01", brief=True)
 class LongQuaternion(FingerService):
     """Publishes raw counts as its quaternion."""
@@ -406,7 +461,7 @@ class _Springy(FingerHand):
         super().take(undamped, mode)
 
 
-@wrong_hand("DEX3-MOVE-05")
+@wrong_hand("DEX3-MOVE-05", also=("DEX3-PATH-01",))
 @wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01", "DEX5-PATH-01"))
 class Undamped(FingerService):
     """Applies 15 % of kd where kp is not 0."""
@@ -429,6 +484,20 @@ class Coupled(FingerService):
             changed[5] = replace(motors[5], q=motors[5].q - 0.1 * self.left)
             motors = tuple(changed)
         super().motors(side, motors)
+
+
+class _NarrowRange(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        # the joint before it has the narrower range
+        self.goal[4] = min(max(self.goal[4], self.low[3]), self.high[3])
+
+
+@wrong_hand("DEX3-MOVE-09")
+class LimitsOfTheJointBefore(Dex3Service):
+    """Limits a finger's second joint to the range of its first."""
+
+    hand_fault = _NarrowRange
 
 
 class _Creeps(FingerHand):
@@ -584,11 +653,51 @@ class _IgnoresStatus(FingerHand):
         return np.ones_like(status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-07"))
 class IgnoresStatus(FingerService):
     """Drives its motors whatever the mode byte of the command is."""
 
     hand_fault = _IgnoresStatus
+
+
+class _OneStatus(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        status, guarded = super().understood(mode)
+        return np.full_like(status, status[2]), guarded
+
+
+@wrong_hand("DEX3-MODE-05")
+class StatusOfOneJoint(Dex3Service):
+    """Takes the status of one joint for that of all."""
+
+    hand_fault = _OneStatus
+
+
+class _LimpLock(FingerHand):
+    def changed(self) -> None:
+        super().changed()
+        if self.status[5] == 0:
+            self.law_kd[5] = 0.0
+
+
+@wrong_hand("DEX3-MODE-06")
+class LimpLock(Dex3Service):
+    """Switches the driver of one joint off where it should lock."""
+
+    hand_fault = _LimpLock
+
+
+class _AnyStatus(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        status, guarded = super().understood(mode)
+        return status & 1, guarded
+
+
+@wrong_hand("DEX3-MODE-07")
+class OneBitOfStatus(Dex3Service):
+    """Looks at one bit of the status: 3, 5 and 7 drive as 1 does."""
+
+    hand_fault = _AnyStatus
 
 
 class _Ris(FingerHand):
@@ -653,6 +762,32 @@ class ForceOfOtherGear(Dex3Service):
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] *= 0.4
+
+
+class _Tires(FingerHand):
+    loaded = 0.0
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        if rows[0, 6] != self.goal[6]:
+            self.loaded = 0.0
+        super().take(rows, mode)
+
+    def step(self, dt: float) -> None:
+        self.loaded += dt if abs(self.tau[6]) > 0.3 else 0.0
+        self.rests = False
+        super().step(dt)
+
+    def move(self, dt: float, pull: list[float]) -> None:
+        if self.loaded > 1.5:
+            pull[6] = min(max(pull[6], -0.2), 0.2)
+        super().move(dt, pull)
+
+
+@wrong_hand("DEX3-FORCE-06", also=("DEX3-FORCE-05",), sides=BOTH)
+class Tires(Dex3Service):
+    """Limits the torque of one joint after a second and a half of a firm grip."""
+
+    hand_fault = _Tires
 
 
 @wrong_hand("DEX3-FORCE-02", brief=True)
@@ -760,6 +895,46 @@ class KeepsDriving(FingerService):
     hand_fault = _KeepsSpeed
 
 
+class _KeepsTorque(FingerHand):
+    def expire(self) -> None:
+        push = self.push
+        super().expire()
+        self.push = push
+
+
+@wrong_hand("DEX3-WDOG-01")
+class KeepsPushing(Dex3Service):
+    """Keeps a commanded torque after the time-out, and drops the velocity."""
+
+    hand_fault = _KeepsTorque
+
+
+class _TiresOfHolding(FingerHand):
+    expired_at = math.inf
+
+    def expire(self) -> None:
+        super().expire()
+        self.expired_at = self.now
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        self.expired_at = math.inf
+        super().take(rows, mode)
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        if self.now - self.expired_at > 2.0:
+            self.expired_at = math.inf
+            self.kp = np.zeros_like(self.kp)
+            self.changed()
+
+
+@wrong_hand("DEX3-HOLD-01", sides=BOTH)
+class HoldsForTwoSeconds(Dex3Service):
+    """Lets go two seconds after the time-out, without protection too."""
+
+    hand_fault = _TiresOfHolding
+
+
 class _AlwaysBrakes(FingerHand):
     brakes = False
 
@@ -864,6 +1039,50 @@ class TripsInSecret(FingerService):
     """Does not publish that the protection has tripped."""
 
     hand_fault = _Silent
+
+
+class _OneGuard(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        status, guarded = super().understood(mode)
+        return status, np.full_like(guarded, guarded[-1])
+
+
+@wrong_hand("DEX3-GUARD-02", also=("DEX3-GUARD-03", "DEX3-HOLD-01", "DEX3-MODE-05"))
+class GuardOfTheLast(Dex3Service):
+    """Takes the last motor's time-out bit for that of all."""
+
+    hand_fault = _OneGuard
+
+
+class _Heals(FingerHand):
+    tripped_for = 0.0
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        self.tripped_for = self.tripped_for + dt if self.tripped.any() else 0.0
+        if self.tripped_for > 2.0:
+            self.tripped = np.zeros_like(self.tripped)
+            self.changed()
+
+
+@wrong_hand("DEX3-GUARD-01")
+class HealsByItself(Dex3Service):
+    """Clears its protection two seconds after it has tripped."""
+
+    hand_fault = _Heals
+
+
+class _FedByNews(FingerHand):
+    def command(self, motors: tuple[Motor, ...]) -> None:
+        if motors != self.newest:
+            super().command(motors)
+
+
+@wrong_hand("DEX3-GUARD-02", also=("DEX3-FORCE-05", "DEX3-FORCE-06"), sides=BOTH)
+class DropsEqualCommands(Dex3Service):
+    """Drops commands that equal the last, before they feed the time-out."""
+
+    hand_fault = _FedByNews
 
 
 class _Unlatched(FingerHand):

@@ -82,7 +82,7 @@ class SaturatingGain(ReferenceService):
 
 
 # what it leaves of each step shows in steps of every kind
-@wrong_hand("DEX3-OPER-02", also=("DEX3-ABUSE-01", "DEX3-CMD-01"))
+@wrong_hand("DEX3-OPER-02", also=("DEX3-ABUSE-01", "DEX3-CMD-01", "DEX3-MODE-07"))
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
 
@@ -203,7 +203,7 @@ class _OpenEnd(_PerJoint):
         raise AssertionError  # overridden
 
 
-@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08"))
+@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05"))
 # its session begins at the open end
 @wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01", "DEX5-MOVE-08"))
 class SlowToLeave(_OpenEnd, FingerService):

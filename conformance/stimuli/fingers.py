@@ -21,20 +21,27 @@ beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
 stiff, soft,   a step with the client's gains, with a tenth of its stiffness and with a third of it
 mild
-limp           zero gains, with a q far towards closed
-lock           the same with the client's gains and status 0 or mode 0
+limp           zero gains, with a q far towards closed, and then with one towards open
+lock           the first with the client's gains and status 0 or mode 0
+mixed          a step in which some joints are locked under way, by their mode byte, and the others
+               go on: three times, with other joints
+status         mode bytes with every status that no document defines
+ends           one finger after the other to both ends of its range, with the thumb out of the way
 push, pull     a torque alone, without a position gain: towards closed, and towards open
 replay         a recorded session, as recorded
 single         commands that are sent once
 load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
-guard-drive    with time-out protection (bit 7 of the mode byte) some joints are driven by a
-               velocity and others move slowly to a position, when ...
-guard          ... the commands stop
-guard-latch    commands to elsewhere that still have bit 7 set
-guard-clear    the same without it
-squeeze        close on the object, if there is one
+touch          one finger alone presses on the object, if there is one
+squeeze        all fingers close on it, for seconds
+guarded        meanwhile a hand without an object holds its pose. Some joints of each hand have
+               time-out protection from here on (bit 7 of the mode byte)
+guard-drive    some joints are driven by a velocity or a torque and others move slowly to a
+               position, when ...
+guard          ... the commands stop for seconds; a second time after a restart of the service
+guard-latch    commands to elsewhere, in which the same joints still have bit 7 set
+guard-clear    the same without it: a hand that held an object lets go of it
 drive          without protection: as guard-drive
 silence        the commands stop for longer than the time-out; then on each side alone, while
                rejected commands arrive
@@ -61,6 +68,7 @@ from dataclasses import replace
 from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointMode, Side
 from dexkit.models import JointRoles
 
@@ -79,18 +87,37 @@ MILD = 1.0 / 3.0
 _OPENED = 8
 """Motors of a hand up to which their opening is judged as their closing is."""
 _PUSH, _PUSH_DAMPING, _PUSH_SECONDS = 0.3, 0.5, 0.3  # N m, N m s/rad, s
-_SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of the former
-# of the latter, N m/rad and N m s/rad: still under way two seconds later
-_SLOW_GAINS = (0.2, 0.4)
+_SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of joints that are driven by a velocity
+# of joints that move slowly, N m/rad and N m s/rad: still under way five seconds later
+_SLOW_GAINS = (0.2, 0.8)
+_SPLITS = ((1, 2, 3, 6), (1, 2, 4, 5), (0, 2, 4, 6))
+"""Joints with another mode byte than the rest of the hand, in three commands: each joint is among
+them and not, and no two joints are treated alike three times."""
+_STATUSES = range(2, 8)
+"""What fits into the three bits of the status and has no meaning in a command to a hand. A status
+of 6 calibrates a motor only with a certain torque, which these commands do not have
+(docs/sources/unitree-dex.md#g)."""
+_STAYS = 4.1
+"""Seconds after the time-out in which a hand must do what its protection says: a client that has
+died is started again within them, and its operator relies on what the hand holds."""
+_WIDE = (CLOSED + 5.0, 5.0)
+"""Percent of closing between which joints are locked under way."""
+_UNDER_WAY = 0.08
+"""Seconds after which a joint moves fast in a step with the client's gains."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
     "empty": "empty commands: nothing may move",
     "short": "commands for a motor too few: nothing may move",
     "long": "commands for more motors than there are: nothing may move",
-    "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
     "negative": "negative gains: no joint may run away",
+    "status": "mode bytes with an unknown status: nothing may move",
+    "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
 }
+
+
+_TOGETHER = (("short", "long"), ("negative", "status", "wrong-id"))
+"""Bad commands with one step after all of them, to save time."""
 
 
 class FingerScript(HandScript):
@@ -100,6 +127,12 @@ class FingerScript(HandScript):
     _settling = 0.2
     _standing = 0.1
     _least = 0.5
+    _beside_s = 0.75
+
+    _turn_of_splits = 0
+    """How often joints have been treated differently."""
+    _drives = 0
+    """How often joints have been set in motion."""
 
     def _provoke(self) -> Steps:
         sides, phases = self.plan.sides, self.plan.phases
@@ -123,6 +156,8 @@ class FingerScript(HandScript):
         for name in ("limp", "lock"):
             if name in phases:
                 yield from self._unpulled(name)
+        if "mixed" in phases:
+            yield from self._locks_some()
         if "push" in phases:
             yield from self._pushes()
         if "replay" in phases and self.plan.session is not None:
@@ -130,16 +165,23 @@ class FingerScript(HandScript):
             yield from self._everyone("center", {s: self._home(s) for s in sides})
         if "single" in phases:
             yield from self._single()
+        if "ends" in phases:
+            yield from self._to_the_ends()
         if "load" in phases:
             yield from self._load()
         if "old-stamps" in phases:
             yield from self._old_stamps()
         if "late-joiner" in phases:
             yield from self._late_joiner()
-        if phases & {"guard", "guard-latch", "guard-clear"}:
-            yield from self._guard()
-        if phases & {"squeeze", "silence", "resume"}:
+        guards = bool(phases & {"guard", "guard-latch", "guard-clear"})
+        if "touch" in phases:
+            yield from self._touches()
+        if guards:
+            yield from self._squeeze_and_guard()
+        elif phases & {"squeeze", "silence", "resume"}:
             yield from self._squeeze_and_silence()
+        if phases & {"silence", "resume"}:
+            yield from self._each_silent()
 
     @property
     def _roles(self) -> JointRoles:
@@ -222,6 +264,11 @@ class FingerScript(HandScript):
             for side in self.plan.sides:
                 kinds = [{side: motors} for motors in self._not_finite(side)]
                 yield from self._bad_commands(name, (side,), kinds, 0.08)
+        elif name == "status":
+            kinds = [
+                {s: self._with_status(s, first) for s in self.plan.sides} for first in _STATUSES
+            ]
+            yield from self._bad_commands(name, self.plan.sides, kinds, 0.1)
         elif name == "out-of-range":
             far = [
                 {s: self._at(s, [end] * len(self._joints[s])) for s in self.plan.sides}
@@ -240,7 +287,13 @@ class FingerScript(HandScript):
                 for i in range(len(kinds_by_side[alone[0]])):
                     kind = {s: kinds_by_side[s][i] for s in alone}
                     yield from self._bad_commands(name, alone, [kind], 0.25)
-        yield from self._everyone("recover", self._other_place(), most=1.5, after=name)
+        group = next((names for names in _TOGETHER if name in names), (name,))
+        these = [n for n in group if n in self.plan.phases]
+        if name != these[-1]:
+            yield from self._hold(BETWEEN)
+            return  # a later one has the step
+        after = " ".join(these)
+        yield from self._everyone("recover", self._other_place(), most=1.5, after=after)
 
     def _at(self, side: Side, q: Sequence[float]) -> Motors:
         return [replace(m, q=x) for m, x in zip(self._motors(side, tuple(q)), q, strict=True)]
@@ -258,6 +311,14 @@ class FingerScript(HandScript):
             near = self._motors(side, self._aside(side, 0.1))
             return [[replace(m, kp=-m.kp, kd=-m.kd) for m in near]]
         return [self._crossed(side, good)]
+
+    def _with_status(self, side: Side, first: int) -> Motors:
+        """Far goals with statuses that have no meaning, another one in each joint."""
+        count = len(_STATUSES)
+        return [
+            replace(m, mode=self._codec.mode(i, _STATUSES[(first + i) % count]))
+            for i, m in enumerate(self._motors(side, self._other_place()[side]))
+        ]
 
     def _not_finite(self, side: Side) -> list[Motors]:
         """One bad field in one joint each: the last, the first and a middle one in turn."""
@@ -297,14 +358,21 @@ class FingerScript(HandScript):
 
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)
-        yield from self._drive("drive", self.plan.sides, {}, guard=False)
+        sides = self.plan.sides
+        if "guard" in self.plan.phases:
+            splits = self._next_splits()
+            yield from self._drive("guard-drive", sides, {}, guarded=splits)
+            yield from self._silence("guard", self._model.command_timeout + 0.5)
+            yield from self._latch_and_clear(splits)
+            return
+        yield from self._drive("drive", sides, {})
         yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._to("resume", CLOSED - 5.0)
 
     def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
         """No command to one side but rejected ones, while it moves and the other is commanded."""
         self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
-        yield from self._drive("drive", (side,), {}, guard=False)
+        yield from self._drive("drive", (side,), {})
         yield from self._silence_alone("silence", side, {side: rejected})
         yield from self._everyone("resume", {s: self._home(s) for s in self.plan.sides}, most=1.5)
 
@@ -344,21 +412,83 @@ class FingerScript(HandScript):
         )
         sides = self.plan.sides
         yield from self._hold(0.1)
-        targets = {s: dict(enumerate(self._pose(s, CLOSED))) for s in sides}
-        phase = self._begin(name, sides, targets=targets)
         if name == "limp":
-            motors = self._all(CLOSED, kp=0.0, kd=0.0)
+            # what moves by its weight moves the same way whatever q is
+            for percent in (CLOSED, 0.0):
+                targets = {s: dict(enumerate(self._pose(s, percent))) for s in sides}
+                phase = self._begin(name, sides, targets=targets)
+                yield from self._hold(0.25, self._all(percent, kp=0.0, kd=0.0))
+                self._end(phase)
         else:
-            motors = {
-                s: [
-                    replace(m, mode=self._codec.mode(i, JointMode.BRAKE))
-                    for i, m in enumerate(every)
-                ]
-                for s, every in self._all(CLOSED).items()
-            }
-        yield from self._hold(0.5, motors)
-        self._end(phase)
+            targets = {s: dict(enumerate(self._pose(s, CLOSED))) for s in sides}
+            phase = self._begin(name, sides, targets=targets)
+            every = {s: frozenset(range(len(self._joints[s]))) for s in sides}
+            yield from self._hold(0.35, self._locked(self._all(CLOSED), every))
+            self._end(phase)
         yield from self._to("center", OPEN)
+
+    def _locked(
+        self, hands: Mapping[Side, Motors], joints: Mapping[Side, frozenset[int]]
+    ) -> dict[Side, Motors]:
+        """The commands with status 0 for some joints."""
+        return {
+            s: [
+                replace(m, mode=self._codec.mode(i, JointMode.BRAKE)) if i in joints[s] else m
+                for i, m in enumerate(motors)
+            ]
+            for s, motors in hands.items()
+        }
+
+    def _next_splits(self) -> dict[Side, frozenset[int]]:
+        """The joints of each side that are treated differently next; others on each side."""
+        turn = self._turn_of_splits
+        self._turn_of_splits += 1
+        return {
+            s: frozenset(_SPLITS[(turn + (s is Side.RIGHT)) % len(_SPLITS)])
+            for s in self.plan.sides
+        }
+
+    def _locks_some(self) -> Steps:
+        self._report("some joints are locked under way: they must stop, and the others go on")
+        sides = self.plan.sides
+        for turn in range(len(_SPLITS)):
+            percent = _WIDE[turn % 2]  # wide: a joint that is not braked must have room to run
+            poses = {s: self._pose(s, percent) for s in sides}
+            hands = self._all(percent)
+            splits = self._next_splits()
+            yield from self._hold(_UNDER_WAY, hands)
+            phase = self._begin(
+                "mixed", sides, targets={s: dict(enumerate(poses[s])) for s in sides}
+            )
+            yield from self._hold(0.35, self._locked(hands, splits))
+            self._end(phase)
+            self._goal.update(poses)
+        yield from self._to("center", OPEN)
+
+    def _to_the_ends(self) -> Steps:
+        self._report("to both ends of each joint's range, fingers and thumb in turn")
+        sides = self.plan.sides
+        for thumb in (False, True):
+            poses = {s: self._end_pose(s, thumb=thumb) for s in sides}
+            targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+            self._goal.update(poses)
+            phase = self._begin("ends", sides, targets=targets)
+            free = [s for s in sides if self._reachable(s)]
+            # an object holds some joints back for ever
+            yield from self._until_settled(
+                phase, free, least=self._least, most=1.5, stand=self._standing
+            )
+        if "load" not in self.plan.phases:  # that is made from anywhere
+            yield from self._to("center", OPEN)
+
+    def _end_pose(self, side: Side, *, thumb: bool) -> Pose:
+        """The thumb closed and the fingers open, or the other way round, to the ends."""
+        pose = []
+        for j in self._joints[side]:
+            closes = j.name.startswith("thumb") is thumb
+            towards = (1 if closes else -1) * (j.closing or 1)
+            pose.append(j.q_max if towards > 0 else j.q_min)
+        return tuple(pose)
 
     def _pushes(self) -> Steps:
         """Close and open all flexing joints by a torque alone."""
@@ -380,20 +510,28 @@ class FingerScript(HandScript):
         yield from self._to("center", OPEN)
 
     def _drive(
-        self, name: str, sides: Sequence[Side], others: Mapping[Side, Motors], *, guard: bool
+        self,
+        name: str,
+        sides: Sequence[Side],
+        others: Mapping[Side, Motors],
+        *,
+        guarded: Mapping[Side, frozenset[int]] | None = None,
     ) -> Steps:
-        """Some joints by velocity, others slowly to a position: both are under way for long."""
+        """Some joints by a velocity or a torque, others slowly to a position: both are under way
+        for long.
+
+        :param guarded: the joints with time-out protection.
+        """
         hands = dict(others)
         targets: dict[Side, dict[int, float]] = {}
+        by_torque = self._by_torque()
         for s in sides:
-            motors = [
-                replace(m, mode=self._codec.mode(i, timeout=guard))
-                for i, m in enumerate(self._motors(s, self._goal[s]))
-            ]
+            motors = self._guarded(self._motors(s, self._goal[s]), s, guarded or {})
             far = self._pose(s, CLOSED)
             for i in self._roles.driven:
                 speed = math.copysign(_SPEED, self._joints[s][i].closing)
-                motors[i] = replace(motors[i], dq=speed, kp=0.0, kd=_DAMPING)
+                dq, tau = (0.0, _DAMPING * speed) if i == by_torque else (speed, 0.0)
+                motors[i] = replace(motors[i], dq=dq, tau=tau, kp=0.0, kd=_DAMPING)
             for i in self._roles.slow:
                 motors[i] = replace(motors[i], q=far[i], kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
             hands[s] = motors
@@ -402,33 +540,102 @@ class FingerScript(HandScript):
         yield from self._hold(0.3, hands)
         self._end(phase)
 
-    def _guard(self) -> Steps:
+    def _by_torque(self) -> int | None:
+        """The joint that is driven by a torque this time, where protection is for each joint."""
+        self._drives += 1
+        if "guard" not in self.plan.phases:
+            return None
+        return self._roles.driven[self._drives % len(self._roles.driven)]
+
+    def _guarded(
+        self, motors: Motors, side: Side, guarded: Mapping[Side, frozenset[int]]
+    ) -> list[Motor]:
+        """The command with time-out protection for some joints."""
+        mine = guarded.get(side, frozenset())
+        return [
+            replace(m, mode=self._codec.mode(i, timeout=True)) if i in mine else m
+            for i, m in enumerate(motors)
+        ]
+
+    def _latch_and_clear(self, guarded: Mapping[Side, frozenset[int]]) -> Steps:
+        """Commands to elsewhere with the same joints protected, and then with none."""
         sides = self.plan.sides
-        timeout = self._model.command_timeout
-        self._report("moving with time-out protection, and then ...")
-        yield from self._drive("guard-drive", sides, {}, guard=True)
-        self._report("... silence: after a second the motors must brake, and say so")
-        yield from self._silence("guard", timeout + 0.7)
-        self._report("they stay braked until the protection is cleared")
         poses = {s: self._pose(s, CLOSED - 5.0) for s in sides}
-        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        targets = {s: {i: poses[s][i] for i in sorted(guarded[s])} for s in sides}
         phase = self._begin("guard-latch", sides, targets=targets)
-        guarded = {
-            s: [replace(m, mode=self._codec.mode(i, timeout=True)) for i, m in enumerate(motors)]
-            for s, motors in self._all(CLOSED - 5.0).items()
-        }
-        yield from self._hold(0.4, guarded)
+        hands = {s: self._guarded(self._motors(s, poses[s]), s, guarded) for s in sides}
+        yield from self._hold(0.4, hands)
         self._end(phase)
         yield from self._everyone("guard-clear", poses, most=1.5)
-        yield from self._to("center", OPEN)
 
-    def _squeeze_and_silence(self) -> Steps:
+    def _touches(self) -> Steps:
+        """One finger after the other presses on the object."""
+        pressing = [s for s in self.plan.sides if s in self.plan.objects]
+        if not pressing:
+            return
+        self._report("touching the object with one finger after the other")
+        for finger in dict.fromkeys(j.name.partition("_")[0] for j in self._joints[pressing[0]]):
+            targets: dict[Side, dict[int, float]] = {}
+            hands: dict[Side, Motors] = {}
+            for s in pressing:
+                far = self._pose(s, self.plan.objects[s] + BEYOND)
+                targets[s] = {
+                    i: far[i]
+                    for i, j in enumerate(self._joints[s])
+                    if j.closing and j.name.startswith(finger)
+                }
+                pose = [targets[s].get(i, q) for i, q in enumerate(self._home(s))]
+                hands[s] = self._motors(s, tuple(pose))
+            phase = self._begin("touch", pressing, targets=targets, finger=finger)
+            yield from self._hold(0.36, hands)
+            self._end(phase)
+
+    def _squeeze_and_guard(self) -> Steps:
+        """Close on the object, with some joints protected; then no commands."""
         sides = self.plan.sides
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
-        squeeze = {
-            s: self._motors(s, self._pose(s, self.plan.objects[s] + BEYOND)) for s in pressing
+        splits = self._next_splits()
+        squeeze = self._squeezes(pressing, splits)
+        still = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
+        phases: list[Phase] = []
+        if pressing:
+            self._report("squeezing the object")
+            targets = {
+                s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
+                for s in pressing
+            }
+            phases.append(self._begin("squeeze", pressing, targets=targets))
+        if still:
+            phases.append(self._begin("guarded", tuple(still)))
+        yield from self._hold(2.0, {**squeeze, **still})
+        for phase in phases:
+            self._end(phase)
+        self._report("some joints have time-out protection, some of them move, and then ...")
+        yield from self._drive("guard-drive", free, squeeze, guarded=splits)
+        self._report("... silence: the protected ones must brake and say so, the others go on")
+        yield from self._silence("guard", self._model.command_timeout + _STAYS)
+        self._report("they stay braked until the protection is cleared")
+        yield from self._latch_and_clear(splits)
+
+    def _squeezes(
+        self, sides: Sequence[Side], guarded: Mapping[Side, frozenset[int]]
+    ) -> dict[Side, Motors]:
+        """The command to press on the object: as far as a client can, where force is judged."""
+        most = 100.0 if guarded else 0.0
+        return {
+            s: self._guarded(
+                self._motors(s, self._pose(s, max(most, self.plan.objects[s] + BEYOND))), s, guarded
+            )
+            for s in sides
         }
+
+    def _squeeze_and_silence(self) -> Steps:
+        """Close on the object, and no commands, where no joint has protection."""
+        sides = self.plan.sides
+        pressing = [s for s in sides if s in self.plan.objects]
+        free = [s for s in sides if s not in pressing]
+        squeeze = self._squeezes(pressing, {})
         if pressing:
             self._report("squeezing the object")
             targets = {
@@ -440,12 +647,20 @@ class FingerScript(HandScript):
             self._end(phase)
         if self.plan.phases & {"silence", "resume"}:
             self._report("slow motion without protection, and then ...")
-            yield from self._drive("drive", free, squeeze, guard=False)
+            yield from self._drive("drive", free, squeeze)
             self._report("... silence: nothing may be left driven by a velocity, a grip is kept")
             yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
-        yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})
+
+    def _each_silent(self) -> Steps:
+        """No commands to each hand alone."""
+        sides = self.plan.sides
+        if len(sides) == 1 and "guard" in self.plan.phases:
+            yield from self._drive("drive", sides, {})
+            yield from self._silence("silence", self._model.command_timeout + 0.7)
+            yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
         if len(sides) > 1 and "silence" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 home = self._motors(side, self._home(side))
                 yield from self._silent_alone(side, [replace(m, q=bad) for m in home])
+        yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})

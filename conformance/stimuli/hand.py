@@ -39,7 +39,7 @@ PATIENCE = 6.0
 """Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
 FLOOD = 500
 """Commands of a burst."""
-LOADS = ((400.0, 1.5, 1), (2500.0, 1.0, 10))
+LOADS = ((400.0, 1.5, 1), (2500.0, 0.8, 10))
 """Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation
 sends, the second what Unitree's C++ example sends (docs/sources/unitree-dex.md#b1)."""
 ASIDE = 0.15
@@ -61,6 +61,8 @@ class HandScript(Script[Side]):
     """The same in every other step."""
     _least = 0.6
     """Least duration of such a step, s."""
+    _beside_s = ASIDE_SECONDS
+    """Seconds in which a side makes a step while the other one is silent."""
 
     def __init__(self, plan: Plan[Side], report: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(plan, report)
@@ -401,7 +403,7 @@ class HandScript(Script[Side]):
         """
         phase = self._begin(name, (side,))
         beside: list[Phase] = []
-        for seconds in (self._model.command_timeout + 0.1, ASIDE_SECONDS):
+        for seconds in (self._model.command_timeout + 0.1, self._beside_s):
             good = {s: self._motors(s, q) for s, q in self._goal.items() if s != side}
             payloads = self._codec.encode({**good, **rejected})
             yield from self._repeat(

@@ -311,7 +311,8 @@ class _Coasts(What):
                 hand.changed()
 
 
-_add("brake", _Coasts, "brake-coast", "coasts when it brakes")
+# a status of 0 locks a hand of several joints (DEX3-MODE-06): coasting is a fault there
+_add("brake", _Coasts, "brake-coast", "coasts when it brakes", **_ONE)
 
 
 class _Holds(What):

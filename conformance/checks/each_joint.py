@@ -1,0 +1,412 @@
+"""Checks of each joint and each finger for itself: its range, its part of a command's mode bytes,
+its grip, its sensors; and the low-rate copy of the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks.motion import Step, steps, steps_of
+from dexkit.conformance.checks.safety import stays
+from dexkit.conformance.stimulus_record import Phase
+from dexkit.hand import Floats, JointMode
+from dexkit.models import HandModel
+
+__all__: list[str] = []
+
+_BEFORE_S = 0.1  # s before a phase or at its end in which a pose or a pressure is taken
+_STATUS = 7  # mask of a mode byte's status, from bit 4 on
+
+
+# --------------------------------------------------------------------------------------- range
+
+
+@check("DEX3-MOVE-09")
+def whole_range(ctx: Context) -> Outcome:
+    """Distance of each joint from both ends of its range, unless the object holds it back."""
+    found = steps(ctx)
+    if not found:
+        return ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
+    short = [s for s in found if not _held(ctx, s)]
+    if not short:
+        return ctx.skipped("the object held every joint back")
+    worst = max(short, key=lambda s: s.error / s.stroke)
+    limit = ctx.tolerance("max_error_stroke", worst.joint)
+    if worst.error <= limit:
+        text = f"{len(short)} ends of a joint's range, at most {worst.error:.3f} rad off"
+        met = ctx.passed(f"{worst.error:.3f} rad", text, error_rad=worst.error)
+        return met.placed(worst.error, limit)
+    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
+    outcome = ctx.failed(f"{worst.error:.2f} rad", str(worst), place, error_rad=worst.error)
+    outcome = outcome.about(worst.joint).placed(worst.error, limit)
+    return outcome.if_late(STROKE_S * worst.error / worst.stroke)
+
+
+def _held(ctx: Context, step: Step) -> bool:
+    """Whether a joint presses on the hand's object as its command says."""
+    spec = ctx.joints[step.joint]
+    if ctx.object_at is None or (step.target - step.start) * spec.closing <= 0:
+        return False
+    tau = ctx.states.tau[ctx.states.between(step.end - _BEFORE_S, step.end), step.joint]
+    given = ctx.commands.kp[(ctx.commands.t >= step.begin) & (ctx.commands.t <= step.end)]
+    given = given[np.isfinite(given).all(axis=1)]
+    if not len(tau) or not len(given):
+        return False
+    asked = min(float(np.median(given[:, step.joint])) * step.error, spec.tau_max)
+    return abs(float(np.median(tau))) >= ctx.tolerance("min_part") * asked
+
+
+# ---------------------------------------------------------------------------------- mode byte
+
+
+def _mode_at(ctx: Context, begin: float, end: float) -> NDArray[np.intp] | None:
+    """The mode bytes of the last command in [begin, end]."""
+    rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+    mode = ctx.commands.mode[rows]
+    mode = mode[np.isfinite(mode).all(axis=1)]
+    return mode[-1].astype(np.intp) if len(mode) else None
+
+
+@check("DEX3-MODE-05")
+def own_mode(ctx: Context) -> Outcome:
+    """How far the joints go that are driven, while others are locked or have tripped."""
+    worst: tuple[float, float, float, int, float] | None = None
+    for phase in (*ctx.phases(), *ctx.phases("guard-latch")):
+        begin, end = ctx.span(phase)
+        mode = _mode_at(ctx, begin, end)
+        if mode is None:
+            continue
+        rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        target = ctx.commands.q[rows][-1]
+        # a step may have begun before some of its joints were locked
+        before = ctx.states.q[ctx.states.between(begin - 0.25, begin - 0.15)]
+        after = ctx.states.q[ctx.states.between(end - _BEFORE_S, end)]
+        if not len(before) or not len(after):
+            continue
+        start, final = np.median(before, axis=0), np.median(after, axis=0)
+        for joint, spec in enumerate(ctx.joints):
+            driven = mode[joint] >> 4 & _STATUS == JointMode.FOC and not mode[joint] >> 7
+            size = float(target[joint] - start[joint])
+            if not driven or abs(size) < ctx.requirement.tolerance("min_step_stroke") * spec.stroke:
+                continue
+            part = float(final[joint] - start[joint]) / size
+            found = (part, begin, end, joint, size)
+            worst = found if worst is None or found < worst else worst
+    if worst is None:
+        return ctx.skipped("no state while some joints were driven and others were not")
+    part, begin, end, joint, size = worst
+    text = ctx.named(
+        f"made {part:.0%} of a step of {size:.2f} rad while other joints were locked or had "
+        "tripped",
+        joint,
+    )
+    if part >= ctx.tolerance("min_progress"):
+        return ctx.passed(f"{part:.0%}", text, part=part)
+    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
+    return outcome.about(joint)
+
+
+@check("DEX3-MODE-06")
+def lock_stops(ctx: Context) -> Outcome:
+    """How far a joint moves on that is locked under way, and whether it then stands still.
+
+    What the hand takes to begin the step, it may take to obey the lock.
+    """
+    worst: tuple[float, str, int, float, float, float] | None = None
+    # of the first one: it begins at rest
+    delay = max((_delay(ctx, *ctx.span(p)) for p in ctx.phases()[:1]), default=0.0)
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        mode = _mode_at(ctx, begin, end)
+        rows = ctx.states.between(begin, end)
+        t, q = ctx.states.t[rows], ctx.states.q[rows]
+        if mode is None or len(t) < 5:
+            continue
+        late = q[t >= begin + ctx.tolerance("settle_s") + delay]
+        for joint in np.flatnonzero(mode >> 4 & _STATUS == JointMode.BRAKE).tolist():
+            speed = _top_speed(t, q[:, joint])
+            runs = float(np.abs(q[:, joint] - q[0, joint]).max()) - speed * delay
+            still = float(np.ptp(late[:, joint])) if len(late) else 0.0
+            for far, name, what in (
+                (max(runs, 0.0), "max_run_stroke", "ran on by"),
+                (still, "max_motion_stroke", "still moved by"),
+            ):
+                found = (far / ctx.tolerance(name, joint), what, joint, far, begin, speed)
+                worst = found if worst is None or found > worst else worst
+    if worst is None:
+        return ctx.skipped("no state while joints were locked under way")
+    ratio, what, joint, far, begin, speed = worst
+    text = ctx.named(f"{what} {far:.3f} rad after it was locked", joint)
+    limit = far / ratio if ratio else 0.0
+    if ratio <= 1.0:
+        return ctx.passed(f"{far:.3f} rad", text, motion_rad=far)
+    outcome = ctx.failed(f"{far:.2f} rad", text, ctx.at(ctx.states.topic, begin), motion_rad=far)
+    # a lock that came late made it run on
+    late_by = (far - limit) / speed if speed else STROKE_S * far / ctx.joints[joint].stroke
+    return outcome.about(joint).placed(far, limit).if_late(late_by)
+
+
+_SPEED_S = 0.02  # s over which a speed is taken
+
+
+def _top_speed(t: Floats, q: Floats) -> float:
+    """The largest speed of a joint, rad/s."""
+    later = np.searchsorted(t, t + _SPEED_S)
+    ahead = later < len(t)
+    if not ahead.any():
+        return 0.0
+    rows = np.flatnonzero(ahead)
+    then = later[ahead]
+    return float((np.abs(q[then] - q[rows]) / (t[then] - t[rows])).max())
+
+
+def _delay(ctx: Context, begin: float, end: float) -> float:
+    """Seconds from the command of the step that led into [begin, end] until a joint moves."""
+    commands = ctx.commands
+    rows = np.flatnonzero((commands.t > begin - 0.3) & (commands.t <= end))
+    if not len(rows):
+        return 0.0
+    same = rows[(commands.q[rows] == commands.q[rows[-1]]).all(axis=1)]
+    given = float(commands.t[same[0]])
+    before = ctx.states.q[ctx.states.between(given - 0.05, given)]
+    after = ctx.states.between(given, end)
+    if not len(before):
+        return 0.0
+    strokes = np.array([j.stroke for j in ctx.joints])
+    away = np.abs(ctx.states.q[after] - np.median(before, axis=0)) / strokes
+    moves = (away > _MOVES).any(axis=1)
+    return float(ctx.states.t[after][np.argmax(moves)]) - given if moves.any() else 0.0
+
+
+_MOVES = 0.01  # of the stroke
+
+
+@check("DEX3-MODE-07")
+def unknown_status(ctx: Context) -> Outcome:
+    """Commands whose mode bytes have a status without a meaning."""
+    return stays(ctx, "commands with an unknown status in the mode byte")
+
+
+# ---------------------------------------------------------------------------------------- force
+
+
+@check("DEX3-FORCE-06")
+def keeps_gripping(ctx: Context) -> Outcome:
+    """The least tau_est at the end of a long grip, as a part of that at its beginning."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, int, float, float, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        if end - begin < ctx.tolerance("min_hold_s"):
+            continue
+        first = ctx.states.between(begin + 0.3, begin + 0.6)
+        # the motors' own time-outs are a second after the last command
+        quiet = [p for p in ctx.phases("guard") if p.begin_ns >= phase.end_ns]
+        until = ctx.span(quiet[0])[0] + 0.7 if quiet else end
+        spans = [(end - 0.3, end), (until - 0.3, until)]
+        for a, b in spans:
+            last = ctx.states.between(a, b)
+            if not len(ctx.states.t[first]) or not len(ctx.states.t[last]):
+                continue
+            then, now = (np.median(np.abs(ctx.states.tau[rows]), axis=0) for rows in (first, last))
+            for joint in np.flatnonzero(then >= ctx.tolerance("min_tau_nm")).tolist():
+                part = float(now[joint] / then[joint])
+                found = (part, joint, float(then[joint]), float(now[joint]), a, b)
+                worst = found if worst is None or found < worst else worst
+    if worst is None:
+        return ctx.skipped("no joint pressed on the object for long enough")
+    part, joint, then_nm, now_nm, a, b = worst
+    text = ctx.named(f"tau_est of {then_nm:.2f} N m at first, and of {now_nm:.2f} N m later", joint)
+    limit = ctx.tolerance("min_part")
+    if part >= limit:
+        met = ctx.passed(f"{part:.0%}", text, part=part)
+        return met.pressed(now_nm, limit * then_nm, at_least=True)
+    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, a, b), part=part)
+    return outcome.about(joint).pressed(now_nm, limit * then_nm, at_least=True)
+
+
+# -------------------------------------------------------------------------------------- sensors
+
+
+def _pressures(ctx: Context, begin: float, end: float) -> Floats | None:
+    """The median pressure in each slot, shape (n_packets, 12); NaN for no value; None if there are
+    no packets.
+    """
+    columns = ctx.states.columns
+    rows = ctx.states.between(begin, end)
+    if columns is None or not len(ctx.states.t[rows]):
+        return None
+    count = columns.count("press_sensor_state")[rows]
+    least = int(count.min(initial=99))
+    if not 0 < least < 99:
+        return None
+    values = np.stack(
+        [columns[f"press_sensor_state[{i}].pressure"][rows] for i in range(least)], axis=1
+    )
+    found = np.median(values, axis=0)
+    found[found == _NO_VALUE] = np.nan
+    return np.asarray(found)
+
+
+_NO_VALUE = 30000.0
+"""What a slot without a sensor holds (docs/sources/unitree-dex.md#b4)."""
+
+
+def _finger_packets(ctx: Context, finger: str) -> list[int]:
+    """The packets of a finger's sensors."""
+    hand = ctx.recording.model
+    assert isinstance(hand, HandModel)  # a robot has no fingers
+    return [i for i, s in enumerate(hand.sensors) if s.place.partition(" ")[0] == finger]
+
+
+def _touches(ctx: Context) -> Iterator[tuple[Phase, str, Floats, Floats]]:
+    """Each phase in which a finger presses, the finger, and the pressures before and during it."""
+    for phase in ctx.phases("touch"):
+        begin, end = ctx.span(phase)
+        free = _pressures(ctx, begin - _BEFORE_S, begin)
+        held = _pressures(ctx, end - _BEFORE_S, end)
+        if free is not None and held is not None:
+            yield phase, phase.params.get("finger", ""), free, held
+
+
+def _presses(ctx: Context, phase: Phase) -> bool:
+    """Whether the object holds the finger back, by the course of q."""
+    return any(
+        s.error > ctx.requirement.tolerance("min_held_stroke") * s.stroke
+        for s in steps_of(ctx, phase)
+    )
+
+
+@check("DEX3-SENS-04")
+def touch(ctx: Context) -> Outcome:
+    """The rise of the pressure in a finger's own packets while it alone presses."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = list(_touches(ctx))
+    if not found:
+        return ctx.absent("the states hold no sensor packets")
+    judged = 0
+    for phase, finger, free, held in found:
+        mine = [i for i in _finger_packets(ctx, finger) if i < len(held)]
+        if not mine or not _presses(ctx, phase):
+            continue
+        judged += 1
+        rises = held - free
+        if np.nanmax(rises[mine], initial=0.0) > 0 or np.isnan(rises[mine]).all():
+            continue
+        others = [i for i in range(len(rises)) if np.nanmax(rises[i], initial=0.0) > 0]
+        outcome = ctx.failed(
+            "other packets" if others else "no touch",
+            f"the {finger} presses on the object, and the pressure rises in "
+            + (f"packets {others}, not in its own ({mine})" if others else "no packet"),
+            ctx.at(ctx.states.topic, *ctx.span(phase)),
+        )
+        return outcome
+    if not judged:
+        return ctx.skipped("the object held no finger back")
+    return ctx.passed(f"{judged} fingers", f"{judged} fingers feel the object, each by its own")
+
+
+@check("DEX3-SENS-07")
+def saturates(ctx: Context) -> Outcome:
+    """Whether a slot that held a value becomes a slot without a sensor, or the other way round."""
+    columns = ctx.states.columns
+    assert columns is not None
+    count = columns.count("press_sensor_state")
+    full = count == count.max(initial=0)
+    for packet in range(int(count.max(initial=0))):
+        marked = columns[f"press_sensor_state[{packet}].pressure"][full] == _NO_VALUE
+        changes = (marked != marked[:1]).any(axis=1)
+        if changes.any():
+            at = float(ctx.states.t[full][int(np.argmax(changes))])
+            return ctx.failed(
+                "changes",
+                f"at {at:.2f} s an element of packet {packet} begins or ends to hold "
+                f"{_NO_VALUE:g}, which means that there is no sensor",
+                ctx.at(ctx.states.topic, at),
+            )
+    return ctx.passed("constant", "the same slots hold a value throughout")
+
+
+@check("DEX3-SENS-08")
+def releases(ctx: Context) -> Outcome:
+    """What is left of each element's pressure some time after the object was let go."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    rest = [ctx.span(p)[0] for p in (ctx.phases("touch") or ctx.phases("squeeze"))[:1]]
+    held = [ctx.span(p) for p in ctx.phases("squeeze")]
+    let_go = [ctx.span(p)[0] for p in ctx.phases()]
+    if not rest or not held or not let_go:
+        return ctx.skipped("the hand held no object")
+    free = _pressures(ctx, rest[0] - 2 * _BEFORE_S, rest[0])
+    most = _pressures(ctx, held[0][1] - 2 * _BEFORE_S, held[0][1])
+    at = let_go[0] + ctx.tolerance("release_s")
+    later = _pressures(ctx, at, at + _BEFORE_S)
+    if free is None or most is None or later is None:
+        return ctx.absent("the states hold no sensor packets")
+    rise, left = most - free, later - free
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = np.where(rise > 0, left / rise, 0.0)
+    part = np.nan_to_num(part)
+    if not (rise > 0).any():
+        return ctx.skipped("no pressure rose at the object")
+    packet, slot = (int(i) for i in np.unravel_index(int(np.argmax(part)), part.shape))
+    worst = float(part[packet, slot])
+    text = (
+        f"{worst:.0%} of the pressure in slot {slot} of packet {packet} is left "
+        f"{ctx.tolerance('release_s'):g} s after the release"
+    )
+    if worst <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{worst:.0%}", text, part=worst)
+    return ctx.failed(f"{worst:.0%}", text, ctx.at(ctx.states.topic, at), part=worst)
+
+
+# ----------------------------------------------------------------------------------- low rate
+
+
+@check("DEX3-TOPIC-04")
+def low_rate_is_fresh(ctx: Context) -> Outcome:
+    """Whether each state of the low-rate topic is one that the fast topic had just then."""
+    slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
+    if slow is None or not len(slow) or not len(fast):
+        return ctx.absent("there is no low-rate topic")
+    age = ctx.tolerance("max_age_s")
+    margin = np.array([ctx.tolerance("margin_stroke", j) for j in range(len(ctx.joints))])
+    odd: list[tuple[float, int, str]] = []
+    judged = 0
+    for i, t in enumerate(slow.t.tolist()):
+        rows = fast.between(t - age, t + _AHEAD_S)
+        q, mode = fast.q[rows], fast.mode[rows]
+        if len(q) < 3 or not np.isfinite(q).all():
+            continue
+        judged += 1
+        with np.errstate(invalid="ignore"):
+            away = np.maximum(q.min(axis=0) - slow.q[i], slow.q[i] - q.max(axis=0))
+            other = (mode.min(axis=0) > slow.mode[i]) | (mode.max(axis=0) < slow.mode[i])
+        off = ~(away <= margin)
+        if off.any():
+            joint = int(np.argmax(np.nan_to_num(away / margin, nan=np.inf)))
+            text = f"q is {away[joint]:.2f} rad from all that the fast topic had within {age:g} s"
+            odd.append((t, joint, text))
+        elif other.any():
+            joint = int(np.argmax(other))
+            text = f"mode is {slow.mode[i, joint]:g}, which the fast topic did not have"
+            odd.append((t, joint, text))
+    if judged < 3:
+        return ctx.skipped("too few states on the low-rate topic beside those on the fast one")
+    if len(odd) < ctx.tolerance("min_odd"):
+        return ctx.passed(f"{judged} states", f"{judged} states on {slow.topic}, all as fast ones")
+    _, joint, what = odd[0]
+    text = ctx.named(f"{what}; so in {len(odd)} of {judged} states on {slow.topic}", joint)
+    outcome = ctx.failed(
+        f"{len(odd)} of {judged}", text, *(ctx.at(slow.topic, t) for t, *_ in odd[:5])
+    )
+    return outcome.about(joint).if_late(age)
+
+
+_AHEAD_S = 0.05  # s by which the low-rate topic may be received before the fast one
