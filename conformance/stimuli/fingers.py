@@ -476,7 +476,7 @@ class FingerScript(HandScript):
             free = [s for s in sides if self._reachable(s)]
             # an object holds some joints back for ever
             yield from self._until_settled(
-                phase, free, least=self._least, most=1.5, stand=self._standing
+                phase, free, least=self._least if free else 1.0, most=1.5, stand=self._standing
             )
         if "load" not in self.plan.phases:  # that is made from anywhere
             yield from self._to("center", OPEN)
