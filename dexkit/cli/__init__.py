@@ -53,6 +53,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "sign": ("dexkit.cli.sign", "Sign a result with its recording as one archive."),
     "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
     "verify": ("dexkit.cli.verify", "Verify a signed result, and judge it again."),
+    "view": ("dexkit.cli.view", "Show hands on a page in the browser, live or recorded."),
 }
 
 

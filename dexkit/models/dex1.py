@@ -88,4 +88,5 @@ DEX1_1 = HandModel(
     simulator="sim-dex1",
     client=Lazy("dexkit.teleop.client:Dex1Client"),
     operator_profiles=Lazy("dexkit.teleop.profiles:gripper_profiles"),
+    skeleton=Lazy("dexkit.models.skeletons:dex1"),
 )

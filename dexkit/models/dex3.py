@@ -137,4 +137,5 @@ DEX3_1 = HandModel(
         ),
         palm_sensors=((10.0, -40.0), (-24.0, 34.0), (44.0, 34.0)),
     ),
+    skeleton=Lazy("dexkit.models.skeletons:dex3"),
 )

@@ -137,4 +137,5 @@ DEX5_1 = HandModel(
             Finger("thumb", range(16, 20), (-167.0, 26.0), (-9.0, -66.0), tip=0.15, root=0.1),
         ),
     ),
+    skeleton=Lazy("dexkit.models.skeletons:dex5"),
 )

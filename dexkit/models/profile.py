@@ -21,6 +21,7 @@ from dexkit.lazy import Lazy
 if TYPE_CHECKING:
     from dexkit.conformance.stimuli.script import Script
     from dexkit.conformance.virtual import Service
+    from dexkit.kinematics import Skeleton
     from dexkit.service.dialects import DialectMap
     from dexkit.teleop.client import TeleopClient
     from dexkit.teleop.profiles import Profile
@@ -233,6 +234,8 @@ class HandModel:
         ``dexkit.conformance.mutants.wrong_hand``: they prove its requirements.
 
     :param layout: how it is drawn; None for a gripper, and where no drawing is needed.
+    :param skeleton: makes the joint axes and origins of a side; None where they are not known, and
+        ``dexkit view`` draws fingers side by side.
     """
 
     name: str
@@ -265,6 +268,7 @@ class HandModel:
     session: str | Path = ""
     wrong_hands: Lazy[ModuleType] | None = None
     layout: HandLayout | None = None
+    skeleton: Lazy[Callable[[Side], Skeleton]] | None = None
 
     @property
     def short_name(self) -> str:

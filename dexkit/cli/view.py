@@ -1,0 +1,204 @@
+"""``dexkit view``: hands on a page in the browser, live or from a recording."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
+from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
+from dexkit.escaping import REMARK, one_line
+from dexkit.hand import ROBOT, JointSpec, Side
+from dexkit.stop_signals import stop_on_signals
+
+if TYPE_CHECKING:
+    from dexkit.kinematics import Skeleton
+    from dexkit.traces import Trace
+    from dexkit.view.sources import Source
+    from dexkit.watch import Mark
+
+__all__ = ["command"]
+
+
+@click.command("view")
+@click.argument("recordings", type=FILE, nargs=-1, metavar="[RECORDING]...")
+@click.option(
+    "--live", is_flag=True, help="Show the live domain beside a recording, as its baseline."
+)
+@topic_option("Listen to", "every topic of a known type, also those that appear later")
+@dds_options()
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Bind the page to this address. It has no password: others on the network could see it.",
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    metavar="N",
+    help="TCP port of the page; 0 for any.  [default: the first free one from 8720]",
+)
+@click.option(
+    "--open/--no-open",
+    "open_browser",
+    default=None,
+    help="Open the page in a browser.  [default: where there is a display]",
+)
+@click.option(
+    "--judge/--no-judge",
+    default=True,
+    show_default=True,
+    help="Judge recordings, to mark what fails on the time line.",
+)
+@click.option(
+    "--urdf",
+    "urdfs",
+    multiple=True,
+    metavar="[SIDE=]FILE",
+    help="Draw the hand of this side by a URDF of yours (boxes, cylinders and spheres; no "
+    "meshes); SIDE is left, right or robot; may be repeated.",
+)
+@duration_option()
+def command(
+    recordings: tuple[Path, ...],
+    live: bool,
+    topics: tuple[str, ...],
+    domain: int,
+    interface: str,
+    host: str,
+    port: int | None,
+    open_browser: bool | None,
+    judge: bool,
+    urdfs: tuple[str, ...],
+    duration: float | None,
+) -> None:
+    """Show hands and robots on a page in the browser: how they move, what is wrong, and when.
+
+    Without RECORDING: what is on the wire now. The viewer only listens and publishes nothing. A
+    RECORDING has a time line to go along, with the phases of a conformance run and the
+    requirements that failed; two are shown side by side. Until Ctrl-C.
+
+    Needs the extra 'view': pip install 'dexkit[view]'. The page loads nothing from elsewhere.
+
+    Exit code: 0; 2 wrong usage, an unusable recording, or a missing package.
+    """
+    if len(recordings) + live > 2:
+        raise UsageError("at most two can be shown at once")
+    from dexkit.view.page import Page  # names the extra before anything else is done
+
+    with contextlib.ExitStack() as stack:
+        stop = stack.enter_context(stop_on_signals())
+        sources: list[Source] = [_recorded(path, judge) for path in recordings]
+        if live or not recordings:
+            sources.insert(0, _live(stack, domain, interface, topics))
+        skeletons = _skeletons(urdfs)
+        page = stack.enter_context(Page(sources, host=host, port=port, skeletons=skeletons))
+        what = " beside ".join(one_line(s.title) for s in sources)
+        click.echo(f"ready: {what} at {page.url}")
+        if open_browser is None:
+            open_browser = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        if open_browser and not webbrowser.open(page.url):
+            click.echo("warning: no browser could be opened", err=True)
+        if duration is not None:
+            timer = threading.Timer(duration, stop.set)
+            timer.daemon = True
+            timer.start()
+        page.run(stop.event)
+    click.echo("stopped")
+
+
+def _live(
+    stack: contextlib.ExitStack, domain: int, interface: str, topics: Sequence[str]
+) -> Source:
+    from dexkit.dds import DdsNode
+    from dexkit.traces.names import dds_topic
+    from dexkit.view.sources import Live
+    from dexkit.watch import Collector
+    from dexkit.watch.listener import Listener
+
+    node = stack.enter_context(DdsNode(domain=domain, interface=interface))
+    patterns = [dds_topic(t) for t in topics] or None
+    listener = stack.enter_context(Listener(node, Collector(), patterns))
+    return Live(f"domain {domain} on {node.interface}", listener)
+
+
+def _recorded(path: Path, judge: bool) -> Source:
+    from dexkit.traces import open_trace
+    from dexkit.view.sources import Recorded
+    from dexkit.watch.recorded import feed
+
+    trace = open_trace(path)
+    for text in trace.warnings:
+        click.echo(one_line(f"warning: {path}: {text}", REMARK), err=True)
+    if not trace.message_count:
+        raise UsageError(f"{path} holds no messages")
+    return Recorded(path.name, feed(trace), _marks(trace, judge))
+
+
+def _marks(trace: Trace, judge: bool) -> list[Mark]:
+    """Phases and verdicts; a recording that cannot be judged is shown all the same."""
+    from dexkit.conformance.judge import judge as verdict_on
+    from dexkit.conformance.layers import recording_of
+    from dexkit.conformance.marks import phase_marks, verdict_marks
+
+    try:
+        marks = phase_marks(trace)
+        if judge:
+            marks += verdict_marks(verdict_on(recording_of(trace, None, ())))
+    except (ConformanceError, TraceUnsupported) as error:
+        click.echo(one_line(f"warning: not judged: {error}", REMARK), err=True)
+        return []
+    return marks
+
+
+def _skeletons(urdfs: Sequence[str]) -> dict[tuple[str, str], Skeleton]:
+    """The skeletons of ``--urdf``, by model and subject.
+
+    A file is for the hand or robot that has most of its joints.
+
+    :raises UsageError: a file is no URDF, or none of a hand or robot that is known.
+    """
+    from dexkit.models import MODELS
+    from dexkit.models.skeletons import skeleton_of
+    from dexkit.robots import ROBOTS
+    from dexkit.urdf import read_urdf
+
+    known: dict[tuple[str, str], Sequence[JointSpec]] = {
+        (m.name, str(side)): m.joints[side] for m in MODELS.values() for side in Side
+    }
+    known |= {(r.name, str(ROBOT)): [r.joint(i) for i in r.used] for r in ROBOTS.values()}
+    found: dict[tuple[str, str], Skeleton] = {}
+    for text in urdfs:
+        prefix, equals, rest = text.partition("=")
+        subjects = [str(s) for s in (*Side, ROBOT)]
+        wanted, path = (prefix, Path(rest)) if equals and prefix in subjects else ("", Path(text))
+        best: dict[tuple[str, str], Skeleton] = {}
+        most, problem = 0, None
+        for key, joints in known.items():
+            if wanted not in ("", key[1]):
+                continue
+            owner = ROBOTS.get(key[0]) or MODELS[key[0]]
+            side = Side(key[1]) if key[1] != ROBOT else None
+            try:
+                made = read_urdf(path, joints, skeleton_of(owner, side).mount)
+            except UsageError as error:
+                problem = error
+                continue
+            count = len({s.joint for s in made.segments if s.joint is not None})
+            if count >= most:
+                best = {**best, key: made} if count == most else {key: made}
+                most = count
+        if not best:
+            assert problem is not None
+            raise problem
+        found |= best
+    return found

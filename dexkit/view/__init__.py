@@ -1,0 +1,5 @@
+"""``dexkit view``: hands on a page in the browser, moving as on the wire. Needs the extra ``view``.
+
+The page shows what a :class:`~dexkit.watch.Collector` knows; only :mod:`~dexkit.view.page`,
+:mod:`~dexkit.view.scene` and :mod:`~dexkit.view.charts` touch the library that draws it.
+"""

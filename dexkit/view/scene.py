@@ -1,0 +1,296 @@
+"""Hands and robots in the scene: measured pose, commanded ghost, torque, pressure, faults."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from dexkit.hand import Floats, Side
+from dexkit.kinematics import Skeleton, quaternions, rotation
+from dexkit.models.skeletons import skeleton_of
+from dexkit.robots import RobotModel
+from dexkit.watch import SubjectView
+
+__all__ = ["Figure", "drawn_q"]
+
+Colors = NDArray[np.uint8]
+
+_BODY = np.array([173, 181, 189])
+_STALE = np.array([222, 226, 230])
+_NEAR = np.array([247, 163, 37])
+_FAULT = np.array([224, 49, 49])
+_WARM = np.array([247, 103, 7])
+_CALM = np.array([73, 80, 87])
+_GHOST = (51, 154, 240)
+_COLD = np.array([233, 236, 239])
+# from no pressure to the most that was seen
+_PRESSURE = np.array([[208, 235, 255], [81, 207, 102], [252, 196, 25], [240, 62, 62]])
+
+
+class Figure:
+    """One hand or robot in the scene.
+
+    :param name: of its nodes, unique.
+    :param place: where its base is, m.
+    :param skeleton: None for that of its model.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        view: SubjectView,
+        title: str,
+        place: tuple[float, float, float],
+        skeleton: Skeleton | None = None,
+    ) -> None:
+        self._robot = isinstance(view.model, RobotModel)
+        side = view.subject if isinstance(view.subject, Side) else None
+        self.skeleton = skeleton or skeleton_of(view.model, side)
+        self._server = server
+        scene = server.scene
+        mount = quaternions(rotation(self.skeleton.mount)[None])[0]
+        self._root = scene.add_frame(name, wxyz=mount, position=place, show_axes=False)
+        vertices, faces = _rounded_box()
+        count = len(self.skeleton.boxes)
+        still = np.tile([1.0, 0.0, 0.0, 0.0], (max(count, 1), 1)).astype(np.float32)
+        nowhere = np.zeros((max(count, 1), 3), np.float32)
+        sizes = self.skeleton.sizes.astype(np.float32)
+        self._bodies = scene.add_batched_meshes_simple(
+            f"{name}/bodies",
+            vertices,
+            faces,
+            still[:count],
+            nowhere[:count],
+            batched_scales=sizes,
+            batched_colors=np.tile(_BODY, (count, 1)).astype(np.uint8),
+            lod="off",
+        )
+        self._ghost = scene.add_batched_meshes_simple(
+            f"{name}/ghost",
+            vertices,
+            faces,
+            still[:count],
+            nowhere[:count],
+            batched_scales=sizes * 1.04,
+            batched_colors=_GHOST,
+            opacity=0.28,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
+        )
+        pins = self.skeleton.pins
+        self._pin_joints = np.array([p.joint for p in pins], dtype=int)
+        thick = 0.045 if self._robot else 0.0105
+        self._pins = scene.add_batched_meshes_simple(
+            f"{name}/joints",
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (len(pins), 1)).astype(np.float32),
+            np.zeros((len(pins), 3), np.float32),
+            batched_scales=np.array([(p.length, thick, thick) for p in pins], np.float32).reshape(
+                -1, 3
+            ),
+            batched_colors=np.tile(_CALM, (len(pins), 1)).astype(np.uint8),
+            lod="off",
+            cast_shadow=False,
+        )
+        elements = len(self.skeleton.elements)
+        self._elements = self._balls(f"{name}/elements", elements, 0.0045) if elements else None
+        bottom = -1.0 if self._robot else -0.055
+        turn = mount * np.array([1.0, -1.0, -1.0, -1.0])  # labels are placed upright
+        self._upright = scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
+        self._label = scene.add_label(
+            f"{name}/upright/title", title, position=(0.0, 0.0, bottom), anchor="top-center"
+        )
+        self._fault = scene.add_label(
+            f"{name}/upright/fault",
+            "",
+            position=(0.0, 0.0, 0.75 if self._robot else 0.215),
+            anchor="bottom-center",
+            visible=False,
+        )
+        self._title = title
+        self._shown: dict[str, object] = {}
+        self._most_pressure = 1.0
+
+    def _balls(self, name: str, count: int, radius: float) -> viser.BatchedMeshHandle:
+        vertices, faces = _ball()
+        return self._server.scene.add_batched_meshes_simple(
+            name,
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)).astype(np.float32),
+            np.zeros((count, 3), np.float32),
+            batched_scales=np.full(count, radius, np.float32),
+            batched_colors=np.tile(_CALM, (count, 1)).astype(np.uint8),
+            lod="off",
+            cast_shadow=False,
+        )
+
+    def update(self, view: SubjectView) -> None:
+        """Show another state; what has not changed is not sent."""
+        q = drawn_q(view, view.q)
+        poses = self.skeleton.poses(q)
+        self._place(self._bodies, "bodies", self.skeleton.box_poses(poses))
+        if len(self._pin_joints):
+            self._place(self._pins, "pins", self.skeleton.pin_poses(poses))
+            self._color(self._pins, "pin colors", _effort_colors(view)[self._pin_joints])
+        self._color(self._bodies, "body colors", self._body_colors(view))
+        driven = np.isfinite(view.target)
+        self._flag(self._ghost, "visible", bool(driven.any()))
+        if driven.any():
+            target = drawn_q(view, np.where(driven, view.target, view.q))
+            ghost = self.skeleton.box_poses(self.skeleton.poses(target))
+            self._place(self._ghost, "ghost", ghost)
+        if self._elements is not None:
+            places = self.skeleton.element_places(poses)
+            self._set(self._elements, "batched_positions", "elements", places)
+            self._color(self._elements, "element colors", self._pressure_colors(view))
+        self._tell(view)
+
+    def remove(self) -> None:
+        """Take it off the scene."""
+        self._root.remove()
+
+    def _tell(self, view: SubjectView) -> None:
+        faults = view.faults
+        text = ""
+        if view.stale:
+            text = "no state" if not math.isfinite(view.age) else f"state {view.age:.1f} s old"
+        elif faults:
+            text = "; ".join(faults[:2]) + (f" and {len(faults) - 2} more" if faults[2:] else "")
+        if self._shown.get("fault") != text:
+            self._shown["fault"] = text
+            self._fault.text = text
+            self._fault.visible = bool(text)
+
+    def _place(self, handle: viser.BatchedMeshHandle, what: str, frames: Floats) -> None:
+        self._set(handle, "batched_positions", f"{what} places", frames[:, :3, 3])
+        self._set(handle, "batched_wxyzs", f"{what} turns", quaternions(frames))
+
+    def _set(self, handle: object, name: str, what: str, values: Floats) -> None:
+        sent = values.astype(np.float32)
+        before = self._shown.get(what)
+        # a tenth of a millimetre, or of a thousandth of a turn, cannot be seen
+        if isinstance(before, np.ndarray) and np.allclose(before, sent, rtol=0, atol=1e-4):
+            return
+        self._shown[what] = sent
+        setattr(handle, name, sent)
+
+    def _color(self, handle: object, what: str, colors: Colors) -> None:
+        before = self._shown.get(what)
+        if isinstance(before, np.ndarray) and np.array_equal(before, colors):
+            return
+        self._shown[what] = colors
+        setattr(handle, "batched_colors", colors)  # noqa: B010 - a property of several handles
+
+    def _flag(self, handle: viser.SceneNodeHandle, name: str, value: bool) -> None:
+        if self._shown.get(name) != value:
+            self._shown[name] = value
+            handle.visible = value
+
+    def _body_colors(self, view: SubjectView) -> Colors:
+        joints = [
+            None if b.segment < 0 else self.skeleton.segments[b.segment].joint
+            for b in self.skeleton.boxes
+        ]
+        base = _STALE if view.stale else _BODY
+        out = np.tile(base, (len(joints), 1))
+        for i, joint in enumerate(joints):
+            if joint is None or view.stale:
+                continue
+            if view.fault[joint]:
+                out[i] = _FAULT
+            elif view.near[joint]:
+                out[i] = _NEAR
+            elif not len(self._pin_joints):  # a gripper's jaws show its torque
+                out[i] = base + (_WARM - base) * float(view.effort[joint])
+        return out.astype(np.uint8)
+
+    def _pressure_colors(self, view: SubjectView) -> Colors:
+        values = np.nan_to_num(view.pressure)
+        count = len(self.skeleton.elements)
+        if len(values) != count:
+            return np.tile(_COLD, (count, 1)).astype(np.uint8)
+        self._most_pressure = max(self._most_pressure, float(values.max(initial=0.0)))
+        part = np.clip(values / self._most_pressure, 0.0, 1.0) * (len(_PRESSURE) - 1)
+        low = np.minimum(part.astype(int), len(_PRESSURE) - 2)
+        mix = (part - low)[:, None]
+        colors = _PRESSURE[low] * (1 - mix) + _PRESSURE[low + 1] * mix
+        return np.where(values[:, None] > 0, colors, _COLD).astype(np.uint8)
+
+
+def drawn_q(view: SubjectView, q: Floats) -> Floats:
+    """Q in the radians of the model's skeleton, which a gripper's dialects may scale."""
+    if isinstance(view.model, RobotModel) or not isinstance(view.subject, Side):
+        return q
+    own = view.model.joints[view.subject]
+    scale = np.array(
+        [mine.stroke / told.stroke for mine, told in zip(own, view.joints, strict=True)]
+    )
+    return np.asarray(q * scale)
+
+
+def _effort_colors(view: SubjectView) -> Colors:
+    part = view.effort[:, None]
+    warm = np.where(part < 0.5, _CALM + (_NEAR - _CALM) * part * 2,
+                    _NEAR + (_FAULT - _NEAR) * (part * 2 - 1))  # fmt: skip
+    return np.asarray(warm, dtype=np.uint8)
+
+
+@cache
+def _rounded_box() -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """A cube of side 1 around the origin with rounded edges."""
+    steps, radius = 7, 0.2
+    line = np.linspace(-0.5, 0.5, steps)
+    u, v = (a.ravel() for a in np.meshgrid(line, line, indexing="ij"))
+    vertices: list[Floats] = []
+    faces: list[list[int]] = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            points = np.empty((steps * steps, 3))
+            points[:, axis] = 0.5 * sign
+            points[:, (axis + 1) % 3], points[:, (axis + 2) % 3] = u, v
+            inner = np.clip(points, -0.5 + radius, 0.5 - radius)
+            away = points - inner
+            away /= np.linalg.norm(away, axis=1, keepdims=True)
+            first = sum(len(part) for part in vertices)
+            vertices.append(inner + radius * away)
+            for i in range(steps - 1):
+                for j in range(steps - 1):
+                    a = first + i * steps + j
+                    corners = [a, a + steps, a + steps + 1, a + 1]
+                    if sign < 0:
+                        corners.reverse()
+                    faces += [[corners[0], corners[1], corners[2]],
+                              [corners[0], corners[2], corners[3]]]  # fmt: skip
+    return np.concatenate(vertices).astype(np.float32), np.array(faces, dtype=np.uint32)
+
+
+@cache
+def _ball() -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """A ball of radius 1, made of a rounded box."""
+    vertices, faces = _rounded_box()
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+
+
+def places(count: int, robots: Mapping[int, bool]) -> list[tuple[float, float, float]]:
+    """Where figures stand: hands in a row, robots behind them.
+
+    :param robots: whether each is a robot.
+    """
+    hands = [i for i in range(count) if not robots[i]]
+    out = []
+    for i in range(count):
+        if robots[i]:
+            out.append((0.0, 1.4, 0.25))
+        else:
+            out.append(((hands.index(i) - (len(hands) - 1) / 2) * 0.22, 0.0, 0.0))
+    return out

@@ -1,0 +1,68 @@
+"""Which moment is shown: following a live domain, or playing a recording; sans IO."""
+
+from __future__ import annotations
+
+__all__ = ["SPEEDS", "Transport"]
+
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
+
+
+class Transport:
+    """The position on the time line. Times of the line are seconds, ``now`` is a monotonic clock.
+
+    :param live: the end of the line is now; it is followed unless paused.
+    :param end: of a recording, seconds.
+
+    :ivar at: the moment that is shown.
+    :ivar paused: whether it stands.
+    :ivar speed: of playing a recording.
+    """
+
+    def __init__(self, *, live: bool, end: float = 0.0) -> None:
+        self.live = live
+        self.begin = 0.0
+        self.end = end
+        self.at = 0.0
+        self.paused = False
+        self.speed = 1.0
+        self._last: float | None = None
+
+    @property
+    def following(self) -> bool:
+        """Whether it shows now."""
+        return self.live and not self.paused
+
+    def advance(self, now: float, begin: float, end: float) -> float:
+        """Go on with the clock; returns the moment to show.
+
+        :param begin: of the line, ``end`` its end: of a live one what the history reaches back to,
+            and now.
+        """
+        passed = 0.0 if self._last is None else max(0.0, now - self._last)
+        self._last = now
+        self.begin, self.end = begin, max(begin, end)
+        if self.following:
+            self.at = self.end
+        elif not self.paused:
+            self.at += self.speed * passed
+            if self.at >= self.end:
+                self.at = self.end
+                self.paused = True
+        self.at = min(max(self.at, self.begin), self.end)
+        return self.at
+
+    def hold(self) -> None:
+        """Let the time until the next :meth:`advance` not count."""
+        self._last = None
+
+    def seek(self, at: float) -> None:
+        """Go to a moment; a live line stands there."""
+        self.at = min(max(at, self.begin), self.end)
+        if self.live:
+            self.paused = True
+
+    def toggle(self) -> None:
+        """Pause, or go on; a recording at its end begins anew."""
+        self.paused = not self.paused
+        if not self.live and not self.paused and self.at >= self.end:
+            self.at = self.begin

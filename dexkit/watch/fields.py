@@ -1,0 +1,188 @@
+"""Which numbers of a message are shown, and where they are, per topic and hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from dexkit.hand import ROBOT, JointSpec, Side, Subject
+from dexkit.messages import message_type
+from dexkit.messages.layout import Struct
+from dexkit.models import Dialect, HandModel, ModeByte, model
+from dexkit.robots import ROBOTS, RobotModel
+from dexkit.topics import roles
+
+__all__ = ["Field", "Part", "parts_of"]
+
+NO_VALUE = 30000.0
+"""Pressure of a slot without a sensor element (docs/sources/unitree-dex.md#b4)."""
+
+_GO_STATE = {
+    "q": "q",
+    "dq": "dq",
+    "ddq": "ddq",
+    "tau": "tau_est",
+    "temperature": "temperature",
+    # where dexkit's services put the motor error bits (docs/service.md); Unitree's leave it 0
+    "fault": "reserve[0]",
+    "mode": "mode",
+}
+_HG_STATE = {
+    **_GO_STATE,
+    "temperature": "temperature[0]",
+    "voltage": "vol",
+    "fault": "motorstate",
+}
+_COMMAND = {name: name for name in ("q", "dq", "tau", "kp", "kd", "mode")}
+_UNITS = {
+    "q": "rad",
+    "dq": "rad/s",
+    "ddq": "rad/s²",
+    "tau": "N·m",
+    "kp": "N·m/rad",
+    "kd": "N·m·s/rad",
+    "temperature": "°C",
+    "voltage": "V",
+}
+_SUPPLY = {"power_v": "V", "power_a": "A", "system_v": "V", "device_v": "V"}
+
+
+@dataclass(frozen=True)
+class Field:
+    """One number of a message.
+
+    :param path: in the message, as :class:`~dexkit.messages.columns.Columns` takes it.
+    :param name: for people: ``thumb_0 q``.
+    :param quantity: ``q``, ``tau``, ``pressure``, ...
+    :param index: of the joint, or of the sensor; -1 for the whole hand.
+    :param factor: from the message's unit to that of ``unit``.
+    """
+
+    path: str
+    name: str
+    quantity: str
+    index: int
+    unit: str = ""
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a topic says of one hand, or of a robot.
+
+    :param kind: ``"cmd"``, ``"state"`` or ``"low"``.
+    :param joints: in the units of the topic's dialect.
+    :param expected: samples a second that the vendor's publisher sends.
+    :param mode_byte: what the mode byte of a motor holds.
+    :param timeout: seconds after which a command no longer counts.
+    """
+
+    subject: Subject
+    kind: str
+    model: HandModel | RobotModel
+    dialect: str
+    joints: tuple[JointSpec, ...]
+    fields: tuple[Field, ...]
+    expected: float
+    mode_byte: ModeByte
+    timeout: float
+
+    def columns(self, quantity: str) -> list[int]:
+        """The places of a quantity in :attr:`fields`, by joint or sensor element."""
+        return [i for i, f in enumerate(self.fields) if f.quantity == quantity]
+
+
+def parts_of(topic: str, type_name: str) -> list[Part]:
+    """What a topic of a type says, of which hands or robot; empty for other topics."""
+    found = [
+        _hand_part(role.dialect, role.kind, side, type_name)
+        for role in roles(topic, type_name)
+        for side in role.sides
+    ]
+    return found or list(_robot_parts(topic, type_name))
+
+
+def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
+    hand = model(dialect.model)
+    joints = hand.joints[side]
+    if dialect.is_gripper:
+        joints = tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
+    units = dialect.torque_units or (1.0,) * len(joints)
+    first = dialect.index[side]
+    fields = list(
+        _motor_fields(type_name, kind, [(first + i, j) for i, j in enumerate(joints)], units)
+    )
+    if type_name.startswith("unitree_hg") and kind != "cmd":
+        fields += [
+            Field(
+                f"press_sensor_state[{i}].pressure[{slot}]",
+                f"{sensor.place} {n} pressure",
+                "pressure",
+                i,
+            )
+            for i, sensor in enumerate(hand.sensors)
+            for n, slot in enumerate(sensor.slots)
+        ]
+        fields += [Field(name, name, name, -1, unit) for name, unit in _SUPPLY.items()]
+    rate = {"cmd": hand.command_rate, "state": hand.state_rate, "low": hand.low_rate}[kind]
+    return Part(
+        side,
+        kind,
+        hand,
+        dialect.name,
+        joints,
+        tuple(fields),
+        rate,
+        dialect.mode_byte,
+        hand.command_timeout,
+    )
+
+
+def _motor_fields(
+    type_name: str, kind: str, joints: list[tuple[int, JointSpec]], units: tuple[float, ...]
+) -> Iterator[Field]:
+    motors = next(
+        f.name
+        for f in message_type(type_name).layout.fields
+        if isinstance(f.type, Struct) and any(m.name == "q" for m in f.type.fields)
+    )
+    if kind == "cmd":
+        members = _COMMAND
+    else:
+        members = _HG_STATE if type_name.startswith("unitree_hg") else _GO_STATE
+    for number, (slot, joint) in enumerate(joints):
+        for quantity, member in members.items():
+            yield Field(
+                f"{motors}[{slot}].{member}",
+                f"{joint.name} {quantity}",
+                quantity,
+                number,
+                _UNITS.get(quantity, ""),
+                units[number] if quantity == "tau" else 1.0,
+            )
+
+
+def _robot_parts(topic: str, type_name: str) -> Iterator[Part]:
+    for robot in ROBOTS.values():
+        kinds = {
+            (robot.cmd_topic, robot.cmd_type): ("cmd", robot.command_rate),
+            (robot.arm_topic, robot.cmd_type): ("arm", robot.teleop_rate),
+            (robot.state_topic, robot.state_type): ("state", robot.state_rate),
+        }
+        if (topic, type_name) not in kinds:
+            continue
+        kind, rate = kinds[topic, type_name]
+        slots = [(i, robot.joint(i)) for i in robot.used]
+        one = (1.0,) * len(slots)
+        as_kind = "state" if kind == "state" else "cmd"
+        yield Part(
+            ROBOT,
+            kind,
+            robot,
+            robot.name,
+            tuple(joint for _, joint in slots),
+            tuple(_motor_fields(type_name, as_kind, slots, one)),
+            rate,
+            ModeByte.UNUSED,
+            robot.command_timeout,
+        )

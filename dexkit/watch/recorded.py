@@ -1,0 +1,42 @@
+"""Feed a collector with a whole recording."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dexkit.watch.collector import Collector
+from dexkit.watch.fields import parts_of
+
+if TYPE_CHECKING:
+    from dexkit.traces import Trace
+
+__all__ = ["feed"]
+
+
+def feed(trace: Trace) -> Collector:
+    """A collector that has taken everything in a recording; it holds all values of hands.
+
+    :raises TraceUnreadable: the file cannot be read.
+    """
+    collector = Collector(most=None)
+    shown = {c.topic for c in trace.channels if c.message_count}
+    decoded = {c.topic for c in trace.channels if parts_of(c.topic, c.type_name)} & shown
+    samples = {
+        **(trace.load(sorted(decoded), decode=True) if decoded else {}),
+        **(trace.load(sorted(shown - decoded), payloads=False) if shown - decoded else {}),
+    }
+    collector.origin_ns = trace.first_ns
+    for topic, some in sorted(samples.items()):
+        columns = None
+        if topic in decoded and not some.problem:
+            columns = some.columns()
+        collector.take(
+            topic,
+            some.type_name if columns is not None else "",
+            columns if columns is not None else [],
+            some.log_time_ns,
+            some.publish_time_ns,
+        )
+    for number, endpoint in enumerate(trace.endpoints):
+        collector.endpoint(str(number), endpoint.topic, endpoint.kind, "")
+    return collector
