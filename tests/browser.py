@@ -133,6 +133,19 @@ class Browser:
         text = self.run("document.body ? document.body.innerText : ''")
         raise AssertionError(f"never true: {expression}\nthe page says: {text}")
 
+    def click(self, text: str) -> None:
+        """Click with the mouse on the last button or tab whose text begins so."""
+        find = (
+            "(() => { const found = [...document.querySelectorAll('button,[role=tab],label')]"
+            f".filter(e => e.innerText.trim().startsWith({json.dumps(text)})).pop();"
+            "if (!found) return null; found.scrollIntoView({block: 'center'});"
+            "const box = found.getBoundingClientRect();"
+            "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+        )
+        x, y = self.wait(find)
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
     def picture(self) -> bytes:
         """What is seen, as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

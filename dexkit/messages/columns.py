@@ -19,7 +19,7 @@ from dexkit.messages.codec import check_count, check_end, is_big, truncated
 from dexkit.messages.layout import Field, Primitive, Struct, max_size
 from dexkit.messages.packed import Words, aligned, pieces, rows_at
 
-__all__ = ["Columns", "encode_columns"]
+__all__ = ["Columns", "RowReader", "encode_columns"]
 
 _STEP = re.compile(r"(?P<name>[A-Za-z_]\w*)(?:\[(?P<index>\d*)\])?")
 _UINT32 = (struct.Struct("<I"), struct.Struct(">I"))
@@ -238,6 +238,100 @@ class Columns:
             if index is None and member.array is not None:
                 return (member.array,)
         return ()
+
+
+class RowReader:
+    """Decodes small batches of one type again and again: the same numbers of every sample.
+
+    Where :class:`Columns` is made for whole recordings, this keeps what it has learnt of a shape,
+    so that a batch costs little more than its numbers.
+
+    :param paths: of one number each, as :class:`Columns` takes them.
+    :raises UsageError: the type has no such member.
+    """
+
+    def __init__(self, kind: Struct, paths: Sequence[str]) -> None:
+        self._kind = kind
+        self._limit = max_size(kind)
+        self._paths = [_steps(kind, path) for path in paths]
+        self._plans: dict[int, _Plan] = {}
+
+    def read(self, payloads: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The numbers, shape (n, len(paths)), and which samples can be decoded, shape (n,).
+
+        What a sample does not have is NaN.
+        """
+        out = np.full((len(payloads), len(self._paths)), np.nan)
+        good = np.ones(len(payloads), dtype=np.bool_)
+        sizes = {len(payload) for payload in payloads}
+        for size in sizes:
+            rows = np.arange(len(payloads))
+            some = payloads
+            if len(sizes) > 1:
+                rows = np.array([i for i, p in enumerate(payloads) if len(p) == size])
+                some = [payloads[i] for i in rows.tolist()]
+            self._read(some, size, rows, out, good)
+        return out, good
+
+    def _read(
+        self,
+        payloads: Sequence[bytes],
+        size: int,
+        rows: NDArray[np.intp],
+        out: NDArray[np.float64],
+        good: NDArray[np.bool_],
+    ) -> None:
+        raw = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), size)
+        waiting = np.arange(len(payloads))
+        while len(waiting):
+            plan = self._plans.get(size)
+            if plan is not None and len(same := waiting[plan.agrees(raw[waiting])]):
+                plan.read(raw[same], rows[same], out)
+                waiting = np.setdiff1d(waiting, same, assume_unique=True)
+                continue
+            first = int(waiting[0])
+            try:
+                data = payloads[first]
+                big = is_big(data, self._limit, self._kind.name)
+                self._plans[size] = _Plan(self._kind, self._paths, data, big)
+            except WireError:
+                good[rows[first]] = False
+                waiting = waiting[1:]
+
+
+class _Plan:
+    """Where the numbers are in samples of one shape."""
+
+    def __init__(self, kind: Struct, paths: Sequence[_Steps], data: bytes, big: bool) -> None:
+        counts = _counts(kind, data, big)
+        dtype = _dtype(kind, counts, ">" if big else "<", len(data))
+        words = _count_words(kind, counts)
+        # the header's first two bytes, and the lengths of the sequences
+        self._fixed = np.array([0, 1, *(4 * w + i for w in words for i in range(4))])
+        self._example = np.frombuffer(data, np.uint8)[self._fixed]
+        by_type: dict[np.dtype[Any], tuple[list[int], list[int]]] = {}
+        for column, steps in enumerate(paths):
+            leaf, places = _places(dtype, 0, steps)
+            if len(places) == 1:
+                columns, starts = by_type.setdefault(leaf, ([], []))
+                columns.append(column)
+                starts.append(places[0])
+        self._gathers = [
+            (leaf, columns, (np.array(starts)[:, None] + np.arange(leaf.itemsize)).ravel())
+            for leaf, (columns, starts) in by_type.items()
+        ]
+
+    def agrees(self, raw: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which samples are of this shape."""
+        return np.asarray((raw[:, self._fixed] == self._example).all(axis=1))
+
+    def read(
+        self, raw: NDArray[np.uint8], rows: NDArray[np.intp], out: NDArray[np.float64]
+    ) -> None:
+        """Put the numbers into rows of a table."""
+        for leaf, columns, octets in self._gathers:
+            values = np.ascontiguousarray(raw[:, octets]).view(leaf)
+            out[rows[:, None], columns] = values
 
 
 def encode_columns(

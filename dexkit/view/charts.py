@@ -70,7 +70,7 @@ class Chart:
         self._last = now
         times, values = common_times(found)
         if len(times) < 2:
-            times, values = np.array([at - window, at]), [np.full(2, np.nan) for _ in found]
+            times, values = np.array([at - window, at]), [np.zeros(2) for _ in found]
         self._plot.data = (times, *values)
 
     def remove(self) -> None:

@@ -156,7 +156,16 @@ class Page:
         server, gui = self._server, self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.scene.set_up_direction("+z")
-        server.scene.configure_default_lights()
+        # from where one looks: the library's own lights are above, and its room washes colours out
+        server.scene.configure_default_lights(enabled=False)
+        server.scene.configure_environment_map(hdri=None)
+        server.scene.add_light_ambient("/lights/ambient", intensity=1.1)
+        server.scene.add_light_directional(
+            "/lights/main", position=(-1.2, -2.0, 2.2), intensity=2.0, cast_shadow=True
+        )
+        server.scene.add_light_directional(
+            "/lights/fill", position=(1.8, -1.2, 0.4), intensity=0.8, cast_shadow=False
+        )
         server.scene.add_grid("/grid", width=4.0, height=4.0, position=(0.0, 0.0, -0.08),
                               cell_size=0.05, section_size=0.25)  # fmt: skip
         server.initial_camera.fov = math.radians(50)
@@ -382,11 +391,11 @@ class Page:
         self._offer_numbers()
 
     def _look_at(self, hands: int, robots: bool) -> None:
-        distance = 0.62 * max(1.0, hands / 2) if hands else 2.4
+        distance = 0.62 * max(1.0, hands / 2) if hands else 0.2
         if robots and hands:
             distance = max(distance, 0.8)
         position = (0.1 if hands else 0.5, -distance, 0.24 if hands else 0.6)
-        target = (0.0, 0.0, 0.07) if hands else (0.0, 1.4, 0.3)
+        target = (0.0, 0.0, 0.07) if hands else (0.0, 2.2, 0.6)
         self._server.initial_camera.position = position
         self._server.initial_camera.look_at = target
         for client in self._server.get_clients().values():

@@ -20,7 +20,7 @@ __all__ = ["Figure", "drawn_q"]
 
 Colors = NDArray[np.uint8]
 
-_BODY = np.array([173, 181, 189])
+_BODY = np.array([151, 160, 170])
 _STALE = np.array([222, 226, 230])
 _NEAR = np.array([247, 163, 37])
 _FAULT = np.array([224, 49, 49])
@@ -103,7 +103,7 @@ class Figure:
         )
         elements = len(self.skeleton.elements)
         self._elements = self._balls(f"{name}/elements", elements, 0.0045) if elements else None
-        bottom = -1.0 if self._robot else -0.055
+        bottom = -0.85 if self._robot else -0.055
         turn = mount * np.array([1.0, -1.0, -1.0, -1.0])  # labels are placed upright
         self._upright = scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
         self._label = scene.add_label(
@@ -290,7 +290,7 @@ def places(count: int, robots: Mapping[int, bool]) -> list[tuple[float, float, f
     out = []
     for i in range(count):
         if robots[i]:
-            out.append((0.0, 1.4, 0.25))
+            out.append((0.0, 2.2, 0.72))
         else:
             out.append(((hands.index(i) - (len(hands) - 1) / 2) * 0.22, 0.0, 0.0))
     return out

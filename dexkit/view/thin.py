@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from dexkit.hand import Floats
@@ -20,28 +18,33 @@ def thin(t: Floats, values: Floats, most: int) -> tuple[Floats, Floats]:
     """
     if len(t) <= most:
         return t, values
-    edges = np.linspace(0, len(t), most // 2 + 1).astype(int)
-    chosen = []
-    for begin, end in pairwise(edges.tolist()):
-        part = values[begin:end]
-        finite = np.flatnonzero(np.isfinite(part))
-        if not len(finite):
-            chosen.append(begin)
-            continue
-        low = begin + finite[np.argmin(part[finite])]
-        high = begin + finite[np.argmax(part[finite])]
-        chosen += sorted({int(low), int(high)})
+    bins = most // 2
+    width = -(-len(t) // bins)
+    # the last stretch is filled up with what does not count
+    padded = np.full(width * bins, np.nan)
+    padded[: len(t)] = values
+    table = padded.reshape(bins, width)
+    known = np.isfinite(table)
+    first = np.arange(bins) * width
+    low = first + np.where(known, table, np.inf).argmin(axis=1)
+    high = first + np.where(known, table, -np.inf).argmax(axis=1)
+    chosen = np.unique(np.concatenate((low, high)))
+    chosen = chosen[chosen < len(t)]
     return t[chosen], values[chosen]
 
 
 def common_times(curves: list[tuple[Floats, Floats]]) -> tuple[Floats, list[Floats]]:
-    """Several curves on the times of all; between its points a curve keeps its last value."""
+    """Several curves on the times of all; between its points a curve keeps its last number.
+
+    Before its first number it has that one, and without any it is 0: a chart cannot scale NaN.
+    """
     times: Floats = np.unique(np.concatenate([t for t, _ in curves])) if curves else np.empty(0)
     out: list[Floats] = []
     for t, values in curves:
-        if not len(t):
-            out.append(np.full(len(times), np.nan))
+        finite = np.isfinite(values)
+        if not finite.any():
+            out.append(np.zeros(len(times)))
             continue
-        at = np.searchsorted(t, times, "right") - 1
-        out.append(np.where(at >= 0, values[np.maximum(at, 0)], np.nan))
+        at = np.searchsorted(t[finite], times, "right") - 1
+        out.append(values[finite][np.maximum(at, 0)])
     return times, out

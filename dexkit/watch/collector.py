@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, JointSpec, MotorError, Subject
 from dexkit.messages import Columns, message_type
+from dexkit.messages.columns import RowReader
 from dexkit.models import HandModel, ModeByte
 from dexkit.robots import RobotModel
 from dexkit.watch.cycles import Cycles
@@ -164,6 +165,8 @@ class Picture:
 
 def fault_names(bits: int) -> list[str]:
     """The names of motor error bits; a bit without a name is given as its number."""
+    if not bits:
+        return []
     names = [
         (e.name or "").lower().replace("_", " ") for e in MotorError if e.value and bits & e.value
     ]
@@ -187,29 +190,38 @@ class _Topic:
         self.offsets: dict[int, tuple[float, float]] = {}
         self.bad = History(0, most)
         self._factors = np.array([f.factor for f in self.fields])
+        self._reader = (
+            RowReader(message_type(type_name).layout, [f.path for f in self.fields])
+            if self.fields
+            else None
+        )
         # the writer of each of the last samples, by time
         self._writers = History(1, most)
         self._numbers: dict[int, int] = {}
 
     def take(
         self,
-        columns: Columns | None,
+        payloads: Columns | Sequence[bytes],
         received: Floats,
         sent: Floats,
         writers: Times,
     ) -> None:
         t = self._times(received, sent, writers)
-        if columns is not None and self.fields:
-            rows = columns.table([f.path for f in self.fields]) * self._factors
-        else:
-            rows = np.empty((len(t), len(self.fields)))
+        bad: NDArray[np.intp] = np.empty(0, dtype=np.intp)
+        rows = np.empty((len(t), len(self.fields)))
+        if isinstance(payloads, Columns):
+            rows = payloads.table([f.path for f in self.fields]) * self._factors
+            bad = np.flatnonzero(~payloads.ok)
+        elif self._reader is not None:
+            rows, good = self._reader.read(payloads)
+            rows *= self._factors
+            bad = np.flatnonzero(~good)
         order = np.argsort(t, kind="stable")
         self.history.append(t[order], rows[order])
         numbers = [self._numbers.setdefault(w, len(self._numbers)) for w in writers.tolist()]
         self._writers.append(t[order], np.array(numbers, dtype=np.float64)[order, None])
-        if columns is not None and columns.errors:
-            bad = np.sort(t[list(columns.errors)])
-            self.bad.append(bad, np.empty((len(bad), 0)))
+        if len(bad):
+            self.bad.append(np.sort(t[bad]), np.empty((len(bad), 0)))
 
     def _times(self, received: Floats, sent: Floats, writers: Times) -> Floats:
         t = received.copy()
@@ -225,8 +237,7 @@ class _Topic:
                 t[stamped] = sent[stamped] + offset
             if writer not in self.cycles and len(self.cycles) >= _MOST_WRITERS:
                 continue
-            nominal = 1.0 / self.expected if self.expected else 0.0
-            cycles = self.cycles.setdefault(writer, Cycles(nominal))
+            cycles = self.cycles.setdefault(writer, Cycles())
             cycles.add(np.sort(t[mine]))
         return t
 
@@ -311,13 +322,8 @@ class Collector:
         if not self.origin_ns:
             self.origin_ns = int(received[0])
         sent = np.asarray(sent_ns, dtype=np.int64)
-        columns: Columns | None = None
-        if isinstance(payloads, Columns):
-            columns = payloads
-        elif found.fields:
-            columns = message_type(type_name).columns(payloads)
         found.take(
-            columns,
+            payloads,
             (received - self.origin_ns) / 1e9,
             np.where(sent > 0, (sent - self.origin_ns) / 1e9, np.nan),
             np.asarray(writers if len(writers) else np.zeros(count), dtype=np.int64),

@@ -12,6 +12,7 @@ GAP = 2.5
 """An interval longer than so many periods is a gap; a shorter one is jitter."""
 
 _BLOCK = 64  # intervals after which the period is measured again
+_FIRST = 16  # those after which it is measured for the first time
 _REMEMBERED = 4 * _BLOCK
 _MOST_GAPS = 10_000
 
@@ -26,22 +27,22 @@ class Cycles:
     """Counts of one publisher's missed cycles.
 
     The period is the median of the last whole blocks of intervals, not what a model's service
-    promises: a slower publisher misses none, it is slow (its rate shows that). What comes out does
-    not depend on how the times are split over calls.
-
-    :param nominal: seconds of a period, until it is known; 0 if nothing is.
+    promises: a slower publisher misses none, it is slow (its rate shows that). Nothing is judged
+    before the first 16 intervals; they are judged then. What comes out does not depend on how the
+    times are split over calls.
 
     :ivar gaps: the last gaps, oldest first.
     :ivar count: gaps, ever.
     :ivar missed: cycles missed, ever.
     """
 
-    def __init__(self, nominal: float = 0.0) -> None:
+    def __init__(self) -> None:
         self.gaps: list[Gap] = []
         self.count = 0
         self.missed = 0
         self.longest = 0.0
-        self._period = nominal
+        self._period = 0.0
+        self._early: list[tuple[float, float]] | None = []
         self._last = np.nan
         self._block: list[float] = []
         self._recent: list[float] = []
@@ -60,6 +61,16 @@ class Cycles:
         intervals = np.diff(times)
         ends = times[1:]
         at = 0
+        if self._early is not None:
+            at = min(len(intervals), _FIRST - len(self._early))
+            self._early += zip(intervals[:at].tolist(), ends[:at].tolist(), strict=True)
+            if len(self._early) < _FIRST:
+                return
+            first = np.array(self._early)
+            self._early = None
+            self._period = float(np.median(first[:, 0]))
+            self._judge(first[:, 0], first[:, 1])
+            self._block = first[:, 0].tolist()
         while at < len(intervals):
             stop = min(len(intervals), at + _BLOCK - len(self._block))
             part = intervals[at:stop]

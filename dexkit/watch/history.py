@@ -49,6 +49,7 @@ class History:
             self.added += count - self._most
             t, rows = t[-self._most :], rows[-self._most :]
             count = self._most
+            self._count = 0  # what was there before them is older
         if self._count + count > len(self._t):
             self._make_room(count)
         there = slice(self._count, self._count + count)

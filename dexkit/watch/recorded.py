@@ -27,13 +27,11 @@ def feed(trace: Trace) -> Collector:
     }
     collector.origin_ns = trace.first_ns
     for topic, some in sorted(samples.items()):
-        columns = None
-        if topic in decoded and not some.problem:
-            columns = some.columns()
+        readable = topic in decoded and not some.problem
         collector.take(
             topic,
-            some.type_name if columns is not None else "",
-            columns if columns is not None else [],
+            some.type_name if readable else "",
+            some.columns() if readable else [],
             some.log_time_ns,
             some.publish_time_ns,
         )

@@ -1,0 +1,238 @@
+"""The page of ``dexkit view``: its time line, its tables, and what it shows, without a browser."""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from http.client import HTTPConnection
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.cli.view import _skeletons
+from dexkit.conformance.judge import judge
+from dexkit.conformance.marks import phase_marks, verdict_marks
+from dexkit.conformance.recording import Recording
+from dexkit.errors import ExtraMissing, UsageError
+from dexkit.hand import MotorError
+from dexkit.traces import open_trace, sample_path
+from dexkit.view.sources import Recorded
+from dexkit.view.texts import hand_table, seconds, time_strip, topics_table
+from dexkit.view.thin import common_times, thin
+from dexkit.view.transport import Transport
+from dexkit.watch import Collector, Mark
+from tests.cli_helpers import running
+from tests.patience import PATIENCE
+from tests.watch_helpers import closing_hands, ns
+
+FEW = settings(max_examples=25, deadline=None)
+
+pytest.importorskip("viser")
+from dexkit.view.page import Page  # noqa: E402
+
+# -- the time line ---------------------------------------------------------------------------------
+
+
+def test_a_live_page_follows_until_it_is_paused() -> None:
+    line = Transport(live=True)
+    assert line.advance(100.0, 0.0, 5.0) == 5.0
+    assert line.following
+    line.toggle()
+    assert line.advance(101.0, 0.0, 6.0) == 5.0
+    line.seek(2.0)
+    assert line.advance(102.0, 3.0, 7.0) == 3.0  # the history no longer reaches back to 2 s
+    line.toggle()
+    assert line.advance(103.0, 3.0, 8.0) == 8.0
+
+
+def test_a_recording_plays_at_its_speed_to_its_end_and_again() -> None:
+    line = Transport(live=False, end=10.0)
+    assert line.advance(0.0, 0.0, 10.0) == 0.0
+    assert line.advance(2.0, 0.0, 10.0) == 2.0
+    line.speed = 0.5
+    assert line.advance(4.0, 0.0, 10.0) == 3.0
+    line.hold()
+    assert line.advance(50.0, 0.0, 10.0) == 3.0  # nobody looked meanwhile
+    line.speed = 5.0
+    assert line.advance(60.0, 0.0, 10.0) == 10.0
+    assert line.paused
+    line.toggle()
+    assert line.advance(60.1, 0.0, 10.0) == pytest.approx(0.5)
+    line.seek(99.0)
+    assert line.at == 10.0
+
+
+# -- curves ----------------------------------------------------------------------------------------
+
+
+@FEW
+@given(
+    values=st.lists(st.one_of(st.floats(-1e3, 1e3), st.just(float("nan"))), max_size=400),
+    most=st.integers(4, 60),
+)
+def test_thin_curves_keep_their_extremes(values: list[float], most: int) -> None:
+    t, y = np.arange(len(values)) * 0.5, np.array(values, dtype=float)
+    few_t, few = thin(t, y, most)
+    assert len(few) <= max(most, len(values) if len(values) <= most else 0)
+    assert (np.diff(few_t) > 0).all()
+    finite = y[np.isfinite(y)]
+    if len(finite):
+        assert np.nanmax(few) == finite.max()
+        assert np.nanmin(few) == finite.min()
+
+
+def test_curves_on_common_times_hold_their_values() -> None:
+    nan = float("nan")
+    first = (np.array([0.0, 2.0]), np.array([1.0, 3.0]))
+    second = (np.array([1.0, 1.5, 3.0]), np.array([5.0, nan, 7.0]))
+    times, (a, b, c) = common_times([first, second, (np.array([2.0]), np.array([nan]))])
+    assert times.tolist() == [0.0, 1.0, 1.5, 2.0, 3.0]
+    assert a.tolist() == [1.0, 1.0, 1.0, 3.0, 3.0]
+    assert b.tolist() == [5.0, 5.0, 5.0, 5.0, 7.0]
+    assert c.tolist() == [0.0] * 5
+
+
+# -- tables ----------------------------------------------------------------------------------------
+
+
+def test_names_from_the_wire_are_escaped() -> None:
+    evil = "<img src=x onerror=alert(1)>"
+    collector = closing_hands(0.2)
+    collector.endpoint("k", "rt/dex3/left/cmd", "writer", evil)
+    collector.endpoint("l", f"rt/{evil}", "writer", evil)
+    picture = collector.picture(0.1)
+    marks = [(0.0, 1.0, "phase", evil), (0.0, 1.0, "fail", evil)]
+    for html in (
+        hand_table(picture.subjects[0], evil),
+        topics_table(picture.topics, evil),
+        time_strip(marks, 1.0, 0.5, evil),
+    ):
+        assert "<img" not in html
+        assert "&lt;img" in html
+
+
+def test_a_hand_tells_what_is_wrong() -> None:
+    collector = closing_hands(1.0, faults=lambda t: {1: int(MotorError.OVERCURRENT)})
+    collector.endpoint("k", "rt/dex3/right/cmd", "writer", "one (pid 1)")
+    collector.endpoint("l", "rt/dex3/right/cmd", "writer", "two (pid 2)")
+    left, right = collector.picture(0.9).subjects
+    html = hand_table(right, "right")
+    assert "thumb_1: overcurrent" in html
+    assert "commanded by 2: one (pid 1), two (pid 2)" in html
+    assert "overcurrent" not in hand_table(left, "left")
+    near = replace(left, near=np.array([0, 1, 0, 0, 0, 0, -1]))
+    assert "at a limit: thumb_1 upper, index_1 lower" in hand_table(near, "left")
+    old = collector.picture(60.0).subjects[0]
+    assert "the state is 59.0 s old" in hand_table(old, "left")
+
+
+def test_times_for_people() -> None:
+    for value, text in ((0.0, "0 ms"), (0.0123, "12 ms"), (1.25, "1.2 s"), (250.4, "250 s"),
+                        (float("nan"), "-")):  # fmt: skip
+        assert seconds(value) == text
+
+
+# -- marks -----------------------------------------------------------------------------------------
+
+
+def test_failed_requirements_are_marked_where_they_show() -> None:
+    trace = open_trace(sample_path("dex1_hand_dropout"))
+    result = judge(Recording.decode(trace))
+    marks = verdict_marks(result)
+    failed = {r.requirement.id for r in result.results if str(r.verdict) == "fail" and r.evidence}
+    assert failed
+    assert failed <= {m.title.split()[0] for m in marks}
+    assert [m.kind for m in marks] == sorted((m.kind for m in marks), key=lambda k: k != "fail")
+    for mark in marks:
+        assert trace.first_ns <= mark.time_ns <= mark.end_ns + 1
+    assert phase_marks(trace) == []
+
+
+# -- the page, without a browser -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    marks = (Mark(ns(0), ns(1), "phase", "step left"), Mark(ns(1), ns(1), "fail", "DEX3-X-01 left"))
+    recording = Recorded("one", closing_hands(2.0), marks)
+    with Page([recording, Recorded("two", closing_hands(1.0))], port=0) as made:
+        yield made
+
+
+def test_page_shows_the_moment(page: Page) -> None:
+    page.step(10.0)
+    page.go_to(0, 1.0)
+    page.step(11.0)
+    first, second = page._shown
+    assert first.transport.at == 1.0
+    assert "1.00 s" in first.strip.content
+    assert "DEX3-X-01 left" in first.strip.content
+    assert "left Dex3-1 hand · one" in first.hands_html.content
+    assert second.transport.at == 1.0 - 0.01  # it has gone on to its end
+    assert len(first.figures) == len(second.figures) == 2
+    assert "rt/dex3/right/state" in second.topics_html.content
+    assert page._number.options[0] == "dex3/left/cmd  thumb_0 q  #1"
+    assert len(page._charts) == 2
+
+
+def test_what_has_not_changed_is_not_sent(page: Page) -> None:
+    page.go_to(0, 0.5)
+    page.go_to(1, 0.5)
+    page.step(20.0)
+    figure = next(iter(page._shown[0].figures.values()))
+    before = dict(figure._shown)
+    page.step(20.01)
+    assert all(figure._shown[name] is value for name, value in before.items())
+
+
+def test_page_is_bound_to_this_machine_and_to_a_free_port(page: Page) -> None:
+    assert page.url == f"http://127.0.0.1:{page.port}"
+    with pytest.raises(UsageError, match="cannot be bound"):
+        Page([Recorded("x", Collector())], port=page.port)
+
+
+def test_page_asks_nobody_for_a_share_link(page: Page) -> None:
+    assert page._server.request_share_url() is None
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+
+def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "dexkit.view.page")
+    with pytest.raises(ExtraMissing) as error:
+        import dexkit.view.page  # noqa: F401
+    assert "dexkit[view]" in error.value.hint
+
+
+def test_command_serves_the_page_until_it_is_stopped() -> None:
+    with running("view", sample_path("dex3_pinch"), "--no-open", "--port", "0") as process:
+        url = re.search(r"http://127\.0\.0\.1:(\d+)$", process.ready())
+        assert url is not None
+        connection = HTTPConnection("127.0.0.1", int(url[1]), timeout=PATIENCE)
+        connection.request("GET", "/")
+        body = connection.getresponse().read()
+        connection.close()
+        # one file, which names no other place than the name space of SVG
+        assert set(re.findall(rb"https?://[^\"' )]*", body)) <= {b"http://www.w3.org/2000/svg"}
+        code, out, err = process.end(signal.SIGINT)
+    assert (code, err) == (0, "")
+    assert out == "stopped\n"
+
+
+def test_a_urdf_is_for_the_hand_that_has_its_joints(tmp_path: Path) -> None:
+    path = tmp_path / "left.urdf"
+    path.write_text(
+        '<robot name="x"><joint name="left_hand_thumb_0_joint" type="revolute">'
+        '<parent link="a"/><child link="b"/></joint></robot>'
+    )
+    assert list(_skeletons([str(path)])) == [("dex3-1", "left")]
+    with pytest.raises(UsageError, match="none of the hand's joints"):
+        _skeletons([f"right={path}"])
