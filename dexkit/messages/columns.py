@@ -265,7 +265,7 @@ class RowReader:
         good = np.ones(len(payloads), dtype=np.bool_)
         sizes = {len(payload) for payload in payloads}
         for size in sizes:
-            rows = np.arange(len(payloads))
+            rows: NDArray[np.intp] = np.arange(len(payloads))
             some = payloads
             if len(sizes) > 1:
                 rows = np.array([i for i, p in enumerate(payloads) if len(p) == size])
@@ -282,7 +282,7 @@ class RowReader:
         good: NDArray[np.bool_],
     ) -> None:
         raw = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), size)
-        waiting = np.arange(len(payloads))
+        waiting: NDArray[np.intp] = np.arange(len(payloads))
         while len(waiting):
             plan = self._plans.get(size)
             if plan is not None and len(same := waiting[plan.agrees(raw[waiting])]):

@@ -1,9 +1,9 @@
 """Skeletons of the hands and robots: joint axes and origins, and the boxes that are drawn.
 
 Origins and axes are those of Unitree's URDFs (docs/sources/unitree-dex.md#i1). The boxes have the
-extents of the meshes that the URDFs name, rounded to mm (docs/sources/unitree-dex.md#i2); the
-meshes themselves are not used. Places of pressure sensor elements are schematic: no source has
-them.
+extents of the meshes that the URDFs name, rounded (docs/sources/unitree-dex.md#i2); the
+meshes themselves are not used. Places of pressure sensor elements are schematic
+(docs/sources/unitree-dex.md#i3).
 """
 
 from __future__ import annotations

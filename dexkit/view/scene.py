@@ -141,7 +141,7 @@ class Figure:
         self._place(self._bodies, "bodies", self.skeleton.box_poses(poses))
         if len(self._pin_joints):
             self._place(self._pins, "pins", self.skeleton.pin_poses(poses))
-            self._color(self._pins, "pin colors", _effort_colors(view)[self._pin_joints])
+            self._color(self._pins, "pin colors", _torque_colors(view)[self._pin_joints])
         self._color(self._bodies, "body colors", self._body_colors(view))
         driven = np.isfinite(view.target)
         self._flag(self._ghost, "visible", bool(driven.any()))
@@ -211,7 +211,7 @@ class Figure:
             elif view.near[joint]:
                 out[i] = _NEAR
             elif not len(self._pin_joints):  # a gripper's jaws show its torque
-                out[i] = base + (_WARM - base) * float(view.effort[joint])
+                out[i] = base + (_WARM - base) * float(view.torque_part[joint])
         return out.astype(np.uint8)
 
     def _pressure_colors(self, view: SubjectView) -> Colors:
@@ -238,8 +238,8 @@ def drawn_q(view: SubjectView, q: Floats) -> Floats:
     return np.asarray(q * scale)
 
 
-def _effort_colors(view: SubjectView) -> Colors:
-    part = view.effort[:, None]
+def _torque_colors(view: SubjectView) -> Colors:
+    part = view.torque_part[:, None]
     warm = np.where(part < 0.5, _CALM + (_NEAR - _CALM) * part * 2,
                     _NEAR + (_FAULT - _NEAR) * (part * 2 - 1))  # fmt: skip
     return np.asarray(warm, dtype=np.uint8)

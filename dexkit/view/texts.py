@@ -51,7 +51,7 @@ def hand_table(view: SubjectView, title: str) -> str:
             + _cell(_bar(view, i))
             + _cell(_number(float(view.q[i])), "n warn" if near else "n")
             + _cell(_number(float(view.target[i])), "n dim")
-            + _cell(_effort(view, i))
+            + _cell(_torque(view, i))
             + _cell(_number(float(view.tau[i])), "n")
             + _cell(f"{celsius:.0f}" if math.isfinite(celsius) and celsius else "", "n dim")
             + "</tr>"
@@ -71,7 +71,7 @@ def hand_table(view: SubjectView, title: str) -> str:
     return (
         f'{_STYLE}<div class="dk"><h4>{escape(title)}</h4><p>{_ages(view)}</p>{told}'
         '<table><tr><th>joint</th><th>between its limits</th><th class="n">q rad</th>'
-        '<th class="n">cmd</th><th>effort</th><th class="n">N·m</th><th class="n">°C</th></tr>'
+        '<th class="n">cmd</th><th>torque</th><th class="n">N·m</th><th class="n">°C</th></tr>'
         f"{''.join(rows)}</table></div>"
     )
 
@@ -119,8 +119,8 @@ def _bar(view: SubjectView, i: int) -> str:
     return f'<svg width="{_WIDTH}" height="{_HEIGHT}">{"".join(parts)}</svg>'
 
 
-def _effort(view: SubjectView, i: int) -> str:
-    part = float(view.effort[i])
+def _torque(view: SubjectView, i: int) -> str:
+    part = float(view.torque_part[i])
     color = "#e03131" if part > 0.9 else "#f08c00" if part > 0.6 else "#868e96"
     return (
         '<svg width="34" height="12"><rect y="4" width="34" height="4" fill="#adb5bd"'

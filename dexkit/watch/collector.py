@@ -47,7 +47,7 @@ __all__ = [
     "fault_names",
 ]
 
-NEAR_LIMIT = 0.03
+NEAR_LIMIT = 0.015
 """Part of a joint's stroke beside a limit that counts as near it."""
 STALE = 0.5
 """Seconds after which a state is old."""
@@ -129,7 +129,7 @@ class SubjectView:
         return not self.age <= STALE
 
     @property
-    def effort(self) -> Floats:
+    def torque_part(self) -> Floats:
         """Torque as a part of each joint's largest, 0 to 1, shape (n_joints,); 0 where unknown."""
         most = np.array([j.tau_max for j in self.joints])
         return np.asarray(np.clip(np.abs(np.nan_to_num(self.tau)) / most, 0.0, 1.0))
@@ -208,7 +208,7 @@ class _Topic:
     ) -> None:
         t = self._times(received, sent, writers)
         bad: NDArray[np.intp] = np.empty(0, dtype=np.intp)
-        rows = np.empty((len(t), len(self.fields)))
+        rows: Floats = np.empty((len(t), len(self.fields)))
         if isinstance(payloads, Columns):
             rows = payloads.table([f.path for f in self.fields]) * self._factors
             bad = np.flatnonzero(~payloads.ok)
