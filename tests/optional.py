@@ -94,6 +94,8 @@ OPTIONAL = (
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
+    Optional("viser", _package("viser"), ("view",)),
+    Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 

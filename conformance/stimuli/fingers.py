@@ -354,7 +354,7 @@ class FingerScript(HandScript):
     def _before_shutdown(self) -> Steps:
         """Move: what was commanded last must not be in force after the restart."""
         yield from self._to("center", OPEN)
-        yield from self._drive("drive", self.plan.sides, {}, guard=False)
+        yield from self._drive("drive", self.plan.sides, {})
 
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)
