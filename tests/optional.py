@@ -96,6 +96,7 @@ OPTIONAL = (
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
     Optional("viser", _package("viser"), ("view",)),
     Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),
+    Optional("ray", _package("ray"), ("audit_ray",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 

@@ -89,8 +89,8 @@ def test_a_torque_moves_the_gripper_one_way_at_least() -> None:
 
 
 def test_a_default_run_of_hands_is_short_enough() -> None:
-    """The hands' own time to arrive is not in this length: six seconds of a Dex3-1."""
+    """90 s, less the start of the service and the hands' own time to arrive: 3 s and more."""
     for name in ("dex1-1", "dex3-1"):
         stimuli = length(name, phases_for(catalogue(name)))
         session = Session.default(name).duration if MODELS[name].session else 0.0
-        assert stimuli + session <= 84.0, name
+        assert stimuli + session <= 87.0, name

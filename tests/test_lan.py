@@ -540,6 +540,7 @@ _KNOWN = {
     "dexkit/dds.py": {"Domain", "DomainParticipant"},
     "dexkit/domains.py": {"bind"},  # reserves a port of DDS and reads nothing from it
     "dexkit/doctor/dds.py": {"bind"},
+    "dexkit/view/page.py": {"bind"},  # tries whether a port is free; the page has an address
     "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address
     "emulators/dex3_mcu/server.py": {"bind", "listen"},
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from html import escape
+from dexkit.escaping import html as escape
 
 from dexkit.watch import SubjectView, TopicView
 

@@ -488,8 +488,7 @@ def _target(row: Floats, command: tuple[_Topic, Part]) -> Floats:
     q, kp, mode = (_values(row, command, name) for name in ("q", "kp", "mode"))
     part = command[1]
     if part.mode_byte is ModeByte.UNUSED:
-        # the interface specification's clients send no gains (docs/sources/unitree-dex.md)
-        driven = (kp > 0) | (part.dialect == "unitree_hg")
+        driven = (kp > 0) | (not part.gains_are_used)
     else:
         bits = np.nan_to_num(mode).astype(np.int64)
         driven = (bits >> 4 & 7 if part.mode_byte is ModeByte.RIS else bits) == 1

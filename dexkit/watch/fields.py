@@ -75,6 +75,7 @@ class Part:
     :param expected: samples a second that the vendor's publisher sends.
     :param mode_byte: what the mode byte of a motor holds.
     :param timeout: seconds after which a command no longer counts.
+    :param gains_are_used: whether kp and kd of a command have an effect.
     """
 
     subject: Subject
@@ -86,6 +87,7 @@ class Part:
     expected: float
     mode_byte: ModeByte
     timeout: float
+    gains_are_used: bool = True
 
     def columns(self, quantity: str) -> list[int]:
         """The places of a quantity in :attr:`fields`, by joint or sensor element."""
@@ -135,6 +137,7 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
         rate,
         dialect.mode_byte,
         hand.command_timeout,
+        dialect.gains_are_used,
     )
 
 
