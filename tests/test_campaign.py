@@ -61,6 +61,7 @@ def result(out: Path) -> dict[str, Any]:
     return content
 
 
+@pytest.mark.soak
 def test_campaign_finds_planted_faults_and_repeats_them(tmp_path: Path) -> None:
     options = ("--sample", "--jobs", "2", "--minutes", "10")
     code, output, errors = run(tmp_path, [*PLANTED, "CLEAN", "Skipped"], *options)

@@ -296,7 +296,9 @@ def test_stopped_run_leaves_no_process(tmp_path: Path) -> None:
     assert left.stdout == ""
 
 
-@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "signum", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGINT]
+)
 def test_signal_to_suite_ends_the_service_cleanly(tmp_path: Path, signum: signal.Signals) -> None:
     recording = tmp_path / "run.mcap"
     run = subprocess.Popen(

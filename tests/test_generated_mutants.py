@@ -101,6 +101,7 @@ def test_a_reference_without_known_mechanics_is_refused() -> None:
         compose("x", "", Service, ())
 
 
+@pytest.mark.soak
 def test_without_faults_the_reference_behaves_as_before() -> None:
     service = compose("x", "", model("dex1-1").reference.load(), ())
     assert oracle.examine(service, GO, (Side.LEFT,)).effects == ()
@@ -171,6 +172,7 @@ class _Watches(What):
                 values.add(when.test(self.rig, self.side))
 
 
+@pytest.mark.soak
 def test_every_condition_is_true_and_false_at_some_time() -> None:
     seen: dict[str, set[bool]] = {}
     watch = type("Watches", (_Watches,), {"seen": seen})
@@ -280,6 +282,7 @@ def test_a_campaign_is_resumed_and_not_done_again(tmp_path: Path) -> None:
         Campaign(1, done)._done()
 
 
+@pytest.mark.soak
 def test_command_tries_a_generated_hand(tmp_path: Path) -> None:
     path = tmp_path / "score.json"
     run = CliRunner().invoke(command, ["--hand", HAND, "--jobs", "1", "--json", str(path)])

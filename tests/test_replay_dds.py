@@ -198,7 +198,7 @@ def test_after_a_pause_the_hand_is_led_from_where_it_is() -> None:
     assert max(after) == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize("how", ["interrupt", "key"])
+@pytest.mark.parametrize("how", ["interrupt", pytest.param("key", marks=pytest.mark.soak)])
 def test_stopped_by_the_user_it_leaves_the_hand_at_rest(tmp_path: Path, how: str) -> None:
     hand = Watched()
     main, terminal = pty.openpty()

@@ -379,6 +379,7 @@ def test_a_missing_or_wrong_file_of_scores(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------------------- the tool
 
 
+@pytest.mark.soak
 def test_the_tool_judges_a_hand_in_every_kind_of_run() -> None:
     chosen = tasks("dex1-1", {(RunKind.QUICK, s): 1 for s in Setting})
     assert [t.setting for t in chosen] == list(Setting)

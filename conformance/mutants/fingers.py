@@ -324,7 +324,7 @@ class SaturatesToNothing(FingerService):
         return np.where(felt > 5000.0, 30000.0, felt)
 
 
-@wrong_hand("DEX3-SENS-08", sides=BOTH)
+@wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
 class SlowFoam(Dex3Service):
     """Its pressures fall with a time constant of 2 s."""
 
@@ -1117,7 +1117,7 @@ class _ForEver(FingerHand):
             self.tripped_at = self.now
 
 
-@wrong_hand("DEX3-GUARD-04")
+@wrong_hand("DEX3-GUARD-04", whole=True)
 class SlowToClear(FingerService):
     """Stays tripped for 2 s after it was cleared."""
 

@@ -643,7 +643,7 @@ class FingerScript(HandScript):
                 for s in pressing
             }
             phase = self._begin("squeeze", pressing, targets=targets)
-            yield from self._hold(1.0, squeeze)
+            yield from self._hold(2.0, squeeze)
             self._end(phase)
         if self.plan.phases & {"silence", "resume"}:
             self._report("slow motion without protection, and then ...")
