@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dexkit.escaping import html as escape
 
+from dexkit.escaping import html as escape
 from dexkit.watch import SubjectView, TopicView
 
 __all__ = ["hand_table", "seconds", "time_strip", "topics_table"]
