@@ -157,7 +157,7 @@ class BurstsWithGoodStamps(Service):
         return super().end()
 
 
-@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"), also=("DEX1-FIELD-16",))
+@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"))
 class Bursts(BurstsWithGoodStamps):
     """Publishes states in bursts of ten."""
 
@@ -192,7 +192,7 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX5-GAIN-03",), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -354,7 +354,7 @@ class Swapped(Service):
         "DEX1-WDOG-03",
     ),
 )
-@wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-SAFE-09"))
+@wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-WDOG-03"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -745,7 +745,6 @@ class StopsInABurst(Service):
         "DEX3-SAFE-10",
         "DEX1-RATE-03",
         "DEX3-RATE-03",
-        "DEX1-RATE-04",
     ),
 )
 class GivesUpOnTwo(Service):
