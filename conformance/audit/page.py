@@ -16,6 +16,7 @@ from dexkit.conformance.audit.records import FINDING, FileRecord, State
 from dexkit.conformance.report.charts import Line, chart
 from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import ANSWERS, VERDICTS
+from dexkit.conformance.report.tables import table
 from dexkit.conformance.requirements import LAYERS, catalogue
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.conformance.run_record import catalogue_digest
@@ -244,23 +245,6 @@ def _date(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; the cells are HTML, the first of each row is its heading."""
-    head = "".join(f'<th scope="col">{h}</th>' for h in heads)
-    body = "".join(
-        f'<tr><th scope="row">{row[0]}</th>'
-        + "".join(
-            f'<td data-run="{h}">{cell}</td>' for h, cell in zip(heads[1:], row[1:], strict=True)
-        )
-        + "</tr>"
-        for row in rows
-    )
-    return (
-        f'<div class="wrap"><table class="matrix"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
-
-
 def _worst(summary: Summary) -> str:
     lines = summary.worst
     if not lines:
@@ -279,7 +263,7 @@ def _worst(summary: Summary) -> str:
         found += [escape(line.error)] if line.error else []
         where = f"<span class='dim'>{escape(line.where)}</span>" if line.where else ""
         rows.append((f"{escape(line.name)}{where and '<br>' + where}", verdict, "<br>".join(found)))
-    return f"<h2>Worst files</h2>{_table(('file', 'verdict', 'why'), rows)}{more}"
+    return f"<h2>Worst files</h2>{table(('file', 'verdict', 'why'), rows)}{more}"
 
 
 def _trend(summary: Summary) -> str:
@@ -326,7 +310,7 @@ def _changes(summary: Summary, days: Sequence[float]) -> str:
     ]
     middle = _date(days[len(days) // 2])
     heads = ("part of files in which it fails", f"before {middle}", "since then")
-    return _table(heads, rows) if rows else ""
+    return table(heads, rows) if rows else ""
 
 
 def _requirements(summary: Summary, about: str, title: str) -> str:
@@ -343,7 +327,7 @@ def _requirements(summary: Summary, about: str, title: str) -> str:
         )
         for n in ordered
     ]
-    return f"<h2>{title}</h2>{_table(('requirement', 'files that fail', 'warnings'), rows)}"
+    return f"<h2>{title}</h2>{table(('requirement', 'files that fail', 'warnings'), rows)}"
 
 
 def _groups(title: str, groups: Mapping[str, Group]) -> str:
@@ -367,4 +351,4 @@ def _groups(title: str, groups: Mapping[str, Group]) -> str:
     rest = len(ordered) - len(rows)
     more = f"<p>and {rest} more</p>" if rest else ""
     heads = (title, "files", "recorded", "failing", "not usable", "most frequent failures")
-    return f"<h2>By {escape(title)}</h2>{_table(heads, rows)}{more}"
+    return f"<h2>By {escape(title)}</h2>{table(heads, rows)}{more}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timezone
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from dexkit import __version__
 from dexkit.conformance.report.charts import Band, Level, Line, chart
 from dexkit.conformance.report.html import document
+from dexkit.conformance.report.tables import table, unbroken
 from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehearsed
 from dexkit.escaping import html as escape
 from dexkit.hand import Side
@@ -89,37 +90,17 @@ def _findings(prepared: Prepared) -> str:
         return "<h2>Findings</h2><p>Nothing was found.</p>"
     rows = [
         (
-            _whole(f"<code>{escape(f.name)}</code>"),
-            _whole(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
-            _whole(escape(f.where)),
+            unbroken(f"<code>{escape(f.name)}</code>"),
+            unbroken(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
+            unbroken(escape(f.where)),
             escape(f.text),
-            _whole(f"<code>{escape(f.cure)}</code>") if f.cure.startswith("--") else escape(f.cure),
+            unbroken(f"<code>{escape(f.cure)}</code>")
+            if f.cure.startswith("--")
+            else escape(f.cure),
         )
         for f in prepared.findings
     ]
-    return "<h2>Findings</h2>" + _table(("finding", "verdict", "hand", "what", "cure"), rows)
-
-
-def _whole(text: str) -> str:
-    """A cell that is not broken."""
-    return f'<bdi style="white-space:nowrap">{text}</bdi>'
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; the cells are HTML, the first of each row is its heading."""
-    head = "".join(f'<th scope="col">{h if " " in h else _whole(h)}</th>' for h in heads)
-    body = "".join(
-        f'<tr><th scope="row">{row[0]}</th>'
-        + "".join(
-            f'<td data-run="{h}">{cell}</td>' for h, cell in zip(heads[1:], row[1:], strict=True)
-        )
-        + "</tr>"
-        for row in rows
-    )
-    return (
-        f'<div class="wrap"><table class="matrix"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
+    return "<h2>Findings</h2>" + table(("finding", "verdict", "hand", "what", "cure"), rows)
 
 
 def _hand(rehearsal: Rehearsal, side: Side) -> str:
@@ -203,7 +184,7 @@ def _overview(
 def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
     rows = [
         (
-            _whole(escape(f.name)),
+            unbroken(escape(f.name)),
             f"{f.commanded:.2f}",
             f"{f.moved:.2f}",
             f"{f.rms:.3f}",
@@ -226,4 +207,4 @@ def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
         "torque ripple rms, N·m",
         "time at largest torque",
     )
-    return _table(heads, rows)
+    return table(heads, rows)
