@@ -311,7 +311,7 @@ def _nudges(ctx: Context) -> list[_Nudge]:
         if not len(before) or not len(after) or not given.any():
             continue
         kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
-        if kp > 0:
+        if kp > 0 and tau != 0:  # a damaged recording may hold another command here
             way = (median(after) - median(before)) * (1 if tau > 0 else -1)
             found.append(_Nudge(begin, end, way, abs(tau) / kp))
     return found
