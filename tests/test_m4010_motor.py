@@ -32,6 +32,7 @@ from dexkit.wire.m4010 import (
     Status,
     calibration_outcome,
 )
+from tests.dds_helpers import wait_until
 from tests.each import each
 
 ZEROS = MotorCmd.setpoint(0)
@@ -455,11 +456,7 @@ def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path, signum: signa
         assert re.fullmatch(
             rf"ready: {link} left,right id=1,0 baudrate=6000000 pty=/dev/pts/\d+", motors.ready_line
         )
-        with serial.Serial(str(link), m4010.OPENING_BAUD_RATE, timeout=0) as port:
-            assert (
-                exchange(port, ZEROS, 0.1) is None
-            )  # until the rate is changed, as the vendor does
-            port.baudrate = m4010.BAUD_RATE
+        with serial.Serial(str(link), m4010.BAUD_RATE, timeout=0) as port:
             for number in (0, 1):
                 data = exchange(port, MotorCmd(number))
                 assert data is not None
@@ -470,9 +467,20 @@ def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path, signum: signa
     finally:
         motors.close()
     assert b"2 commands" in output
-    assert b"20 garbled" in output
     assert errors == b""
     assert not link.is_symlink()
+
+
+def test_hears_nothing_until_the_baud_rate_is_right(tmp_path: Path) -> None:
+    """The vendor's service opens the port at another rate, too, and then changes it."""
+    with Dex1Motors((Side.LEFT,), links={Side.LEFT: tmp_path / "l"}) as motors:
+        counters = motors.bus(Side.LEFT).counters
+        with serial.Serial(motors.path, m4010.OPENING_BAUD_RATE, timeout=0) as port:
+            assert exchange(port, ZEROS, 0.01) is None
+            wait_until(lambda: counters.garbled == 20)
+            port.baudrate = m4010.BAUD_RATE
+            assert exchange(port, MotorCmd(1)) is not None
+        assert counters.garbled == 20
 
 
 def test_a_line_each(tmp_path: Path) -> None:

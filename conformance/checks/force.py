@@ -27,12 +27,17 @@ def squeezes(ctx: Context) -> tuple[float, float] | None:
 
 
 def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
-    """(median tau_est, begin, end) of a gripper while it squeezes."""
+    """(median tau_est of the last half second, begin, end) of a squeeze.
+
+    The failure's place is the whole phase: a machine that is busy before the last half second
+    delays the contact as well.
+    """
     span = squeezes(ctx)
     if span is None:
         return None
     tau = ctx.states.tau[ctx.states.between(*span), 0]
-    return float(np.median(tau[np.isfinite(tau)])), *span
+    begin = next(b for b, e in map(ctx.span, reversed(ctx.phases())) if e == span[1])
+    return float(np.median(tau[np.isfinite(tau)])), begin, span[1]
 
 
 @check("DEX1-FORCE-01")

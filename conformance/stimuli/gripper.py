@@ -71,6 +71,8 @@ _BACK = 0.13
 """Part of the stroke by which a free hand is commanded back after a restart of its service."""
 _GRIP, _LONG_GRIP = 3.0, 30.0
 """Seconds of equal commands between two pushes; those of a thorough run."""
+_SQUEEZE = 1.5
+"""Seconds of a squeeze: contact takes 0.3 s on an idle machine, and twice that after a pause."""
 _SILENCE, _LONG_SILENCE = 4.2, 67.0
 """Seconds without a command: longer than counters of 8 bits in steps of 10 ms last; in a thorough
 run, than those of 16 bits in milliseconds."""
@@ -382,7 +384,7 @@ class GripperScript(HandScript):
             self._grip = dict(self._squeeze(pressing))
             beyond = {s: {0: motors[0].q} for s, motors in self._grip.items()}
             phase = self._begin("squeeze", pressing, targets=beyond)
-            yield from self._hold(1.0)
+            yield from self._hold(_SQUEEZE)
             self._end(phase)
         if phases & {"silence", "resume", "rejected"}:
             yield from self._silences(pressing, free)
