@@ -338,10 +338,12 @@ class GripperScript(HandScript):
         yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
         if "limp" in self.plan.phases:
             self._report("commands without force (zero gains): the hand must not be pulled")
-            low = {s: self._low(s) for s in sides}
-            phase = self._begin("limp", sides, targets={s: {0: q} for s, q in low.items()})
-            yield from self._hold(0.5, {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in low.items()})
-            self._end(phase)
+            # on either side of the hand: a weight pulls the same way at both
+            for places in ({s: self._low(s) for s in sides}, dict.fromkeys(sides, self._stroke)):
+                phase = self._begin("limp", sides, targets={s: {0: q} for s, q in places.items()})
+                limp = {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in places.items()}
+                yield from self._hold(0.3, limp)
+                self._end(phase)
         if "push" in self.plan.phases:
             yield from self._pushes(sides)
         yield from self._everyone("center", {s: self._home(s) for s in sides})

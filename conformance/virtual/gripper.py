@@ -73,9 +73,11 @@ class ReferenceHand:
         """Let time pass."""
         self.now += dt
         self.tau = self.motor_torque()
-        force = self.tau + self.contact()
-        damping = self.viscous + (self.brake if self.braking else 0.0)
-        # implicit in the damping, so that a stiff brake is stable at this step
+        braking = self.braking
+        kd = 0.0 if braking or self.goal is None or abs(self.tau) >= self.tau_max else self.goal.kd
+        # implicit in the damping, so that a stiff brake and a high kd are stable at this step
+        force = self.tau + kd * self.dq + self.contact()
+        damping = self.viscous + kd + (self.brake if braking else 0.0)
         dq = (self.dq + dt * force / self.inertia) / (1.0 + dt * damping / self.inertia)
         slip = dt * self.coulomb / self.inertia
         was, self.dq = self.dq, 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)

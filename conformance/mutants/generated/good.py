@@ -273,8 +273,9 @@ class _StateLatency(What):
         return out
 
 
-_add("state", _StateLatency, "state-late-6", "publishes 6 ms after it measured", seconds=0.006)
-_add("state", _StateLatency, "state-late-10", "publishes 10 ms after it measured", seconds=0.01)
+# with a late command they make more than the 20 ms that a round may take
+_add("latency", _StateLatency, "state-late-6", "publishes 6 ms after it measured", seconds=0.006)
+_add("latency", _StateLatency, "state-late-10", "publishes 10 ms after it measured", seconds=0.01)
 
 
 class _Jitters(What):
