@@ -33,6 +33,10 @@ TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 LOST = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
 
 
+PATIENT: dict[str, Any] = {"timeout": 5.0, "send_timeout": 5.0}
+"""Settings of a driver that shares a busy machine with its emulated hand."""
+
+
 def hand_at(url: str, side: Side = Side.LEFT, **values: Any) -> Dex3Usb:
     return Dex3Usb(side, Dex3Settings(server=parse_server(url)[0], **values))
 
@@ -63,7 +67,7 @@ def drive(
 @pytest.mark.parametrize("process", [False, True], ids=["thread", "process"])
 def test_both_hands_reach_their_goals(process: bool) -> None:
     with emulated_dex3((Side.LEFT, Side.RIGHT), process=process) as emulated:
-        hands = {side: hand_at(emulated.url, side) for side in Side}
+        hands = {side: hand_at(emulated.url, side, **PATIENT) for side in Side}
         for hand in hands.values():
             hand.open()
         assert hands[Side.LEFT].serial != hands[Side.RIGHT].serial
@@ -91,7 +95,7 @@ def test_the_units_are_right_on_both_ends() -> None:
     with emulated_dex3() as emulated:
         assert isinstance(emulated, Dex3Hands)
         mechanics = emulated.device().mechanics
-        with hand_at(emulated.url) as hand:
+        with hand_at(emulated.url, **PATIENT) as hand:
             state = drive(hand, go(GOAL[Side.LEFT], kp=1.0), lambda s: np.abs(s.dq).max() > 1.0)
             assert (
                 np.sign(state.dq[1:]).tolist()
@@ -116,7 +120,7 @@ def test_opening_and_closing_move_nothing() -> None:
         mechanics = emulated.device().mechanics
         before = np.array(mechanics.q)
         for _ in range(2):
-            with hand_at(emulated.url) as hand:
+            with hand_at(emulated.url, **PATIENT) as hand:
                 for _ in range(20):
                     hand.exchange(HandCommand.brake(7))
         assert np.array(mechanics.q) == pytest.approx(before, abs=1e-3)
@@ -210,14 +214,14 @@ for count in range(10**9):
             wait_until(lambda: all(device.tripped), what="the motors to stop")
             assert time.monotonic() - killed > 0.9
             # the next driver works
-            with hand_at(emulated.url) as hand:
+            with hand_at(emulated.url, **PATIENT) as hand:
                 assert not hand.exchange(HandCommand.brake(7)).fault.any()
 
     def test_a_closed_hand_is_braked_and_not_tripped(self) -> None:
         with emulated_dex3() as emulated:
             assert isinstance(emulated, Dex3Hands)
             device = emulated.device()
-            with hand_at(emulated.url) as hand:
+            with hand_at(emulated.url, **PATIENT) as hand:
                 hand.exchange(go(GOAL[Side.LEFT]))
             state = device.mechanics.state(0.0)
             assert state.mode.tolist() == [JointMode.BRAKE] * 7
@@ -228,7 +232,7 @@ for count in range(10**9):
 class TestCable:
     def test_lost_cable_is_detected_and_recovered(self) -> None:
         with emulated_dex3() as emulated:
-            hand = hand_at(emulated.url, timeout=5.0, send_timeout=5.0)
+            hand = hand_at(emulated.url, **PATIENT)
             hand.open()
             hand.exchange(go(GOAL[Side.LEFT]))
             emulated.inject("unplug:for=300ms")

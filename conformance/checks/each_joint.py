@@ -366,6 +366,43 @@ def releases(ctx: Context) -> Outcome:
     return ctx.failed(f"{worst:.0%}", text, ctx.at(ctx.states.topic, at), part=worst)
 
 
+@check("DEX3-SENS-09")
+def pressure_lasts(ctx: Context) -> Outcome:
+    """The least part of an element's pressure that is left at the end of a grip."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, int, int, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        if end - begin < ctx.tolerance("min_hold_s"):
+            continue
+        free = _pressures(ctx, begin - 2 * _BEFORE_S, begin)
+        first = _pressures(ctx, begin + 0.5, begin + 0.5 + _BEFORE_S)
+        last = _pressures(ctx, end - _BEFORE_S, end)
+        if free is None or first is None or last is None:
+            continue
+        rise, later = np.nan_to_num(first - free), np.nan_to_num(last - free)
+        most = float(rise.max(initial=0.0))
+        if most <= 0.0:
+            continue
+        part = np.where(rise >= 0.3 * most, later / np.where(rise > 0, rise, 1.0), np.inf)
+        packet, slot = (int(k) for k in np.unravel_index(int(np.argmin(part)), part.shape))
+        found = (float(part[packet, slot]), packet, slot, begin, end)
+        worst = found if worst is None or found < worst else worst
+    if worst is None:
+        return ctx.absent("no pressure rose at the object")
+    part_left, packet, slot, begin, end = worst
+    part_left = max(part_left, 0.0)
+    text = (
+        f"at the end of a grip of {end - begin:.1f} s, {part_left:.0%} of its pressure is left in "
+        f"slot {slot} of packet {packet}"
+    )
+    if part_left >= ctx.tolerance("min_part"):
+        return ctx.passed(f"{part_left:.0%}", text, part=part_left)
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{part_left:.0%}", text, place, part=part_left)
+
+
 # ----------------------------------------------------------------------------------- low rate
 
 
@@ -407,6 +444,30 @@ def low_rate_is_fresh(ctx: Context) -> Outcome:
         f"{len(odd)} of {judged}", text, *(ctx.at(slow.topic, t) for t, *_ in odd[:5])
     )
     return outcome.about(joint).if_late(age)
+
+
+@check("DEX3-TOPIC-05")
+def low_rate_goes_on(ctx: Context) -> Outcome:
+    """The longest time without a state on the low-rate topic while the fast one had states."""
+    slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
+    if slow is None or len(slow) < 3 or not len(fast):
+        return ctx.absent("there is no low-rate topic")
+    limit = ctx.tolerance("max_gap_s")
+    times = np.concatenate((slow.t, fast.t[-1:]))
+    worst = (0.0, float(times[0]))
+    for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+        if end - begin <= worst[0]:
+            continue
+        # a service that is restarted, or a machine that stood still, is silent on both
+        own = fast.t[(fast.t > begin) & (fast.t < end)]
+        quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
+        worst = max(worst, (end - begin - quiet, begin))
+    gap, at = worst
+    text = f"no state on {slow.topic} for {gap:.2f} s, while the fast topic had states"
+    if gap <= limit:
+        return ctx.passed(f"{gap:.2f} s", text, gap_s=gap).timed(gap, limit)
+    outcome = ctx.failed(f"{gap:.2f} s", text, ctx.at(slow.topic, at, at + gap), gap_s=gap)
+    return outcome.timed(gap, limit).if_late(gap - limit)
 
 
 _AHEAD_S = 0.05  # s by which the low-rate topic may be received before the fast one

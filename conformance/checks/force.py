@@ -158,12 +158,8 @@ def _soft(ctx: Context) -> list[tuple[float, float, float, float, float, float]]
     return found
 
 
-@check("DEX1-FORCE-12")
-def in_proportion(ctx: Context) -> Outcome:
-    """The force of soft grips, compared with that of a stiff one, in parts of what is asked for."""
-    soft = _soft(ctx)
-    if not soft:
-        return ctx.skipped("no grips with little stiffness")
+def _usual(ctx: Context) -> float | None:
+    """The force of a grip with the client's stiffness, in parts of what is asked for."""
     stiff = []
     for phase in ctx.phases("grip"):
         begin, end = ctx.span(phase)
@@ -175,9 +171,18 @@ def in_proportion(ctx: Context) -> Outcome:
             wanted = median(ctx.commands.kp[asked, 0]) * away
             if wanted >= ctx.tolerance("min_asked_nm"):
                 stiff.append(median(np.abs(ctx.states.tau[rows, 0])) / wanted)
-    if not stiff:
+    return min(stiff) if stiff else None
+
+
+@check("DEX1-FORCE-12")
+def in_proportion(ctx: Context) -> Outcome:
+    """The force of soft grips, compared with that of a stiff one, in parts of what is asked for."""
+    soft = _soft(ctx)
+    if not soft:
+        return ctx.skipped("no grips with little stiffness")
+    usual, part = _usual(ctx), ctx.tolerance("max_change_part")
+    if usual is None:
         return ctx.skipped("no grip with the client's stiffness")
-    usual, part = min(stiff), ctx.tolerance("max_change_part")
     if abs(usual - 1.0) > part:
         return ctx.absent("this gripper has a force of its own")
     worst = max(soft, key=lambda f: abs(f[0] - 1.0))
@@ -189,6 +194,50 @@ def in_proportion(ctx: Context) -> Outcome:
     if abs(ratio - 1.0) <= part:
         return ctx.passed(f"{ratio:.0%}", text, part=ratio)
     return ctx.failed(f"{ratio:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=ratio)
+
+
+@check("DEX1-FORCE-14")
+def no_more_than_asked(ctx: Context) -> Outcome:
+    """The greatest force of soft grips, in parts of what is asked for."""
+    soft, usual = _soft(ctx), _usual(ctx)
+    if not soft or usual is None:
+        return ctx.skipped("no grips to compare, one of them with the client's stiffness")
+    if abs(usual - 1.0) > ctx.tolerance("max_own_part"):
+        return ctx.absent("this gripper has a force of its own")
+    ratio, tau, torque, kp, begin, end = max(soft)
+    text = f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, which asks for {torque:.2f} N m"
+    limit = ctx.tolerance("max_part") * torque
+    if tau <= limit:
+        return ctx.passed(f"{ratio:.0%}", text, tau_nm=tau).pressed(tau, limit)
+    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
+    return outcome.pressed(tau, limit)
+
+
+@check("DEX1-FORCE-15")
+def lets_go(ctx: Context) -> Outcome:
+    """tau_est after zero gains at the q of a grip, in parts of the grip's."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, float, float, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        before = np.abs(ctx.states.tau[ctx.states.between(begin - 0.3, begin), 0])
+        after = np.abs(ctx.states.tau[ctx.states.between(end - 0.1, end), 0])
+        before, after = before[np.isfinite(before)], after[np.isfinite(after)]
+        if len(before) < 3 or len(after) < 3 or median(before) < ctx.tolerance("min_tau_nm"):
+            continue
+        part = median(after) / median(before)
+        if worst is None or part > worst[0]:
+            worst = part, median(after), median(before), begin, end
+    if worst is None:
+        return ctx.skipped("no force was reported while it squeezed")
+    part, left, had, begin, end = worst
+    limit = ctx.tolerance("max_part") * had
+    text = f"tau_est {left:.2f} N m after zero gains at the same q, {had:.2f} N m before"
+    if left <= limit:
+        return ctx.passed(f"{part:.0%}", text, tau_nm=left).pressed(left, limit)
+    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), tau_nm=left)
+    return outcome.pressed(left, limit)
 
 
 @check("DEX1-FORCE-13")

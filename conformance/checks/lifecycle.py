@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
@@ -188,3 +190,44 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
         if worst is None or rad / limit > worst[0] / worst[1]:
             worst = rad, limit, joint
     return worst
+
+
+@check("DEX1-LIFE-06", "DEX3-LIFE-06")
+def no_new_goal(ctx: Context) -> Outcome:
+    """How far a hand was found, after a restart of its service, from where it may have gone.
+
+    A motor may go on as its last command says (DEX1-LIFE-05), but no other way.
+    """
+    worst: tuple[float, float, float, int, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        before = ctx.states.between(begin - 0.2, begin + 0.2)
+        later = ctx.states.between(end - 0.1, end + 1.0)
+        t, q = ctx.states.t[before], ctx.states.q[before]
+        after = ctx.states.q[later][ctx.states.t[later] > begin + 0.25]
+        if len(q) < 3 or not len(after):
+            continue
+        for joint, spec in enumerate(ctx.joints):
+            place, found = q[:, joint], float(after[0, joint])
+            if not np.isfinite(place).all() or not math.isfinite(found):
+                continue
+            speed = float(place[-1] - place[0]) / max(float(t[-1] - t[0]), 1e-3)
+            rad = found - float(place[-1])
+            moved = abs(speed) >= ctx.tolerance("min_speed_stroke", joint)
+            against = 0.0 if moved and rad * speed > 0.0 else abs(rad)
+            part = against / spec.stroke
+            if worst is None or part > worst[0]:
+                worst = part, against, float(place[-1]), joint, begin, end
+    if worst is None:
+        return ctx.skipped("no state before the service ended, or none after it started again")
+    _, rad, was, joint, begin, end = worst
+    limit = ctx.tolerance("max_motion_stroke", joint)
+    text = ctx.named(
+        f"found {rad:.2f} rad from the {was:.2f} rad at which the service ended, where it was not "
+        "going",
+        joint,
+    )
+    if rad <= limit:
+        return ctx.passed(f"{rad:.2f} rad", text, motion_rad=rad).placed(rad, limit)
+    outcome = ctx.failed(f"{rad:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
+    return outcome.about(joint).placed(rad, limit)

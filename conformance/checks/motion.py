@@ -651,10 +651,12 @@ def _driven(ctx: Context) -> list[tuple[int, int]]:
     return [(i, 1 if ctx.joints[i].closing > 0 else -1) for i in roles.driven]
 
 
-@check("DEX1-GAIN-02", "DEX3-GAIN-03")
-def velocity_drives(ctx: Context) -> Outcome:
-    """Motion by a commanded velocity without a position gain."""
-    far: tuple[float, float, int] | None = None
+def _least_driven(ctx: Context) -> tuple[float, int, Phase] | None:
+    """The least motion with a commanded velocity without a position gain, rad, its joint and phase.
+
+    Negative where a joint has moved the other way; None without states.
+    """
+    far: tuple[float, float, int, Phase] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
@@ -667,14 +669,37 @@ def velocity_drives(ctx: Context) -> Outcome:
                 continue
             moved = (float(q[-1]) - float(q[0])) * way
             part = moved / ctx.joints[joint].stroke
-            far = (part, moved, joint) if far is None or part < far[0] else far
-    if far is None:
+            far = (part, moved, joint, phase) if far is None or part < far[0] else far
+    return far[1:] if far is not None else None
+
+
+@check("DEX1-GAIN-02", "DEX3-GAIN-03")
+def velocity_drives(ctx: Context) -> Outcome:
+    """Motion by a commanded velocity without a position gain."""
+    found = _least_driven(ctx)
+    if found is None:
         return ctx.skipped("no state while a velocity was commanded")
-    _, moved, joint = far
+    moved, joint, phase = found
     text = ctx.named(f"moved by {moved:.2f} rad while a velocity was commanded", joint)
     if moved >= ctx.tolerance("min_motion_stroke", joint):
         return ctx.passed(f"{moved:.2f} rad", text, motion_rad=moved)
-    begin, end = ctx.span(ctx.phases()[0])
-    return ctx.failed(
-        f"{moved:.2f} rad", text, ctx.at(ctx.states.topic, begin, end), motion_rad=moved
-    ).about(joint)
+    place = ctx.at(ctx.states.topic, *ctx.span(phase))
+    return ctx.failed(f"{moved:.2f} rad", text, place, motion_rad=moved).about(joint)
+
+
+@check("DEX1-GAIN-06", "DEX3-GAIN-06")
+def velocity_way(ctx: Context) -> Outcome:
+    """Motion against a commanded velocity without a position gain."""
+    found = _least_driven(ctx)
+    if found is None:
+        return ctx.skipped("no state while a velocity was commanded")
+    moved, joint, phase = found
+    limit = ctx.tolerance("max_motion_stroke", joint)
+    against = max(0.0, -moved)
+    if against <= limit:
+        text = ctx.named(f"moved by {moved:.2f} rad with a commanded velocity", joint)
+        return ctx.passed(f"{against:.2f} rad", text, motion_rad=moved).placed(against, limit)
+    text = ctx.named(f"moved by {against:.2f} rad against a commanded velocity", joint)
+    place = ctx.at(ctx.states.topic, *ctx.span(phase))
+    outcome = ctx.failed(f"{against:.2f} rad", text, place, motion_rad=moved).about(joint)
+    return outcome.placed(against, limit)

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import replace
 
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.motor_messages import Motor, mode_byte
 from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
@@ -993,6 +993,18 @@ class LeavesItDriven(Service):
     def brake(self) -> None:
         for hand in self.hands.values():  # type: ignore[attr-defined]
             hand.timeout = math.inf
+
+
+@wrong_hand(("DEX1-LIFE-06", "DEX3-LIFE-06"), also=("DEX1-LIFE-05", "DEX3-LIFE-05"))
+class ParksWhenItEnds(Service):
+    """Commands the motors to their zeros when its service ends, and nothing stops them."""
+
+    def brake(self) -> None:
+        kp, kd = model(self.dialect.model).client_gains
+        for side, hand in self.hands.items():  # type: ignore[attr-defined]
+            hand.timeout = math.inf
+            motors = [Motor(kp=kp, kd=kd, mode=mode_byte(i)) for i in range(self.codec.joints)]
+            self.motors(side, tuple(motors))
 
 
 # --------------------------------------------------------------------------------- tracking

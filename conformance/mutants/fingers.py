@@ -60,6 +60,18 @@ class OldLowRate(Dex3Service):
         return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
+@wrong_hand("DEX3-TOPIC-05")
+class LowRateOnlyWhenDriven(Dex3Service):
+    """Copies states to the low-rate topic only while a motor is driven."""
+
+    def low_rate(self, samples: list[Sample]) -> list[Sample]:
+        driven = {
+            self.dialect.low_rate_topic.format(side=s): bool(hand.driven.any())
+            for s, hand in self.hands.items()
+        }
+        return [sample for sample in super().low_rate(samples) if driven[sample.topic]]
+
+
 class _Zero(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
@@ -346,6 +358,29 @@ class SlowFoam(Dex3Service):
             hand.version += 1
 
 
+@wrong_hand("DEX3-SENS-09", sides=BOTH, whole=True)
+class TaresInAGrip(Dex3Service):
+    """Takes what each pressure has been for the last second as its zero, as drift."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.drift: dict[Side, tuple[float, Floats]] = {}
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        felt = super().pressures(hand)
+        empty = felt == 30000.0
+        rest = np.where(empty, 0.0, felt)
+        at, drift = self.drift.get(hand.side, (self.now, np.zeros_like(rest)))
+        drift = rest + (drift - rest) * math.exp((at - self.now) / 0.7)
+        self.drift[hand.side] = self.now, drift
+        return np.asarray(np.where(empty, felt, np.maximum(rest - drift, 0.0)))
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.version += 1
+
+
 @wrong_hand("DEX3-IMU-01", brief=True)
 class LongQuaternion(FingerService):
     """Publishes raw counts as its quaternion."""
@@ -618,6 +653,20 @@ class TurnedTorque(FingerService):
     """Obeys the torque of a command with the wrong sign."""
 
     hand_fault = _TurnedTorque
+
+
+class _TurnedVelocityCommand(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[1] = -own[1]
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-06", also=("DEX3-GAIN-03",))
+class TurnedVelocityCommand(FingerService):
+    """Obeys the velocity of a command with the wrong sign."""
+
+    hand_fault = _TurnedVelocityCommand
 
 
 class _Graded(FingerHand):

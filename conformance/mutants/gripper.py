@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.registry import LEFT, wrong_hand
+from dexkit.conformance.mutants.registry import BOTH, LEFT, wrong_hand
 from dexkit.conformance.virtual import TopicDevice
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
@@ -493,7 +493,53 @@ class DeafToVelocity(ReferenceService):
     hand = _Deaf
 
 
+class _TurnedVelocityCommand(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return accepted if accepted.kp > 0 else replace(accepted, dq=-accepted.dq)
+
+
+@wrong_hand("DEX1-GAIN-06", also=("DEX1-GAIN-02",))
+class TurnedVelocityCommand(ReferenceService):
+    """Obeys dq with the wrong sign where there is no position gain."""
+
+    hand = _TurnedVelocityCommand
+
+
+class _KeepsGains(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        before = self.goal
+        if before is not None and accepted.kp == 0.0 and accepted.q == before.q:
+            return replace(accepted, kp=before.kp, kd=before.kd)
+        return accepted
+
+
+@wrong_hand("DEX1-FORCE-15", sides=BOTH)
+class KeepsGainsAtTheSamePlace(ReferenceService):
+    """Takes gains of 0 for those before where q has not changed."""
+
+    hand = _KeepsGains
+
+
 # ------------------------------------------------------------------------------------ force
+
+
+class _HardReflex(ReferenceHand):
+    gripped = False
+
+    def motor_torque(self) -> float:
+        tau = super().motor_torque()
+        soft = self.goal is not None and 0.0 < self.goal.kp < 5.0
+        self.gripped = self.contact() != 0.0 and (self.gripped or soft)
+        return max(min((2.0 if self.gripped else 1.0) * tau, self.tau_max), -self.tau_max)
+
+
+@wrong_hand("DEX1-FORCE-14", also=("DEX1-FORCE-12",), sides=BOTH)
+class GripsHarderWhenSoft(ReferenceService):
+    """Takes a softer grip for slip, and doubles its force until it lets go."""
+
+    hand = _HardReflex
 
 
 class _DeafToTorque(ReferenceHand):

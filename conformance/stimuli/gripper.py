@@ -26,6 +26,7 @@ grip           close on the object, if there is one, by xr_teleoperate's lead: e
                long, 30 a second; meanwhile the other side is held in the free, and pushed by a
                torque at first and at last (nudge)
 squeeze        the same, by half as much again
+release        zero gains at the q of the squeeze
 soft-grip      grips of less stiffness
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
 silence        ... the commands stop for longer than counters of 8 bits last
@@ -56,6 +57,7 @@ from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
+from dexkit.models import ModeByte
 
 __all__ = ["GripperScript"]
 
@@ -80,8 +82,22 @@ _CAMERA_HZ = 30.0
 """Commands a second of a client that sends one for each picture of a camera."""
 _NUDGE, _NUDGE_SECONDS = 0.6, 0.3
 """A torque that pushes a hand that is held by kp, N m, and for how long, s."""
-_SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6))
-"""kp, N m/rad, and how far they are commanded into the object, rad: some 0.5 N m each."""
+_SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (16.0, 0.05))
+"""kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 0.8 N m each. The last
+is beyond what a byte holds in steps of 1/16 and less."""
+_SOFT_SECONDS = 0.6
+_VENDORS_MODE = 1
+"""Mode byte of the vendor's test programs; teleoperation sends 0
+(docs/sources/unitree-dex.md#b1)."""
+_ALONE_SECONDS = 0.15
+"""Seconds in which the first command after a silence is the only one."""
+_BEYOND, _BEYOND_TAU, _BEYOND_AFTER = 0.05, 0.7, 0.5
+"""A grip by a q below the closed end: by which part of the stroke, its torque, N m, and how much
+longer than a time-out it lasts, s: a command that is clamped is in force as any other."""
+_RELEASE = 0.3
+"""Seconds of zero gains at the q of a squeeze."""
+_SLOWEST_HZ, _FASTEST_HZ = 30.0, 1000.0
+"""Commands a second before a silence: the time-out counts seconds, whatever the client's rate."""
 _SOFTEST, _SOFT_STEP = 0.8, 0.3
 """kp, N m/rad, and size, in parts of the stroke, of a soft step."""
 _PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
@@ -104,6 +120,8 @@ class GripperScript(HandScript):
         self._gains_used = plan.dialect.gains_are_used
         self._gainless = False
         """Whether commands have no gains: clients of a dialect that does not use them send none."""
+        self._mode = 0
+        """The mode byte of position commands, in dialects that do not use it."""
         self._grip: dict[Side, Motors] = {}
         """What a side gets instead of its goal; nothing at all if empty."""
 
@@ -171,7 +189,9 @@ class GripperScript(HandScript):
         return self._goal[side][0] > self.plan.objects.get(side, -math.inf)
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
-        return (Motor(q=pose[0], kp=0.0, kd=0.0) if self._gainless else Motor(q=pose[0]),)
+        kept = self.plan.dialect.mode_byte is not ModeByte.UNUSED
+        motor = Motor(q=pose[0], mode=0 if kept else self._mode)
+        return (replace(motor, kp=0.0, kd=0.0) if self._gainless else motor,)
 
     def _command(self, motors: Mapping[Side, Motors] | None = None) -> Steps:
         """Every side holds its goal, but for those named and those that grip."""
@@ -186,7 +206,8 @@ class GripperScript(HandScript):
 
     def _steps(self, side: Side) -> Steps:
         self._report(f"large steps of the {side} hand; the other one must not move")
-        for target in (self._high(), self._low(side), self._middle(side)):
+        places = (self._high(), 0), (self._low(side), _VENDORS_MODE), (self._middle(side), 0)
+        for target, self._mode in places:
             self._goal[side] = (target,)
             phase = self._begin("step", (side,), targets={side: {0: target}})
             yield from self._until_settled(phase, (side,), least=0.6, most=2.5)
@@ -275,7 +296,7 @@ class GripperScript(HandScript):
             kp, kd = self._model.client_gains
             wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
             yield from self._bad_commands("negative", sides, [wrong], 0.15)
-        yield from self._far_away(1000.0, 0.2)
+        yield from self._far_away(1e6, 0.2)
         yield from self._everyone(
             "recover", self._other_place(), after=self._bad_phases_since_recovery
         )
@@ -318,7 +339,8 @@ class GripperScript(HandScript):
         yield from self._everyone("center", {s: (self._low(s),) for s in sides})
         pressing = [s for s in sides if s in self.plan.objects]
         self._grip = dict(self._squeeze(pressing))
-        yield from self._drive([s for s in sides if s not in pressing], 0.16)
+        free = [s for s in sides if s not in pressing]
+        yield from self._drive(free, 0.16, last_hz=_SLOWEST_HZ)
         first, *rest = sides
         if rest and not self._codec.shared and "rejected" in self.plan.phases:
             silent = self._begin("silence", (first,))
@@ -330,7 +352,7 @@ class GripperScript(HandScript):
         else:
             yield from self._silence("silence", self._model.command_timeout + 0.6)
         self._grip = {}
-        yield from self._everyone("resume", self._other_place())
+        yield from self._resume(self._other_place())
 
     def _undriven(self) -> Steps:
         """Commands without a position gain."""
@@ -346,6 +368,8 @@ class GripperScript(HandScript):
                 self._end(phase)
         if "push" in self.plan.phases:
             yield from self._pushes(sides)
+        if "drive" in self.plan.phases:  # the others are driven before they are left alone
+            yield from self._drive([s for s in sides if s in self.plan.objects], 0.16, seconds=0.5)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _pushes(self, sides: Sequence[Side], names: Sequence[str] = ("pull", "push")) -> Steps:
@@ -388,6 +412,13 @@ class GripperScript(HandScript):
             phase = self._begin("squeeze", pressing, targets=beyond)
             yield from self._hold(_SQUEEZE)
             self._end(phase)
+            if self._gains_used and "release" in phases:
+                phase = self._begin("release", pressing)
+                grip = dict(self._grip)
+                self._grip = {s: (replace(m[0], kp=0.0, kd=0.0),) for s, m in grip.items()}
+                yield from self._hold(_RELEASE)
+                self._end(phase)
+                self._grip = grip
         if phases & {"silence", "resume", "rejected"}:
             yield from self._silences(pressing, free)
         elif phases & {"soft", "soft-grip"}:
@@ -432,22 +463,22 @@ class GripperScript(HandScript):
             yield from self._soft_grips(pressing, {})
             self._grip = dict(self._squeeze(pressing))
             if free and self._gains_used:
-                yield from self._drive(free, 0.16)
+                yield from self._drive(free, 0.16, last_hz=_FASTEST_HZ)
             self._report("... silence: after a second the hand must brake")
             yield from self._silence("silence", long)
             self._grip = {}
-            yield from self._everyone("resume", self._other_place())
+            yield from self._resume(self._other_place())
             yield from self._soft_step(sides)
         else:
             self._grip.pop(first, None)
             if self._gains_used:
                 if not free:
                     yield from self._turn("center", {first: (self._low(first),)}, least=0.5)
-                yield from self._drive((first,), 0.16)
+                yield from self._drive((first,), 0.16, last_hz=_FASTEST_HZ)
             self._report(f"... silence on the {first} side: after a second it must brake")
             yield from self._silent_beside(first, [s for s in rest if s in pressing], long)
             # away from where it was going before the silence
-            yield from self._turn("resume", {first: (_NEARLY * self._stroke,)}, least=0.6)
+            yield from self._resume({first: (_NEARLY * self._stroke,)})
             if self._gains_used:
                 low = {s: (self._low(s),) for s in (first,) if s in pressing}
                 if low:
@@ -457,15 +488,26 @@ class GripperScript(HandScript):
             self._report("... silence on both sides, and broken commands to one: both must brake")
             yield from self._silent_and_rejected(first, rest, timeout)
             self._grip = {}
-            yield from self._everyone("resume", self._other_place())
+            yield from self._resume(self._other_place())
         yield from self._bad_at_once({s: (self._not_finite(s)[-1],) for s in sides})
+
+    def _resume(self, goals: Mapping[Side, Pose]) -> Steps:
+        """A step after a silence, whose first command is alone for a while: it counts as it is."""
+        self._goal.update(goals)
+        targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
+        phase = self._begin("resume", tuple(goals), targets=targets)
+        yield from self._command()
+        yield from self._through(phase, _ALONE_SECONDS, lambda: self._wait(0.01))
+        yield from self._until_settled(
+            phase, tuple(goals), least=0.6, most=2.5, stand=self._standing
+        )
 
     def _silent_beside(self, side: Side, pressing: Sequence[Side], seconds: float) -> Steps:
         """No command to one side, while the others grip softly, hold, and make a step."""
         phase = self._begin("silence", (side,))
         self._grip[side] = ()
         yield from self._soft_grips(pressing, {})
-        yield from self._hold(max(0.3, seconds - 3.8))
+        yield from self._hold(max(0.3, seconds - 5.3))
         grip, self._grip = self._grip, {side: ()}
         beside = self._beside_others((side,), ASIDE_SECONDS)
         yield from self._hold(0.8)
@@ -489,7 +531,7 @@ class GripperScript(HandScript):
         yield from self._hold(0.8 * timeout)
         self._end(rejected)
         del self._grip[first]
-        yield from self._turn("resume", {first: self._other_place()[first]}, least=0.6)
+        yield from self._resume({first: self._other_place()[first]})
         yield from self._soft_step((first,))
         beside = self._beside_others(rest, ASIDE_SECONDS)
         yield from self._hold(0.6)
@@ -500,12 +542,18 @@ class GripperScript(HandScript):
         """Grips of less stiffness than the client's."""
         if not self._gains_used or "soft-grip" not in self.plan.phases or not pressing:
             return
-        for kp, depth in _SOFT_GRIPS:
-            soft = {s: (Motor(q=max(self.plan.objects[s] - depth, 0.0), kp=kp),) for s in pressing}
-            beyond = {s: {0: motors[0].q} for s, motors in soft.items()}
-            phase = self._begin("soft-grip", pressing, targets=beyond)
-            self._grip.update(soft)
-            yield from self._hold(0.75, others)
+        touch = self.plan.objects
+        grips = [
+            ({s: Motor(q=max(touch[s] - depth, 0.0), kp=kp) for s in pressing}, _SOFT_SECONDS)
+            for kp, depth in _SOFT_GRIPS
+        ]
+        below = {s: Motor(q=-_BEYOND * self._stroke, kp=_BEYOND_TAU / touch[s]) for s in pressing}
+        grips.append((below, self._model.command_timeout + _BEYOND_AFTER))
+        for soft, seconds in grips:
+            targets = {s: {0: motor.q} for s, motor in soft.items()}
+            phase = self._begin("soft-grip", pressing, targets=targets)
+            self._grip.update({s: (motor,) for s, motor in soft.items()})
+            yield from self._hold(seconds, others)
             self._end(phase)
 
     def _soft_step(self, sides: Sequence[Side]) -> Steps:
@@ -518,12 +566,21 @@ class GripperScript(HandScript):
         self._end(phase)
         self._goal.update(goals)
 
-    def _drive(self, sides: Sequence[Side], part: float, kd: float = 0.5) -> Steps:
+    def _drive(
+        self,
+        sides: Sequence[Side],
+        part: float,
+        kd: float = 0.5,
+        *,
+        seconds: float = 0.8,
+        last_hz: float = 0.0,
+    ) -> Steps:
         """Open at a steady low speed by velocity feedback alone, whatever the friction.
 
         :param part: of the stroke in a second: far from the stop even after a whole time-out.
+        :param last_hz: rate of the last few commands; 0: as the others.
         """
-        self._report("slow motion, and then ...")
+        self._report("slow motion")
         if not sides:
             return
         phase = self._begin("drive", sides)
@@ -531,15 +588,19 @@ class GripperScript(HandScript):
         wanted = dict.fromkeys(sides, slow)
         # by q, as dq may be wrong: over as many commands as are visible as motion
         seen: deque[tuple[int, Mapping[Side, float]]] = deque(maxlen=8)
-        while self._elapsed(phase) < 0.8:
+        motors: dict[Side, Motors] = {}
+        while self._elapsed(phase) < seconds:
             here = {s: self._obs.q[s][0] for s in sides if s in self._obs.q}
             seen.append((self._obs.now_ns, here))
             then, before = seen[0]
-            seconds = max((self._obs.now_ns - then) / 1e9, 1e-3)
+            took = max((self._obs.now_ns - then) / 1e9, 1e-3)
             for s in sides:
-                if (here.get(s, 0.0) - before.get(s, 0.0)) / seconds < slow:
+                if (here.get(s, 0.0) - before.get(s, 0.0)) / took < slow:
                     wanted[s] = min(wanted[s] * 1.03, 20 * slow)
-            yield from self._command(
-                {s: (Motor(self._goal[s][0], wanted[s], kp=0.0, kd=kd),) for s in sides}
-            )
+            motors = {s: (Motor(self._goal[s][0], wanted[s], kp=0.0, kd=kd),) for s in sides}
+            yield from self._command(motors)
+        if last_hz:
+            period, self._period_ns = self._period_ns, round(1e9 / last_hz)
+            yield from self._hold(max(0.1, 6 / last_hz), motors)
+            self._period_ns = period
         self._end(phase)

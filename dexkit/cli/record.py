@@ -14,6 +14,7 @@ import click
 from dexkit import threads
 from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
 from dexkit.cli.remarks import remark, remarks
+from dexkit.cli.status_line import Stderr
 from dexkit.errors import DexkitError, TraceError, UsageError
 from dexkit.escaping import REMARK, one_line
 from dexkit.stop_signals import stop_on_signals
@@ -79,7 +80,8 @@ def command(
         raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
     before = _episodes(episodes) if episodes is not None else {}
     started = time.monotonic()
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", force=True)
+    form = "%(levelname)s %(message)s"
+    logging.basicConfig(level=logging.WARNING, format=form, handlers=[Stderr()], force=True)
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
         recorder = Recorder(out, overwrite=force, keep_empty=False, compression=compression)
         status = _Status(recorder, started)

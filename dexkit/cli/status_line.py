@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from typing import TextIO
 
 from dexkit.escaping import REMARK, one_line
 
@@ -12,6 +13,7 @@ __all__ = [
     "MOST_REMARKS",
     "STATUS_LINES",
     "StatusLine",
+    "Stderr",
     "log_to_stderr",
 ]
 
@@ -29,6 +31,18 @@ class _OneLine(logging.Formatter):
         return super().formatMessage(record)
 
 
+class Stderr(logging.StreamHandler):  # type: ignore[type-arg]
+    """Writes to the standard error of the moment: a caller may have replaced and closed it."""
+
+    def __init__(self) -> None:
+        logging.Handler.__init__(self)
+
+    @property
+    def stream(self) -> TextIO:
+        """The standard error at this moment."""
+        return sys.stderr
+
+
 def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
     """Log to stderr for as long as the command runs.
 
@@ -38,7 +52,7 @@ def log_to_stderr(quiet: bool, status: bool, always: str) -> None:
     """
     clear = "\r\x1b[K" if status else ""
     level = logging.WARNING if quiet else logging.INFO
-    handler = logging.StreamHandler()
+    handler = Stderr()
     handler.setFormatter(_OneLine(f"{clear}%(levelname)s %(message)s"))
     logging.basicConfig(level=level, handlers=[handler], force=True)
     logging.getLogger(always).setLevel(logging.INFO)
