@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import replace
 
-from dexkit.conformance.motor_messages import Motor, mode_byte
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
@@ -539,7 +539,7 @@ class BadCommandsStopBoth(Service):
 @wrong_hand(
     ("DEX1-SIDE-02", "DEX3-SIDE-02"),
     also=(
-        "DEX1-FORCE-06",
+        "DEX1-FORCE-11",
         "DEX1-GAIN-04",
         "DEX1-WDOG-03",
     ),
@@ -741,6 +741,7 @@ class StopsInABurst(Service):
 @wrong_hand(
     ("DEX1-SAFE-08", "DEX3-SAFE-09"),
     also=(
+        "DEX1-RATE-04",
         "DEX1-SAFE-09",
         "DEX3-SAFE-10",
         "DEX1-RATE-03",
@@ -997,14 +998,20 @@ class LeavesItDriven(Service):
 
 @wrong_hand(("DEX1-LIFE-06", "DEX3-LIFE-06"), also=("DEX1-LIFE-05", "DEX3-LIFE-05"))
 class ParksWhenItEnds(Service):
-    """Commands the motors to their zeros when its service ends, and nothing stops them."""
+    """Commands each motor to its farther end when its service ends, and nothing stops it."""
 
     def brake(self) -> None:
         kp, kd = model(self.dialect.model).client_gains
         for side, hand in self.hands.items():  # type: ignore[attr-defined]
             hand.timeout = math.inf
-            motors = [Motor(kp=kp, kd=kd, mode=mode_byte(i)) for i in range(self.codec.joints)]
-            self.motors(side, tuple(motors))
+            here = [hand.q] if self.codec.joints == 1 else hand.q
+            joints = joints_of(self.dialect, side)
+            ends = [
+                j.q_min if q > 0.5 * (j.q_min + j.q_max) else j.q_max
+                for q, j in zip(here, joints, strict=True)
+            ]
+            goals = [Motor(q=q, kp=kp, kd=kd, mode=self.codec.mode(i)) for i, q in enumerate(ends)]
+            self.motors(side, tuple(goals))
 
 
 # --------------------------------------------------------------------------------- tracking

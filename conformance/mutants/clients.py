@@ -72,7 +72,7 @@ class SendsDegrees(ReferenceClient):
 class SendsNormalised(ReferenceClient):
     """Sends q from 0 to 1, and takes states for the same."""
 
-    course = ((0, 0.0), (0.8, 1.0), (2.3, 0.0), (3.6, 1.0), (5, 0.0))
+    course = ((0, 0.0), (2.0, 1.0), (3.2, 0.0), (4.4, 1.0), (5.9, 1.0))
 
     def receive(self, now: float, q: Mapping[Side, Pose]) -> None:
         stroke = self.dialect.q_open

@@ -429,7 +429,13 @@ class _Creeps(ReferenceHand):
         return 0.5 * (wanted - self.dq) + friction
 
 
-@wrong_hand("DEX1-MOVE-07", also=("DEX1-FORCE-06",))
+@wrong_hand(
+    "DEX1-MOVE-07",
+    also=(
+        "DEX1-FORCE-11",
+        "DEX1-FORCE-06",
+    ),
+)
 class Creeps(ReferenceService):
     """Moves the last 3 mm to its goal slowly."""
 
@@ -515,7 +521,7 @@ class _KeepsGains(ReferenceHand):
         return accepted
 
 
-@wrong_hand("DEX1-FORCE-15", sides=BOTH)
+@wrong_hand("DEX1-FORCE-15", also=("DEX1-GAIN-02",), sides=BOTH)
 class KeepsGainsAtTheSamePlace(ReferenceService):
     """Takes gains of 0 for those before where q has not changed."""
 
@@ -1000,7 +1006,7 @@ class _Wraps(ReferenceHand):
         return (self.now - self.heard) % self.wraps > self.timeout
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+@wrong_hand("DEX1-WDOG-01")
 class WatchdogWraps(ReferenceService):
     """Releases the brake for a second every three seconds: its counter wraps."""
 
@@ -1048,7 +1054,7 @@ class OldGoalFirst(ReferenceService):
     hand = _OldGoalFirst
 
 
-@wrong_hand("DEX1-STILL-01", also=("DEX1-SAFE-01",))
+@wrong_hand("DEX1-STILL-01")
 class TakesTheOtherSides(ReferenceService):
     """Of commands that come at once it now and then gives the left hand the right one's."""
 
