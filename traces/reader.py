@@ -459,11 +459,12 @@ class Trace:
     ) -> None:
         """Put the messages of the channels in ``sinks`` there."""
         begins = begins + HEADS.itemsize
+        whole = every.view(f"V{HEADS.itemsize}")  # copied several times as fast as members
         for channel_id, mine in by_channel(every["channel"]):
             sink = sinks.get(channel_id)
             if sink is None:
                 continue
-            heads = every[mine]
+            heads = whole[mine].view(HEADS)
             sink.log.append(heads["log"])
             sink.publish.append(heads["publish"])
             if sink.payloads is None and sink.columns is None:

@@ -48,7 +48,7 @@ class Columns:
         self._bad: dict[str, WireError] = {}
         self._groups: dict[_Shape, _Group] = {}
         self._usual: dict[int, _Group] = {}  # by length of the samples
-        self._paths: dict[str, _Steps] = {}
+        self._paths = _known_paths(kind)
         self._extremes: dict[str, tuple[float, float]] = {}
         for piece in pieces(payloads):
             self.append(*piece)
@@ -93,6 +93,8 @@ class Columns:
         if not len(rows):
             return
         usual = self._usual[size]
+        if usual.put_alike(table, rows):
+            return
         changes = usual.words.changes(table)
         same = usual.agrees(table, changes)
         if same is None:
@@ -199,10 +201,10 @@ class Columns:
             leaf, places = group.places(steps)
             if len(places) != (shape[0] if shape else 1):
                 return np.nan, np.nan
-            for at in places:
-                for _, values in group.words.parts(leaf, at):
-                    low.append(float(values.min()))
-                    high.append(float(values.max()))
+            if len(group.words) and places:
+                least, most = group.words.extremes(leaf, places)
+                low.append(least)
+                high.append(most)
         # numpy's, which pass NaN on
         return (float(np.min(low)), float(np.max(high))) if low else (np.nan, np.nan)
 
@@ -400,6 +402,18 @@ class _Group:
             return None
         return self.words.same(table, self._fixed, self._mask)
 
+    def put_alike(self, table: NDArray[np.uint32], rows: NDArray[np.intp]) -> bool:
+        """Add samples if nothing changes in them that has not changed before.
+
+        :returns: whether it has; if not, none is added.
+        """
+        if any(self.words.varies(4 * word) for word in self._fixed.tolist()):
+            return False
+        if not self.words.put_alike(table):
+            return False
+        self.rows.append(rows)
+        return True
+
     def put(
         self, table: NDArray[np.uint32], rows: NDArray[np.intp], changes: NDArray[np.uint32]
     ) -> None:
@@ -439,6 +453,14 @@ def _places(here: np.dtype[Any], start: int, steps: _Steps) -> tuple[np.dtype[An
             leaf, more = _places(kind, at, tuple(rest))
             places += more
     return leaf, places
+
+
+_PATHS: dict[int, tuple[Struct, dict[str, _Steps]]] = {}
+
+
+def _known_paths(kind: Struct) -> dict[str, _Steps]:
+    """The paths of a type that have been parsed; by identity, for comparing types takes longer."""
+    return _PATHS.setdefault(id(kind), (kind, {}))[1]
 
 
 def _steps(kind: Struct, path: str) -> _Steps:

@@ -15,7 +15,11 @@ _BLOCK = 512
 _SEGMENT = 1 << 16
 """Most samples whose changing words are kept in one table."""
 _FIRST = 1 << 18
-"""Words of the first table; those that are not filled cost no memory."""
+"""Words of the first samples that get a table; those that are not filled cost no memory."""
+_COMPARED = 1 << 18
+"""Words of samples that are compared with the first one at once."""
+_FOLDED = 16
+"""Rows of changing words that are reduced as one."""
 
 Piece: TypeAlias = "tuple[bytes | NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]"
 """A buffer, where some payloads begin in it, and how long each of them is."""
@@ -119,16 +123,42 @@ class Words:
         self._row = first
         self._n = 0
         # changing words in the order in which they began to
-        self._changing: list[int] = []
+        self._changing: NDArray[np.intp] = np.empty(0, dtype=np.intp)
         self._place: dict[int, int] = {}
-        # tables of columns, each as long as all before it: no more is allocated than twice the
-        # samples take, beyond a first table, and memory that is not touched costs nothing
+        # tables of the words that changed until then, a row for each sample: no more is allocated
+        # than twice the samples take, beyond a first table, and memory that is not touched costs
+        # nothing
         self._tables: list[NDArray[np.uint32]] = []
         self._begins: list[int] = []  # the first sample of each table
-        self._known: list[int] = []  # how many words changed when a table was full
+        self._like_first = b""  # the first sample, again and again
+        self._limits: dict[np.dtype[Any], tuple[NDArray[Any], NDArray[Any]]] = {}
 
     def __len__(self) -> int:
         return self._n
+
+    def put_alike(self, piece: NDArray[np.uint32]) -> bool:
+        """Add samples in which only words change that have changed before.
+
+        :param piece: written to, and restored.
+        :returns: whether they are; if not, none is added.
+        """
+        kept = piece.take(self._changing, axis=1)
+        piece[:, self._changing] = self._row[self._changing]
+        try:
+            # comparing memory takes a tenth of the time that arrays of differences do
+            step = max(1, _COMPARED // piece.shape[1])
+            wanted = 4 * min(step, len(piece)) * piece.shape[1]
+            if len(self._like_first) < wanted:
+                self._like_first = np.tile(self._row, wanted // (4 * piece.shape[1])).tobytes()
+            if not all(
+                self._like_first.startswith(piece[at : at + step].data)
+                for at in range(0, len(piece), step)
+            ):
+                return False
+        finally:
+            piece[:, self._changing] = kept
+        self._add(kept)
+        return True
 
     def changes(self, piece: NDArray[np.uint32]) -> NDArray[np.uint32]:
         """Which bits of each word differ from the first sample's, anywhere in ``piece``."""
@@ -143,26 +173,33 @@ class Words:
     def put(self, piece: NDArray[np.uint32], changes: NDArray[np.uint32]) -> None:
         """Add samples, and what of them :meth:`changes`."""
         changes[self._changing] = 0
-        new = np.flatnonzero(changes).tolist()
-        self._place |= {word: place for place, word in enumerate(new, len(self._changing))}
-        self._changing += new
-        if self._tables and new:
-            words = slice(len(self._changing) - len(new), len(self._changing))
-            self._tables[-1][words, : self._n - self._begins[-1]] = self._row[new][:, None]
-        kept = piece.take(self._changing, axis=1).T
-        while kept.shape[1]:
-            if not self._tables or self._n - self._begins[-1] == self._tables[-1].shape[1]:
-                if self._tables:
-                    self._known.append(len(self._changing))
+        new = np.flatnonzero(changes)
+        if len(new):
+            self._place |= {word: at for at, word in enumerate(new.tolist(), len(self._changing))}
+            self._changing = np.concatenate([self._changing, new])
+        self._add(piece.take(self._changing, axis=1))
+
+    def _add(self, kept: NDArray[np.uint32]) -> None:
+        """Add samples' changing words."""
+        self._limits.clear()
+        if self._tables and self._tables[-1].shape[1] < kept.shape[1]:
+            used = self._n - self._begins[-1]
+            if 2 * used < len(self._tables[-1]):
+                self._tables[-1] = self._tables[-1][:used].copy()
+        while len(kept):
+            table = self._tables[-1] if self._tables else kept[:0]
+            at = self._n - self._begins[-1] if self._begins else 0
+            if at == len(table) or table.shape[1] < kept.shape[1]:
                 first = _FIRST // len(self._row)
-                length = min(max(kept.shape[1], self._n, first), _SEGMENT)
-                self._tables.append(np.empty((len(self._row), length), dtype=np.uint32))
+                length = min(max(len(kept), self._n, first), _SEGMENT)
+                table = np.empty((length, kept.shape[1]), dtype=np.uint32)
+                self._tables.append(table)
                 self._begins.append(self._n)
-            at = self._n - self._begins[-1]
-            some = min(kept.shape[1], self._tables[-1].shape[1] - at)
-            self._tables[-1][: len(self._changing), at : at + some] = kept[:, :some]
+                at = 0
+            some = min(len(kept), len(table) - at)
+            table[at : at + some] = kept[:some]
             self._n += some
-            kept = kept[:, some:]
+            kept = kept[some:]
 
     def varies(self, at: int) -> bool:
         """Whether the word with the byte ``at`` ever changes."""
@@ -172,20 +209,68 @@ class Words:
         """The number at byte ``at`` of the first sample."""
         return self._row.view(np.uint8)[at : at + leaf.itemsize].view(leaf)[0]
 
+    def extremes(self, leaf: np.dtype[Any], places: Sequence[int]) -> tuple[float, float]:
+        """The lowest and highest of the numbers at some bytes, in all samples; NaN passes on."""
+        low, high = [], []
+        same = [at for at in places if at // 4 not in self._place]
+        if same:
+            octets = np.array(same)[:, None] + np.arange(leaf.itemsize)
+            values = self._row.view(np.uint8)[octets].view(leaf)
+            low.append(float(values.min()))
+            high.append(float(values.max()))
+        for at in places:
+            if at // 4 not in self._place:
+                continue
+            if leaf.itemsize == 4:
+                least, most = self._bounds(leaf)
+                low.append(float(least[self._place[at // 4]]))
+                high.append(float(most[self._place[at // 4]]))
+                continue
+            for _, values in self.parts(leaf, at):
+                low.append(float(values.min()))
+                high.append(float(values.max()))
+        return float(np.min(low)), float(np.max(high))
+
+    def _bounds(self, leaf: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The lowest and highest of each changing word, all of them taken for this type."""
+        if leaf not in self._limits:
+            # a word that changes only in a later table has the first sample's value until then
+            least = self._row[self._changing].view(leaf)
+            most = least.copy()
+            ends = [*self._begins[1:], self._n]
+            for begin, end, table in zip(self._begins, ends, self._tables, strict=True):
+                k = table.shape[1]
+                for rows in _wide(table[: end - begin]):
+                    values = rows.view(leaf)
+                    for found, of in ((least, np.minimum), (most, np.maximum)):
+                        some = of.reduce(of.reduce(values, axis=0).reshape(-1, k), axis=0)
+                        of(found[:k], some, out=found[:k])
+            self._limits[leaf] = least, most
+        return self._limits[leaf]
+
     def parts(self, leaf: np.dtype[Any], at: int) -> Iterator[tuple[slice, Any]]:
         """The number at byte ``at`` of each sample: arrays, or one number that some all have."""
         place = self._place.get(at // 4)
         if place is None:
             yield slice(0, self._n), self.first(leaf, at)
             return
-        step = 4 // leaf.itemsize
-        for number, (begin, table) in enumerate(zip(self._begins, self._tables, strict=True)):
-            end = min(begin + table.shape[1], self._n)
-            if number < len(self._known) and place >= self._known[number]:
+        ends = [*self._begins[1:], self._n]
+        for begin, end, table in zip(self._begins, ends, self._tables, strict=True):
+            if place >= table.shape[1]:
                 yield slice(begin, end), self.first(leaf, at)  # it changed only later
             else:
-                column = table[place, : end - begin].view(leaf)
-                yield slice(begin, end), column[at % 4 // leaf.itemsize :: step]
+                column = table[: end - begin, place : place + 1].view(leaf)
+                yield slice(begin, end), column[:, at % 4 // leaf.itemsize]
+
+
+def _wide(table: NDArray[np.uint32]) -> Iterator[NDArray[np.uint32]]:
+    """Rows of a table, several as one: long rows are reduced several times as fast."""
+    n, k = table.shape
+    whole = n // _FOLDED * _FOLDED
+    if whole and k:
+        yield table[:whole].reshape(-1, _FOLDED * k)
+    if whole < n and k:
+        yield table[whole:]
 
 
 def aligned(table: NDArray[np.uint8]) -> NDArray[np.uint32]:
