@@ -38,6 +38,8 @@ class Times:
         self.t = t
         self.rising = bool((t[1:] >= t[:-1]).all()) and bool(np.isfinite(t).all())
         """Whether they are in order."""
+        self.advancing = self.rising and bool((t[1:] > t[:-1]).all())
+        """Whether each is later than the one before."""
         self._known: dict[tuple[float, str], Rows] = {}
 
     def shifted(self, seconds: float, side: Literal["left", "right"] = "left") -> Rows:

@@ -11,14 +11,15 @@ a constant factor on dq (DEX1-FIELD-16 tells it), and torque only in contact.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.excess import Course
 from dexkit.conformance.median import median
-from dexkit.conformance.rows import Rows, SomeTimes, Times, extremes, finite_rows
+from dexkit.conformance.rows import Rows, SomeTimes, Times, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
@@ -32,28 +33,36 @@ _FAST = 0.999
 hand's fastest: a single wrong value does not make it fast."""
 _OWN = 1.2
 """By how much a hand may exceed that speed."""
+_LAGS = np.array([1.25, 4.0, 10.0, 25.0])
+"""Lengths of the windows in which q is compared with the integral of dq, in lags."""
 
 
 class _Joint:
     """What a joint reported, without repetitions.
 
+    :ivar times: of its measurements.
     :ivar t: seconds; ``q``, rad, and ``dq``, rad/s, have the same length.
     """
 
+    @classmethod
+    def of(cls, ctx: Context, joint: int) -> _Joint:
+        """A joint; the same for all checks."""
+        return ctx.once(("joint", joint), lambda: cls(ctx, joint))
+
     def __init__(self, ctx: Context, joint: int) -> None:
         clock = ctx.once("clock", lambda: Times(ctx.states.clock))
-        found = ctx.once(("measurements", joint), lambda: _measurements(ctx, joint))
-        self._times = SomeTimes(clock, found)
+        found = _measurements(ctx, joint)
+        self.times = SomeTimes(clock, found)
         self._rising = clock.rising
         rows = slice(None) if len(found) == len(ctx.states) else found
-        self.t = self._times.t
+        self.t = self.times.t
         self.q: Floats = ctx.states.q[:, joint][rows]
         self.dq: Floats = ctx.states.dq[:, joint][rows]
         self._steps: Floats = np.diff(self.t)
 
     def windows(self, seconds: float, longest: float) -> tuple[Rows | slice, Rows]:
         """First and last rows of all windows of that length without a gap above ``longest``."""
-        ends = self._times.shifted(seconds)
+        ends = self.times.shifted(seconds)
         gap = self._steps > longest
         if self._rising and 2 * longest <= seconds and not gap.any():
             # every window that ends before the last row is whole, and not too long
@@ -65,6 +74,11 @@ class _Joint:
         whole = (gaps[ends] == gaps[starts]) & (self.t[ends] - self.t[starts] < 2 * seconds)
         return starts[whole], ends[whole]
 
+    @cached_property
+    def said(self) -> Floats:
+        """The integral of dq up to each measurement, rad."""
+        return self.integral(self.dq)
+
     def integral(self, speeds: Floats) -> Floats:
         """The integral of speeds up to each measurement, rad."""
         found = np.zeros(len(speeds))
@@ -73,12 +87,6 @@ class _Joint:
         steps *= self._steps
         np.cumsum(steps, out=found[1:])
         return found
-
-    def reach(self, values: Floats, seconds: float) -> tuple[Floats, Floats]:
-        """The least and greatest of values within that time of each measurement."""
-        first = self._times.shifted(-seconds)
-        last = self._times.shifted(seconds, "right")
-        return extremes(values, first, last)
 
 
 def _measurements(ctx: Context, joint: int) -> Rows:
@@ -91,7 +99,9 @@ def _measurements(ctx: Context, joint: int) -> Rows:
     if len(t):
         again = np.flatnonzero(q[1:] == q[:-1])
         again = again[(dq[again + 1] == dq[again]) & (dq[again + 1] != 0)]
-        new = np.concatenate(([True], np.maximum.accumulate(t)[:-1] < t[1:]))
+        new = np.ones(len(t), dtype=np.bool_)
+        if not ctx.once("clock", lambda: Times(states.clock)).advancing:
+            new[1:] = np.maximum.accumulate(t)[:-1] < t[1:]
         new[again + 1] = False
         if not new.all():
             rows = rows[new]
@@ -186,10 +196,12 @@ def alternates(ctx: Context) -> Outcome:
             _fastest(ctx, joint) * ctx.tolerance("max_age_s"),
         )
         change = np.diff(q)
-        change[np.abs(change) < ctx.tolerance("ignored_stroke", joint)] = 0.0
-        cells = ((t[1:] - t[0]) / cell).astype(np.intp)
+        rows = np.flatnonzero(~(np.abs(change) < ctx.tolerance("ignored_stroke", joint)))
+        change = change[rows]
+        cells = ((t[rows + 1] - t[0]) / cell).astype(np.intp)
+        most = max(count, int((float(t.max()) - float(t[0])) / cell) + 1)
         up, down = (
-            np.bincount(cells, weights=np.maximum(way * change, 0.0), minlength=count)
+            np.bincount(cells, weights=np.maximum(way * change, 0.0), minlength=most)
             for way in (1, -1)
         )
         back = np.minimum(up, down)
@@ -216,7 +228,9 @@ def alternates(ctx: Context) -> Outcome:
 
 
 def _filled(ctx: Context) -> bool:
-    return bool(np.nan_to_num(ctx.states.dq).any())
+    """Whether any dq is a number other than 0; in the first states of those that fill it."""
+    dq = ctx.states.dq
+    return bool(np.nan_to_num(dq[:_FEW]).any() or np.nan_to_num(dq[_FEW:]).any())
 
 
 @check("DEX1-FIELD-16", "DEX3-FIELD-16")
@@ -226,7 +240,7 @@ def slope(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        found = _window_error(ctx, _Joint(ctx, joint), spec.stroke)
+        found = _window_error(ctx, _Joint.of(ctx, joint), spec.stroke)
         if found is not None and (worst is None or found[0] > worst[0]):
             worst = (*found[:2], joint, found[2])
     if worst is None:
@@ -261,7 +275,7 @@ def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float,
     last = np.minimum(np.searchsorted(x.t, grid + step), len(x.t) - 1)
     span = x.t[last] - x.t[first]
     whole = (span > 0.5 * step) & (span < 2 * step)
-    c = x.integral(x.dq)
+    c = x.said
     moved = np.where(whole, x.q[last] - x.q[first], 0.0)
     said = np.where(whole, c[last] - c[first], 0.0)
 
@@ -287,11 +301,18 @@ def keeps_up(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float, float, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        x = _Joint(ctx, joint)
+        x = _Joint.of(ctx, joint)
         if len(x.t) < _FEW:
             continue
-        for excess, begin, end, speed in _excesses(ctx, x):
-            found = (excess / spec.stroke, excess, joint, begin, end, speed)
+        course, dq = _course(ctx, x)
+        for seconds in _LAGS * ctx.tolerance("max_lag_s"):
+            above = -math.inf if worst is None else worst[0] * spec.stroke
+            most = course.worst(float(seconds), above)
+            if most is None:
+                continue
+            speed = float(np.abs(dq[most.start : most.end + 1]).max())
+            begin, end = float(x.t[most.start]), float(x.t[most.end])
+            found = (most.rad / spec.stroke, most.rad, joint, begin, end, speed)
             if worst is None or found > worst:
                 worst = found
     if worst is None:
@@ -313,27 +334,22 @@ def keeps_up(ctx: Context) -> Outcome:
     return outcome.about(joint).placed(excess, limit).if_late(late)
 
 
-def _excesses(ctx: Context, x: _Joint) -> Iterator[tuple[float, float, float, float]]:
-    """For each length of window: the largest excess, begin, end, and fastest speed around."""
-    lag, part = ctx.tolerance("max_lag_s"), ctx.tolerance("max_part")
-    said = x.integral(x.dq)
-    factor = _factor(x, said, lag)
+def _course(ctx: Context, x: _Joint) -> tuple[Course, Floats]:
+    """A joint's course, and its dq without a constant factor."""
+    lag = ctx.tolerance("max_lag_s")
+    factor = _factor(x, x.said, lag)
     dq = factor * x.dq
-    low, high = x.reach(said if factor == 1.0 else x.integral(dq), lag)
-    path = x.integral(np.abs(dq))
-    for seconds in (1.25 * lag, 4 * lag, 10 * lag, 25 * lag):
-        starts, ends = x.windows(seconds, 0.5 * lag)
-        if not len(ends):
-            continue
-        moved = x.q[ends] - x.q[starts]
-        most, least = high[ends] - low[starts], low[ends] - high[starts]
-        beyond = np.maximum(moved - most, least - moved) - part * (path[ends] - path[starts])
-        for begin, end in _unstable(ctx):
-            beyond[(x.t[starts] < end) & (x.t[ends] > begin)] = -np.inf
-        i = int(np.argmax(beyond))
-        start = i if isinstance(starts, slice) else int(starts[i])
-        speed = float(np.abs(dq[start : ends[i] + 1]).max())
-        yield float(beyond[i]), float(x.t[start]), float(x.t[ends[i]]), speed
+    course = Course(
+        x.times,
+        x.q,
+        x.said if factor == 1.0 else x.integral(dq),
+        x.integral(np.abs(dq)),
+        lag=lag,
+        part=ctx.tolerance("max_part"),
+        longest=0.5 * lag,
+        barred=_unstable(ctx),
+    )
+    return course, dq
 
 
 def _unstable(ctx: Context) -> list[tuple[float, float]]:

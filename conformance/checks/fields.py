@@ -219,16 +219,19 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     if len(moving) < 50:
         return ctx.skipped("the hand hardly moves in this recording")
     cumulated = np.concatenate(([0.0], np.cumsum((dq[1:] + dq[:-1]) / 2 * np.diff(t))))
-    mean = (cumulated[ends] - cumulated[starts]) / span
+
+    def mean(rows: NDArray[np.intp]) -> Floats:
+        return np.asarray((cumulated[ends[rows]] - cumulated[starts[rows]]) / span[rows])
+
     size = math.sqrt(sums.mean(slope[moving] ** 2))
-    error = math.sqrt(sums.mean((mean[moving] - slope[moving]) ** 2)) / size
+    error = math.sqrt(sums.mean((mean(moving) - slope[moving]) ** 2)) / size
     text = ctx.named(
         f"dq differs from the slope of q by {error:.0%} of its size ({size:.2f} rad/s RMS)", joint
     )
     if error <= ctx.tolerance("max_relative_rms"):
         return ctx.passed(f"{error:.0%} off", text, relative_rms=error)
-    worst = starts[np.argmax(np.abs(mean - slope))]
-    turned = sums.mean(mean[moving] * slope[moving]) < 0
+    worst = starts[np.argmax(np.abs(mean(np.arange(len(ends))) - slope))]
+    turned = sums.mean(mean(moving) * slope[moving]) < 0
     return (
         ctx.failed(
             f"{error:.0%} off",

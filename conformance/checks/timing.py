@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -381,20 +382,53 @@ def order(ctx: Context) -> Outcome:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """The positions of a joint that are numbers, and where they change.
+
+    :param changes: rows that differ from the one before; ``steps``: by how much, rad.
+    """
+
+    t: Floats
+    q: Floats
+    changes: NDArray[np.intp]
+    steps: Floats
+
+    @classmethod
+    def of(cls, ctx: Context, joint: int) -> _Course:
+        """A joint's; the same for all checks."""
+        return ctx.once(("course", joint), lambda: cls._of(ctx, joint))
+
+    @classmethod
+    def _of(cls, ctx: Context, joint: int) -> _Course:
+        t, q = ctx.states.t, ctx.states.q[:, joint]
+        good = finite_rows(q)
+        t, q = t[good], q[good]
+        steps = np.diff(q)
+        rows = np.flatnonzero(steps)
+        return cls(t, q, rows + 1, steps[rows])
+
+    def held(self, samples: float, which: NDArray[np.bool_]) -> bool:
+        """Whether one of these changes comes after so many states of the same position."""
+        chosen = np.flatnonzero(which)
+        before = np.where(chosen > 0, self.changes[chosen - 1], 0)
+        return bool((self.changes[chosen] - before >= samples).any())
+
+
 @check("DEX1-FRESH-02", "DEX3-FRESH-02")
 def not_frozen(ctx: Context) -> Outcome:
     """The longest interval of equal positions that ends in a jump that no joint can make."""
     limit = ctx.tolerance("max_frozen_s")
     worst = 0.0
     for joint in range(len(ctx.joints)):
-        t, q = ctx.states.t, ctx.states.q[:, joint]
-        good = finite_rows(q)
-        t, q = t[good], q[good]
-        steps = np.diff(q)
-        changes = np.flatnonzero(steps) + 1
+        course = _Course.of(ctx, joint)
+        t, q, changes = course.t, course.q, course.changes
         if len(changes) < 2:
             continue
-        jump = np.abs(steps[changes - 1])
+        jump = np.abs(course.steps)
+        least = ctx.tolerance("min_jump_stroke", joint)
+        if not course.held(ctx.tolerance("min_samples"), jump >= least):
+            continue
         # before the first command a hand may rest for any time
         first = np.inf if not len(ctx.commands) else max(float(t[0]), float(ctx.commands.t[0]))
         changes = np.concatenate(([0], changes))
@@ -404,7 +438,7 @@ def not_frozen(ctx: Context) -> Outcome:
         begin[0] = min(first, end[0])
         usual = 2 * percentile(jump, 99)  # with rare measurements every change is a jump
         at_once = t[changes[1:]] - t[changes[1:] - 1] < 0.05
-        frozen = (jump >= max(ctx.tolerance("min_jump_stroke", joint), usual)) & at_once
+        frozen = (jump >= max(least, usual)) & at_once
         frozen &= sent >= ctx.tolerance("min_samples")
         held = np.zeros(len(begin))
         for i in np.flatnonzero(frozen):
@@ -499,22 +533,18 @@ def fresh(ctx: Context) -> Outcome:
 
 
 def _fresh(ctx: Context, joint: int) -> Outcome:
-    t, q = ctx.states.t, ctx.states.q[:, joint]
-    good = finite_rows(q)
-    t, q = t[good], q[good]
+    course = _Course.of(ctx, joint)
+    t, q, changes, size = course.t, course.q, course.changes, course.steps
     if len(q) < 2:
         return ctx.skipped("fewer than two states with a position")
-    steps = np.diff(q)
-    changes = np.flatnonzero(steps) + 1
     if len(changes) < 3:
         return ctx.skipped("the hand does not move in this recording")
-    size = steps[changes - 1]
     least = ctx.tolerance("min_change_stroke", joint)
     big = np.abs(size) >= least
-    same_way = np.sign(size[1:]) == np.sign(size[:-1])
     # a value repeated between two large changes in one direction was old
-    moving = big[1:] & big[:-1] & same_way
-    holds = np.diff(t[changes])[moving]
+    moving = np.flatnonzero(big[1:] & big[:-1])
+    moving = moving[np.sign(size[moving + 1]) == np.sign(size[moving])]
+    holds = t[changes[moving + 1]] - t[changes[moving]]
     travel = float(np.ptp(q))
     if len(holds) < ctx.tolerance("min_intervals"):
         if travel < least:
@@ -526,7 +556,7 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
         ).timed(quickest, ctx.tolerance("max_hold_s"))
     # the median of a few in a row, so that a hand whose values become old later is found
     count = min(_IN_A_ROW, len(holds))
-    starts = t[changes][:-1][moving]
+    starts = t[changes[moving]]
     rows = sliding_window_view(holds, count)
     near = starts[count - 1 :] - starts[: len(rows)] <= ctx.tolerance("window_s")
     medians = np.where(near, _medians(rows), median(holds))

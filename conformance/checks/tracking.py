@@ -22,6 +22,8 @@ _TOLERANCES = (
 """Tolerances that the figures depend on."""
 _SAME = 1e-12
 """Part of a sum of squares by which sums in another order differ at most."""
+_ROUNDING = 1e-12
+"""Part of the sums of squares by which sums of products by Fourier transforms are off at most."""
 
 
 @dataclass(frozen=True)
@@ -125,23 +127,12 @@ def _measure(
     if top_speed is not None:
         asked = _within_reach(commanded, top_speed * _GRID)
     # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
-    every = bool(free.all())
-    at_work = slice(None) if every else np.flatnonzero(free)
+    at_work = slice(None) if free.all() else np.flatnonzero(free)
     middle = mean(q[at_work])
     seen, asked, commanded = np.where(free, q - middle, 0.0), asked - middle, commanded - middle
     n = len(grid)
-    late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, asked**2))  # by delay
-    if every:
-        sums = np.concatenate(([0.0], np.cumsum(asked**2)))
-        squares = (sums[n:] - sums[:-n])[::-1]
-    else:
-        squares = np.einsum("ki,i->k", late2, free.astype(np.float64))
-    # einsum, for BLAS would start threads for this
-    errors = np.einsum("i,i", seen, seen) + squares
-    errors -= 2.0 * np.einsum("ki,i->k", late, seen)
-    # the shortest of delays that differ by less than sums of two machines do
-    same = _SAME * float(np.einsum("i,i", seen, seen))
-    best = int(np.argmax(errors <= max(float(errors.min()), 0.0) + same))
+    late = sliding_window_view(asked, n)[::-1]  # by delay
+    best = _best_delay(seen, asked, free)
     # a hand that is faster at times than it showed lies between what it reaches and the command
     reached, wanted = late[best][at_work], commanded[most - best : most - best + n][at_work]
     low, high = np.minimum(reached, wanted), np.maximum(reached, wanted)
@@ -158,6 +149,55 @@ def _measure(
         raw=math.sqrt(mean((seen - late[0])[at_work] ** 2)),
         blocked=float((~free).mean()),
     )
+
+
+def _best_delay(seen: Floats, asked: Floats, free: NDArray[np.bool_]) -> int:
+    """The shortest delay with the least sum of squares, in steps of the grid.
+
+    :param seen: positions; 0 where they do not count.
+    :param asked: what they are compared with: longer by the longest delay.
+    :param free: which positions count.
+    """
+    n, delays = len(seen), len(asked) - len(seen) + 1
+    squared = asked**2
+    # einsum, for BLAS would start threads for this
+    own = float(np.einsum("i,i", seen, seen))
+    if free.all():
+        sums = np.concatenate(([0.0], np.cumsum(squared)))
+        squares = about = (sums[n:] - sums[:-n])[::-1]
+        some = None
+        most = 0.0
+    else:
+        some = free.astype(np.float64)
+        about = _products(some, squared)
+        most = float(free.sum()) * float(squared.max())
+    # transforms round otherwise than sums, but tell which delays are worth a sum
+    about = own + about - 2.0 * _products(seen, asked)
+    most += own + float(np.einsum("i,i", asked, asked))
+    same = _SAME * own  # sums of two machines differ by less
+    near = np.flatnonzero(about <= max(float(about.min()), 0.0) + same + _ROUNDING * most)
+    late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, squared))
+
+    def errors(of: slice) -> Floats:
+        """The sums of squares at some delays; of two or more, for one alone adds up otherwise."""
+        wanted = squares[of] if some is None else np.einsum("ki,i->k", late2[of], some)
+        return np.asarray(own + wanted - 2.0 * np.einsum("ki,i->k", late[of], seen))
+
+    if delays < 2 or not 0 < 4 * len(near) <= delays:
+        near, found = np.arange(delays), errors(slice(None))
+    else:
+        pairs = np.minimum(near, delays - 2)
+        found = np.array([errors(slice(i, i + 2))[k - i] for i, k in zip(pairs, near, strict=True)])
+    return int(near[np.argmax(found <= max(float(found.min()), 0.0) + same)])
+
+
+def _products(short: Floats, long: Floats) -> Floats:
+    """The sums of products of a column with a longer one, for every delay of the longer one."""
+    size = 1 << (len(long) - 1).bit_length()
+    if size * 3 // 4 >= len(long):
+        size = size * 3 // 4  # transforms of such a length are as fast
+    spectrum = np.conj(np.fft.rfft(short, size)) * np.fft.rfft(long, size)
+    return np.fft.irfft(spectrum, size)[: len(long) - len(short) + 1][::-1]
 
 
 def _top_speed(ctx: Context, joint: int) -> float | None:

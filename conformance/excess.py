@@ -1,0 +1,203 @@
+"""Where a joint moves further than its reported speed allows: looked for only where it can be.
+
+A window begins at one measurement and ends at another, a given time later. What q moved in it
+beyond the integral of dq is worked out for every window of a recording, or, several times as
+fast, for those alone whose blocks of measurements leave room for more than a given excess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dexkit.conformance.rows import Rows, SomeTimes, extremes
+from dexkit.hand import Floats
+
+__all__ = ["Course", "Excess"]
+
+_SPANNED = 4
+"""Blocks in which the windows that begin in one block may end; others are always looked at."""
+_ROUNDING = 1e-12
+"""Part of the largest number by which a bound may be wrong."""
+_MANY = 8
+"""One in so many rows is left to be looked at one by one; with more of them, all are."""
+
+
+@dataclass(frozen=True)
+class Excess:
+    """The window with the largest excess.
+
+    :param rad: by how much q moved beyond what dq allows.
+    :param start: row at which it begins, as ``end``.
+    """
+
+    rad: float
+    start: int
+    end: int
+
+
+class Course:
+    """What a joint did and what it reported.
+
+    :param times: of its measurements, rising.
+    :param q: rad.
+    :param said: the integral of dq, rad.
+    :param path: the integral of its size, rad.
+    :param lag: seconds by which dq may be early or late.
+    :param part: of ``path`` that q may move beyond.
+    :param longest: seconds; windows with a longer step between two measurements do not count.
+    :param barred: begin and end, seconds, of what no window may overlap.
+    """
+
+    def __init__(
+        self,
+        times: SomeTimes,
+        q: Floats,
+        said: Floats,
+        path: Floats,
+        *,
+        lag: float,
+        part: float,
+        longest: float,
+        barred: list[tuple[float, float]],
+    ) -> None:
+        self._times, self.t = times, times.t
+        self.q, self.said, self.path = q, said, path
+        self._lag, self._part, self._barred = lag, part, barred
+        gap = np.diff(self.t) > longest
+        self._gaps = np.concatenate(([0], np.cumsum(gap))) if gap.any() else None
+
+    def worst(self, seconds: float, above: float) -> Excess | None:
+        """The window of that length with the largest excess, the first of several.
+
+        :param above: excesses below it need not be found.
+        :returns: None without such a window.
+        """
+        blocks = self._blocks
+        starts = None
+        if blocks is not None:
+            bounds = blocks.bounds(seconds)
+            if above == -np.inf:  # an excess that is there leaves few places for a larger one
+                first = self._worst_in(blocks.rows(int(np.argmax(bounds))), seconds)
+                above = -np.inf if first is None else first.rad
+            if above > -np.inf:
+                starts = blocks.rows(*np.flatnonzero(bounds >= above).tolist())
+        if starts is None or len(starts) * _MANY > len(self.t):
+            ends = self._times.shifted(seconds)
+            return self._worst_of(np.arange(len(ends)), ends, seconds)
+        return self._worst_in(starts, seconds)
+
+    def _worst_in(self, starts: Rows, seconds: float) -> Excess | None:
+        """Of the windows that begin at some rows."""
+        ends = np.searchsorted(self.t, self.t[starts] + seconds)
+        return self._worst_of(starts, ends, seconds)
+
+    def _worst_of(self, starts: Rows, ends: Rows, seconds: float) -> Excess | None:
+        inside = np.flatnonzero(ends < len(self.t))
+        starts, ends = starts[inside], ends[inside]
+        whole = self.t[ends] - self.t[starts] < 2 * seconds
+        if self._gaps is not None:
+            whole &= self._gaps[ends] == self._gaps[starts]
+        if not whole.all():
+            starts, ends = starts[whole], ends[whole]
+        if not len(starts):
+            return None
+        low, high, at, to = self._allowed(starts, ends)
+        moved = self.q[ends] - self.q[starts]
+        beyond = np.maximum(moved - (high[to] - low[at]), (low[to] - high[at]) - moved)
+        beyond -= self._part * (self.path[ends] - self.path[starts])
+        for begin, end in self._barred:
+            beyond[(self.t[starts] < end) & (self.t[ends] > begin)] = -np.inf
+        i = int(np.argmax(beyond))
+        return Excess(float(beyond[i]), int(starts[i]), int(ends[i]))
+
+    def _allowed(
+        self, starts: Rows, ends: Rows
+    ) -> tuple[Floats, Floats, Rows | slice, Rows | slice]:
+        """Least and greatest of ``said`` around rows, and where those of starts and ends are."""
+        n = len(starts)
+        if n * _MANY > len(self.t):
+            return *self._around, starts, ends
+        at = self.t[np.concatenate((starts, ends))]
+        first = np.searchsorted(self.t, at - self._lag)
+        last = np.searchsorted(self.t, at + self._lag, "right")
+        return *extremes(self.said, first, last), slice(0, n), slice(n, 2 * n)
+
+    @cached_property
+    def _around(self) -> tuple[Floats, Floats]:
+        """The least and greatest of ``said`` within the lag of each row."""
+        first = self._times.shifted(-self._lag)
+        return extremes(self.said, first, self._times.shifted(self._lag, "right"))
+
+    @cached_property
+    def _blocks(self) -> _Blocks | None:
+        span = float(self.t[-1] - self.t[0])
+        # so many that a block and its neighbours lie within the lag of each of its rows
+        size = min(int(0.5 * self._lag * (len(self.t) - 1) / span), 32) if span > 0 else 0
+        return _Blocks(self, size, self._lag, self._part) if size >= 4 else None
+
+
+class _Blocks:
+    """Blocks of rows, and between what bounds their numbers lie."""
+
+    def __init__(self, course: Course, size: int, lag: float, part: float) -> None:
+        self._size, self._t = size, course.t
+        n = len(course.t)
+        self._count = count = -(-n // size)
+        first = np.arange(count) * size
+        last = np.minimum(first + size, n) - 1
+
+        def bounds(values: Floats) -> tuple[Floats, Floats]:
+            padded = np.full(count * size, values[-1])
+            padded[:n] = values
+            table = padded.reshape(count, size).T.copy()  # long rows are compared much faster
+            return table.min(axis=0), table.max(axis=0)
+
+        q_low, q_high = bounds(course.q)
+        said_low, said_high = bounds(course.said)
+        # around every row of a block lie the blocks beside it, if they are near enough; if not
+        # even the block itself does, the row does
+        begins, ends = course.t[first], course.t[last]
+        self._begins, self._numbers = begins, np.arange(float(count))
+        near = lag * (1 - 1e-9) - 1e-9
+        least, most = said_low.copy(), said_high.copy()
+        beside = ends[1:] - begins[:-1] <= near
+        least[1:] = np.where(beside, np.minimum(least[1:], said_low[:-1]), least[1:])
+        least[:-1] = np.where(beside, np.minimum(least[:-1], said_low[1:]), least[:-1])
+        most[1:] = np.where(beside, np.maximum(most[1:], said_high[:-1]), most[1:])
+        most[:-1] = np.where(beside, np.maximum(most[:-1], said_high[1:]), most[:-1])
+        alone = ends - begins > near
+        least[alone], most[alone] = said_high[alone], said_low[alone]
+        before, after = part * course.path[first], part * course.path[last]
+        # of what ends in a block, and of what begins in one; see :meth:`bounds`
+        self._end_up, self._end_down = q_high - most - before, q_low - least + before
+        self._start_up, self._start_down = q_low - least - after, q_high - most + after
+        largest = max(float(np.abs(v).max()) for v in (q_low, q_high, said_low, said_high))
+        self._slack = _ROUNDING * (1 + largest + abs(float(course.path[-1])))
+
+    def bounds(self, seconds: float) -> Floats:
+        """What the excess of no window is above that begins in a block, for each block."""
+        most = self._count - 1
+        ahead = self._begins + seconds
+        # the last block that begins until then, in which, or behind which, the first window ends
+        begin = np.interp(ahead, self._begins, self._numbers).astype(np.intp)
+        begin -= self._begins[begin] > ahead
+        # the last window ends before the first one of the next block
+        end = np.minimum(np.append(begin[1:], most) + 1, most)
+        # moved - most = (q - high) at the end - (q - low) at the start; least - moved likewise
+        up, down = self._end_up[begin], self._end_down[begin]
+        for step in range(1, _SPANNED):
+            block = np.minimum(begin + step, end)
+            np.maximum(up, self._end_up[block], out=up)
+            np.minimum(down, self._end_down[block], out=down)
+        found: Floats = np.maximum(up - self._start_up, self._start_down - down) + self._slack
+        found[end - begin >= _SPANNED] = np.inf
+        found[ahead > self._t[-1]] = -np.inf  # no window begins here
+        return found
+
+    def rows(self, *blocks: int) -> Rows:
+        """The rows of some blocks."""
+        found = (np.array(blocks, dtype=np.intp)[:, None] * self._size) + np.arange(self._size)
+        return found[found < len(self._t)]
