@@ -319,6 +319,17 @@ def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> Non
         rehearse(plan)
 
 
+def test_a_goal_out_of_reach_of_joints_that_are_not_driven_is_no_endless_ramp(
+    tmp_path: Path,
+) -> None:
+    found = prepare(session(tmp_path, fingers(np.full((3, 7), 1e30), mode=0)))
+    assert {"limits", "locked"} <= {f.name for f in found.refused}
+    assert found.plan is not None
+    done = rehearse(found.plan, Guards(ramp_speed=20.0))
+    assert done.machine.end is End.DONE
+    assert done.seconds < 5.0
+
+
 def test_commands_to_a_hand_with_other_joints_are_refused(tmp_path: Path) -> None:
     six = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 50, 0.0)[:, :6]))
     found = prepare(six)

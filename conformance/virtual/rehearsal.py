@@ -164,6 +164,11 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     now, due, ended = 0.0, _SETTLED, 0.0
     while not ended or now < ended + _SETTLED:
         now += service.tick
+        if now > plan.duration + _LONGEST:
+            raise UsageError(
+                f"the hand is not where the session begins after {_LONGEST:,.0f} s",
+                hint="--ramp-speed RAD/S says how fast it goes there",
+            )
         for sample in service.advance(service.tick):
             if sample.topic not in topics:
                 continue

@@ -279,10 +279,18 @@ class ReplayMachine:
         if self._faulty():
             return
         self._from = {s: self._seen[s][1].q for s in self.plan.sides}
+        # to a goal beyond a joint's range, if that was accepted, it does not go further than to its
+        # end: a ramp takes no longer than a stroke does
         way = max(
-            abs(c.q - q)
+            abs(min(max(c.q, low), high) - q)
             for s, start in self._from.items()
-            for c, q in zip(self._goal(s), start, strict=True)
+            for c, q, low, high in zip(
+                self._goal(s),
+                start,
+                self._limits[s].low.tolist(),
+                self._limits[s].high.tolist(),
+                strict=True,
+            )
         )
         self._ramp = way / self.guards.ramp_speed
         self._far_since.clear()

@@ -28,7 +28,7 @@ from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
 from tools.campaign.mutate import mutator
 
-__all__ = ["TIME", "TYPES", "cases", "content", "count_calls"]
+__all__ = ["TIME", "TYPES", "cases", "content", "count_calls", "damage"]
 
 TIME = 1_795_251_429_000_000_000
 TYPES = {
@@ -286,6 +286,11 @@ def _craft(rng: random.Random, data: bytes) -> bytes:
     return out + data[-8:]
 
 
+def damage(rng: random.Random, data: bytes) -> bytes:
+    """Damage a file in one of the ways."""
+    return rng.choice(_PLAIN)(rng, data)
+
+
 _PLAIN: tuple[Callable[[random.Random, bytes], bytes], ...] = (
     _flip,
     _flip,
@@ -354,7 +359,7 @@ def _damaged(rng: random.Random, scratch: Path) -> Target:
             return _craft(rng, data)
         # a recording without checksums cannot show each change
         expected = originals[which] if sums else None
-        return rng.choice(_PLAIN)(rng, data)
+        return damage(rng, data)
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
