@@ -25,6 +25,10 @@ def finite_rows(*columns: Floats) -> Selected:
     return slice(None) if good.all() else good
 
 
+_PASSES = 3
+"""Passes over all values that ranges may take together to be gone through one by one."""
+
+
 class Times:
     """Times of rows, and which rows lie a while after or before each of them.
 
@@ -109,6 +113,8 @@ def extremes(values: Floats, first: Rows, last: Rows) -> tuple[Floats, Floats]:
     n = len(lengths)
     if not n:
         return np.empty(0), np.empty(0)
+    if int(lengths.sum()) < _PASSES * len(values):
+        return _extremes_of_each(values, first, last)
     # two ranges of one length, which is a power of two, cover a range up to twice as long
     step = 1 << (int(np.partition(lengths, n // 50)[n // 50]).bit_length() - 1)
     low: Floats = values
@@ -124,8 +130,11 @@ def extremes(values: Floats, first: Rows, last: Rows) -> tuple[Floats, Floats]:
     end: Rows = np.where(fits, last - step, 0) if len(odd) else last - step
     least, most = np.minimum(low[begin], low[end]), np.maximum(high[begin], high[end])
     if len(odd):
-        ranges = np.column_stack((first[odd], last[odd])).ravel()
-        longer = np.append(values, values[-1])  # an end may be one past the last row
-        least[odd] = np.minimum.reduceat(longer, ranges)[::2]
-        most[odd] = np.maximum.reduceat(longer, ranges)[::2]
+        least[odd], most[odd] = _extremes_of_each(values, first[odd], last[odd])
     return least, most
+
+
+def _extremes_of_each(values: Floats, first: Rows, last: Rows) -> tuple[Floats, Floats]:
+    ranges = np.column_stack((first, last)).ravel()
+    longer = np.append(values, values[-1])  # an end may be one past the last row
+    return np.minimum.reduceat(longer, ranges)[::2], np.maximum.reduceat(longer, ranges)[::2]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import stat
 import struct
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -848,12 +849,22 @@ def _decompress_zstd(packed: bytes, size: int, cut: bool) -> tuple[bytes, bool]:
         return bytes(out[:size]), False
     if size and zstandard.frame_content_size(packed) == size:
         try:  # at once, into memory of that size
-            whole = zstandard.ZstdDecompressor().decompress(packed, allow_extra_data=False)
+            whole = _of_thread.decompressor.decompress(packed, allow_extra_data=False)
             return whole, False
         except zstandard.ZstdError:
             pass  # damaged, or with something behind it: what can be had is read below
     with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
         return reader.read(size), bool(reader.read(1))
+
+
+class _OfThread(threading.local):
+    """What a thread keeps, for making one takes as long as decompressing a chunk."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_of_thread = _OfThread()
 
 
 def _message_index(
@@ -886,10 +897,10 @@ def _heads_at(data: bytes, starts: NDArray[np.int64]) -> Heads | None:
     if not len(starts) or starts[0] < 0 or starts[-1] > len(data) - HEADS.itemsize:
         return None
     heads = rows_at(data, starts, HEADS.itemsize).view(HEADS)[:, 0]
-    lengths = heads["length"]
-    if (heads["opcode"] != Opcode.MESSAGE).any() or (lengths < LEAST[Opcode.MESSAGE]).any():
+    if (heads["opcode"] != Opcode.MESSAGE).any():
         return None
-    return None if (lengths > len(data)).any() else heads
+    lengths = heads["length"].copy()
+    return heads if LEAST[Opcode.MESSAGE] <= lengths.min() and lengths.max() <= len(data) else None
 
 
 def _open_ordinary(path: Path) -> BinaryIO:

@@ -414,7 +414,7 @@ class Trace:
                     columns=columns.get(topic),
                 )
                 by_topic[topic].append(sinks[i])
-        bytearray(_MALLOC_KEEP)
+        _keep_memory()
         with self._file.open_file() as file:
             for segment in self._file.segments:
                 if segment.counts is None or not sinks.keys().isdisjoint(segment.counts):
@@ -558,6 +558,12 @@ def open_trace(path: str | os.PathLike[str], open_file: OpenFile | None = None) 
             )
         found = files[0]
     return Trace(found)
+
+
+@cache
+def _keep_memory() -> None:
+    """Let glibc keep what is freed; once is enough for a process."""
+    bytearray(_MALLOC_KEEP)
 
 
 def _remainder_after(parts: Sequence[str], prefix: str) -> str:

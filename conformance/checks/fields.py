@@ -12,7 +12,7 @@ from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import joints_of
-from dexkit.conformance.rows import finite_rows
+from dexkit.conformance.rows import Times, finite_rows
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
@@ -188,9 +188,10 @@ def velocity(ctx: Context) -> Outcome:
     return max(judged, key=lambda o: o.values["relative_rms"]) if judged else found[0]
 
 
-def _windows(t: Floats, window: float) -> Windows:
+def _windows(times: Times, window: float) -> Windows:
     """Rows at which windows begin and end, and their lengths in seconds."""
-    ends = np.searchsorted(t, t + window)
+    t = times.t
+    ends = times.shifted(window)
     starts = np.flatnonzero(ends < len(t))
     ends = ends[starts]
     span = t[ends] - t[starts]
@@ -204,13 +205,15 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     t, q, dq = states.clock[good], states.q[good, joint], states.dq[good, joint]
     if len(t) < 10 or float(t[-1] - t[0]) <= 0:
         return ctx.skipped("too few states")
-    if not dq.any():
+    if not (dq[:10].any() or dq.any()):
         return ctx.absent("dq is not filled (0 throughout)")
     window = ctx.tolerance("window_s")
     # the same for all joints, unless some states lack joints
     which = b"" if isinstance(good, slice) else good.tobytes()
     if which not in known:
-        known[which] = _windows(t, window)
+        every = isinstance(good, slice)
+        times = ctx.once("clock", lambda: Times(states.clock)) if every else Times(t)
+        known[which] = _windows(times, window)
     starts, ends, span = known[which]
     if not len(starts):
         return ctx.skipped("the states are too far apart to derive a velocity")

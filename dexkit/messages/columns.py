@@ -372,6 +372,36 @@ def encode_columns(
     return [row.tobytes() for row in raw]
 
 
+class _Layout:
+    """Where the members of a sample of one shape are."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._dtype = dtype
+        self._known: dict[int, tuple[_Steps, np.dtype[Any], list[int]]] = {}
+
+    def places(self, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
+        """Type and first byte of each number."""
+        if id(steps) not in self._known:
+            self._known[id(steps)] = (steps, *_places(self._dtype, 0, steps))
+        _, leaf, places = self._known[id(steps)]
+        return leaf, places
+
+
+_LAYOUTS: dict[tuple[int, tuple[int, ...], str, int], tuple[Struct, _Layout]] = {}
+_MOST_LAYOUTS = 64
+"""Layouts that are kept: of every type that dexkit knows, in the lengths that are usual."""
+
+
+def _layout(kind: Struct, counts: tuple[int, ...], order: str, size: int) -> _Layout:
+    """The layout of samples with these sequence lengths."""
+    key = (id(kind), counts, order, size)
+    if key not in _LAYOUTS:
+        while len(_LAYOUTS) >= _MOST_LAYOUTS:
+            _LAYOUTS.pop(next(iter(_LAYOUTS)))
+        _LAYOUTS[key] = kind, _Layout(_dtype(kind, counts, order, size))
+    return _LAYOUTS[key][1]
+
+
 class _Group:
     """Samples of one shape.
 
@@ -385,7 +415,7 @@ class _Group:
         self.rows: list[NDArray[np.intp]] = []
         self.moved = False
         self.words = Words(first)
-        self._dtype = _dtype(kind, self.counts, ">" if big else "<", size)
+        self._layout = _layout(kind, self.counts, ">" if big else "<", size)
         # the header's first two bytes define the byte order, the others are free
         self._fixed = np.array([0, *_count_words(kind, self.counts)])
         self._mask = np.full(len(self._fixed), 0xFFFFFFFF, dtype=np.uint32)
@@ -430,7 +460,7 @@ class _Group:
 
     def places(self, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
         """Type, and first byte of each number, of what a path names; none that it lacks."""
-        return _places(self._dtype, 0, steps)
+        return self._layout.places(steps)
 
 
 def _places(here: np.dtype[Any], start: int, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
