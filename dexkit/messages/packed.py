@@ -16,8 +16,8 @@ _SEGMENT = 1 << 16
 """Most samples whose changing words are kept in one table."""
 _FIRST = 1 << 18
 """Words of the first samples that get a table; those that are not filled cost no memory."""
-_COMPARED = 1 << 18
-"""Words of samples that are compared with the first one at once."""
+_COMPARED = 1 << 15
+"""Words of samples that are compared with the first one at once: they stay in the cache."""
 _FOLDED = 16
 """Rows of changing words that are reduced as one."""
 
