@@ -16,7 +16,7 @@ from dexkit.conformance.audit.records import FINDING, FileRecord, State
 from dexkit.conformance.report.charts import Line, chart
 from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import ANSWERS, VERDICTS
-from dexkit.conformance.report.tables import table
+from dexkit.conformance.report.tables import table, unbroken
 from dexkit.conformance.requirements import LAYERS, catalogue
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.conformance.run_record import catalogue_digest
@@ -30,6 +30,8 @@ _ROWS = 60
 """Rows of a group's table."""
 _MOST = 3
 """Requirements that are named for a file or a group."""
+_SHORT = 40
+"""Characters of a file's name that are not broken into lines."""
 _DAY = 86_400.0
 
 _ABOUT, _REQUIREMENT, _SIDE, _VERDICT, _OBSERVED = (
@@ -166,7 +168,8 @@ def _day(recorded_at: str) -> float:
 
 def _where(facts: Mapping[str, Any]) -> str:
     labels = [f"{key} {value}" for key, value in facts.get("labels", {}).items()]
-    parts = [facts.get("recorded_at", ""), facts.get("dialect", ""), *labels]
+    recorded = facts.get("recorded_at", "")[:16].replace("T", " ")  # to the minute, UTC
+    parts = [recorded, facts.get("dialect", ""), *labels]
     return ", ".join(part for part in parts if part)
 
 
@@ -178,11 +181,14 @@ def render(summary: Summary, *, locations: Sequence[str], left: int = 0) -> str:
     sections = [
         _head(summary, left),
         _facts(summary, locations),
-        _worst(summary),
+        _worst(summary, locations),
         _trend(summary),
         _requirements(summary, "hand", "Requirements that hands do not meet"),
         _requirements(summary, "client", "Requirements that clients do not meet"),
-        *(_groups(title, groups) for title, groups in sorted(summary.groups.items(), key=_order)),
+        *(
+            _groups(title, groups, locations)
+            for title, groups in sorted(summary.groups.items(), key=_order)
+        ),
     ]
     return document(f"Audit of {_count(summary.all.files, 'file')}", "".join(sections))
 
@@ -245,7 +251,14 @@ def _date(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, timezone.utc).date().isoformat()
 
 
-def _worst(summary: Summary) -> str:
+def _short(name: str, locations: Sequence[str]) -> str:
+    """A file or folder as a cell: without the location, if the page is about one alone."""
+    if len(locations) == 1:
+        name = name.removeprefix(locations[0].rstrip("/") + "/")
+    return unbroken(escape(name)) if len(name) <= _SHORT else escape(name)
+
+
+def _worst(summary: Summary, locations: Sequence[str]) -> str:
     lines = summary.worst
     if not lines:
         return ""
@@ -262,7 +275,8 @@ def _worst(summary: Summary) -> str:
         found += [f"and {line.more} more"] if line.more else []
         found += [escape(line.error)] if line.error else []
         where = f"<span class='dim'>{escape(line.where)}</span>" if line.where else ""
-        rows.append((f"{escape(line.name)}{where and '<br>' + where}", verdict, "<br>".join(found)))
+        name = _short(line.name, locations)
+        rows.append((f"{name}{where and '<br>' + where}", verdict, "<br>".join(found)))
     return f"<h2>Worst files</h2>{table(('file', 'verdict', 'why'), rows)}{more}"
 
 
@@ -330,7 +344,7 @@ def _requirements(summary: Summary, about: str, title: str) -> str:
     return f"<h2>{title}</h2>{table(('requirement', 'files that fail', 'warnings'), rows)}"
 
 
-def _groups(title: str, groups: Mapping[str, Group]) -> str:
+def _groups(title: str, groups: Mapping[str, Group], locations: Sequence[str]) -> str:
     if len(groups) < 2:
         return ""
     ordered = sorted(groups, key=lambda n: (-groups[n].failing / groups[n].files, n))
@@ -340,7 +354,7 @@ def _groups(title: str, groups: Mapping[str, Group]) -> str:
         most = [f"<code>{escape(n)}</code> ({k})" for n, k in group.failures.most_common(_MOST)]
         rows.append(
             (
-                escape(name),
+                _short(name, locations),
                 f"{group.files:,}",
                 _span(group.seconds),
                 f"{group.failing} ({group.failing / group.files:.0%})",
