@@ -137,6 +137,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add("report", metavar="FILE.html", help="write the report page")
     add("markdown", metavar="FILE.md", help="write a summary in Markdown, for a comment or a wiki")
     add("recording", metavar="FILE.mcap", help="keep the recording")
+    add("view", action="store_true", help="show the run on a page in the browser")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -153,7 +154,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", f"{_MARK}: a requirement of the conformance suite")
     config.stash[OPTIONS_KEY] = None
     config.stash[REPORTED_KEY] = []
-    names = ("device", "side", "object", "set", "domain", "trace", *_FILES)
+    names = ("device", "side", "object", "set", "domain", "trace", "view", *_FILES)
     if not config.getoption("dexkit_backend"):
         given = [f"--{name}" for name in names if config.getoption(f"dexkit_{name}")]
         if given:

@@ -36,6 +36,7 @@ from dexkit.models import DEX1_1, Dialect, dialect, model
 from dexkit.open_file_limit import require_open_files
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import TemporaryFolder
+from dexkit.view.process import viewer
 
 if TYPE_CHECKING:
     import pytest
@@ -54,6 +55,7 @@ class SuiteOptions:
 
     :param domain: None for a free one.
     :param thorough: every stimulus again and again, as :class:`RunKind` says.
+    :param view: show the run on a page in the browser.
     """
 
     backend: str
@@ -72,6 +74,7 @@ class SuiteOptions:
     report: Path | None = None
     markdown: Path | None = None
     recording: Path | None = None
+    view: bool = False
 
     @classmethod
     def from_pytest(cls, config: pytest.Config) -> SuiteOptions:
@@ -107,6 +110,7 @@ class SuiteOptions:
             report=path("report"),
             markdown=path("markdown"),
             recording=path("recording"),
+            view=get("view"),
         )
 
     @classmethod
@@ -131,6 +135,7 @@ class SuiteOptions:
         report: Path | None = None,
         markdown: Path | None = None,
         recording: Path | None = None,
+        view: bool = False,
     ) -> SuiteOptions:
         """Check a user's options and fill in defaults.
 
@@ -212,6 +217,7 @@ class SuiteOptions:
             report=report,
             markdown=markdown,
             recording=recording,
+            view=view,
         )
         options.rig(0).check()
         return options
@@ -392,6 +398,8 @@ def run_suite(
             folder = stack.enter_context(TemporaryFolder())
             if (domain := options.domain) is None:
                 domain = stack.enter_context(reserve_free_domain(options.interface)).domain
+            if options.view:
+                stack.enter_context(viewer(domain, options.interface, stop, report))
             path = options.recording or folder / "run.mcap"
             if not record_run(live_options(options, domain), path, report=report, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")

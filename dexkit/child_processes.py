@@ -97,6 +97,8 @@ class Tool:
         self.ready = threading.Event()
         self.place = ""
         """The first word after ``ready:``."""
+        self.ready_line = ""
+        """What it printed when it was ready."""
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=40)
         # closed when this process ends, even by SIGKILL
@@ -142,6 +144,7 @@ class Tool:
             self._tail.append(line.rstrip())
             if line.startswith("ready:") and not self.place:
                 self.place = line.split()[1] if len(line.split()) > 1 else ""
+                self.ready_line = line.rstrip()
                 self.ready.set()
             if self._on_line is not None:
                 self._on_line(line.rstrip())

@@ -134,17 +134,28 @@ class Browser:
         raise AssertionError(f"never true: {expression}\nthe page says: {text}")
 
     def click(self, text: str) -> None:
-        """Click with the mouse on the last button or tab whose text begins so."""
+        """Click with the mouse on the last button or tab whose text begins so, when it is seen."""
         find = (
             "(() => { const found = [...document.querySelectorAll('button,[role=tab],label')]"
             f".filter(e => e.innerText.trim().startsWith({json.dumps(text)})).pop();"
             "if (!found) return null; found.scrollIntoView({block: 'center'});"
             "const box = found.getBoundingClientRect();"
-            "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+            "const x = box.x + box.width / 2, y = box.y + box.height / 2;"
+            "return found.contains(document.elementFromPoint(x, y)) ? [x, y] : null; })()"
         )
-        x, y = self.wait(find)
+        before, place = None, self.wait(find)
+        while place != before:  # the page may still be arranging itself
+            time.sleep(0.05)
+            before, place = place, self.wait(find)
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+            self.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=place[0],
+                y=place[1],
+                button="left",
+                clickCount=1,
+            )
 
     def picture(self) -> bytes:
         """What is seen, as PNG."""

@@ -27,11 +27,15 @@ class Process:
         )
 
     def ready(self) -> str:
+        line = self.line_out()
+        assert line.startswith("ready: "), self.end(signal.SIGTERM)
+        return line
+
+    def line_out(self) -> str:
+        """The next line that it prints."""
         stdout = self._popen.stdout
         assert stdout is not None
-        line = stdout.readline()
-        assert line.startswith("ready: "), self.end(signal.SIGTERM)
-        return line.strip()
+        return stdout.readline().strip()
 
     def line(self, pattern: str) -> str:
         """The next line of its log that matches."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import signal
 import sys
@@ -22,6 +23,7 @@ from dexkit.conformance.recording import Recording
 from dexkit.errors import ExtraMissing, UsageError
 from dexkit.hand import MotorError
 from dexkit.traces import open_trace, sample_path
+from dexkit.view.process import viewer
 from dexkit.view.sources import Recorded
 from dexkit.view.texts import hand_table, seconds, time_strip, topics_table
 from dexkit.view.thin import common_times, thin
@@ -210,6 +212,12 @@ def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(ExtraMissing) as error:
         import dexkit.view.page  # noqa: F401
     assert "dexkit[view]" in error.value.hint
+
+
+def test_view_beside_another_command_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ExtraMissing), viewer(1, "lo"):
+        pass
 
 
 def test_command_serves_the_page_until_it_is_stopped() -> None:

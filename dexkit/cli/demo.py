@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import DOMAIN
+from dexkit.cli.options import DOMAIN, view_option
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
 from dexkit.stop_signals import stop_on_signals
@@ -42,7 +42,8 @@ _INTRO = (
     help="Hand to show; its device is emulated.",
 )
 @click.option("--domain", type=DOMAIN, help="DDS domain.  [default: a free one]")
-def command(out: Path, backend: str, domain: int | None) -> None:
+@view_option()
+def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
     """Run the conformance suite on two emulated EZGrippers, in some 90 seconds.
 
     Traffic stays on this machine, on a DDS domain of its own. Exit code: 0 the hands passed,
@@ -59,6 +60,7 @@ def command(out: Path, backend: str, domain: int | None) -> None:
         json=out / "result.json",
         report=out / "report.html",
         recording=out / "recording.mcap",
+        view=view,
     )
     for paragraph in _INTRO:
         console.print(paragraph)
@@ -83,7 +85,8 @@ def command(out: Path, backend: str, domain: int | None) -> None:
     console.print(f"\n{seconds:.0f} s. Look at it: [bold]{out / 'report.html'}[/bold]")
     console.print(
         f"[dim]{options.recording} has the ros2msg schemas that Foxglove and PlotJuggler read; "
-        f"'dexkit check {options.recording}' judges it again.[/dim]"
+        f"'dexkit check {options.recording}' judges it again, and 'dexkit view "
+        f"{options.recording}' shows it.[/dim]"
     )
     if result.judged == 0:
         raise ConformanceError("nothing was judged, which is not a pass")

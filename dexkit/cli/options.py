@@ -50,6 +50,7 @@ __all__ = [
     "start_option",
     "topic_option",
     "verbose_option",
+    "view_option",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -365,6 +366,15 @@ def real_time_option(*, default: bool = True) -> Callable[[F], F]:
         default=default,
         show_default=True,
         help="Run before ordinary processes where the system permits it (docs/service.md).",
+    )
+
+
+def view_option() -> Callable[[F], F]:
+    """``--view`` of the commands that run hands; see :func:`dexkit.view.process.viewer`."""
+    return click.option(
+        "--view",
+        is_flag=True,
+        help="Show the hands on a page in the browser; needs dexkit[view] (docs/view.md).",
     )
 
 

@@ -23,6 +23,7 @@ from dexkit.cli.options import (
     real_time_option,
     set_option,
     side_option,
+    view_option,
 )
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
 from dexkit.errors import DexkitError, TopicConflict, UsageError
@@ -105,6 +106,7 @@ _LONELY = 10.0  # seconds without a client before a hint
 )
 @force_option()
 @real_time_option()
+@view_option()
 @quiet_option()
 def command(
     backend_name: str,
@@ -121,6 +123,7 @@ def command(
     wait_for_device: bool,
     force: bool,
     real_time: bool,
+    view: bool,
     quiet: bool,
 ) -> int:
     """Serve a hand on Unitree's topics until Ctrl-C or SIGTERM.
@@ -151,11 +154,14 @@ def command(
     groups = _groups(hands, language)
 
     from dexkit.dds import DdsNode
+    from dexkit.view.process import viewer
 
     with (
-        # before any thread is started: they inherit it
-        real_time_priority() if real_time else nullcontext(True) as granted,
         stop_on_signals() as stop,
+        # at ordinary priority: it must not wait for the service, nor the service for it
+        viewer(chosen, interface, stop.event, click.echo) if view else nullcontext(),
+        # before any thread of the service is started: they inherit it
+        real_time_priority() if real_time else nullcontext(True) as granted,
         DdsNode(domain=chosen, interface=interface) as node,
     ):
         if not granted:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import click
 
@@ -21,12 +22,14 @@ from dexkit.cli.options import (
     force_option,
     quiet_option,
     set_option,
+    view_option,
 )
 from dexkit.cli.status_line import STATUS_LINES, StatusLine
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import StopRequest, stop_on_signals
+from dexkit.view.process import viewer
 
 __all__ = ["emulate_all"]
 
@@ -53,6 +56,7 @@ _POLL = 0.05  # seconds between looks whether all parts live
 @dds_options()
 @duration_option()
 @force_option()
+@view_option()
 @quiet_option()
 def emulate_all(
     robot: str,
@@ -63,6 +67,7 @@ def emulate_all(
     interface: str,
     duration: float | None,
     force: bool,
+    view: bool,
     quiet: bool,
 ) -> None:
     """Emulate a robot with two hands on Unitree's topics.
@@ -85,7 +90,11 @@ def emulate_all(
         own = [option for text in settings for option in ("--set", text)]
         own += ["--dialect", dialect] if dialect else []
         parts["hands"] = ("serve", _HANDS[hands].simulator, "--side", "both", *own, *common)
-    with stop_on_signals() as stop, _Processes(parts, quiet) as processes:
+    with (
+        stop_on_signals() as stop,
+        viewer(domain, interface, stop.event, click.echo) if view else nullcontext(),
+        _Processes(parts, quiet) as processes,
+    ):
         processes.wait_ready(stop)
         if not stop:
             title = ROBOTS[robot].title
