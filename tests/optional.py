@@ -94,6 +94,7 @@ OPTIONAL = (
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
+    Optional("pyte", _package("pyte"), ("monitor_terminal",)),
     Optional("viser", _package("viser"), ("view", "view_browser")),
     Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),
     Optional("ray", _package("ray"), ("audit_ray",)),

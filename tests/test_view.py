@@ -25,10 +25,11 @@ from dexkit.hand import MotorError
 from dexkit.traces import open_trace, sample_path
 from dexkit.view.process import viewer
 from dexkit.view.sources import Recorded
-from dexkit.view.texts import hand_table, seconds, time_strip, topics_table
+from dexkit.view.texts import hand_table, time_strip, topics_table
 from dexkit.view.thin import common_times, thin
 from dexkit.view.transport import Transport
 from dexkit.watch import Collector, Mark
+from dexkit.watch.texts import seconds
 from tests.cli_helpers import running
 from tests.patience import PATIENCE
 from tests.watch_helpers import closing_hands, ns

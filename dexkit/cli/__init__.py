@@ -43,6 +43,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
         "Write systemd units and udev rules that serve hands.",
     ),
     "merge": ("dexkit.cli.merge", "Write several recordings as one."),
+    "monitor": ("dexkit.cli.monitor", "Show hands and topics in the terminal, live."),
     "models": ("dexkit.cli.models", "Print hands and robots: joints, limits, topics, rates."),
     "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),

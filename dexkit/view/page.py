@@ -19,6 +19,7 @@ from dexkit.view.sources import HISTORY, Source
 from dexkit.view.texts import hand_table, time_strip, topics_table
 from dexkit.view.transport import SPEEDS, Transport
 from dexkit.watch import Mark, Picture, SubjectView
+from dexkit.watch.texts import subject_name
 
 try:
     import viser
@@ -431,7 +432,7 @@ class Page:
 
 
 def _title(view: SubjectView, source: str) -> str:
-    name = view.model.title if view.subject == "robot" else f"{view.subject} {view.model.title}"
+    name = subject_name(view)
     return f"{name} · {source}" if source else name
 
 

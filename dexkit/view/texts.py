@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 from dexkit.escaping import html as escape
 from dexkit.watch import SubjectView, TopicView
+from dexkit.watch.texts import number, seconds
 
-__all__ = ["hand_table", "seconds", "time_strip", "topics_table"]
+__all__ = ["hand_table", "time_strip", "topics_table"]
 
 _STYLE = (
     "<style>.dk{font:12px/1.35 system-ui,sans-serif;padding:0 10px;overflow-x:auto}"
@@ -19,19 +20,6 @@ _STYLE = (
     ".dk .warn{color:#c77700}.dk .dim{color:#868e96}.dk p{margin:2px 0}</style>"
 )
 _WIDTH, _HEIGHT = 92, 12
-
-
-def seconds(value: float) -> str:
-    """A time for people: ``3 ms``, ``1.2 s``, ``-``."""
-    if not math.isfinite(value):
-        return "-"
-    if value < 0.0995:
-        return f"{value * 1e3:.0f} ms"
-    return f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
-
-
-def _number(value: float, digits: int = 2) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def _cell(text: str, kind: str = "") -> str:
@@ -49,10 +37,10 @@ def hand_table(view: SubjectView, title: str) -> str:
             "<tr>"
             + _cell(escape(joint.name), "bad" if bad else "warn" if near else "")
             + _cell(_bar(view, i))
-            + _cell(_number(float(view.q[i])), "n warn" if near else "n")
-            + _cell(_number(float(view.target[i])), "n dim")
+            + _cell(number(float(view.q[i])), "n warn" if near else "n")
+            + _cell(number(float(view.target[i])), "n dim")
             + _cell(_torque(view, i))
-            + _cell(_number(float(view.tau[i])), "n")
+            + _cell(number(float(view.tau[i])), "n")
             + _cell(f"{celsius:.0f}" if math.isfinite(celsius) and celsius else "", "n dim")
             + "</tr>"
         )
