@@ -158,8 +158,11 @@ def _change_text(comparison: Comparison, change: Change) -> str:
 # ----------------------------------------------------------------------------------- HTML
 
 
-def render_comparison(comparison: Comparison) -> str:
-    """Return the page as text."""
+def render_comparison(comparison: Comparison, curves: str = "") -> str:
+    """Return the page as text.
+
+    :param curves: of the runs' recordings, HTML, for the end of the page.
+    """
     runs, names = comparison.runs, comparison.names
     title = f"{len(runs)} runs as {model_title(runs[0])}"
     heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
@@ -175,6 +178,7 @@ def render_comparison(comparison: Comparison) -> str:
         _matrix(differing, names, heads) if differing else "<p>Nowhere: all verdicts agree.</p>",
         f"<h2>Where they agree ({len(agreeing)})</h2>",
         _matrix(agreeing, names, heads) if agreeing else "<p>Nowhere.</p>",
+        curves,
     ]
     return document(f"Comparison: {title}", "".join(body))
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from dexkit.cli.options import html_option, markdown_option
 from dexkit.cli.report import write_text
+from dexkit.digests import sha256_of_file
 from dexkit.documents import check_output_paths
+
+if TYPE_CHECKING:
+    from dexkit.conformance.report.compare import Comparison
 
 
 @click.command("compare")
@@ -25,7 +30,8 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     """Put results of several hands, or of several versions of one, side by side.
 
     Runs of the same hand (its name in capabilities.toml, else the backend) are taken in the order
-    of their time; what became worse from one to the next is named as a regression.
+    of their time; what became worse from one to the next is named as a regression. The page also
+    shows the curves of their recordings beside each other, where these lie beside the results.
 
     Exit code: 0 no regression, 1 there is one, 2 the results cannot be compared.
     """
@@ -39,7 +45,7 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     check_output_paths([html_path, markdown_path], results)
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
     if html_path:
-        write_text(html_path, render_comparison(comparison))
+        write_text(html_path, render_comparison(comparison, _curves(comparison, results)))
         click.echo(f"report: {html_path}", err=True)
     if markdown_path or not html_path:
         write_text(markdown_path or Path("-"), render_comparison_markdown(comparison))
@@ -49,3 +55,26 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
         what = "regression" if len(regressions) == 1 else "regressions"
         click.echo(f"{len(regressions)} {what}: {names}", err=True)
         raise click.exceptions.Exit(1)
+
+
+def _curves(comparison: Comparison, results: tuple[Path, ...]) -> str:
+    """The curves of the recordings that lie beside the results, as HTML.
+
+    A recording is taken only if it is the one that was judged.
+    """
+    from dexkit.conformance.report.curves import beside, recorded
+    from dexkit.escaping import html as escape
+    from dexkit.traces import open_trace
+
+    found, missing = [], []
+    for run, name, path in zip(comparison.runs, comparison.names, results, strict=True):
+        file = path.with_name(Path(run.subject.get("recording", "")).name or "nothing")
+        wanted = run.subject.get("recording_sha256")
+        if wanted and file.is_file() and sha256_of_file(file) == wanted:
+            found.append(recorded(open_trace(file), name))
+        else:
+            missing.append(name)
+    if not found:
+        return ""
+    lacking = f"<p>Not beside its result: the recording of {escape(', '.join(missing))}.</p>"
+    return "<h2>What they did</h2>" + (lacking if missing else "") + beside(found)

@@ -12,8 +12,11 @@ import click
 
 from dexkit.cli.options import FILE, Number, json_option, topic_option
 from dexkit.cli.remarks import remarks
+from dexkit.cli.report import write_text
+from dexkit.documents import check_output_paths
 
 if TYPE_CHECKING:
+    from dexkit.traces import Trace
     from dexkit.traces.sessions.compare import Comparison
 
 __all__ = ["command"]
@@ -38,6 +41,13 @@ __all__ = ["command"]
 )
 @topic_option("Compare", "all")
 @json_option("Print JSON.")
+@click.option(
+    "--html",
+    "html_path",
+    type=FILE,
+    metavar="FILE",
+    help="Write a page with the curves of both over each other, those that differ most first.",
+)
 def command(
     a: Path,
     b: Path,
@@ -45,6 +55,7 @@ def command(
     tolerance: float,
     topics: tuple[str, ...],
     as_json: bool,
+    html_path: Path | None,
 ) -> int:
     """Compare two runs of one session: topics, rates, gaps, and the position of every joint.
 
@@ -57,6 +68,7 @@ def command(
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.compare import compare
 
+    check_output_paths([html_path], [a, b])
     traces = [open_trace(a), open_trace(b)]
     found = compare(*traces, topics=topics or None, offset=offset, tolerance=tolerance)
     for trace in traces:
@@ -65,7 +77,39 @@ def command(
         click.echo(json.dumps(_finite({"equal": found.equal, **asdict(found)}), indent=1))
     else:
         _print(found)
+    if html_path is not None:
+        write_text(html_path, _page(found, *traces))
+        click.echo(f"page: {html_path}", err=True)
     return 0 if found.equal and not any(t.damage for t in traces) else 1
+
+
+def _page(found: Comparison, a: Trace, b: Trace) -> str:
+    """The joints of both, on A's clock; those that differ most come first."""
+    from dexkit.conformance.report.curves import over_each_other, recorded, topics
+    from dexkit.conformance.report.html import document
+    from dexkit.escaping import html as escape
+
+    names = (f"A: {a.path.name}", f"B: {b.path.name}")
+    one = recorded(a, names[0])
+    other = recorded(b, names[1], begin_ns=a.first_ns + round(found.offset * 1e9))
+    order = [
+        (
+            j.part,
+            j.kind,
+            j.joint,
+            f"rms {j.rms:.4f} rad, worst {j.worst:.4f} rad at {j.worst_at:.3f} s",
+        )
+        for j in sorted(found.joints, key=lambda j: -j.worst if j.samples else 1.0)
+        if j.samples
+    ]
+    title = f"{a.path.name} and {b.path.name}"
+    head = (
+        f"<h1>{escape(title)}</h1><p>{'The same' if found.equal else 'They differ'}. B is "
+        f"{found.offset:+.4f} s later than A, and is drawn on A's clock; they have "
+        f"{found.overlap:.3f} s in common.</p>"
+    )
+    notes = "".join(f"<p>{escape(note)}</p>" for note in found.notes)
+    return document(title, head + notes + over_each_other(one, other, order) + topics([one, other]))
 
 
 def _finite(value: Any) -> Any:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from dexkit.cli.options import json_option
+from dexkit.cli.options import FILE, json_option
+from dexkit.cli.report import write_text
+from dexkit.documents import check_output_paths
 
 if TYPE_CHECKING:
     from dexkit.traces import Trace
@@ -70,26 +72,49 @@ def summary(trace: Trace) -> dict[str, Any]:
 
 
 @click.command("info")
-@click.argument("file", type=click.Path(path_type=Path))
-@json_option("Print JSON.")
-def command(file: Path, as_json: bool) -> int:
-    """Show the topics, types, rates, gaps and damage of a recording.
+@click.argument("files", type=FILE, nargs=-1, required=True, metavar="FILE...")
+@json_option("Print JSON: an object, or a list of them for several files.")
+@click.option(
+    "--plot", is_flag=True, help="Draw commands, states and rates over time in the terminal."
+)
+@click.option(
+    "--html",
+    "html_path",
+    type=FILE,
+    metavar="FILE",
+    help="Write a page with their curves; several files are drawn beside each other.",
+)
+def command(files: tuple[Path, ...], as_json: bool, plot: bool, html_path: Path | None) -> int:
+    """Show the topics, types, rates, gaps and damage of recordings.
 
     FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
     read as far as it goes.
 
-    Exit code: 0 the file agrees with its checksums and counts, 1 it is damaged (what can be read
-    is shown, what is lost is named), 2 it is not a recording.
+    Exit code: 0 the files agree with their checksums and counts, 1 one is damaged (what can be
+    read is shown, what is lost is named), 2 one is not a recording.
     """
     from dexkit.traces import open_trace
 
-    trace = open_trace(file)
-    data = summary(trace)
+    check_output_paths([html_path], files)
+    traces = [open_trace(file) for file in files]
+    found = [summary(trace) for trace in traces]
     if as_json:
-        click.echo(json.dumps(data, indent=1))
+        click.echo(json.dumps(found if len(found) > 1 else found[0], indent=1))
     else:
-        _print(data)
-    return 1 if trace.damage else 0
+        for number, (trace, data) in enumerate(zip(traces, found, strict=True)):
+            if number:
+                click.echo()
+            _print(data)
+            if plot:
+                from dexkit.cli.info_plot import print_plot
+
+                print_plot(trace)
+    if html_path is not None:
+        from dexkit.conformance.report.curves import page, recorded
+
+        write_text(html_path, page([recorded(trace) for trace in traces]))
+        click.echo(f"page: {html_path}", err=True)
+    return 1 if any(trace.damage for trace in traces) else 0
 
 
 def _print(data: dict[str, Any]) -> None:
