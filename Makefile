@@ -47,7 +47,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak platforms aarch64 wheels campaign campaign-sample lint format docs bench lock clean
+.PHONY: help setup demo test soak platforms aarch64 wheels campaign campaign-sample lint format docs pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -92,7 +92,10 @@ format: $(STAMP) ## put the code in ruff's format
 docs: $(STAMP) ## write the generated pages, drawings and message modules (ARGS=--check compares)
 	$(RUN) python -m tools.generate $(ARGS)
 
-bench: $(STAMP) ## the benchmarks; prints ratios and saves benchmarks/results/*.json
+pictures: $(STAMP) ## make the pictures of docs/images that a browser draws (ARGS=view-hands makes one)
+	$(RUN) python -m tools.pictures $(ARGS)
+
+bench: $(STAMP) ## the benchmarks; prints ratios, saves benchmarks/results/*.json and index.html
 	$(RUN) python -m benchmarks $(ARGS)
 
 lock: | $(UV) ## resolve the dependencies again

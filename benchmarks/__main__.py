@@ -13,9 +13,9 @@ import time
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 import benchmarks
+from benchmarks.show import page, saved, terminal_lines
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -37,25 +37,9 @@ def main(argv: list[str]) -> int:
         console.print(f"[dim]{name} ...[/dim]")
         module = importlib.import_module(f"benchmarks.bench_{name}")
         results: list[benchmarks.Result] = module.run()
-        table = Table(
-            box=None, pad_edge=False, header_style="bold", title=name, title_justify="left"
-        )
-        for heading in ("measured", "dexkit", "peer", "peer's", "ratio", "target", ""):
-            table.add_column(heading, overflow="fold")
-        for r in results:
-            verdict = {None: "", True: "[green]met[/green]", False: "[red]missed[/red]"}[r.met]
-            table.add_row(
-                r.name,
-                f"{r.value:,.4g} {r.unit}",
-                r.peer,
-                f"{r.peer_value:,.4g} {r.unit}",
-                f"{r.ratio:.2f}",
-                r.target,
-                verdict,
-            )
-            if r.note:
-                table.add_row(f"[dim]{r.note}[/dim]")
-        console.print(table)
+        console.print(f"[bold]{name}[/bold]")
+        for line in terminal_lines(results, min(console.width, 80)):
+            console.print(line, highlight=False, no_wrap=True)
         rows += [{"benchmark": name, **dataclasses.asdict(r)} for r in results]
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / time.strftime("%Y%m%d-%H%M%S.json")
@@ -71,6 +55,9 @@ def main(argv: list[str]) -> int:
         )
     )
     console.print(f"saved {path}")
+    index = RESULTS / "index.html"
+    index.write_text(page(saved(RESULTS)), encoding="utf-8")
+    console.print(f"page  {index}")
     return 0
 
 

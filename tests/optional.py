@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from tools.browser import chromium
 from tools.platforms.interpreters import UV, find_python
 
 __all__ = [
@@ -38,13 +39,6 @@ class Optional(NamedTuple):
     name: str
     there: Callable[[], object]
     tests: tuple[str, ...]
-
-
-@functools.cache
-def chromium() -> str | None:
-    """A browser."""
-    names = ("chromium", "chromium-browser", "chrome", "google-chrome")
-    return next(filter(None, map(shutil.which, names)), None)
 
 
 def ssh_keygen() -> str | None:

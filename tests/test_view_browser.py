@@ -15,9 +15,8 @@ from dexkit.hand import MotorError
 from dexkit.threads import Worker
 from dexkit.view.sources import Recorded
 from dexkit.watch import Mark
-from tests.browser import Browser
-from tests.optional import chromium
 from tests.watch_helpers import closing_hands, ns
+from tools.browser import Browser, chromium
 
 pytest.importorskip("viser")
 if chromium() is None:

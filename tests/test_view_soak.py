@@ -17,11 +17,10 @@ import pytest
 from dexkit.child_processes import Tool
 from dexkit.hand import Floats
 from dexkit.messages import message_type
-from tests.browser import Browser
 from tests.cli_helpers import running
 from tests.dds_helpers import DdsNode, free_domain
-from tests.optional import chromium
 from tests.watch_helpers import STATE
+from tools.browser import Browser, chromium
 
 pytest.importorskip("viser")
 if chromium() is None:

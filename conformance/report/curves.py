@@ -283,7 +283,7 @@ def _rate_chart(r: Recorded, topic: str, span: tuple[float, float]) -> str:
     mean = len(t) / r.seconds
     return chart(
         f"{r.name}, {topic}: messages a second",
-        [Line("rate", "force", edges[1:] - _WINDOW / 2, counts / _WINDOW)],
+        [Line("rate", "force", np.asarray(edges[1:] - _WINDOW / 2), np.asarray(counts / _WINDOW))],
         y_unit="Hz",
         span=span,
         height=90,

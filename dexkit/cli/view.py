@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dexkit.view.sources import Source
     from dexkit.watch import Mark
 
-__all__ = ["command"]
+__all__ = ["command", "recorded"]
 
 
 @click.command("view")
@@ -97,7 +97,7 @@ def command(
 
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
-        sources: list[Source] = [_recorded(path, judge) for path in recordings]
+        sources: list[Source] = [recorded(path, judge) for path in recordings]
         if live or not recordings:
             sources.insert(0, _live(stack, domain, interface, topics))
         skeletons = _skeletons(urdfs)
@@ -131,7 +131,8 @@ def _live(
     return Live(f"domain {domain} on {node.interface}", listener)
 
 
-def _recorded(path: Path, judge: bool) -> Source:
+def recorded(path: Path, judge: bool) -> Source:
+    """A recording as a source of the page, with its phases and failures if it can be judged."""
     from dexkit.traces import open_trace
     from dexkit.view.sources import Recorded
     from dexkit.watch.recorded import feed

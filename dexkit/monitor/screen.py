@@ -196,7 +196,7 @@ def _joint(view: SubjectView, i: int, signs: Signs, width: int) -> Text:
     joint = view.joints[i]
     bad, near = bool(view.fault[i]), int(view.near[i])
     style = "dim" if view.stale else _STYLES["bad" if bad else "warn" if near else "info"]
-    kinds = {"line": "dim", "ghost": "blue", "measured": style or "green"}
+    kinds = {"line": "dim", "ghost": "cyan", "measured": style or "green"}
     names = [_short(j.name) for j in view.joints]
     most = max(4, width - _Q - _TAU - 2 - _LEAST_BAR)
     cells_of_name = min(max(map(cell_len, names)), most)

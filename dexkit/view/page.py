@@ -383,9 +383,10 @@ class Page:
                 self._server,
                 f"/figures/{self._arranged}_{i}",
                 view,
-                _title(view, each.source.title if many else ""),
+                f"{view.subject} · {each.source.title}" if many else subject_name(view),
                 spots[i],
                 self._skeletons.get((view.model.name, str(view.subject))),
+                i % 2 if len(everything) > 2 else 0,
             )
         self._arranged += 1
         self._look_at(len(everything) - sum(robots.values()), any(robots.values()))

@@ -38,6 +38,7 @@ class Figure:
     :param name: of its nodes, unique.
     :param place: where its base is, m.
     :param skeleton: None for that of its model.
+    :param row: of the title below it; neighbours have different ones where they are narrow.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Figure:
         title: str,
         place: tuple[float, float, float],
         skeleton: Skeleton | None = None,
+        row: int = 0,
     ) -> None:
         self._robot = isinstance(view.model, RobotModel)
         side = view.subject if isinstance(view.subject, Side) else None
@@ -103,7 +105,7 @@ class Figure:
         )
         elements = len(self.skeleton.elements)
         self._elements = self._balls(f"{name}/elements", elements, 0.0045) if elements else None
-        bottom = -0.85 if self._robot else -0.055
+        bottom = -0.85 if self._robot else -0.05 - 0.026 * row
         turn = mount * np.array([1.0, -1.0, -1.0, -1.0])  # labels are placed upright
         self._upright = scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
         self._label = scene.add_label(

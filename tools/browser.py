@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import base64
+import functools
 import itertools
 import json
+import shutil
 import subprocess
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from tests.optional import chromium
+__all__ = ["Browser", "chromium"]
 
 PATIENCE = 60.0
 """Seconds that a loaded machine is given for anything."""
+
+
+@functools.cache
+def chromium() -> str | None:
+    """The browser of this machine, or None."""
+    names = ("chromium", "chromium-browser", "chrome", "google-chrome")
+    return next(filter(None, map(shutil.which, names)), None)
 
 
 class Browser:
