@@ -47,7 +47,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak platforms aarch64 wheels campaign campaign-sample lint format docs pictures bench lock clean
+.PHONY: help setup demo test soak platforms aarch64 wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -91,6 +91,9 @@ format: $(STAMP) ## put the code in ruff's format
 
 docs: $(STAMP) ## write the generated pages, drawings and message modules (ARGS=--check compares)
 	$(RUN) python -m tools.generate $(ARGS)
+
+docs-site: $(STAMP) ## the documentation as a site in build/site, with search, requirements and API; checks every link
+	$(RUN) --group site mkdocs build --quiet -f tools/site/mkdocs.yml $(ARGS)
 
 pictures: $(STAMP) ## make the pictures of docs/images that a browser draws (ARGS=view-hands makes one)
 	$(RUN) python -m tools.pictures $(ARGS)

@@ -71,7 +71,7 @@ def _package(name: str) -> Callable[[], object]:
 
 
 OPTIONAL = (
-    Optional("Chromium", chromium, ("conformance_report_browser", "view_browser")),
+    Optional("Chromium", chromium, ("conformance_report_browser", "view_browser", "view_soak")),
     Optional("user and network namespaces", namespaces, ("dds_multicast", "lan", "networks")),
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
@@ -89,7 +89,7 @@ OPTIONAL = (
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
     Optional("pyte", _package("pyte"), ("monitor_terminal",)),
-    Optional("viser", _package("viser"), ("view", "view_browser")),
+    Optional("viser", _package("viser"), ("view", "view_browser", "view_soak")),
     Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),
     Optional("ray", _package("ray"), ("audit_ray",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),

@@ -22,6 +22,8 @@ pytest.importorskip("viser")
 if chromium() is None:
     pytest.skip("no chromium here", allow_module_level=True)
 
+pytestmark = pytest.mark.soak  # a page needs seven seconds of a processor
+
 TEXT = "document.body.innerText"
 
 
@@ -96,7 +98,6 @@ def test_a_click_on_a_failed_requirement_shows_its_fault(seen: Seen) -> None:
     assert browser.errors == []
 
 
-@pytest.mark.soak
 def test_a_recording_scrubs_and_its_hands_move(seen: Seen) -> None:
     browser, _ = seen
     browser.click("Hands")
@@ -115,7 +116,6 @@ def test_a_recording_scrubs_and_its_hands_move(seen: Seen) -> None:
     assert moved.mean() > 0.002  # of the scene
 
 
-@pytest.mark.soak
 def test_numbers_are_charted(seen: Seen) -> None:
     browser, _ = seen
     browser.click("Charts")

@@ -91,6 +91,16 @@ def test_history_keeps_the_newest_rows(sizes: list[int], most: int | None) -> No
         assert kept == len(wanted)
 
 
+def test_history_of_a_slow_topic_is_no_longer_than_it_has_to_be() -> None:
+    history = History(1, most=20_000, seconds=100.0)
+    for second in range(10_000):
+        t = second + np.arange(20) / 20
+        history.append(t, t[:, None])
+    assert 2000 <= len(history) <= 4096
+    assert history.rows[-2000:, 0].tolist() == history.t[-2000:].tolist()
+    assert len(history._t) == 4096
+
+
 def test_times_never_fall() -> None:
     history = History(1)
     history.append(np.array([1.0, 3.0]), np.zeros((2, 1)))

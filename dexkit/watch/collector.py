@@ -53,6 +53,7 @@ STALE = 0.5
 """Seconds after which a state is old."""
 
 _RATE_WINDOW = 1.0
+_KEPT = 120.0  # seconds of a live topic
 _DRIFT = 1e-4  # seconds a second by which two clocks may run apart
 _MOST_TOPICS = 256
 _MOST_WRITERS = 16  # whose cycles are counted, of a topic
@@ -185,10 +186,11 @@ class _Topic:
         self.parts = parts_of(name, type_name)
         self.expected = self.parts[0].expected if self.parts else 0.0
         self.fields = [f for part in self.parts for f in part.fields]
-        self.history = History(len(self.fields), most)
+        seconds = None if most is None else _KEPT
+        self.history = History(len(self.fields), most, seconds)
         self.cycles: dict[int, Cycles] = {}
         self.offsets: dict[int, tuple[float, float]] = {}
-        self.bad = History(0, most)
+        self.bad = History(0, most, seconds)
         self._factors = np.array([f.factor for f in self.fields])
         self._reader = (
             RowReader(message_type(type_name).layout, [f.path for f in self.fields])
@@ -196,7 +198,7 @@ class _Topic:
             else None
         )
         # the writer of each of the last samples, by time
-        self._writers = History(1, most)
+        self._writers = History(1, most, seconds)
         self._numbers: dict[int, int] = {}
 
     def take(
@@ -278,7 +280,8 @@ class _Topic:
 class Collector:
     """What was seen of a domain, or in a recording.
 
-    :param most: samples of each topic whose values are kept; None keeps all, for a recording.
+    :param most: samples of each topic whose values are kept, as far as they are not older than two
+        minutes; None keeps all, for a recording.
 
     :ivar origin_ns: time of second 0, ns since the epoch; 0 before the first sample.
     :ivar ignored: samples of topics beyond the first 256.

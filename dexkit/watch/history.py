@@ -16,12 +16,14 @@ class History:
 
     :param most: rows that are kept at least; older ones go, at the latest when there are twice as
         many. None keeps all.
+    :param seconds: rows that are older than this, seen from the newest one, need not be kept.
 
     :ivar added: rows that were ever appended.
     """
 
-    def __init__(self, width: int, most: int | None = None) -> None:
+    def __init__(self, width: int, most: int | None = None, seconds: float | None = None) -> None:
         self._most = most
+        self._seconds = seconds
         self._t: Floats = np.empty(_FIRST)
         self._rows: Floats = np.empty((_FIRST, width))
         self._count = 0
@@ -63,8 +65,10 @@ class History:
 
     def _make_room(self, count: int) -> None:
         kept = self._count if self._most is None else min(self._count, self._most)
+        if self._seconds is not None and self._count:
+            kept = min(kept, self._count - self.until(float(self.t[-1]) - self._seconds))
         size = len(self._t)
-        while kept + count > size:
+        while kept + max(count, kept // 2) > size:  # so that rows are not moved all the time
             size *= 2
         first = self._count - kept
         if size == len(self._t):  # move down in place

@@ -77,7 +77,7 @@ def _commands() -> str:
         [
             first.offsets[f.name],
             second.offsets[f.name],
-            f"{f.type}[{N_BUSES}][N]" if f.name == "cmd" else _type(f.type, f.count),
+            f"`{f.type}[{N_BUSES}][N]`" if f.name == "cmd" else _type(f.type, f.count),
             f"`{f.name}`",
             f"{N_BUSES} bus buffers" if f.name == "cmd" else f.meaning,
         ]

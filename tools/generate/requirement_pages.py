@@ -5,6 +5,7 @@ Of a requirement that is like another one, only the differences are written.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,7 +14,7 @@ from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Kind, Requirement, catalogue, renamed
 from tools.generate import DOCS
 
-__all__ = ["PAGES", "catalogue_page", "files"]
+__all__ = ["PAGES", "catalogue_entry", "catalogue_page", "files"]
 
 _BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
 _END = "<!-- end of catalogue -->"
@@ -49,6 +50,15 @@ def catalogue_page(layer: str) -> str:
         killers = [m.name for m in wrong_hands if m.kills == requirement.id]
         lines += _entry(requirement, _judged_from(requirement), killers)
     return "\n".join(lines)
+
+
+_wrong_hands = functools.cache(mutants)
+
+
+def catalogue_entry(requirement: Requirement, layer: str) -> str:
+    """Markdown of one requirement; its citations are seen from docs/."""
+    killers = [m.name for m in _wrong_hands(layer) if m.kills == requirement.id]
+    return "\n".join(_entry(requirement, _judged_from(requirement), killers))
 
 
 def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[str]:

@@ -1,0 +1,58 @@
+"""The pages that the documentation site adds, and its links that leave docs/."""
+
+from __future__ import annotations
+
+import importlib.util
+import posixpath
+import re
+from pathlib import Path
+
+import pytest
+
+from dexkit.conformance.requirements import catalogue
+from tools.site import hooks
+
+ROOT = Path(__file__).parent.parent
+NAV = re.compile(r"^ +- (?:[\w ]+: )?([\w/-]+\.md)$", re.MULTILINE)
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
+
+
+def test_every_document_is_in_the_navigation() -> None:
+    text = (ROOT / "tools/site/mkdocs.yml").read_text()
+    listed = {name for name in NAV.findall(text) if "/index" not in name} - {"index.md"}
+    docs = {str(p.relative_to(ROOT / "docs")) for p in (ROOT / "docs").rglob("*.md")}
+    assert docs - listed == set()
+    assert {name for name in listed - docs if not name.startswith(("api", "requirements"))} == set()
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    return hooks.pages()
+
+
+def test_each_requirement_has_a_page_whose_links_exist(pages: dict[str, str]) -> None:
+    every = {r.id for layer in ("dds", "robot", "usb", "client") for r in catalogue(layer=layer)}
+    assert every == {Path(p).stem for p in pages if p.startswith("requirements/")} - {"index"}
+    documents = {p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    for path, text in pages.items():
+        for target in LINK.findall(text):
+            if "://" in target or not path.startswith("requirements"):
+                continue
+            name = posixpath.normpath(posixpath.join(posixpath.dirname(path), target))
+            assert name in pages or name in documents, f"{path}: {target}"
+
+
+def test_api_pages_name_modules_that_exist(pages: dict[str, str]) -> None:
+    names = [Path(p).stem for p in pages if p.startswith("api/") and not p.endswith("index.md")]
+    assert len(names) > 5
+    for name in names:
+        assert importlib.util.find_spec(name) is not None
+
+
+def test_links_that_leave_docs_become_text() -> None:
+    text = "[a test](../tests/test_x.py), [`x.py`](../dexkit/x.py#l1), [b](c.md), ![d](../e.png)"
+    assert hooks.local_links(text, "page.md") == (
+        "a test (`tests/test_x.py`), `x.py` (`dexkit/x.py`), [b](c.md), ![d](../e.png)"
+    )
+    assert hooks.local_links("[a](../traces.md)", "sources/x.md") == "[a](../traces.md)"
+    assert hooks.local_links("```\n[a](../x)\n```\n", "page.md") == "```\n[a](../x)\n```\n"

@@ -1,0 +1,119 @@
+"""Hooks of mkdocs: pages that are made of other files, and links that leave docs/."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from dexkit.conformance.requirements import Requirement, catalogue
+from tools.generate.requirement_pages import PAGES, catalogue_entry
+
+__all__ = ["on_files", "on_page_markdown"]
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+API = {
+    "dexkit.hand": "Hands: joints, states, commands",
+    "dexkit.backends": "Backends",
+    "dexkit.models": "Models of hands",
+    "dexkit.robots": "Robots",
+    "dexkit.messages": "Messages",
+    "dexkit.service": "Service",
+    "dexkit.teleop": "Teleoperation client",
+    "dexkit.traces": "Recordings",
+    "dexkit.watch": "What is on the wire",
+    "dexkit.kinematics": "Kinematics",
+    "dexkit.errors": "Errors",
+}
+_LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
+_CODE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages that are made."""
+    from mkdocs.structure.files import File
+
+    for path, text in pages().items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **more: object) -> str:
+    """Make text of links that leave docs/."""
+    return local_links(markdown, page.file.src_uri)
+
+
+def local_links(markdown: str, path: str) -> str:
+    """Replace links to files outside docs/ by their text and path; code is left alone.
+
+    :param path: of the page in docs/.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        picture, text, target = match.groups()
+        if picture or "://" in target or target.startswith(("#", "mailto:")):
+            return match[0]
+        place = posixpath.normpath(posixpath.join(posixpath.dirname(path), target))
+        if not place.startswith(".."):
+            return match[0]
+        name = place.lstrip("./").partition("#")[0]
+        return text if name in text else f"{text} (`{name}`)"
+
+    parts = _CODE.split(markdown)
+    parts[::2] = [_LINK.sub(replace, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def pages() -> dict[str, str]:
+    """Markdown of every page that is made, by its path."""
+    made = {"index.md": home(), "requirements/index.md": "", "api/index.md": ""}
+    index = ["# Requirements", "", "Each has a page of its own, whose address stays.", ""]
+    area = ""
+    for layer in PAGES:
+        for requirement in catalogue(layer=layer):
+            heading = f"{requirement.model}: {requirement.area}"
+            if heading != area:
+                area = heading
+                index += ["", f"## {heading}", ""]
+            name = requirement.id
+            index.append(f"- [{name}]({name}.md) ({requirement.level}) {requirement.title}")
+            made[f"requirements/{name}.md"] = requirement_page(requirement, layer)
+    made["requirements/index.md"] = "\n".join(index) + "\n"
+    listed = "\n".join(f"- [`{name}`]({name}.md): {title}" for name, title in API.items())
+    made["api/index.md"] = f"# API\n\nMade from the docstrings.\n\n{listed}\n"
+    for name, title in API.items():
+        made[f"api/{name}.md"] = f"# {title}\n\n::: {name}\n"
+    return made
+
+
+def home() -> str:
+    """The first page: README.md, its links seen from docs/."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+
+    def replace(match: re.Match[str]) -> str:
+        picture, shown, target = match.groups()
+        inside = target.removeprefix("docs/")
+        return f"{picture}[{shown}]({inside if inside != target else _outside(target)})"
+
+    parts = _CODE.split(text)
+    parts[::2] = [_LINK.sub(replace, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def _outside(target: str) -> str:
+    return target if "://" in target or target.startswith("#") else f"../{target}"
+
+
+def requirement_page(requirement: Requirement, layer: str) -> str:
+    """The page of one requirement."""
+    entry = catalogue_entry(requirement, layer)
+    # sources are cited as seen from docs/
+    entry = re.sub(r"\]\((sources/)", r"](../\1", entry)
+    like = requirement.like
+    if like:
+        entry = entry.replace(f"Like {like}.", f"Like [{like}]({like}.md).")
+    return (
+        f"# {requirement.id}: {requirement.title}\n\n{entry}\n\n"
+        f"All requirements of this layer: [{PAGES[layer]}](../{PAGES[layer]}).\n"
+    )
