@@ -29,6 +29,8 @@ def test_every_generator_contributes() -> None:
         "docs/dex3-protocol.md",
         "docs/doctor.md",
         "docs/images/model-dex3-1.svg",
+        "docs/layouts/foxglove-dex3-1.json",
+        "docs/layouts/plotjuggler-dex3-1.xml",
         "docs/models.md",
     }
 

@@ -49,6 +49,15 @@ def test_api_pages_name_modules_that_exist(pages: dict[str, str]) -> None:
         assert importlib.util.find_spec(name) is not None
 
 
+def test_references_of_docstrings_become_code() -> None:
+    html = (
+        "a :class:<code>~dexkit.hand.Hand</code>, :mod:<code>~.scene</code>, :func:<code>f</code>"
+    )
+    assert hooks.on_page_content(html) == (
+        "a <code>Hand</code>, <code>scene</code>, <code>f</code>"
+    )
+
+
 def test_links_that_leave_docs_become_text() -> None:
     text = "[a test](../tests/test_x.py), [`x.py`](../dexkit/x.py#l1), [b](c.md), ![d](../e.png)"
     assert hooks.local_links(text, "page.md") == (

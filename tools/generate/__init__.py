@@ -7,6 +7,7 @@
 :mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
 :mod:`~.doctor_page`           the table of docs/doctor.md, from the doctor's diagnoses
 :mod:`~.conformity_page`       docs/conformity.md, from conformity.toml
+:mod:`~.layouts`               docs/layouts, for Foxglove and PlotJuggler, from the model profiles
 =============================  ==================================================================
 
 Each has a function ``files()``: the content of its files by path.
@@ -30,6 +31,7 @@ def generated_files() -> dict[Path, str]:
         conformity_page,
         dex3_protocol_page,
         doctor_page,
+        layouts,
         message_modules,
         models_page,
         requirement_pages,
@@ -42,6 +44,7 @@ def generated_files() -> dict[Path, str]:
         **dex3_protocol_page.files(),
         **doctor_page.files(),
         **conformity_page.files(),
+        **layouts.files(),
     }
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from dexkit.conformance.requirements import Requirement, catalogue
 from tools.generate.requirement_pages import PAGES, catalogue_entry
 
-__all__ = ["on_files", "on_page_markdown"]
+__all__ = ["on_files", "on_page_content", "on_page_markdown"]
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 API = {
@@ -27,6 +27,7 @@ API = {
     "dexkit.errors": "Errors",
 }
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
+_ROLE = re.compile(r":(?:class|mod|func|meth|data|attr|exc):<code>~?(\.?[\w.]*\.)?~?([^<]*)</code>")
 _CODE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
 
 
@@ -42,6 +43,11 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, **more: object) -> str:
     """Make text of links that leave docs/."""
     return local_links(markdown, page.file.src_uri)
+
+
+def on_page_content(html: str, **more: object) -> str:
+    """Show references of docstrings (``:class:`` and others) as plain code."""
+    return _ROLE.sub(r"<code>\2</code>", html)
 
 
 def local_links(markdown: str, path: str) -> str:
