@@ -104,7 +104,8 @@ def _mosaic(names: list[str], direction: str) -> object:
 
 def _plotjuggler(found: Curves) -> str:
     root = ElementTree.Element("root")
-    window = ElementTree.SubElement(root, "tabbed_widget", name="Main Window", parent="main_window")
+    titles = {"name": "Main Window", "parent": "main_window"}
+    window = ElementTree.SubElement(root, "tabbed_widget", titles)
     for side, joints in found.items():
         tab = ElementTree.SubElement(window, "Tab", tab_name=str(side), containers="1")
         container = ElementTree.SubElement(tab, "Container")
