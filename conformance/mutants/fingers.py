@@ -60,7 +60,7 @@ class OldLowRate(Dex3Service):
         return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
-@wrong_hand("DEX3-TOPIC-05")
+@wrong_hand("DEX3-TOPIC-05", whole=True)
 class LowRateOnlyWhenDriven(Dex3Service):
     """Copies states to the low-rate topic only while a motor is driven."""
 
@@ -336,7 +336,7 @@ class SaturatesToNothing(FingerService):
         return np.where(felt > 5000.0, 30000.0, felt)
 
 
-@wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
+@wrong_hand("DEX3-SENS-08", also=("DEX3-SENS-09",), sides=BOTH, whole=True)
 class SlowFoam(Dex3Service):
     """Its pressures fall with a time constant of 2 s."""
 
@@ -832,7 +832,15 @@ class _Tires(FingerHand):
         super().move(dt, pull)
 
 
-@wrong_hand("DEX3-FORCE-06", also=("DEX3-FORCE-05",), sides=BOTH)
+@wrong_hand(
+    "DEX3-FORCE-06",
+    also=(
+        "DEX3-SENS-09",
+        "DEX3-FORCE-05",
+    ),
+    sides=BOTH,
+    whole=True,
+)
 class Tires(Dex3Service):
     """Limits the torque of one joint after a second and a half of a firm grip."""
 

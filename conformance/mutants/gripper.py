@@ -521,7 +521,7 @@ class _KeepsGains(ReferenceHand):
         return accepted
 
 
-@wrong_hand("DEX1-FORCE-15", also=("DEX1-GAIN-02",), sides=BOTH)
+@wrong_hand("DEX1-FORCE-15", also=("DEX1-GAIN-02",), sides=BOTH, whole=True)
 class KeepsGainsAtTheSamePlace(ReferenceService):
     """Takes gains of 0 for those before where q has not changed."""
 

@@ -65,7 +65,17 @@ __all__ = ["GripperScript"]
 LEAD = 0.18 / 5.4
 _PUSH = (0.25, 1.0)
 """Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
-_LATE = {"grip", "nudge", "squeeze", "soft-grip", "soft", "silence", "resume", "rejected"}
+_LATE = {
+    "grip",
+    "nudge",
+    "squeeze",
+    "release",
+    "soft-grip",
+    "soft",
+    "silence",
+    "resume",
+    "rejected",
+}
 """Phases that come one after the other, as each begins where the one before it ends."""
 _NEARLY = 0.15
 """Part of the stroke to which a free hand is closed before it is driven open."""
@@ -73,9 +83,9 @@ _BACK = 0.13
 """Part of the stroke by which a free hand is commanded back after a restart of its service."""
 _GRIP, _LONG_GRIP = 3.0, 30.0
 """Seconds of equal commands between two pushes; those of a thorough run."""
-_SQUEEZE = 1.5
+_SQUEEZE = 1.3
 """Seconds of a squeeze: contact takes 0.3 s on an idle machine, and twice that after a pause."""
-_SILENCE, _LONG_SILENCE = 4.2, 67.0
+_SILENCE, _LONG_SILENCE = 3.8, 67.0
 """Seconds without a command: longer than counters of 8 bits in steps of 10 ms last; in a thorough
 run, than those of 16 bits in milliseconds."""
 _CAMERA_HZ = 30.0
@@ -85,13 +95,13 @@ _NUDGE, _NUDGE_SECONDS = 0.6, 0.3
 _SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (16.0, 0.11))
 """kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 1.8 N m each. The last
 is beyond what a byte holds in steps of 1/16 and less."""
-_SOFT_SECONDS = 0.6
+_SOFT_SECONDS = 0.5
 _VENDORS_MODE = 1
 """Mode byte of the vendor's test programs; teleoperation sends 0
 (docs/sources/unitree-dex.md#b1)."""
 _ALONE_SECONDS = 0.15
 """Seconds in which the first command after a silence is the only one."""
-_BEYOND, _BEYOND_TAU, _BEYOND_AFTER = 0.05, 0.7, 0.5
+_BEYOND, _BEYOND_TAU, _BEYOND_AFTER = 0.05, 0.7, 0.3
 """A grip by a q below the closed end: by which part of the stroke, its torque, N m, and how much
 longer than a time-out it lasts, s: a command that is clamped is in force as any other."""
 _RELEASE = 0.3
@@ -142,7 +152,7 @@ class GripperScript(HandScript):
             yield from self._foreign()
         if "burst" in self.plan.phases:
             yield from self._flood()
-        if self.plan.phases & {"limp", "push"} and self._gains_used:
+        if self.plan.phases & {"limp", "push", "drive"} and self._gains_used:
             yield from self._undriven()
         if not self._gains_used:
             self._gainless = True
@@ -364,12 +374,12 @@ class GripperScript(HandScript):
             for places in ({s: self._low(s) for s in sides}, dict.fromkeys(sides, self._stroke)):
                 phase = self._begin("limp", sides, targets={s: {0: q} for s, q in places.items()})
                 limp = {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in places.items()}
-                yield from self._hold(0.3, limp)
+                yield from self._hold(0.24, limp)
                 self._end(phase)
         if "push" in self.plan.phases:
             yield from self._pushes(sides)
-        if "drive" in self.plan.phases:  # the others are driven before they are left alone
-            yield from self._drive([s for s in sides if s in self.plan.objects], 0.16, seconds=0.5)
+        if "drive" in self.plan.phases:
+            yield from self._drive(sides, 0.16, seconds=0.35)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _pushes(self, sides: Sequence[Side], names: Sequence[str] = ("pull", "push")) -> Steps:
@@ -499,7 +509,7 @@ class GripperScript(HandScript):
         yield from self._command()
         yield from self._through(phase, _ALONE_SECONDS, lambda: self._wait(0.01))
         yield from self._until_settled(
-            phase, tuple(goals), least=0.6, most=2.5, stand=self._standing
+            phase, tuple(goals), least=0.6 - _ALONE_SECONDS, most=2.5, stand=self._standing
         )
 
     def _silent_beside(self, side: Side, pressing: Sequence[Side], seconds: float) -> Steps:
@@ -507,7 +517,7 @@ class GripperScript(HandScript):
         phase = self._begin("silence", (side,))
         self._grip[side] = ()
         yield from self._soft_grips(pressing, {})
-        yield from self._hold(max(0.3, seconds - 5.3))
+        yield from self._hold(max(0.2, seconds - 4.9))
         grip, self._grip = self._grip, {side: ()}
         beside = self._beside_others((side,), ASIDE_SECONDS)
         yield from self._hold(0.8)
@@ -601,6 +611,6 @@ class GripperScript(HandScript):
             yield from self._command(motors)
         if last_hz:
             period, self._period_ns = self._period_ns, round(1e9 / last_hz)
-            yield from self._hold(max(0.1, 6 / last_hz), motors)
+            yield from self._hold(max(0.05, 5 / last_hz), motors)
             self._period_ns = period
         self._end(phase)
