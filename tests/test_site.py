@@ -8,8 +8,11 @@ import re
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from dexkit.cli import cli
 from dexkit.conformance.requirements import catalogue
+from tests.report_helpers import result_of_every_kind
 from tools.site import hooks
 
 ROOT = Path(__file__).parent.parent
@@ -50,12 +53,8 @@ def test_api_pages_name_modules_that_exist(pages: dict[str, str]) -> None:
 
 
 def test_references_of_docstrings_become_code() -> None:
-    html = (
-        "a :class:<code>~dexkit.hand.Hand</code>, :mod:<code>~.scene</code>, :func:<code>f</code>"
-    )
-    assert hooks.on_page_content(html) == (
-        "a <code>Hand</code>, <code>scene</code>, <code>f</code>"
-    )
+    html = "a :class:<code>~dexkit.hand.Hand</code>, :mod:<code>~.it</code>, :func:<code>f</code>"
+    assert hooks.on_page_content(html) == "a <code>Hand</code>, <code>it</code>, <code>f</code>"
 
 
 def test_links_that_leave_docs_become_text() -> None:
@@ -65,3 +64,19 @@ def test_links_that_leave_docs_become_text() -> None:
     )
     assert hooks.local_links("[a](../traces.md)", "sources/x.md") == "[a](../traces.md)"
     assert hooks.local_links("```\n[a](../x)\n```\n", "page.md") == "```\n[a](../x)\n```\n"
+
+
+def test_reports_link_to_the_pages_of_requirements(tmp_path: Path) -> None:
+    result = tmp_path / "result.json"
+    result_of_every_kind("a").write_json(result)
+    out = tmp_path / "report.html"
+    arguments = ["report", str(result), "--html", str(out), "--catalogue"]
+    done = CliRunner().invoke(cli, [*arguments, "https://example.org/requirements/"])
+    assert done.exit_code == 0, done.output
+    found = re.findall(r'href="https://example.org/requirements/([^"]+)"', out.read_text())
+    assert found
+    assert {Path(name).stem for name in found} <= {
+        r.id for layer in ("dds", "robot", "usb", "client") for r in catalogue(layer=layer)
+    }
+    refused = CliRunner().invoke(cli, [*arguments, "javascript:alert(1)"])
+    assert refused.exit_code == 2

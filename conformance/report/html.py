@@ -73,17 +73,23 @@ _REALITY = {
 
 
 def write_html(
-    result: RunResult, view: Recording | None, path: Path, *, recording: Path | None = None
+    result: RunResult,
+    view: Recording | None,
+    path: Path,
+    *,
+    recording: Path | None = None,
+    catalogue: str = "",
 ) -> None:
     """Write the page.
 
     :param view: the recording that was judged, or None: no plots then.
     :param recording: its file, which the page links to; None for the name that the result has.
+    :param catalogue: address of the requirements' pages, as :func:`render` takes it.
     """
     link = result.subject.get("recording", "")
     if recording is not None:
         link = Path(os.path.relpath(recording.absolute(), path.absolute().parent)).as_posix()
-    write_file(path, render(result, view, link=link))
+    write_file(path, render(result, view, link=link, catalogue=catalogue))
 
 
 def document(title: str, content: str) -> str:
@@ -100,10 +106,14 @@ def document(title: str, content: str) -> str:
     )
 
 
-def render(result: RunResult, view: Recording | None = None, *, link: str = "") -> str:
+def render(
+    result: RunResult, view: Recording | None = None, *, link: str = "", catalogue: str = ""
+) -> str:
     """Return the page as text.
 
     :param link: where the recording is, relative to the page; empty where it is not kept.
+    :param catalogue: address of the folder with a page for each requirement (``make docs-site``
+        makes them), which the page links to; empty for no links.
     """
     sections = [
         _verdict(result),
@@ -112,8 +122,8 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         _troubles(result, view, link),
         _operator(result),
         run_plots(result, view) if view is not None else "",
-        _requirements(result, link),
-        _client(result, link),
+        _requirements(result, link, catalogue),
+        _client(result, link, catalogue),
         _what(result),
         _glossary(result),
         _environment(result),
@@ -413,7 +423,7 @@ def _operator(result: RunResult) -> str:
 # ------------------------------------------------------------------------ every requirement
 
 
-def _requirements(result: RunResult, link: str) -> str:
+def _requirements(result: RunResult, link: str, catalogue: str) -> str:
     if not result.results:
         return ""
     choices = [
@@ -437,15 +447,17 @@ def _requirements(result: RunResult, link: str) -> str:
         if need.area != area:
             area = need.area
             parts.append(f'<h3 class="area-head" id="{_anchor(area)}">{escape(area)}</h3>')
-        parts.append(_requirement(need, group, link))
+        parts.append(_requirement(need, group, link, catalogue))
     return f'<section class="every">{"".join(parts)}</section>'
 
 
-def _client(result: RunResult, link: str) -> str:
+def _client(result: RunResult, link: str, catalogue: str) -> str:
     """The requirements about the client; empty where the kit was the client."""
     if not result.client:
         return ""
-    rows = "".join(_requirement(need, group, link) for need, group in grouped(result.client))
+    rows = "".join(
+        _requirement(need, group, link, catalogue) for need, group in grouped(result.client)
+    )
     sentence = result.client_sentence()
     return (
         '<h2 id="client">The client</h2><p class="dim">Judged by the commands in the recording. '
@@ -455,7 +467,7 @@ def _client(result: RunResult, link: str) -> str:
     )
 
 
-def _requirement(need: Requirement, group: list[Result], link: str) -> str:
+def _requirement(need: Requirement, group: list[Result], link: str, catalogue: str) -> str:
     verdict = worst(r.verdict for r in group)
     css = VERDICTS[verdict].css
     cells = "".join(_cell(r) for r in group)
@@ -467,6 +479,8 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
     )
     kind = f", {need.kind}" if need.kind is Kind.SAFETY else ""
     original = f"<p>The original: {escape(need.original)}</p>" if need.original else ""
+    page = f"{catalogue.rstrip('/')}/{quote(need.id)}.html" if catalogue else ""
+    more = f'<p><a href="{escape(page)}">{escape(need.id)} in the catalogue</a></p>' if page else ""
     return (
         f'<details class="req {css}" id="{escape(need.id)}"><summary>'
         f'<span class="id {css}">{escape(need.id)}</span>'
@@ -476,7 +490,7 @@ def _requirement(need: Requirement, group: list[Result], link: str) -> str:
         f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
         f"<p>{escape(need.rationale)}</p>{original}"
         f'<p class="dim">Source: {escape(Card.from_results(group).source)}</p>'
-        "</div></details>"
+        f"{more}</div></details>"
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import html_option, markdown_option
-from dexkit.cli.report import write_text
+from dexkit.cli.report import recording_beside, write_text
 from dexkit.digests import sha256_of_file
 from dexkit.documents import check_output_paths
 
@@ -68,9 +68,9 @@ def _curves(comparison: Comparison, results: tuple[Path, ...]) -> str:
 
     found, missing = [], []
     for run, name, path in zip(comparison.runs, comparison.names, results, strict=True):
-        file = path.with_name(Path(run.subject.get("recording", "")).name or "nothing")
+        file = recording_beside(path, run.subject.get("recording", ""))
         wanted = run.subject.get("recording_sha256")
-        if wanted and file.is_file() and sha256_of_file(file) == wanted:
+        if file is not None and wanted and sha256_of_file(file) == wanted:
             found.append(recorded(open_trace(file), name))
         else:
             missing.append(name)

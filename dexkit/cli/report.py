@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import click
 from dexkit.cli.options import html_option, junit_option, markdown_option, verbose_option
 from dexkit.documents import check_output_paths, write_file
 from dexkit.errors import UsageError
+from dexkit.escaping import one_line
 
 if TYPE_CHECKING:
     from dexkit.conformance.recording import Recording
@@ -26,6 +28,13 @@ def write_text(path: Path, text: str) -> None:
         write_file(path, text)
 
 
+def _address(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
+    """An address of the web, or a path; no other scheme."""
+    if not re.match(r"https?://|[\w./-]*$", text):
+        raise click.BadParameter(f"{one_line(text)} is no address that begins with http")
+    return text
+
+
 @click.command("report")
 @click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
 @click.option(
@@ -38,6 +47,14 @@ def write_text(path: Path, text: str) -> None:
 @html_option()
 @markdown_option()
 @junit_option()
+@click.option(
+    "--catalogue",
+    default="",
+    metavar="URL",
+    callback=_address,
+    help="Let the page link to the page of each requirement there, e.g. the folder requirements/ "
+    "of the site that 'make docs-site' builds.",
+)
 @verbose_option("Also print what could not be judged, and why.")
 def command(
     result: Path,
@@ -45,6 +62,7 @@ def command(
     html_path: Path | None,
     markdown_path: Path | None,
     junit_path: Path | None,
+    catalogue: str,
     verbose: bool,
 ) -> None:
     """Write the reports of a result file.
@@ -69,7 +87,8 @@ def command(
         view = None
         if file is not None:
             view = _matching_recording(file, found, given=recording is not None)
-        write_html(found, view, html_path, recording=file if view is not None else None)
+        shown = file if view is not None else None
+        write_html(found, view, html_path, recording=shown, catalogue=catalogue)
     if markdown_path:
         write_text(markdown_path, render_markdown(found))
     if junit_path:
