@@ -27,7 +27,8 @@ _WINDOW = 0.5  # seconds over which a rate is counted
 _LEAST = 3  # messages of a topic whose rate is drawn
 _STYLE = (
     "<style>.beside{display:grid;gap:0 18px;grid-template-columns:"
-    "repeat(auto-fit,minmax(min(290px,100%),1fr))}.beside figure{min-width:0}</style>"
+    "repeat(auto-fit,minmax(min(290px,100%),1fr))}.beside figure{min-width:0}"
+    ".key .other{border-color:var(--open);border-top-style:dashed}</style>"
 )
 
 
@@ -117,7 +118,7 @@ def over_each_other(
     :param order: (part, kind, joint, what is said of it) of each chart.
     """
     sections = [
-        f'<p class="key"><span><i class="state"></i>{escape(one.name)}</span>'
+        _STYLE + f'<p class="key"><span><i class="state"></i>{escape(one.name)}</span>'
         f'<span><i class="other"></i>{escape(other.name)}</span></p>'
     ]
     span = 0.0, max(one.seconds, other.seconds)
