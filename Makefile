@@ -93,7 +93,7 @@ docs: $(STAMP) ## write the generated pages, drawings and message modules (ARGS=
 	$(RUN) python -m tools.generate $(ARGS)
 
 docs-site: $(STAMP) ## the documentation as a site in build/site, with search, requirements and API; checks every link
-	$(RUN) --group site mkdocs build --quiet -f tools/site/mkdocs.yml $(ARGS)
+	$(RUN) --group site python -m mkdocs build --quiet -f tools/site/mkdocs.yml $(ARGS)
 
 pictures: $(STAMP) ## make the pictures of docs/images that a browser draws (ARGS=view-hands makes one)
 	$(RUN) python -m tools.pictures $(ARGS)
