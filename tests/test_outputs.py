@@ -24,6 +24,8 @@ _WRITERS: dict[tuple[str, ...], list[str]] = {
     ("badge",): ["<result>"],
     ("check",): [_SAMPLE, "--require", "DEX1-RATE-03"],
     ("compare",): ["<result>", "<result>"],
+    ("diff",): [_SAMPLE, _SAMPLE, "--offset", "0"],
+    ("info",): [_SAMPLE],
     ("replay",): [_SAMPLE, "--rehearse"],
     ("report",): ["<result>"],
     ("mutants",): [],
@@ -46,6 +48,7 @@ _ELSEWHERE = {
     ("export", "--out"),  # one, too: tests/test_sessions_export.py
     ("demo", "--out"),  # a folder, made before anything starts
     ("install-service", "--directory"),  # tests/test_install_service.py
+    ("monitor", "--log"),  # a key begins it: tests/test_monitor_terminal.py
     ("setup-dds", "--wheel"),  # tests/test_setup_dds.py
     ("setup-dds", "--log"),
     ("sign", "-o"),  # tests/test_signing.py, which has a key
