@@ -123,7 +123,7 @@ def _judge_one(
             return decided
     requirement = judgement.requirement
     return judgement.run_check(
-        lambda: layer.refine(context, check_of(requirement)(context)),
+        lambda: context.in_unit(layer.refine(context, check_of(requirement)(context))),
         lambda outcome: excuse(context.recording, requirement, outcome, whole),
         lambda outcome: _weighed(context.recording, outcome, whole),
     )

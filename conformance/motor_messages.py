@@ -149,7 +149,9 @@ class MotorCodec:
             return {self.command_topics[side]: motors for side, motors in hands.items()}
         places = [LIMP] * self.dialect.length
         for side, motors in hands.items():
-            places[self.dialect.index[side]] = motors[0]
+            first = self.dialect.index[side]
+            mine = motors[: self.joints]
+            places[first : first + len(mine)] = mine
         return {self.dialect.cmd_topic: places}
 
     def encode_empty(self, sides: Sequence[Side]) -> list[tuple[str, bytes]]:

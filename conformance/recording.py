@@ -1,8 +1,9 @@
 """Decode a recording of DDS topics into arrays of commands and states for each subject.
 
 Times are seconds from the beginning of the recording: ``t`` is reception, ``sent`` the source
-timestamp. Positions are in the dialect's radians, torques of states in N·m whatever the dialect's
-units; columns of joints have shape (n, n_joints).
+timestamp. Positions are in the dialect's radians (or the model's other unit), torques of states in
+N·m and speeds in that unit a second, whatever the dialect's units; columns of joints have shape
+(n, n_joints).
 """
 
 from __future__ import annotations
@@ -282,6 +283,11 @@ class Recording:
         """The model that the dialect belongs to."""
         return model(self.dialect.model)
 
+    @property
+    def unit(self) -> str:
+        """The unit of q, and of what is derived from it."""
+        return self.model.unit
+
     def seconds(self, time_ns: int) -> float:
         """A log time as seconds of this recording."""
         return (time_ns - self.origin_ns) / 1e9
@@ -396,8 +402,8 @@ def _states(
         sent=_sent(samples, origin),
         length=columns.count(codec.state_sequence),
         q=column("q"),
-        dq=column("dq"),
-        ddq=column("ddq"),
+        dq=column("dq") * (codec.dialect.speed_units or 1.0),
+        ddq=column("ddq") * (codec.dialect.speed_units or 1.0),
         tau=column("tau_est") * (codec.dialect.torque_units or 1.0),
         mode=column("mode"),
         errors={i: str(e) for i, e in columns.errors.items()},

@@ -4,8 +4,9 @@ A backend implements :class:`Hand`: a ``spec``, ``open``, ``close`` and ``exchan
 Rates, watchdogs, prediction, DDS and logging belong to :mod:`dexkit.service`.
 
 Joint space, SI units, throughout: q in rad, dq in rad/s, ddq in rad/s², tau in N·m, kp in
-N·m/rad, kd in N·m·s/rad, temperature in °C, voltage in V, current in A. Per-joint values are
-numpy arrays of shape ``(n_joints,)``.
+N·m/rad, kd in N·m·s/rad, temperature in °C, voltage in V, current in A. Hands whose vendor gives q
+in parts of the full travel have that unit instead of rad (:class:`~dexkit.models.HandModel`).
+Per-joint values are numpy arrays of shape ``(n_joints,)``.
 """
 
 from __future__ import annotations
@@ -113,6 +114,7 @@ class JointSpec:
     """One joint: its name and its limits, SI units.
 
     :param closing: sign of dq that closes the hand (+1 or -1), or 0 where neither does.
+    :param straight: q of an open hand; of a joint that closes.
     :param urdf: name of the joint in Unitree's URDF, or empty.
     :param gear_ratio: turns of the rotor for one of the joint.
     """
@@ -125,6 +127,7 @@ class JointSpec:
     closing: int = 0
     urdf: str = ""
     gear_ratio: float = 1.0
+    straight: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.q_min < self.q_max:
@@ -142,6 +145,11 @@ class JointSpec:
     def stroke(self) -> float:
         """Width of the joint's range, rad."""
         return self.q_max - self.q_min
+
+    def closed_by(self, part: float) -> float:
+        """Q of a joint that is so far closed, 0 open to 1 as far as it goes; see `closing`."""
+        end = self.q_max if self.closing > 0 else self.q_min
+        return self.straight + part * (end - self.straight)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ SI units, named in the keys; what a model does not have is ``None`` or an empty 
 
 A hand::
 
-    {"name", "title", "kind": "hand",
+    {"name", "title", "kind": "hand", "unit": "rad",
      "sides": {"left" | "right": {"vendor_id", "joints": [JOINT], "rest_q_rad": [...]}},
      "dialects": [{"name", "summary", "command_type", "state_type", "length", "q_open_rad",
                    "torque_units_nm": [...],
@@ -32,6 +32,11 @@ JOINT::
 ``closing`` is the sign of dq that closes the hand, 0 where neither does. ``index`` is the place
 in the message; a robot's ``joints`` and ``client_gains`` leave out the slots without a joint, its
 ``rest_q_rad`` does not. ``client_gains`` are those that xr_teleoperate sends, joint by joint.
+
+A hand whose ``unit`` of q is ``full travel`` has ``travel`` for ``rad`` in these keys, and no
+degrees or torques ("q_min_travel", "q_max_travel", "dq_max_travel_s", "rest_q_travel",
+"q_open_travel"). One of position servos has no ``client_gains``, but the "client_dq" that it is
+sent.
 """
 
 from __future__ import annotations
@@ -46,7 +51,16 @@ from dexkit.hand import JointSpec, Side
 from dexkit.models import MODELS, Dialect, HandModel
 from dexkit.robots import ROBOTS, RobotModel
 
-__all__ = ["describe", "gain_groups", "indices", "names", "short_type", "torque_units"]
+__all__ = [
+    "describe",
+    "gain_groups",
+    "indices",
+    "names",
+    "short_type",
+    "speed",
+    "torque_units",
+    "width",
+]
 
 _OWN = "dexkit "  # the origin of a built-in backend, before its version
 
@@ -74,15 +88,18 @@ def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
         "name": model.name,
         "title": model.title,
         "kind": "hand",
+        "unit": model.unit,
         "sides": {
             str(side): {
                 "vendor_id": model.vendor_ids.get(side),
-                "joints": [_joint(i, joint) for i, joint in enumerate(model.joints[side])],
-                "rest_q_rad": list(model.rest_q[side]),
+                "joints": [
+                    _joint(i, joint, model.unit) for i, joint in enumerate(model.joints[side])
+                ],
+                f"rest_q_{_short(model.unit)}": list(model.rest_q[side]),
             }
             for side in Side
         },
-        "dialects": [_dialect(d) for d in model.dialects],
+        "dialects": [_dialect(d, model.unit) for d in model.dialects],
         "rates_hz": {
             "state": model.state_rate,
             "state_at_least": model.min_state_rate,
@@ -90,7 +107,7 @@ def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
             "command": model.command_rate,
         },
         "command_timeout_s": model.command_timeout,
-        "client_gains": [_gains(*pair) for pair in model.gains],
+        **_client(model),
         "shared_motors": [list(group) for group in model.shared_motors],
         "pressure_sensors": [
             {"packet": i, "place": sensor.place, "slots": list(sensor.slots)}
@@ -133,17 +150,32 @@ def _robot(model: RobotModel) -> dict[str, Any]:
     }
 
 
-def _joint(index: int, joint: JointSpec) -> dict[str, Any]:
+def _client(model: HandModel) -> dict[str, Any]:
+    if model.dialects[0].position_servo:
+        return {"client_dq": model.client_dq}
+    return {"client_gains": [_gains(*pair) for pair in model.gains]}
+
+
+def _short(unit: str) -> str:
+    """A unit in a key: ``travel``."""
+    return unit.rpartition(" ")[2]
+
+
+def _joint(index: int, joint: JointSpec, unit: str = "rad") -> dict[str, Any]:
+    short = _short(unit)
+    degrees = {
+        "q_min_deg": round(math.degrees(joint.q_min), 2),
+        "q_max_deg": round(math.degrees(joint.q_max), 2),
+    }
     return {
         "index": index,
         "name": joint.name,
         "urdf": joint.urdf or None,
-        "q_min_rad": joint.q_min,
-        "q_max_rad": joint.q_max,
-        "q_min_deg": round(math.degrees(joint.q_min), 2),
-        "q_max_deg": round(math.degrees(joint.q_max), 2),
-        "dq_max_rad_s": joint.dq_max,
-        "tau_max_nm": joint.tau_max,
+        f"q_min_{short}": joint.q_min,
+        f"q_max_{short}": joint.q_max,
+        **(degrees if unit == "rad" else {}),
+        f"dq_max_{short}_s": joint.dq_max,
+        **({"tau_max_nm": joint.tau_max} if unit == "rad" else {}),
         "closing": joint.closing,
         "gear_ratio": joint.gear_ratio,
     }
@@ -153,14 +185,14 @@ def _gains(kp: float, kd: float) -> dict[str, float]:
     return {"kp_nm_per_rad": kp, "kd_nms_per_rad": kd}
 
 
-def _dialect(dialect: Dialect) -> dict[str, Any]:
+def _dialect(dialect: Dialect, unit: str) -> dict[str, Any]:
     return {
         "name": dialect.name,
         "summary": dialect.summary,
         "command_type": dialect.cmd_type,
         "state_type": dialect.state_type,
         "length": dialect.length,
-        "q_open_rad": dialect.q_open if math.isfinite(dialect.q_open) else None,
+        f"q_open_{_short(unit)}": dialect.q_open if math.isfinite(dialect.q_open) else None,
         "torque_units_nm": list(dialect.torque_units),
         "sides": {
             str(side): {
@@ -196,6 +228,18 @@ def indices(values: Sequence[int]) -> str:
         else:
             runs.append([value])
     return ", ".join(f"{r[0]} to {r[-1]}" if len(r) > 2 else ", ".join(map(str, r)) for r in runs)
+
+
+def width(joint: dict[str, Any]) -> tuple[float, float]:
+    """Least and greatest q of a described joint, in its unit."""
+    names = [name for name in joint if name.startswith(("q_min_", "q_max_"))]
+    return joint[names[0]], joint[names[1]]
+
+
+def speed(joint: dict[str, Any]) -> float:
+    """The highest speed of a described joint, in its unit a second."""
+    found: float = next(v for name, v in joint.items() if name.startswith("dq_max_"))
+    return found
 
 
 def gain_groups(data: dict[str, Any]) -> list[tuple[str, float, float]]:

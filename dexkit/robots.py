@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, RobotSubject
@@ -92,6 +92,8 @@ class RobotModel:
     # (docs/sources/unitree-dex.md#b4)
     command_timeout: float = 1.0
     script: Lazy[type[Script[RobotSubject]]] = _SCRIPT
+    unit: ClassVar[str] = "rad"
+    torque_unit: ClassVar[str] = "N m"
 
     @property
     def slots(self) -> int:

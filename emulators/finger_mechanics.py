@@ -136,7 +136,7 @@ class _Motor:
         self.object_wall: Wall | None = None
         if object_at is not None and spec.closing:
             self.object_wall = Wall(
-                _closing_angle(spec, object_at), -spec.closing, _OBJECT_STIFFNESS, _OBJECT_DAMPING
+                spec.closed_by(object_at / 100), -spec.closing, _OBJECT_STIFFNESS, _OBJECT_DAMPING
             )
             walls.append(self.object_wall)
         self.joint = Joint(
@@ -189,11 +189,6 @@ class _Motor:
         to_air = (self.case - AMBIENT) / _CASE_TO_AIR
         self.winding += dt * (self.model.copper_loss * part * part - to_case) / _WINDING_CAPACITY
         self.case += dt * (to_case - to_air) / _CASE_CAPACITY
-
-
-def _closing_angle(spec: JointSpec, percent: float) -> float:
-    """The angle of a joint that is ``percent`` of the way from straight (0) to closed."""
-    return percent / 100.0 * (spec.q_max if spec.closing > 0 else spec.q_min)
 
 
 class FingerMechanics:
@@ -467,8 +462,8 @@ def _start_angle(
 ) -> float:
     if not spec.closing:
         return rest
-    q = rest if start is None else _closing_angle(spec, start)
+    q = rest if start is None else spec.closed_by(start / 100)
     if object_at is not None:
-        touch = _closing_angle(spec, object_at)
+        touch = spec.closed_by(object_at / 100)
         q = min(q, touch) if spec.closing > 0 else max(q, touch)
     return q

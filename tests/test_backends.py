@@ -64,6 +64,7 @@ class TestByName:
             "ezgripper",
             "sim-dex1",
             "sim-dex3",
+            "sim-brainco",
             "sim-dex5",
             "dex3-usb",
         } <= names.keys()

@@ -175,6 +175,22 @@ def _frozen() -> DomainView:
     return dataclasses.replace(GOOD, streams=states + flows)
 
 
+def _moving(*courses: tuple[float, float]) -> DomainView:
+    """BrainCo hands: q of the left and the right one, then of their commands, first and last."""
+    view = _pair(model="brainco")
+    ends = [
+        e
+        for kind in ("state", "cmd")
+        for e in view.endpoints
+        if e.kind == "writer" and e.topic.endswith(kind)
+    ]
+    flows = [
+        _flow(e, began=(began,) * 6, q=(now,) * 6)
+        for e, (began, now) in zip(ends, courses, strict=True)
+    ]
+    return dataclasses.replace(view, streams=tuple(flows))
+
+
 def _limp_client() -> DomainView:
     commands = [e for e in GOOD.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
     flows = tuple(_flow(e, q_span=1.0, limp_span=1.0) for e in commands)
@@ -235,6 +251,8 @@ CASES: dict[str, Observations] = {
         _pair(model="dex3", hand=_who("hand", started=9.0), client=_who("client", started=5.0))
     ),
     "DDS-FROZEN": _seen(_frozen()),
+    "DDS-REVERSED": _seen(_moving((0.9, 0.1), (0.5, 0.5), (0.1, 0.9), (0.5, 0.5))),
+    "DDS-SIDES-SWAPPED": _seen(_moving((0.5, 0.1), (0.5, 0.9), (0.5, 0.9), (0.5, 0.1))),
     "DDS-NO-GAINS": _seen(_limp_client()),
     "DDS-RATE": _seen(_pair(rate=50.0)),
     "DDS-NO-CLIENT": _seen(_without(GOOD, "client")),

@@ -45,7 +45,7 @@ sim-twofinger = twofinger_hand.simulated:sim_twofinger
 
 NAMES = {m.name for m in BUILT_IN} | {m.short_name for m in BUILT_IN} | set(ROBOTS)
 NAMES |= {d.name for m in BUILT_IN for d in m.dialects} | {"unitree_go", "unitree_hg"}
-CONSTANTS = {"DEX1_1", "DEX3_1", "DEX5_1", "H1", "G1"}
+CONSTANTS = {"DEX1_1", "DEX3_1", "DEX5_1", "BRAINCO_REVO2", "H1", "G1"}
 NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
 HOMES = ("dexkit/models/", "dexkit/robots.py")
 # wrong hands are declared for the models on which they are tried
@@ -207,7 +207,7 @@ def test_the_entry_points_are_those_of_the_example() -> None:
 
 def test_a_model_of_another_package_is_listed(example: Packages) -> None:
     assert (NAME in MODELS, DIALECT in DIALECTS) == (True, True)
-    assert list(MODELS)[:3] == [m.name for m in BUILT_IN]
+    assert list(MODELS)[: len(BUILT_IN)] == [m.name for m in BUILT_IN]
     (plugin,) = model_plugins()
     assert (plugin.name, plugin.origin, plugin.error) == (NAME, "twofinger-hand 0.1.0", None)
     assert "Two-finger hand" in run("models")

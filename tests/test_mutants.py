@@ -31,6 +31,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         ("dex3", BOTH),
         ("dex5", LEFT),  # both hands of many joints take long
         pytest.param("dex5", BOTH, marks=pytest.mark.soak),
+        pytest.param("brainco", BOTH, marks=pytest.mark.soak),
     ],
 )
 def test_reference_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
@@ -86,7 +87,14 @@ def test_every_wrong_hand_has_a_summary() -> None:
 
 @each(
     ("layer_name", "model"),
-    [("dds", "dex1-1"), ("dds", "dex3-1"), ("dds", "dex5-1"), ("robot", "h1"), ("robot", "g1")],
+    [
+        ("dds", "dex1-1"),
+        ("dds", "dex3-1"),
+        ("dds", "dex5-1"),
+        ("dds", "brainco-revo2"),
+        ("robot", "h1"),
+        ("robot", "g1"),
+    ],
 )
 def test_a_third_of_the_requirements_are_negative(layer_name: str, model: str) -> None:
     every = catalogue(model, layer_name)

@@ -5,8 +5,8 @@ missing evidence, and takes every limit from its requirement's tolerances, so th
 models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.motion`,
 :mod:`~.force`, :mod:`~.drive`, :mod:`~.safety`, :mod:`~.uncommanded`, :mod:`~.lifecycle`,
-:mod:`~.tracking`, :mod:`~.fingers` and :mod:`~.each_joint` for hands of several joints, and
-:mod:`~.client` for the client that drives them.
+:mod:`~.tracking`, :mod:`~.fingers` and :mod:`~.each_joint` for hands of several joints,
+:mod:`~.servos` for those of position servos, and :mod:`~.client` for the client that drives them.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ __all__ = [
 _HAND = (
     *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "drive"),
     *("safety", "lifecycle", "tracking", "fingers", "each_joint", "operator", "uncommanded"),
+    "servos",
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),
@@ -233,6 +234,10 @@ class BaseContext(Generic[RecordingT, ViewT]):
         """It cannot be judged with this recording."""
         return Outcome(None, reason=reason)
 
+    def in_unit(self, outcome: Outcome) -> Outcome:
+        """An outcome of a check with the subject's unit of q where the check says rad."""
+        return outcome
+
     def absent(self, reason: str) -> Outcome:
         """Not judged: the hand lacks this unit; a failure only where the vendor claims it."""
         return Outcome(None, reason=reason, absent=True)
@@ -270,6 +275,24 @@ class Context(BaseContext[Recording, SideView]):
     def joints(self) -> tuple[JointSpec, ...]:
         """The hand's joints, in the dialect's radians."""
         return self.hand.joints
+
+    @property
+    def unit(self) -> str:
+        """The unit of q, and of what is derived from it."""
+        return self.recording.unit
+
+    def in_unit(self, outcome: Outcome) -> Outcome:
+        """An outcome of a check with the subject's unit of q where the check says rad."""
+        if self.unit == "rad":
+            return outcome
+        short = self.unit.rpartition(" ")[2]
+        return replace(
+            outcome,
+            measures=tuple(
+                replace(m, unit=self.unit) if m.unit == "rad" else m for m in outcome.measures
+            ),
+            values={name.replace("rad", short): v for name, v in outcome.values.items()},
+        )
 
     def once(self, name: object, work_out: Callable[[], T]) -> T:
         """What another check of this hand has worked out under that name, else do it now.

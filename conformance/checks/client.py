@@ -142,7 +142,7 @@ def in_range(ctx: Context) -> Outcome:
     far, spec = float(finite_q[row, joint]), ctx.joints[joint]
     text = ctx.named(
         f"q of {len(rows)} of {len(q)} commands is out of range, up to {far:.4g}; the range is "
-        f"{spec.q_min:.2f} to {spec.q_max:.2f} rad",
+        f"{spec.q_min:.2f} to {spec.q_max:.2f} {ctx.unit}",
         joint,
     )
     outcome = ctx.failed(f"{far:.4g}", text, *_places(ctx, rows)).about(joint)
@@ -173,14 +173,17 @@ def not_normalised(ctx: Context) -> Outcome:
         return ctx.skipped("no command drives the hand")
     low, top, near = float(q.min()), float(q.max()), ctx.tolerance("near_rad")
     rests, above = float((np.abs(q - 1.0) <= near).mean()), float((q > 1.0 + near).mean())
-    text = f"q is {low:.2f} to {top:.2f} rad; {rests:.0%} of commands at 1, {above:.0%} above it"
+    text = (
+        f"q is {low:.2f} to {top:.2f} {ctx.unit}; {rests:.0%} of commands at 1, "
+        f"{above:.0%} above it"
+    )
     usual = (
         low > near
         or rests < ctx.tolerance("min_rest_part")
         or above > ctx.tolerance("max_above_part")
     )
     if usual:
-        return ctx.passed(f"to {top:.2f} rad", text)
+        return ctx.passed(f"to {top:.2f} {ctx.unit}", text)
     return ctx.failed("0 to 1", text, ctx.at(ctx.commands.topic, float(ctx.commands.t[0])))
 
 
@@ -382,17 +385,18 @@ def lead(ctx: Context) -> Outcome:
     if worst < 0:
         return ctx.skipped("no state before a command that drives the hand")
     stroke = ctx.joints[which].stroke
-    text = ctx.named(f"at most {worst * stroke:.2f} rad from the last states", which)
+    text = ctx.named(f"at most {worst * stroke:.2f} {ctx.unit} from the last states", which)
     if worst <= limit:
-        return ctx.passed(f"{worst * stroke:.2f} rad", text, lead_rad=worst * stroke)
+        return ctx.passed(f"{worst * stroke:.2f} {ctx.unit}", text, lead_rad=worst * stroke)
     rows = np.flatnonzero(np.nan_to_num(far) > limit * stroke)
     text = ctx.named(
-        f"{len(rows)} of {len(far)} commands are further than {limit * stroke:.2f} rad from the "
-        f"last states, up to {worst * stroke:.2f} rad",
+        f"{len(rows)} of {len(far)} commands are further than {limit * stroke:.2f} {ctx.unit} "
+        "from the "
+        f"last states, up to {worst * stroke:.2f} {ctx.unit}",
         which,
     )
     outcome = ctx.failed(
-        f"{worst * stroke:.2f} rad", text, *_places(ctx, rows), lead_rad=worst * stroke
+        f"{worst * stroke:.2f} {ctx.unit}", text, *_places(ctx, rows), lead_rad=worst * stroke
     )
     return outcome.about(which)
 

@@ -150,16 +150,17 @@ def jumps(ctx: Context) -> Outcome:
         return ctx.skipped("too few states with a position")
     _, change_rad, limit, joint, at, speed = worst
     text = ctx.named(
-        f"q changes by at most {change_rad:.3f} rad from one state to the next; at the hand's "
-        f"fastest, {speed:.1f} rad/s, it may change by {limit:.2f} rad",
+        f"q changes by at most {change_rad:.3f} {ctx.unit} from one state to the next; at the "
+        "hand's "
+        f"fastest, {speed:.1f} {ctx.unit}/s, it may change by {limit:.2f} {ctx.unit}",
         joint,
     )
     if change_rad <= limit:
-        return ctx.passed(f"{change_rad:.3f} rad", text, change_rad=change_rad).placed(
+        return ctx.passed(f"{change_rad:.3f} {ctx.unit}", text, change_rad=change_rad).placed(
             change_rad, limit
         )
     outcome = ctx.failed(
-        f"{change_rad:.2f} rad",
+        f"{change_rad:.2f} {ctx.unit}",
         text,
         ctx.at(states.topic, at - 0.05, at + 0.05),
         change_rad=change_rad,
@@ -215,7 +216,7 @@ def alternates(ctx: Context) -> Outcome:
     window = count * cell
     text = ctx.named(
         f"in the worst {window:.2g} s q goes forth and back within {cell:g} s {turns} times, by up "
-        f"to {back_rad:.3f} rad",
+        f"to {back_rad:.3f} {ctx.unit}",
         joint,
     )
     if turns <= ctx.tolerance("max_turns"):
@@ -320,15 +321,16 @@ def keeps_up(ctx: Context) -> Outcome:
     _, excess, joint, begin, end, speed = worst
     limit = ctx.tolerance("max_excess_stroke", joint)
     text = ctx.named(
-        f"from {begin:.2f} to {end:.2f} s q moved {excess:.3f} rad beyond what dq allows", joint
+        f"from {begin:.2f} to {end:.2f} s q moved {excess:.3f} {ctx.unit} beyond what dq allows",
+        joint,
     )
     if excess <= limit:
         text = text if excess > 0 else ctx.named("q moves as dq says", joint)
-        return ctx.passed(f"{max(excess, 0.0):.3f} rad", text, excess_rad=excess).placed(
+        return ctx.passed(f"{max(excess, 0.0):.3f} {ctx.unit}", text, excess_rad=excess).placed(
             max(excess, 0.0), limit
         )
     outcome = ctx.failed(
-        f"{excess:.2f} rad", text, ctx.at(ctx.states.topic, begin, end), excess_rad=excess
+        f"{excess:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin, end), excess_rad=excess
     )
     late = (excess - limit) / max(speed, 1e-3)
     return outcome.about(joint).placed(excess, limit).if_late(late)
@@ -476,8 +478,8 @@ def force_in_every_contact(ctx: Context) -> Outcome:
         met = ctx.passed(f"{least.tau:.2f} N m", text, tau_nm=least.tau)
         return met.pressed(least.tau, limit, at_least=True)
     text = (
-        f"tau_est of {least.tau:.3f} N m while q was at {least.q:.2f} rad on the object and "
-        f"{least.goal:.2f} rad was commanded"
+        f"tau_est of {least.tau:.3f} N m while q was at {least.q:.2f} {ctx.unit} on the object and "
+        f"{least.goal:.2f} {ctx.unit} was commanded"
     )
     place = ctx.at(ctx.states.topic, least.begin, least.end)
     outcome = ctx.failed(f"{least.tau:.3f} N m", text, place, tau_nm=least.tau)
@@ -500,8 +502,8 @@ def stops_at_object(ctx: Context) -> Outcome:
     deepest = max(felt, key=into)
     part, limit = into(deepest), ctx.tolerance("max_depth_part")
     text = (
-        f"pressing on an object at {touch:.2f} rad with {deepest.tau:.2f} N m, q was at "
-        f"{deepest.q:.2f} rad, and {deepest.goal:.2f} rad was commanded"
+        f"pressing on an object at {touch:.2f} {ctx.unit} with {deepest.tau:.2f} N m, q was at "
+        f"{deepest.q:.2f} {ctx.unit}, and {deepest.goal:.2f} {ctx.unit} was commanded"
     )
     if part <= limit:
         return ctx.passed(f"{max(part, 0.0):.0%} of the way in", text, part=part)

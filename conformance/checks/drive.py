@@ -246,16 +246,16 @@ def torque_drives(ctx: Context) -> Outcome:
         for joint, moved in _pushed(ctx, phase, after=_LATE):
             if moved < -0.5 * ctx.tolerance("min_motion_stroke", joint):
                 text = ctx.named(
-                    f"moved by {-moved:.2f} rad against a torque that was commanded", joint
+                    f"moved by {-moved:.2f} {ctx.unit} against a torque that was commanded", joint
                 )
                 place = ctx.at(ctx.states.topic, *ctx.span(phase))
                 return ctx.failed("against it", text, place, motion_rad=moved).about(joint)
     _, moved, joint, phase = least
-    text = ctx.named(f"moved by {moved:.2f} rad while a torque was commanded", joint)
+    text = ctx.named(f"moved by {moved:.2f} {ctx.unit} while a torque was commanded", joint)
     if moved >= ctx.tolerance("min_motion_stroke", joint):
-        return ctx.passed(f"{moved:.2f} rad", text, motion_rad=moved)
+        return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
     place = ctx.at(ctx.states.topic, *ctx.span(phase))
-    return ctx.failed(f"{moved:.2f} rad", text, place, motion_rad=moved).about(joint)
+    return ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
 
 
 @check("DEX3-GAIN-05")
@@ -330,15 +330,16 @@ def held(ctx: Context) -> Outcome:
     pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
     for first, last in pairs:
         text = (
-            f"a torque displaced it by {first.way:.3f} rad, and after {last.begin - first.end:.1f} "
-            f"s of equal commands by {last.way:.3f} rad"
+            f"a torque displaced it by {first.way:.3f} {ctx.unit}, and after "
+            f"{last.begin - first.end:.1f} "
+            f"s of equal commands by {last.way:.3f} {ctx.unit}"
         )
         if not least * first.way <= last.way <= most * first.way:
             place = ctx.at(ctx.states.topic, last.begin, last.end)
-            return ctx.failed(f"{last.way:.3f} rad", text, place, motion_rad=last.way)
+            return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
     if not pairs:
         return ctx.absent("the first push displaced it too little to compare the last with it")
-    return ctx.passed(f"{last.way:.3f} rad", text, motion_rad=last.way)
+    return ctx.passed(f"{last.way:.3f} {ctx.unit}", text, motion_rad=last.way)
 
 
 @check("DEX1-GAIN-05")
@@ -349,7 +350,10 @@ def stiffness(ctx: Context) -> Outcome:
         return ctx.skipped("no state while it was pushed")
     worst = max(found, key=lambda n: n.way / n.asked)
     part = worst.way / worst.asked
-    text = f"a torque displaced it by {worst.way:.3f} rad, through kp by {worst.asked:.3f} rad"
+    text = (
+        f"a torque displaced it by {worst.way:.3f} {ctx.unit}, through kp by {worst.asked:.3f} "
+        f"{ctx.unit}"
+    )
     limit = ctx.tolerance("max_part")
     if part <= limit:
         return ctx.passed(f"{part:.0%}", text, part=part).placed(worst.way, limit * worst.asked)

@@ -37,11 +37,11 @@ def whole_range(ctx: Context) -> Outcome:
     worst = max(short, key=lambda s: s.error / s.stroke)
     limit = ctx.tolerance("max_error_stroke", worst.joint)
     if worst.error <= limit:
-        text = f"{len(short)} ends of a joint's range, at most {worst.error:.3f} rad off"
-        met = ctx.passed(f"{worst.error:.3f} rad", text, error_rad=worst.error)
+        text = f"{len(short)} ends of a joint's range, at most {worst.error:.3f} {ctx.unit} off"
+        met = ctx.passed(f"{worst.error:.3f} {ctx.unit}", text, error_rad=worst.error)
         return met.placed(worst.error, limit)
     place = ctx.at(ctx.states.topic, worst.begin, worst.end)
-    outcome = ctx.failed(f"{worst.error:.2f} rad", str(worst), place, error_rad=worst.error)
+    outcome = ctx.failed(f"{worst.error:.2f} {ctx.unit}", str(worst), place, error_rad=worst.error)
     outcome = outcome.about(worst.joint).placed(worst.error, limit)
     return outcome.if_late(STROKE_S * worst.error / worst.stroke)
 
@@ -100,7 +100,7 @@ def own_mode(ctx: Context) -> Outcome:
         return ctx.skipped("no state while some joints were driven and others were not")
     part, begin, end, joint, size = worst
     text = ctx.named(
-        f"made {part:.0%} of a step of {size:.2f} rad while other joints were locked or had "
+        f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were locked or had "
         "tripped",
         joint,
     )
@@ -140,11 +140,13 @@ def lock_stops(ctx: Context) -> Outcome:
     if worst is None:
         return ctx.skipped("no state while joints were locked under way")
     ratio, what, joint, far, begin, speed = worst
-    text = ctx.named(f"{what} {far:.3f} rad after it was locked", joint)
+    text = ctx.named(f"{what} {far:.3f} {ctx.unit} after it was locked", joint)
     limit = far / ratio if ratio else 0.0
     if ratio <= 1.0:
-        return ctx.passed(f"{far:.3f} rad", text, motion_rad=far)
-    outcome = ctx.failed(f"{far:.2f} rad", text, ctx.at(ctx.states.topic, begin), motion_rad=far)
+        return ctx.passed(f"{far:.3f} {ctx.unit}", text, motion_rad=far)
+    outcome = ctx.failed(
+        f"{far:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin), motion_rad=far
+    )
     # a lock that came late made it run on
     late_by = (far - limit) / speed if speed else STROKE_S * far / ctx.joints[joint].stroke
     return outcome.about(joint).placed(far, limit).if_late(late_by)
@@ -428,7 +430,7 @@ def low_rate_is_fresh(ctx: Context) -> Outcome:
         off = ~(away <= margin)
         if off.any():
             joint = int(np.argmax(np.nan_to_num(away / margin, nan=np.inf)))
-            text = f"q is {away[joint]:.2f} rad from all that the fast topic had within {age:g} s"
+            text = f"q is {away[joint]:.2f} {ctx.unit} from all of the fast topic within {age:g} s"
             odd.append((t, joint, text))
         elif other.any():
             joint = int(np.argmax(other))

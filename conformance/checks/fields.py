@@ -80,8 +80,8 @@ def in_stroke(ctx: Context) -> Outcome:
             continue
         low, high = float(q.min()), float(q.max())
         text = ctx.named(
-            f"q from {low:.3f} to {high:.3f} rad; the stroke is {spec.q_min:g} to "
-            f"{spec.q_max:.3f} rad",
+            f"q from {low:.3f} to {high:.3f} {ctx.unit}; the stroke is {spec.q_min:g} to "
+            f"{spec.q_max:.3f} {ctx.unit}",
             joint,
         )
         outside = ((column < spec.q_min - margin) | (column > spec.q_max + margin)) & ~excused
@@ -89,7 +89,7 @@ def in_stroke(ctx: Context) -> Outcome:
             i = int(np.argmax(outside))
             return (
                 ctx.failed(
-                    f"{column[i]:.2f} rad",
+                    f"{column[i]:.2f} {ctx.unit}",
                     f"{text}; outside in {int(outside.sum())} samples",
                     ctx.at(states.topic, float(states.t[i])),
                     q_min=low,
@@ -106,7 +106,7 @@ def in_stroke(ctx: Context) -> Outcome:
             )
         beyond = max(spec.q_min - low, high - spec.q_max)
         if widest is None or beyond > widest[0]:
-            within = ctx.passed(f"{low:.2f} .. {high:.2f} rad", text, q_min=low, q_max=high)
+            within = ctx.passed(f"{low:.2f} .. {high:.2f} {ctx.unit}", text, q_min=low, q_max=high)
             widest = (beyond, within)
     if widest is None:
         return ctx.skipped("no state with a position")
@@ -132,11 +132,12 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
                     break
                 if float(np.ptp(stand)) <= 0.1 * spec.stroke:
                     text = (
-                        f"commanded far out of range it came to a stand at q = {q[i]:.1f} rad; "
-                        f"the stroke is {spec.q_min:g} to {spec.q_max:.3f} rad"
+                        f"commanded far out of range it came to a stand at q = {q[i]:.1f} "
+                        f"{ctx.unit}; "
+                        f"the stroke is {spec.q_min:g} to {spec.q_max:.3f} {ctx.unit}"
                     )
                     outcome = ctx.failed(
-                        f"{q[i]:.1f} rad",
+                        f"{q[i]:.1f} {ctx.unit}",
                         ctx.named(text, joint),
                         ctx.at(ctx.states.topic, float(t[i]), float(t[i]) + _STAND_S),
                         q_stand=float(q[i]),
@@ -168,11 +169,11 @@ def plausible_speed(ctx: Context) -> Outcome:
         return ctx.skipped("no state with a position that lasts long enough")
     if not speed_rad_s:
         return ctx.skipped("the hand does not move in this recording")
-    text = ctx.named(f"q moves by up to {speed_rad_s:.1f} rad/s over {window:g} s", joint)
+    text = ctx.named(f"q moves by up to {speed_rad_s:.1f} {ctx.unit}/s over {window:g} s", joint)
     if part <= ctx.tolerance("max_part"):
-        return ctx.passed(f"{speed_rad_s:.1f} rad/s", text, speed_rad_s=speed_rad_s)
+        return ctx.passed(f"{speed_rad_s:.1f} {ctx.unit}/s", text, speed_rad_s=speed_rad_s)
     return ctx.failed(
-        f"{speed_rad_s:.0f} rad/s",
+        f"{speed_rad_s:.0f} {ctx.unit}/s",
         f"{text}: {part:.1f} times what the joint is good for",
         ctx.at(ctx.states.topic, at, at + window),
         speed_rad_s=speed_rad_s,
@@ -229,7 +230,8 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     size = math.sqrt(sums.mean(slope[moving] ** 2))
     error = math.sqrt(sums.mean((mean(moving) - slope[moving]) ** 2)) / size
     text = ctx.named(
-        f"dq differs from the slope of q by {error:.0%} of its size ({size:.2f} rad/s RMS)", joint
+        f"dq differs from the slope of q by {error:.0%} of its size ({size:.2f} {ctx.unit}/s RMS)",
+        joint,
     )
     if error <= ctx.tolerance("max_relative_rms"):
         return ctx.passed(f"{error:.0%} off", text, relative_rms=error)

@@ -65,7 +65,7 @@ def rest_pose(ctx: Context) -> Outcome:
         ).because(
             "Positions are never read from the device, or the hand rests with all joints at 0."
         )
-    return ctx.passed("not zero", f"a joint is {most[-1]:.3f} rad from 0")
+    return ctx.passed("not zero", f"a joint is {most[-1]:.3f} {ctx.unit} from 0")
 
 
 # ------------------------------------------------------------------------------------ sensors
@@ -306,11 +306,13 @@ def order(ctx: Context) -> Outcome:
             own = float(moved[step.joint])
             name = ctx.joints[step.joint].name
             if own < ctx.tolerance("min_progress") * abs(step.size) or wrong:
-                seen = ", ".join(f"{ctx.joints[j].name} moved {moved[j]:.2f} rad" for j in wrong)
+                seen = ", ".join(
+                    f"{ctx.joints[j].name} moved {moved[j]:.2f} {ctx.unit}" for j in wrong
+                )
                 outcome = ctx.failed(
                     ctx.joints[wrong[0]].name if wrong else "no motion",
-                    f"{name} was commanded to go {abs(step.size):.2f} rad and moved {own:.2f} rad; "
-                    + (seen or "no joint moved"),
+                    f"{name} was commanded to go {abs(step.size):.2f} {ctx.unit} and moved "
+                    f"{own:.2f} {ctx.unit}; " + (seen or "no joint moved"),
                     ctx.at(ctx.states.topic, begin, end),
                 ).about(step.joint, *wrong)
                 cause = _order_cause(ctx, step.joint, wrong, own < 0.1 * abs(step.size))
@@ -524,9 +526,10 @@ def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome
     )
     if after[worst] > ctx.requirement.tolerance("max_motion_stroke"):
         outcome = ctx.failed(
-            f"{rad:.2f} rad",
+            f"{rad:.2f} {ctx.unit}",
             ctx.named(
-                f"moved by {rad:.2f} rad more than {ctx.tolerance('timeout_s'):g} s after the "
+                f"moved by {rad:.2f} {ctx.unit} more than {ctx.tolerance('timeout_s'):g} s "
+                "after the "
                 "last command",
                 joint,
             ),
@@ -539,7 +542,7 @@ def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome
             "no joint that was set in motion still moved when the commands stopped: "
             "a braked joint cannot be distinguished from one at rest"
         )
-    met = ctx.passed("stops", f"moving, then still ({rad:.3f} rad)", motion_rad=rad)
+    met = ctx.passed("stops", f"moving, then still ({rad:.3f} {ctx.unit})", motion_rad=rad)
     return met.resting_on(stop)
 
 

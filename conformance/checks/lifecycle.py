@@ -149,7 +149,7 @@ def last_state(ctx: Context) -> Outcome:
     if went is not None and went[0] > went[1]:
         rad, limit, joint = went
         text = ctx.named(
-            f"it went on by {rad:.2f} rad after its last command, across the restart", joint
+            f"it went on by {rad:.2f} {ctx.unit} after its last command, across the restart", joint
         )
         place = ctx.at(ctx.states.topic, begin, end)
         outcome = ctx.failed("goes on", text, place, motion_rad=rad).about(joint)
@@ -157,7 +157,7 @@ def last_state(ctx: Context) -> Outcome:
     if not status[-1].any():
         return ctx.passed("brakes", "its last state shows that it is not driven any more")
     if went is not None:
-        text = f"it was moving, and was found {went[0]:.2f} rad further on"
+        text = f"it was moving, and was found {went[0]:.2f} {ctx.unit} further on"
         return ctx.passed("stops", text, motion_rad=went[0]).placed(went[0], went[1])
     return ctx.absent(
         "its last state shows it driven, but may have been measured before it braked; it was not "

@@ -322,5 +322,7 @@ def legacy_ready(ctx: Context) -> Outcome:
         return ctx.skipped("no state before the first command")
     most = max((float(np.nanmax(np.abs(q))) for q in before if len(q)), default=0.0)
     if most > 0:
-        return ctx.passed(f"{most:.2f} rad", f"up to {most:.3f} rad before the first command")
+        return ctx.passed(
+            f"{most:.2f} {ctx.unit}", f"up to {most:.3f} {ctx.unit} before the first command"
+        )
     return ctx.failed("all zero", "every q is exactly 0 before the first command")

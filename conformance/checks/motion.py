@@ -22,6 +22,7 @@ class Step:
     :param stroke: of the joint, rad.
     :param start: q before it.
     :param final: q at its end (median of the last 0.2 s).
+    :param unit: of q.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Step:
     final: float
     t: Floats
     q: Floats
+    unit: str
 
     @property
     def size(self) -> float:
@@ -47,8 +49,8 @@ class Step:
 
     def __str__(self) -> str:
         return (
-            f"{self.name}commanded from {self.start:.2f} to {self.target:.2f} rad, q went to "
-            f"{self.final:.2f}"
+            f"{self.name}commanded from {self.start:.2f} to {self.target:.2f} {self.unit}, q went "
+            f"to {self.final:.2f}"
         )
 
 
@@ -79,6 +81,7 @@ def steps_of(ctx: Context, phase: Phase) -> list[Step]:
                 final=float(np.median(q[late])) if late.any() else float(q[-1]),
                 t=t,
                 q=q,
+                unit=ctx.unit,
             )
         )
     return found
@@ -189,13 +192,13 @@ def arrives(ctx: Context) -> Outcome:
     limit = ctx.tolerance("max_error_stroke", worst.joint)
     if worst.error <= limit:
         return ctx.passed(
-            f"{worst.error:.3f} rad",
-            f"{len(found)} steps, ending at most {worst.error:.3f} rad off",
+            f"{worst.error:.3f} {ctx.unit}",
+            f"{len(found)} steps, ending at most {worst.error:.3f} {ctx.unit} off",
             error_rad=worst.error,
         ).placed(worst.error, limit)
     return (
         ctx.failed(
-            f"{worst.error:.2f} rad",
+            f"{worst.error:.2f} {ctx.unit}",
             f"{worst}",
             ctx.at(ctx.states.topic, worst.begin, worst.end),
             error_rad=worst.error,
@@ -236,11 +239,14 @@ def settles(ctx: Context) -> Outcome:
     limit = ctx.tolerance("max_ripple_stroke", step.joint)
     if ripple <= limit:
         return ctx.passed(
-            f"{ripple:.3f} rad", f"ripple of at most {ripple:.3f} rad", ripple_rad=ripple
+            f"{ripple:.3f} {ctx.unit}",
+            f"ripple of at most {ripple:.3f} {ctx.unit}",
+            ripple_rad=ripple,
         ).placed(ripple, limit)
     outcome = ctx.failed(
-        f"{ripple:.2f} rad",
-        f"{step.name}at the target {step.target:.2f} rad q still moves by {ripple:.2f} rad, peak "
+        f"{ripple:.2f} {ctx.unit}",
+        f"{step.name}at the target {step.target:.2f} {ctx.unit} q still moves by {ripple:.2f} "
+        f"{ctx.unit}, peak "
         "to peak",
         ctx.at(ctx.states.topic, step.end - window, step.end),
         ripple_rad=ripple,
@@ -261,13 +267,13 @@ def speed(ctx: Context) -> Outcome:
     if not found:
         return ctx.skipped("no step of that size was finished")
     slowest, step = min(found, key=lambda f: f[0])
-    text = f"{step.name}{slowest:.2f} rad/s in the slowest of {len(found)} large steps"
+    text = f"{step.name}{slowest:.2f} {ctx.unit}/s in the slowest of {len(found)} large steps"
     way = 0.8 * abs(step.size)
     if slowest >= ctx.tolerance("min_speed_rad_s"):
-        return ctx.passed(f"{slowest:.1f} rad/s", text, speed_rad_s=slowest)
+        return ctx.passed(f"{slowest:.1f} {ctx.unit}/s", text, speed_rad_s=slowest)
     return (
         ctx.failed(
-            f"{slowest:.1f} rad/s",
+            f"{slowest:.1f} {ctx.unit}/s",
             text,
             ctx.at(ctx.states.topic, step.begin, step.end),
             speed_rad_s=slowest,
@@ -291,12 +297,14 @@ def overshoot(ctx: Context) -> Outcome:
     beyond = max(beyond, 0.0)
     if beyond <= ctx.tolerance("max_overshoot_stroke", step.joint):
         return ctx.passed(
-            f"{beyond:.3f} rad", f"at most {beyond:.3f} rad beyond the target", overshoot_rad=beyond
+            f"{beyond:.3f} {ctx.unit}",
+            f"at most {beyond:.3f} {ctx.unit} beyond the target",
+            overshoot_rad=beyond,
         )
     return (
         ctx.failed(
-            f"{beyond:.2f} rad",
-            f"{step.name}{beyond:.2f} rad beyond the target {step.target:.2f} rad",
+            f"{beyond:.2f} {ctx.unit}",
+            f"{step.name}{beyond:.2f} {ctx.unit} beyond the target {step.target:.2f} {ctx.unit}",
             ctx.at(ctx.states.topic, step.begin, step.end),
             overshoot_rad=beyond,
         )
@@ -321,14 +329,15 @@ def monotonous(ctx: Context) -> Outcome:
     if not found:
         return ctx.skipped("no step of that size")
     back_by, at, step = max(found, key=lambda f: f[0] / f[2].stroke)
-    text = f"{step.name}turned back by at most {back_by:.3f} rad in {len(found)} steps"
+    text = f"{step.name}turned back by at most {back_by:.3f} {ctx.unit} in {len(found)} steps"
     if back_by <= ctx.tolerance("max_back_stroke", step.joint):
-        return ctx.passed(f"{back_by:.3f} rad", text, back_rad=back_by)
+        return ctx.passed(f"{back_by:.3f} {ctx.unit}", text, back_rad=back_by)
     return (
         ctx.failed(
-            f"{back_by:.2f} rad",
-            f"{step.name}on its way from {step.start:.2f} to {step.target:.2f} rad q went back by "
-            f"{back_by:.2f} rad",
+            f"{back_by:.2f} {ctx.unit}",
+            f"{step.name}on its way from {step.start:.2f} to {step.target:.2f} {ctx.unit} q "
+            "went back by "
+            f"{back_by:.2f} {ctx.unit}",
             ctx.at(ctx.states.topic, at, step.end),
             back_rad=back_by,
         )
@@ -392,7 +401,7 @@ def begins(ctx: Context) -> Outcome:
     if slowest is None:
         return ctx.skipped("no step of that size was finished")
     after, limit, step = slowest
-    text = f"{step.name}after {after:.2f} s in the step to {step.target:.2f} rad"
+    text = f"{step.name}after {after:.2f} s in the step to {step.target:.2f} {ctx.unit}"
     span = step.begin, step.begin + after
     if after <= limit:
         met = ctx.passed(f"{after:.2f} s", text, reaction_s=after)
@@ -433,13 +442,15 @@ def ends(ctx: Context) -> Outcome:
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
     worst = max(found, key=lambda s: s.error)
-    text = "; ".join(f"commanded to {s.target:.2f} rad, q went to {s.final:.2f}" for s in found)
+    text = "; ".join(
+        f"commanded to {s.target:.2f} {ctx.unit}, q went to {s.final:.2f}" for s in found
+    )
     limit = ctx.tolerance("max_error_stroke")
     if worst.error <= limit:
-        met = ctx.passed(f"{worst.error:.3f} rad", text, error_rad=worst.error)
+        met = ctx.passed(f"{worst.error:.3f} {ctx.unit}", text, error_rad=worst.error)
         return met.placed(worst.error, limit)
     outcome = ctx.failed(
-        f"{worst.error:.2f} rad",
+        f"{worst.error:.2f} {ctx.unit}",
         text,
         ctx.at(ctx.states.topic, worst.begin, worst.end),
         error_rad=worst.error,
@@ -482,14 +493,15 @@ def independent(ctx: Context) -> Outcome:
     limit = ctx.tolerance("max_motion_stroke", joint)
     if most <= limit:
         return ctx.passed(
-            f"{most:.3f} rad",
-            f"moved by {most:.3f} rad in {len(others)} steps of the {other} hand",
+            f"{most:.3f} {ctx.unit}",
+            f"moved by {most:.3f} {ctx.unit} in {len(others)} steps of the {other} hand",
             motion_rad=most,
         ).placed(most, limit)
     outcome = ctx.failed(
-        f"{most:.2f} rad",
+        f"{most:.2f} {ctx.unit}",
         ctx.named(
-            f"moved by {most:.2f} rad while only the {other} hand was commanded to move", joint
+            f"moved by {most:.2f} {ctx.unit} while only the {other} hand was commanded to move",
+            joint,
         ),
         ctx.at(ctx.states.topic, begin, end),
         motion_rad=most,
@@ -529,14 +541,15 @@ def not_driven(ctx: Context, how: str) -> Outcome:
     most = ctx.tolerance("max_motion_stroke", step.joint)
     if towards <= most:
         return ctx.passed(
-            f"{towards:.3f} rad",
-            f"{step.name}moved {towards:.3f} rad towards a q that was {abs(step.size):.2f} rad "
+            f"{towards:.3f} {ctx.unit}",
+            f"{step.name}moved {towards:.3f} {ctx.unit} towards a q that was "
+            f"{abs(step.size):.2f} {ctx.unit} "
             "away",
             motion_rad=towards,
         ).placed(towards, most)
     outcome = ctx.failed(
-        f"{towards:.2f} rad",
-        f"{step.name}moved {towards:.2f} rad towards q = {step.target:.2f} {how}",
+        f"{towards:.2f} {ctx.unit}",
+        f"{step.name}moved {towards:.2f} {ctx.unit} towards q = {step.target:.2f} {how}",
         ctx.at(ctx.states.topic, step.begin, step.end),
         motion_rad=towards,
     )
@@ -572,7 +585,7 @@ def every_command(ctx: Context) -> Outcome:
         f"{judged - len(missed)} of {judged}",
         ctx.named(
             f"{len(missed)} of {judged} commands that were sent once were not obeyed; the first, "
-            f"to {target:.2f} rad, made {progress:.0%} of its way in {end - begin:.2f} s",
+            f"to {target:.2f} {ctx.unit}, made {progress:.0%} of its way in {end - begin:.2f} s",
             joint,
         ),
         *(ctx.at(ctx.states.topic, a, b) for a, b, *_ in missed),
@@ -680,11 +693,11 @@ def velocity_drives(ctx: Context) -> Outcome:
     if found is None:
         return ctx.skipped("no state while a velocity was commanded")
     moved, joint, phase = found
-    text = ctx.named(f"moved by {moved:.2f} rad while a velocity was commanded", joint)
+    text = ctx.named(f"moved by {moved:.2f} {ctx.unit} while a velocity was commanded", joint)
     if moved >= ctx.tolerance("min_motion_stroke", joint):
-        return ctx.passed(f"{moved:.2f} rad", text, motion_rad=moved)
+        return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
     place = ctx.at(ctx.states.topic, *ctx.span(phase))
-    return ctx.failed(f"{moved:.2f} rad", text, place, motion_rad=moved).about(joint)
+    return ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
 
 
 @check("DEX1-GAIN-06", "DEX3-GAIN-06")
@@ -697,9 +710,11 @@ def velocity_way(ctx: Context) -> Outcome:
     limit = ctx.tolerance("max_motion_stroke", joint)
     against = max(0.0, -moved)
     if against <= limit:
-        text = ctx.named(f"moved by {moved:.2f} rad with a commanded velocity", joint)
-        return ctx.passed(f"{against:.2f} rad", text, motion_rad=moved).placed(against, limit)
-    text = ctx.named(f"moved by {against:.2f} rad against a commanded velocity", joint)
+        text = ctx.named(f"moved by {moved:.2f} {ctx.unit} with a commanded velocity", joint)
+        return ctx.passed(f"{against:.2f} {ctx.unit}", text, motion_rad=moved).placed(
+            against, limit
+        )
+    text = ctx.named(f"moved by {against:.2f} {ctx.unit} against a commanded velocity", joint)
     place = ctx.at(ctx.states.topic, *ctx.span(phase))
-    outcome = ctx.failed(f"{against:.2f} rad", text, place, motion_rad=moved).about(joint)
+    outcome = ctx.failed(f"{against:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
     return outcome.placed(against, limit)

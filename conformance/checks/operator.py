@@ -155,7 +155,7 @@ def overshoot(ctx: Context) -> Outcome:
         "max_overshoot_stroke",
         lambda f: f.overshoot,
         lambda s: s.overshoot,
-        lambda x: f"overshoots by {x:.3f} rad",
+        lambda x: f"overshoots by {x:.3f} {ctx.unit}",
         "no step was completed",
     )
 
@@ -169,7 +169,7 @@ def stuck(ctx: Context) -> Outcome:
         "max_stuck_stroke",
         lambda f: f.stuck,
         lambda s: s.stuck,
-        lambda x: f"rests {x:.3f} rad off",
+        lambda x: f"rests {x:.3f} {ctx.unit} off",
         "the hand came to rest after no step",
     )
 

@@ -115,8 +115,8 @@ def moves(
             if most > ctx.tolerance("max_motion_stroke", joint):
                 return (
                     ctx.failed(
-                        f"{most:.2f} rad",
-                        ctx.named(f"moved by {most:.2f} rad during {what}", joint),
+                        f"{most:.2f} {ctx.unit}",
+                        ctx.named(f"moved by {most:.2f} {ctx.unit} during {what}", joint),
                         ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
                         motion_rad=most,
                     )
@@ -127,8 +127,8 @@ def moves(
             far = max(far, (most / ctx.joints[joint].stroke, most, joint))
     _, most, joint = far
     return ctx.passed(
-        f"{most:.3f} rad",
-        ctx.named(f"moved by {most:.3f} rad during {what}", joint),
+        f"{most:.3f} {ctx.unit}",
+        ctx.named(f"moved by {most:.3f} {ctx.unit} during {what}", joint),
         motion_rad=most,
     ).placed(most, ctx.tolerance("max_motion_stroke", joint))
 
@@ -171,10 +171,10 @@ def out_of_range(ctx: Context) -> Outcome:
                 i = int(np.argmax(bad))
                 return (
                     ctx.failed(
-                        f"{q[i]:.2f} rad",
+                        f"{q[i]:.2f} {ctx.unit}",
                         ctx.named(
-                            f"q became {q[i]:.2f} rad; the stroke is {spec.q_min:g} to "
-                            f"{spec.q_max:.2f} rad",
+                            f"q became {q[i]:.2f} {ctx.unit}; the stroke is {spec.q_min:g} to "
+                            f"{spec.q_max:.2f} {ctx.unit}",
                             joint,
                         ),
                         ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
@@ -185,7 +185,7 @@ def out_of_range(ctx: Context) -> Outcome:
             wrong = _other_way(ctx, phase, joint)
             if wrong is not None:
                 return wrong
-            reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} rad")
+            reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} {ctx.unit}")
             values = {"q_min": float(q.min()), "q_max": float(q.max())}
     outcome = unharmed(ctx, "commands far out of range")
     if outcome.met is False or outcome.reason:
@@ -224,10 +224,10 @@ def _other_way(ctx: Context, phase: Phase, joint: int) -> Outcome | None:
         if back[i] > ctx.tolerance("max_back_stroke", joint):
             return (
                 ctx.failed(
-                    f"{back[i]:.2f} rad",
+                    f"{back[i]:.2f} {ctx.unit}",
                     ctx.named(
                         f"commanded far {'above' if way > 0 else 'below'} its range it went the "
-                        f"other way by {back[i]:.2f} rad",
+                        f"other way by {back[i]:.2f} {ctx.unit}",
                         joint,
                     ),
                     ctx.at(ctx.states.topic, float(ctx.states.t[later][i])),
@@ -290,8 +290,8 @@ def brakes(ctx: Context) -> Outcome:
         )
         if moved > ctx.tolerance("max_motion_stroke"):
             outcome = ctx.failed(
-                f"{moved:.2f} rad",
-                f"moved by {moved:.2f} rad more than {timeout:g} s after the last command",
+                f"{moved:.2f} {ctx.unit}",
+                f"moved by {moved:.2f} {ctx.unit} more than {timeout:g} s after the last command",
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=moved,
             )
@@ -299,8 +299,8 @@ def brakes(ctx: Context) -> Outcome:
         jump, allowed = _jump(ctx, last + timeout, q_late)
         if jump > allowed:
             outcome = ctx.failed(
-                f"{jump:.2f} rad",
-                f"moved by {jump:.2f} rad while it braked",
+                f"{jump:.2f} {ctx.unit}",
+                f"moved by {jump:.2f} {ctx.unit} while it braked",
                 ctx.at(states.topic, last + timeout, end),
                 motion_rad=jump,
             ).placed(jump, allowed)
@@ -309,7 +309,7 @@ def brakes(ctx: Context) -> Outcome:
         stroke = ctx.joints[0].stroke
         at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
         if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
-            proofs.append(f"was moving, then moved only {moved:.3f} rad")
+            proofs.append(f"was moving, then moved only {moved:.3f} {ctx.unit}")
             values["motion_rad"] = moved
             measures.append(stop)
         pressed = float(np.median(np.abs(before)))
@@ -493,9 +493,9 @@ def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
         course = step.q[: int(near[0]) + 1] if len(near) else step.q
         away = float(np.max((step.start - course) * way))
         if away > limit:
-            text = f"{when}, {step}, but it first went {away:.2f} rad the other way"
+            text = f"{when}, {step}, but it first went {away:.2f} {ctx.unit} the other way"
             place = ctx.at(ctx.states.topic, step.begin, step.end)
-            outcome = ctx.failed(f"{away:.2f} rad away", text, place, away_rad=away)
+            outcome = ctx.failed(f"{away:.2f} {ctx.unit} away", text, place, away_rad=away)
             return outcome.about(step.joint).placed(away, limit)
     return None
 
@@ -591,10 +591,10 @@ def burst(ctx: Context) -> Outcome:
             if away[joint] > ctx.tolerance("max_motion_stroke", joint):
                 return (
                     ctx.failed(
-                        f"{away[joint]:.2f} rad",
+                        f"{away[joint]:.2f} {ctx.unit}",
                         ctx.named(
                             f"{wait:g} s after the last command of the burst it was still up to "
-                            f"{away[joint]:.2f} rad away",
+                            f"{away[joint]:.2f} {ctx.unit} away",
                             joint,
                         ),
                         ctx.at(topic, sent + wait, end),
@@ -605,8 +605,8 @@ def burst(ctx: Context) -> Outcome:
                     .if_late(STROKE_S * float(away[joint]) / spec.stroke)
                 )
     return ctx.passed(
-        f"{far[1]:.3f} rad",
-        ctx.named(f"within {far[1]:.3f} rad {wait:g} s after the burst", far[2]),
+        f"{far[1]:.3f} {ctx.unit}",
+        ctx.named(f"within {far[1]:.3f} {ctx.unit} {wait:g} s after the burst", far[2]),
         motion_rad=far[1],
     ).placed(far[1], ctx.tolerance("max_motion_stroke", far[2]))
 
@@ -630,9 +630,10 @@ def two_writers(ctx: Context) -> Outcome:
             if outside.any():
                 i = int(np.argmax(outside))
                 return ctx.failed(
-                    f"{q[i]:.2f} rad",
+                    f"{q[i]:.2f} {ctx.unit}",
                     ctx.named(
-                        f"commanded to {low:.2f} and {high:.2f} rad it went to {q[i]:.2f} rad",
+                        f"commanded to {low:.2f} and {high:.2f} {ctx.unit} it went to "
+                        f"{q[i]:.2f} {ctx.unit}",
                         joint,
                     ),
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),

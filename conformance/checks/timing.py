@@ -458,8 +458,8 @@ def not_frozen(ctx: Context) -> Outcome:
                 ctx.failed(
                     f"{held[i]:.2f} s",
                     ctx.named(
-                        f"{count} states in a row with q = {q[changes[i]]:.3f} rad over "
-                        f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} rad",
+                        f"{count} states in a row with q = {q[changes[i]]:.3f} {ctx.unit} over "
+                        f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} {ctx.unit}",
                         joint,
                     ),
                     ctx.at(ctx.states.topic, at, at + float(held[i])),

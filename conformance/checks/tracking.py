@@ -254,8 +254,9 @@ def follows(ctx: Context) -> Outcome:
         return ctx.skipped(figures)
     found = max(figures, key=lambda f: f.rms / ctx.joints[f.joint].stroke)
     text = (
-        f"RMS {found.rms:.3f} rad, peak {found.peak:.2f} rad at {found.peak_at:.2f} s, delay "
-        f"{found.delay * 1e3:.0f} ms, RMS without removing it {found.raw:.3f} rad"
+        f"RMS {found.rms:.3f} {ctx.unit}, peak {found.peak:.2f} {ctx.unit} at "
+        f"{found.peak_at:.2f} s, delay "
+        f"{found.delay * 1e3:.0f} ms, RMS without removing it {found.raw:.3f} {ctx.unit}"
     )
     if found.blocked:
         text += f"; {found.blocked:.0%} of the time blocked by an object and left out"
@@ -267,11 +268,13 @@ def follows(ctx: Context) -> Outcome:
         values |= {f"rms_rad_{ctx.joints[f.joint].name}": f.rms for f in figures}
     limit = ctx.tolerance("max_rms_stroke", found.joint)
     if found.rms <= limit:
-        return ctx.passed(f"rms {found.rms:.3f} rad", text, **values).placed(found.rms, limit)
+        return ctx.passed(f"rms {found.rms:.3f} {ctx.unit}", text, **values).placed(
+            found.rms, limit
+        )
     worst_first = sorted(figures, key=lambda f: -f.rms)
     size = STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin)
     outcome = ctx.failed(
-        f"rms {found.rms:.2f} rad",
+        f"rms {found.rms:.2f} {ctx.unit}",
         text,
         ctx.at(ctx.states.topic, found.peak_at),
         ctx.at(ctx.states.topic, found.begin, found.end),

@@ -94,19 +94,23 @@ def still(ctx: Context) -> Outcome:
         for begin, end, goal in _stretches(ctx, goals, excluded):
             moved = _leaves(ctx, joint, begin, end, goal)
             if moved is not None and moved[0] / spec.stroke > worst[0]:
-                when = "before the first command" if goal is None else f"at its goal {goal:.2f} rad"
+                when = (
+                    "before the first command"
+                    if goal is None
+                    else f"at its goal {goal:.2f} {ctx.unit}"
+                )
                 worst = moved[0] / spec.stroke, moved[0], joint, moved[1], when
     part, rad, joint, at, when = worst
     if part < 0:
         return ctx.skipped("no joint came to rest while its command stayed the same")
-    text = ctx.named(f"moved by at most {rad:.3f} rad at rest", joint)
+    text = ctx.named(f"moved by at most {rad:.3f} {ctx.unit} at rest", joint)
     if rad <= ctx.tolerance("max_motion_stroke", joint):
-        met = ctx.passed(f"{rad:.3f} rad", text, motion_rad=rad)
+        met = ctx.passed(f"{rad:.3f} {ctx.unit}", text, motion_rad=rad)
         return met.placed(rad, ctx.tolerance("max_motion_stroke", joint))
     return (
         ctx.failed(
-            f"{rad:.2f} rad",
-            ctx.named(f"at rest {when}, it moved by {rad:.2f} rad at {at:.2f} s", joint),
+            f"{rad:.2f} {ctx.unit}",
+            ctx.named(f"at rest {when}, it moved by {rad:.2f} {ctx.unit} at {at:.2f} s", joint),
             ctx.at(ctx.states.topic, at),
             motion_rad=rad,
         )
@@ -191,15 +195,15 @@ def path(ctx: Context) -> Outcome:
         return ctx.skipped("too few states while positions were commanded")
     if rad <= ctx.tolerance("max_beyond_stroke", joint):
         return ctx.passed(
-            f"{rad:.3f} rad",
-            ctx.named(f"at most {rad:.3f} rad beyond its start and its goal", joint),
+            f"{rad:.3f} {ctx.unit}",
+            ctx.named(f"at most {rad:.3f} {ctx.unit} beyond its start and its goal", joint),
             beyond_rad=rad,
         ).placed(rad, ctx.tolerance("max_beyond_stroke", joint))
     return (
         ctx.failed(
-            f"{rad:.2f} rad",
+            f"{rad:.2f} {ctx.unit}",
             ctx.named(
-                f"at {at:.2f} s it was {rad:.2f} rad outside of where it had been "
+                f"at {at:.2f} s it was {rad:.2f} {ctx.unit} outside of where it had been "
                 f"{ctx.tolerance('before_s'):g} s before and where it was commanded to go",
                 joint,
             ),
@@ -290,8 +294,10 @@ def starts_idle(ctx: Context) -> Outcome:
                 return outcome.pressed(most, ctx.tolerance("max_tau_nm"))
     rad, when = worst
     limit = ctx.tolerance("max_motion_stroke")
-    text = f"moved by {rad:.3f} rad before the first command after a start"
+    text = f"moved by {rad:.3f} {ctx.unit} before the first command after a start"
     if rad > limit:
-        outcome = ctx.failed(f"{rad:.2f} rad", text, ctx.at(ctx.states.topic, when), motion_rad=rad)
+        outcome = ctx.failed(
+            f"{rad:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, when), motion_rad=rad
+        )
         return outcome.placed(rad, limit).if_late(STROKE_S * rad / ctx.joints[0].stroke)
-    return ctx.passed(f"{rad:.3f} rad", text, motion_rad=rad).placed(rad, limit)
+    return ctx.passed(f"{rad:.3f} {ctx.unit}", text, motion_rad=rad).placed(rad, limit)

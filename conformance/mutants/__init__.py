@@ -16,6 +16,7 @@ from dexkit.conformance.mutants import (
     gripper,
     operator,
     robot,
+    servos,
     usb,
 )
 from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
@@ -24,7 +25,7 @@ from dexkit.models import model_plugins
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
-MODULES = (any_model, gripper, fingers, operator, clients, robot, usb)
+MODULES = (any_model, gripper, fingers, servos, operator, clients, robot, usb)
 """Where wrong hands are declared."""
 
 

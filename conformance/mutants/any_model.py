@@ -7,12 +7,12 @@ from collections import deque
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.mutants.registry import BOTH, obeys_gains, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.hand import Side
 from dexkit.messages import message_type
-from dexkit.models import model
+from dexkit.models import HandModel, model
 
 # -------------------------------------------------------------------------------- discovery
 
@@ -80,6 +80,7 @@ class SilentUntilCommanded(Service):
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
+@wrong_hand("BRAINCO-RATE-02")
 class SlowPublisher(Service):
     """Publishes at 125 Hz."""
 
@@ -87,6 +88,7 @@ class SlowPublisher(Service):
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
+@wrong_hand("BRAINCO-RATE-01")
 class SlowsDown(Service):
     """Publishes at 60 Hz from 6 s on, as if it is throttled when warm."""
 
@@ -263,6 +265,7 @@ class FreezesOnce(Service):
     ),
     whole=True,
 )
+@wrong_hand("BRAINCO-FRESH-03", also=("BRAINCO-MOVE-06",), whole=True)
 class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 
@@ -340,6 +343,12 @@ class EmptyNowAndThen(Service):
     ),
     sides=BOTH,
 )
+# both sides do the same while one joint moves, so that only later steps show it
+@wrong_hand(
+    "BRAINCO-SIDE-01",
+    also=("BRAINCO-LIFE-03", "BRAINCO-SAFE-01", "BRAINCO-SAFE-10", "BRAINCO-WDOG-01"),
+    sides=BOTH,
+)
 class Swapped(Service):
     """Each side obeys the other side's commands."""
 
@@ -354,6 +363,7 @@ class Swapped(Service):
         "DEX1-WDOG-03",
     ),
 )
+@wrong_hand("BRAINCO-MOVE-06", also=("BRAINCO-PATH-01", "BRAINCO-WDOG-03"))
 @wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-WDOG-03"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
@@ -371,7 +381,8 @@ class KicksBack(Service):
         before = self.newest.get(side, motors)
         self.newest[side] = motors
         jumps = [b.q - a.q for a, b in zip(before, motors, strict=True)]
-        if any(0.25 < abs(j) < 6.0 for j in jumps) and all(m.kp > 0 for m in motors):
+        drives = self.dialect.position_servo or all(m.kp > 0 for m in motors)
+        if any(0.25 < abs(j) < 6.0 for j in jumps) and drives:
             back = tuple(
                 replace(m, q=q - math.copysign(0.35, j) if abs(j) > 0.25 else m.q)
                 for m, q, j in zip(motors, here, jumps, strict=True)
@@ -387,12 +398,14 @@ class _Moves(Service):
     def go(self, side: Side, part: float) -> None:
         """Command a part of each joint's range from here, towards the middle."""
         every = zip(self.positions(side), joints_of(self.dialect, side), strict=True)
-        gains = model(self.dialect.model).gains
+        hand = model(self.dialect.model)
+        gains = hand.gains
         super().motors(
             side,
             tuple(
                 Motor(
                     q + math.copysign(part * j.stroke, 0.5 * (j.q_min + j.q_max) - q),
+                    dq=hand.client_dq,
                     kp=kp,
                     kd=kd,
                     mode=self.codec.mode(i),
@@ -443,6 +456,7 @@ class HomesWhenRestarted(_Moves):
     also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
     sides=BOTH,
     whole=True,
+    where=obeys_gains,
 )
 class KicksTheOtherSide(_Moves):
     """Moves the other hand when one gets a command with a negative gain."""
@@ -568,6 +582,7 @@ class OneWatchdogForBoth(Service):
         "DEX1-GAIN-04",
         "DEX1-GAIN-05",
     ),
+    where=obeys_gains,
 )
 class WeakAfterNan(Service):
     """Uses a quarter of the stiffness since it has got a command that is not finite."""
@@ -607,7 +622,8 @@ def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
     return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
 
 
-@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), whole=True)
+# a hand without gains gets fewer of them
+@wrong_hand(("DEX1-SAFE-01", "DEX3-SAFE-01"), whole=True, where=obeys_gains)
 class TiresOfNan(Service):
     """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
 
@@ -643,7 +659,8 @@ class EmptyIsZero(Service):
             return
         for side in self.sides:
             if self.codec.command_topics[side] == topic:
-                motors = (Motor(mode=self.codec.mode(i)) for i in range(self.codec.joints))
+                dq = model(self.dialect.model).client_dq
+                motors = (Motor(dq=dq, mode=self.codec.mode(i)) for i in range(self.codec.joints))
                 self.motors(side, tuple(motors))
 
 
@@ -835,9 +852,14 @@ class DropsOldStamps(Service):
             super().receive(topic, payload, client)
 
 
+def _too_slow(service: Service) -> int:
+    """One state of how many is fewer than clients need: of three for most hands."""
+    return int(1.2 / (service.period * model(service.dialect.model).min_state_rate))
+
+
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), whole=True)
 class StuttersUnderLoad(Service):
-    """Publishes one state in three while four commands of one client come within 11 ms."""
+    """Publishes too few states while four commands of one client come within 11 ms."""
 
     tick = period = 0.002
 
@@ -857,14 +879,20 @@ class StuttersUnderLoad(Service):
             len(times) == 4 and times[-1] - times[0] < 0.011 and self.now - times[-1] < 0.01
             for times in self.came.values()
         )
-        return [] if busy and self.cycle % 3 else super().publish()
+        return [] if busy and self.cycle % _too_slow(self) else super().publish()
 
 
-@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"))
+def _needs_many_states(hand: HandModel) -> bool:
+    return hand.min_state_rate >= 200.0
+
+
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), where=_needs_many_states)
 class ChokesOnThousands(Service):
     """Publishes one state in three while more than 1000 commands a second arrive."""
 
     tick = period = 0.002
+    share = 3
+    """One state of how many it publishes then."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -882,7 +910,8 @@ class ChokesOnThousands(Service):
 
     def publish(self) -> list[Sample]:
         self.cycle += 1
-        return [] if self.now < self.busy_until and self.cycle % 3 else super().publish()
+        held = self.now < self.busy_until and self.cycle % self.share
+        return [] if held else super().publish()
 
 
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.mutants.registry import BOTH, obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import (
     Dex3Service,
@@ -26,6 +26,9 @@ from dexkit.conformance.virtual.fingers import (
     Ints,
 )
 from dexkit.hand import Floats, Side
+from dexkit.models import HandModel
+
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
 
 # --------------------------------------------------------------------- discovery and start-up
 
@@ -98,7 +101,12 @@ class NanVelocity(FingerService):
             motors["dq"][5] = math.nan
 
 
-@wrong_hand("DEX3-FIELD-03", sides=BOTH)
+def _mirrored(hand: HandModel) -> bool:
+    joints = hand.joints
+    return any(a.closing * b.closing < 0 for a, b in zip(joints[LEFT], joints[RIGHT], strict=True))
+
+
+@wrong_hand("DEX3-FIELD-03", sides=BOTH, where=_mirrored)
 class Unmirrored(FingerService):
     """Has the left hand's signs on the right one, in commands and states."""
 
@@ -436,7 +444,7 @@ class _Backwards(FingerHand):
         super().take(turned, mode)
 
 
-@wrong_hand("DEX3-MOVE-01")
+@wrong_hand("DEX3-MOVE-01", where=obeys_gains)
 class OneJointBackwards(FingerService):
     """Moves one joint backwards."""
 
@@ -464,7 +472,7 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", whole=True)
+@wrong_hand("DEX3-MOVE-03", whole=True, where=obeys_gains)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
@@ -477,7 +485,7 @@ class _Weak(FingerHand):
         self.viscous = max(self.client_kp.min() / 15, 3 * self.viscous)
 
 
-@wrong_hand("DEX3-MOVE-04")
+@wrong_hand("DEX3-MOVE-04", where=obeys_gains)
 @wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))
 class Slow(FingerService):
     """Has high friction: it moves slowly."""
@@ -496,7 +504,7 @@ class _Springy(FingerHand):
         super().take(undamped, mode)
 
 
-@wrong_hand("DEX3-MOVE-05", also=("DEX3-PATH-01",))
+@wrong_hand("DEX3-MOVE-05", also=("DEX3-PATH-01",), where=obeys_gains)
 @wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01", "DEX5-PATH-01"))
 class Undamped(FingerService):
     """Applies 15 % of kd where kp is not 0."""
@@ -506,6 +514,7 @@ class Undamped(FingerService):
 
 @wrong_hand("DEX3-SIDE-01", also=("DEX3-MOVE-07",), sides=BOTH)
 @wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)
+@wrong_hand("BRAINCO-SIDE-01", also=("BRAINCO-MOVE-02",), sides=BOTH)
 class Coupled(FingerService):
     """The goal of the left hand's first finger leaks into the right one's."""
 
@@ -890,7 +899,7 @@ class _NanPerJoint(FingerHand):
 
 
 @wrong_hand("DEX3-SAFE-01", also=("DEX3-SAFE-03",))
-@wrong_hand("DEX5-SAFE-01")
+@wrong_hand(("DEX5-SAFE-01", "BRAINCO-SAFE-01"))
 class RejectsOnlyTheBadJoint(FingerService):
     """Ignores only the joint whose command is NaN, and moves the others."""
 
@@ -931,13 +940,16 @@ class FillsUpWithZeros(FingerService):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
-        sequence = self.codec.command.decode(payload).motor_cmd
+        sequence = getattr(self.codec.command.decode(payload), self.codec.command_sequence)
+        dq = self.hand.model.client_dq
         for side in self.sides:
             mine = self.codec.command_topics[side] == topic
             if mine and 0 < len(sequence) < self.codec.joints:
                 given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence]
                 missing = range(len(given), self.codec.joints)
-                self.motors(side, (*given, *(Motor(mode=self.codec.mode(i)) for i in missing)))
+                self.motors(
+                    side, (*given, *(Motor(dq=dq, mode=self.codec.mode(i)) for i in missing))
+                )
 
 
 class _KeepsSpeed(FingerHand):

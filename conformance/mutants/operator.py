@@ -11,7 +11,7 @@ from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.any_model import Delayed
-from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.mutants.registry import obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
@@ -82,7 +82,9 @@ class SaturatingGain(ReferenceService):
 
 
 # what it leaves of each step shows in steps of every kind
-@wrong_hand("DEX3-OPER-02", also=("DEX3-ABUSE-01", "DEX3-CMD-01", "DEX3-MODE-07"))
+@wrong_hand(
+    "DEX3-OPER-02", also=("DEX3-ABUSE-01", "DEX3-CMD-01", "DEX3-MODE-07"), where=obeys_gains
+)
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
 
@@ -106,7 +108,7 @@ class CoarseTargets(_Coarse, ReferenceService):
 
 
 @wrong_hand("DEX3-OPER-04", also=("DEX3-MOVE-04",))
-@wrong_hand("DEX5-OPER-04")
+@wrong_hand(("DEX5-OPER-04", "BRAINCO-OPER-04"))
 class CoarseFingers(_Coarse, FingerService):
     """Moves to the nearest of 21 positions."""
 
@@ -204,6 +206,7 @@ class _OpenEnd(_PerJoint):
 
 
 @wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05"))
+@wrong_hand("BRAINCO-OPER-01", also=("BRAINCO-OPER-05",))
 # its session begins at the open end
 @wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01", "DEX5-MOVE-08"))
 class SlowToLeave(_OpenEnd, FingerService):
@@ -232,6 +235,7 @@ class Springs(_OpenEnd, FingerService):
 
 
 @wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02", "DEX3-CMD-01"))
+@wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",))
 # its delay is long compared with the steps of the light joints
 @wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02", "DEX5-CMD-01", "DEX5-GAIN-05"))
 class LateFingers(Delayed, FingerService):

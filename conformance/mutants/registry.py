@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 from dexkit.conformance.layers import layer
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.hand import Side, Subject
+from dexkit.models import HandModel, model
 
-__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "wrong_hand"]
+__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "obeys_gains", "wrong_hand"]
 
 LEFT = (Side.LEFT,)
 BOTH = (Side.LEFT, Side.RIGHT)
@@ -77,6 +78,7 @@ class _Declaration:
     dialect: str
     brief: bool
     whole: bool
+    where: Callable[[HandModel], bool] | None
 
 
 _References = Mapping[tuple[str, str], type[Any]]  # by layer and model
@@ -91,6 +93,7 @@ def wrong_hand(
     dialect: str = "",
     brief: bool = False,
     whole: bool = False,
+    where: Callable[[HandModel], bool] | None = None,
 ) -> Callable[[C], C]:
     """Declare a class to be a wrong hand, robot, USB device or client.
 
@@ -103,14 +106,20 @@ def wrong_hand(
         reference's ``fault_sides`` names.
     :param dialect: see :class:`Mutant`; ``brief`` and ``whole`` likewise. With several ids, all
         but the first are brief: every phase has been applied to the fault with the first.
+    :param where: the hands that can have the fault; None for all.
     """
     ids = (kills,) if isinstance(kills, str) else kills
 
     def declare(made: C) -> C:
-        _declared.append(_Declaration(made, ids, also, sides, dialect, brief, whole))
+        _declared.append(_Declaration(made, ids, also, sides, dialect, brief, whole, where))
         return made
 
     return declare
+
+
+def obeys_gains(hand: HandModel) -> bool:
+    """Whether a hand's commands have gains: a place for ``where``."""
+    return hand.dialects[0].gains_are_used
 
 
 def mix(fault: type[Any], reference: type[C]) -> type[C]:
@@ -147,6 +156,8 @@ def _mutants(
             if not _is_like(requirement, name, by_id):
                 continue
             if requirement.id != name and place in elsewhere:
+                continue
+            if declared.where and not declared.where(model(requirement.model)):
                 continue
             reference = references[place]
             if not issubclass(reference, base):

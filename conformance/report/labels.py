@@ -64,6 +64,7 @@ _UNITS = {
     "ms": "ms",
     "hz": "Hz",
     "rad": "rad",
+    "travel": "of the full travel",
     "nm": "N m",
     "stroke": "of the stroke",
     "part": "",

@@ -192,7 +192,7 @@ def operated(view: Recording, hand: SideView, joint: int, span: tuple[float, flo
     return chart(
         f"{whose(hand.side)}, {_called(hand, joint)}: driven by Unitree's teleoperation client",
         [*([wanted] if wanted else []), *command_and_state(hand, joint)],
-        y_unit="rad",
+        y_unit=view.unit,
         span=span,
         bands=_busy(view, span),
         height=190,
@@ -238,7 +238,7 @@ def _follow(scene: _Scene, span: tuple[float, float] | None = None) -> str:
             f"{whose(hand.side)}, {_called(hand, joint)}: command and state, "
             f"{span[0]:.1f} to {span[1]:.1f} s",
             command_and_state(hand, joint),
-            y_unit="rad",
+            y_unit=scene.view.unit,
             span=span,
             bands=bands,
             height=180,
@@ -279,7 +279,7 @@ def _both_sides(scene: _Scene) -> str:
     return chart(
         f"both hands, {_called(hand, joint)}, while only the other one is to move",
         lines,
-        y_unit="rad",
+        y_unit=scene.view.unit,
         span=span,
         bands=scene.alarms,
         include=_room(hand, joint, span),
@@ -456,7 +456,7 @@ def _samples(scene: _Scene) -> str:
     return chart(
         f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
         [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
-        y_unit="rad",
+        y_unit=scene.view.unit,
         span=span,
         bands=scene.alarms,
     )
@@ -485,7 +485,7 @@ def _torque(scene: _Scene) -> str:
             Line("tau_est", "force", hand.states.t, hand.states.tau[:, j])
             for j in scene.joints(span)
         ],
-        y_unit="N m",
+        y_unit=scene.view.model.torque_unit,
         span=span,
         bands=phase_bands(scene.view, hand.side) + scene.alarms,
         levels=levels,
@@ -513,8 +513,8 @@ def _torque_by_position(scene: _Scene) -> str:
             Line("each state of the run", "force", q[good], tau[good], "dots"),
             Line("here", "bad", q[here], tau[here], "dots"),
         ],
-        y_unit="N m",
-        x_unit="rad",
+        y_unit=scene.view.model.torque_unit,
+        x_unit=scene.view.unit,
         span=(spec.q_min - 0.05 * spec.stroke, spec.q_max + 0.05 * spec.stroke),
         bands=[Band("object", spec.q_min, touch)] if held and touch is not None else [],
         include=(0.0,),
@@ -539,7 +539,7 @@ def _member(scene: _Scene, member: str) -> str:
     return chart(
         f"{whose(scene.hand.side)}: {member}",
         [Line(member, "force", states.t, column) for column in table.T],
-        y_unit=_FIELDS.get(member, ""),
+        y_unit=_FIELDS.get(member, "").replace("rad", scene.view.unit),
         span=span,
         bands=_busy(scene.view, span) + scene.alarms,
         include=(0.0,),

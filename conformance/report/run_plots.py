@@ -61,7 +61,7 @@ def _joint(result: RunResult, view: Recording, hand: SideView, index: int) -> st
     figure = chart(
         f"{whose(hand.side)}, {name}: command and state over the whole run",
         command_and_state(hand, index),
-        y_unit="rad",
+        y_unit=view.unit,
         span=_span(view),
         bands=phase_bands(view, hand.side, label=gripper or index == 0) + _alarms(result, hand),
         levels=_felt(view, hand),
@@ -70,12 +70,16 @@ def _joint(result: RunResult, view: Recording, hand: SideView, index: int) -> st
         legend=False,
         titled=False,
     )
-    return figure if gripper else f'<p class="joint"><b>{escape(name)}</b>{_way(joint)}</p>{figure}'
+    return (
+        figure
+        if gripper
+        else f'<p class="joint"><b>{escape(name)}</b>{_way(joint, view.unit)}</p>{figure}'
+    )
 
 
-def _way(joint: JointSpec) -> str:
+def _way(joint: JointSpec, unit: str) -> str:
     closing = {1: ", closes upwards", -1: ", closes downwards", 0: ""}[joint.closing]
-    return f" ({joint.q_min:.2f} to {joint.q_max:.2f} rad{closing})"
+    return f" ({joint.q_min:.2f} to {joint.q_max:.2f} {unit}{closing})"
 
 
 def _felt(view: Recording, hand: SideView) -> list[Level]:
@@ -95,7 +99,7 @@ def _session(view: Recording, hand: SideView) -> str:
         + chart(
             f"{whose(hand.side)}, replayed session: command and state",
             command_and_state(hand, 0),
-            y_unit="rad",
+            y_unit=view.unit,
             span=span,
             levels=_felt(view, hand),
             include=(0.0, hand.joints[0].stroke),
@@ -121,7 +125,11 @@ def _operator(view: Recording, hand: SideView) -> str:
 def _force(view: Recording, hand: SideView) -> str:
     states, touch, gripper = hand.states, _touch(view, hand), len(hand.joints) == 1
     if gripper:
-        held = "" if touch is None else f" Something is between its fingers at {touch:.2f} rad."
+        held = (
+            ""
+            if touch is None
+            else f" Something is between its fingers at {touch:.2f} {view.unit}."
+        )
         text = f"Force (tau_est): negative is closing.{held}"
     else:
         held = (
@@ -133,7 +141,7 @@ def _force(view: Recording, hand: SideView) -> str:
     return f"<p>{text}</p>" + chart(
         f"{whose(hand.side)}: torque over the whole run",
         [Line("force", "force", states.t, states.tau[:, i]) for i in range(len(hand.joints))],
-        y_unit="N m",
+        y_unit=view.model.torque_unit,
         span=_span(view),
         bands=phase_bands(view, hand.side, label=False),
         height=130,

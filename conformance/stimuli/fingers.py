@@ -66,7 +66,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import BETWEEN, HandScript
+from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointMode, Side
@@ -90,6 +90,8 @@ _PUSH, _PUSH_DAMPING, _PUSH_SECONDS = 0.3, 0.5, 0.3  # N m, N m s/rad, s
 _SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of joints that are driven by a velocity
 # of joints that move slowly, N m/rad and N m s/rad: still under way five seconds later
 _SLOW_GAINS = (0.2, 0.8)
+_SLOW_PART = 0.08
+"""The same of position servos: part of their full speed."""
 _SPLITS = ((1, 2, 3, 6), (1, 2, 4, 5), (0, 2, 4, 6))
 """Joints with another mode byte than the rest of the hand, in three commands: each joint is among
 them and not, and no two joints are treated alike three times."""
@@ -193,9 +195,7 @@ class FingerScript(HandScript):
     def _pose(self, side: Side, percent: float) -> Pose:
         """Every joint so far closed; the thumb's sideways joint swings along."""
         return tuple(
-            percent / 100 * (j.q_max if j.closing > 0 else j.q_min)
-            if j.closing
-            else (percent - 30) / 70 * j.q_max
+            j.closed_by(percent / 100) if j.closing else (percent - 30) / 70 * j.q_max
             for j in self._joints[side]
         )
 
@@ -218,7 +218,7 @@ class FingerScript(HandScript):
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
         return [
-            Motor(q=q, kp=kp, kd=kd, mode=self._codec.mode(i))
+            Motor(q=q, dq=self._model.client_dq, kp=kp, kd=kd, mode=self._codec.mode(i))
             for i, (q, (kp, kd)) in enumerate(zip(pose, self._model.gains, strict=True))
         ]
 
@@ -263,7 +263,9 @@ class FingerScript(HandScript):
         if name == "nan":
             for side in self.plan.sides:
                 kinds = [{side: motors} for motors in self._not_finite(side)]
-                yield from self._bad_commands(name, (side,), kinds, 0.08)
+                # long enough for a step of the other side beside them
+                each = max(0.08, 1.05 * ASIDE_SECONDS / len(kinds))
+                yield from self._bad_commands(name, (side,), kinds, each)
         elif name == "status":
             kinds = [
                 {s: self._with_status(s, first) for s in self.plan.sides} for first in _STATUSES
@@ -327,6 +329,7 @@ class FingerScript(HandScript):
         return [
             self._broken(side, joints[(i + i // 3) % 3], field, value)
             for i, (field, value) in enumerate(NOT_FINITE)
+            if field in self.plan.dialect.command_fields
         ]
 
     def _broken(self, side: Side, joint: int, field: str, value: float) -> Motors:
@@ -339,7 +342,8 @@ class FingerScript(HandScript):
         self._report("bad commands of the new client: nothing may move")
         sides = self.plan.sides
         every = {s: self._not_finite(s) for s in sides}
-        kinds = [{s: every[s][i] for s in sides} for i in range(0, len(NOT_FINITE), 2)]
+        kinds = [dict(zip(sides, each, strict=True)) for each in zip(*every.values(), strict=True)]
+        kinds = kinds[::2]
         yield from self._bad_commands("nan", sides, kinds, 0.08)
         for name in ("empty", "short", "long", "negative"):
             if name in self.plan.phases:
@@ -533,12 +537,18 @@ class FingerScript(HandScript):
                 dq, tau = (0.0, _DAMPING * speed) if i == by_torque else (speed, 0.0)
                 motors[i] = replace(motors[i], dq=dq, tau=tau, kp=0.0, kd=_DAMPING)
             for i in self._roles.slow:
-                motors[i] = replace(motors[i], q=far[i], kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
+                motors[i] = self._slowly(motors[i], far[i])
             hands[s] = motors
             targets[s] = {i: far[i] for i in self._roles.slow}
         phase = self._begin(name, sides, targets=targets)
         yield from self._hold(0.3, hands)
         self._end(phase)
+
+    def _slowly(self, motor: Motor, q: float) -> Motor:
+        """The command to a motor to go to q for seconds, where the dialect has a way to say so."""
+        if self.plan.dialect.position_servo:
+            return replace(motor, q=q, dq=_SLOW_PART)
+        return replace(motor, q=q, kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
 
     def _by_torque(self) -> int | None:
         """The joint that is driven by a torque this time, where protection is for each joint."""

@@ -468,7 +468,9 @@ class HandScript(Script[Side]):
         )
         yield from self._do(Join(Role.STRANGER))
         phase = self._begin("foreign", self.plan.sides)
-        yield from self._beside(phase, far, Role.STRANGER, 0.5)
+        # two goals in turn cancel out in a servo whose speed does not depend on the distance
+        turns = 3 if self.plan.dialect.position_servo else 1
+        yield from self._beside(phase, far, Role.STRANGER, 0.5, turns)
         self._end(phase)
         yield from self._do(Leave(Role.STRANGER))
         yield from self._everyone("recover", self._other_place(), most=1.5, after="foreign")
@@ -544,14 +546,17 @@ class HandScript(Script[Side]):
         self._period_ns, self._echoed = period, False
         yield from self._do(Leave(Role.RIVAL))
 
-    def _beside(self, phase: Phase, payloads: Payloads, role: Role, seconds: float) -> Steps:
-        """Another client sends between this one's commands, at the same rate."""
+    def _beside(
+        self, phase: Phase, payloads: Payloads, role: Role, seconds: float, turns: int = 1
+    ) -> Steps:
+        """Another client sends between this one's commands, so many times as often."""
         period = self._period_ns
         self._period_ns = period // 2
         while self._elapsed(phase) < seconds:
             yield from self._command()
-            self._next_ns += self._period_ns
-            yield from self._do(Send(payloads, self._next_ns, by=role))
+            for _ in range(turns):
+                self._next_ns += self._period_ns
+                yield from self._do(Send(payloads, self._next_ns, by=role))
         self._period_ns = period
 
     def _service_restart(self) -> Steps:

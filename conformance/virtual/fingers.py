@@ -16,7 +16,7 @@ from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
 
-__all__ = ["Dex3Service", "FingerHand", "FingerService"]
+__all__ = ["GO_MOTOR", "Dex3Service", "FingerHand", "FingerService", "Flags", "Ints"]
 
 Flags: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]
@@ -24,16 +24,22 @@ NO_VALUE = 30000.0  # the Dex3-1 manual
 # the joint that presses each sensor packet, in the order of the model's sensors
 _PRESSED_BY = {"thumb": (2, 1), "middle": (4, 3), "index": (6, 5)}
 
-# one motor and one sensor packet of a HandState_ on the wire (docs/sources/unitree-dex.md#a2,
-# docs/sources/unitree-dex.md#a4)
-_MOTOR = np.dtype(
-    {
-        "names": ["mode", "q", "dq", "ddq", "tau_est", "reserve", "values"],
-        "formats": ["u1", "<f4", "<f4", "<f4", "<f4", "<u4", ("<f4", 4)],
-        "offsets": [0, 4, 8, 12, 16, 40, 4],  # values are the four floats at once
-        "itemsize": 56,
-    }
-)
+
+def _motor(size: int) -> np.dtype[Any]:
+    """One motor of a state on the wire, in so many bytes."""
+    return np.dtype(
+        {
+            "names": ["mode", "q", "dq", "ddq", "tau_est", "reserve", "values"],
+            "formats": ["u1", "<f4", "<f4", "<f4", "<f4", "<u4", ("<f4", 4)],
+            "offsets": [0, 4, 8, 12, 16, 40, 4],  # values are the four floats at once
+            "itemsize": size,
+        }
+    )
+
+
+# one motor and one sensor packet of a HandState_ on the wire, and one motor of a MotorStates_
+# (docs/sources/unitree-dex.md#a2, docs/sources/unitree-dex.md#a4)
+_MOTOR, GO_MOTOR = _motor(56), _motor(48)
 _PACKET = np.dtype(
     {"names": ["pressure"], "formats": [("<f4", 12)], "offsets": [0], "itemsize": 104}
 )
@@ -66,9 +72,9 @@ class FingerHand:
         if touch is not None:
             for i, j in enumerate(specs):
                 if j.closing > 0:
-                    self.ceiling[i] = touch / 100 * j.q_max
+                    self.ceiling[i] = j.closed_by(touch / 100)
                 elif j.closing < 0:
-                    self.floor[i] = touch / 100 * j.q_min
+                    self.floor[i] = j.closed_by(touch / 100)
         self.touches = touch is not None
         n = len(specs)
         self.index = np.arange(n)
@@ -254,6 +260,7 @@ class FingerService(Service):
     hand: type[FingerHand]
     hand_fault: type[FingerHand] | None = None
     """Mixed into the hands of a wrong hand's reference."""
+    motor_layout = _MOTOR
     sensors = 0
     """Sensor packets in a state."""
     attitude: Sequence[float] = (0.0, 0.0, 0.0, 0.0)
@@ -271,7 +278,7 @@ class FingerService(Service):
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
         self._blank: dict[int, tuple[bytearray, Any, Any]] = {}
-        self._sent: dict[Side, tuple[object, bytes]] = {}
+        self._sent: dict[tuple[Side, ...], tuple[object, bytes]] = {}
         units = dialect.torque_units or (1.0,) * dialect.length
         self.torque_units: Floats = np.array(units)
 
@@ -301,21 +308,21 @@ class FingerService(Service):
             hand.step(dt)
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        """The state of a hand on the wire."""
-        (side,) = sides
-        hand = self.hands[side]
+        """The state of these hands on the wire."""
         count = self.dialect.length if length is None else length
-        key = (hand.version, count)
-        if self._sent.get(side, (None, b""))[0] == key:
-            return self._sent[side][1]
+        key = (*(self.hands[s].version for s in sides), count)
+        if self._sent.get(sides, (None, b""))[0] == key:
+            return self._sent[sides][1]
         data, motors, packets = self._message(count)
-        n = min(count, len(hand.q))
-        if n:
-            self.fill(motors[:n], hand)
-        if len(packets):
-            packets["pressure"] = self.pressures(hand)[: len(packets)]
-        self._sent[side] = (key, bytes(data))
-        return self._sent[side][1]
+        for side in sides:
+            hand, first = self.hands[side], self.dialect.index[side]
+            mine = motors[first : first + len(hand.q)]
+            if len(mine):
+                self.fill(mine, hand)
+            if len(packets):
+                packets["pressure"] = self.pressures(hand)[: len(packets)]
+        self._sent[sides] = (key, bytes(data))
+        return self._sent[sides][1]
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         """Fill in the motors of a state."""
@@ -349,9 +356,9 @@ class FingerService(Service):
         if count not in self._blank:
             data = bytearray(self.codec.state.encode(self.message(count)))
             at = 8  # header and length
-            motors = np.frombuffer(data, _MOTOR, count, at)
-            at += count * _MOTOR.itemsize + 4
-            packets = np.frombuffer(data, _PACKET, self.sensors, at)
+            motors = np.frombuffer(data, self.motor_layout, count, at)
+            at += count * self.motor_layout.itemsize + 4
+            packets = np.frombuffer(data, _PACKET, self.sensors, at if self.sensors else 0)
             self._blank[count] = (data, motors, packets)
         return self._blank[count]
 

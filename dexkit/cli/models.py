@@ -60,7 +60,12 @@ def _table(
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        table.add_column(
+            column,
+            justify="right" if column in right else "left",
+            overflow="fold",
+            no_wrap=column in ("what", "joints"),
+        )
     for row in rows:
         table.add_row(*map(str, row))
     return table
@@ -133,7 +138,8 @@ def _hand(console: Console, data: dict[str, Any]) -> None:
     for side in _SIDES[:1] if alike else _SIDES:
         rows = [(*_joint(j), _CLOSES[j["closing"]]) for j in joints[side]]
         console.print(f"\n[bold]{'left and right' if alike else side}[/bold]")
-        console.print(_table((*_JOINT_COLUMNS, "closes"), rows, _FIGURES))
+        columns = _columns(data["unit"])
+        console.print(_table((*columns, "closes"), rows, columns[:1] + columns[2:]))
     console.print()
     rates = data["rates_hz"]
     low = f", a copy at {rates['low_rate_state']:g} Hz" if rates["low_rate_state"] else ""
@@ -196,18 +202,24 @@ def _robot(console: Console, data: dict[str, Any]) -> None:
 
 _JOINT_COLUMNS = ("#", "joint", "rad", "deg", "rad/s", "N m")
 _FIGURES = _JOINT_COLUMNS[:1] + _JOINT_COLUMNS[2:]
+
+
+def _columns(unit: str) -> tuple[str, ...]:
+    return _JOINT_COLUMNS if unit == "rad" else ("#", "joint", unit, f"{unit}/s")
+
+
 _CLOSES = {1: "+", -1: "-", 0: "neither"}
 
 
 def _joint(joint: dict[str, Any]) -> tuple[object, ...]:
-    return (
-        joint["index"],
-        joint["name"],
-        f"{round(joint['q_min_rad'], 4):g} .. {round(joint['q_max_rad'], 4):g}",
-        f"{joint['q_min_deg']:.0f} .. {joint['q_max_deg']:.0f}",
-        f"{joint['dq_max_rad_s']:g}",
-        f"{joint['tau_max_nm']:g}",
-    )
+    from dexkit.model_facts import speed, width
+
+    low, high = width(joint)
+    found = [joint["index"], joint["name"], f"{round(low, 4):g} .. {round(high, 4):g}"]
+    if "q_min_deg" not in joint:
+        return (*found, f"{speed(joint):.4g}")
+    found.append(f"{joint['q_min_deg']:.0f} .. {joint['q_max_deg']:.0f}")
+    return (*found, f"{speed(joint):g}", f"{joint['tau_max_nm']:g}")
 
 
 def _both(dialect: dict[str, Any], key: str) -> str:
@@ -227,6 +239,8 @@ def _topics(console: Console, rows: Sequence[tuple[str, str, str]]) -> None:
 def _gains(data: dict[str, Any]) -> list[tuple[str, str]]:
     from dexkit.model_facts import gain_groups
 
+    if "client_gains" not in data:
+        return [("its dq", f"{data['client_dq']:g}, and no gains")]
     groups = gain_groups(data)
     texts = [
         f"kp {kp:g} N m/rad, kd {kd:g} N m s/rad" + ("" if len(groups) == 1 else f": {which}")

@@ -319,7 +319,7 @@ def _report(session: Session, operator: Operator, nominal: float, *, as_json: bo
         if not measured["joints"]:
             click.echo("  no occasion to measure anything")
         for name, values in measured["joints"].items():
-            text = sentence(values) or "no occasion to measure anything"
+            text = sentence(values, model.unit) or "no occasion to measure anything"
             click.echo(f"  {text}" if len(model.joints[Side.LEFT]) == 1 else f"  {name}: {text}")
 
 
@@ -330,13 +330,13 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def sentence(values: Mapping[str, float]) -> str:
-    """The figures of a joint in a line."""
+def sentence(values: Mapping[str, float], unit: str = "rad") -> str:
+    """The figures of a joint in a line; ``unit`` is that of q."""
     formats: dict[str, Callable[[float], str]] = {
         "stroke_s": lambda x: f"full stroke {x:.2f} s",
         "reaction_s": lambda x: f"reacts after {x * _MS:.0f} ms",
-        "overshoot": lambda x: f"overshoots by {x:.3f} rad",
-        "stuck": lambda x: f"rests {x:.3f} rad off",
+        "overshoot": lambda x: f"overshoots by {x:.3f} {unit}",
+        "stuck": lambda x: f"rests {x:.3f} {unit} off",
         "lag_s": lambda x: f"lags {x * _MS:.0f} ms",
     }
     return ", ".join(

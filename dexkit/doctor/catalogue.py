@@ -321,6 +321,24 @@ _ALL = (
         "checks a serial port",
     ),
     Diagnosis(
+        "DDS-REVERSED",
+        _E,
+        "the hand moves away from its commands",
+        "the hand opens when it is to close",
+        "its scale runs the other way: 1 closes a BrainCo hand and opens an Inspire hand; or one "
+        "service is taken for the other",
+        "compare topic and hand; a service of one vendor's hand must not be on the other's topics",
+    ),
+    Diagnosis(
+        "DDS-SIDES-SWAPPED",
+        _E,
+        "each hand's state is where the other one is commanded to",
+        "one hand moves with the operator's other hand, or is shown as it",
+        "the adapters of two hands are swapped, or states are taken from the other hand's place",
+        "exchange the serial adapters, or the ids of the hands; where both hands share a message, "
+        "the right one's motors come first in Inspire's",
+    ),
+    Diagnosis(
         "DDS-NO-GAINS",
         _W,
         "a client changes q in commands without gains",

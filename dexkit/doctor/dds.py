@@ -63,6 +63,7 @@ class _Watch:
     low: list[float] = field(default_factory=list)
     high: list[float] = field(default_factory=list)
     q: tuple[float, ...] = ()
+    began: tuple[float, ...] = ()
     driven: dict[int, tuple[float, float]] = field(default_factory=dict)
     limp: dict[int, tuple[float, float]] = field(default_factory=dict)
     nonzero: bool = False
@@ -109,6 +110,7 @@ class _Watch:
                     seen[i] = min(low, q[i]), max(high, q[i])
         if len(q) != len(self.low):
             self.low, self.high = list(q), list(q)
+            self.began = tuple(q)
         self.low = [min(pair) for pair in zip(self.low, q, strict=True)]
         self.high = [max(pair) for pair in zip(self.high, q, strict=True)]
 
@@ -128,6 +130,7 @@ class _Watch:
             rate=gaps / elapsed if gaps and elapsed > 0 else 0.0,
             identical=self.identical and self.samples > 1,
             q=self.q,
+            began=self.began,
             q_span=max((h - low for low, h in zip(self.low, self.high, strict=True)), default=0.0),
             driven_span=max((high - low for low, high in self.driven.values()), default=0.0),
             limp_span=max((high - low for low, high in self.limp.values()), default=0.0),

@@ -95,6 +95,7 @@ class Stream:
     :param rate: samples a second that it writes, by its own count.
     :param identical: all samples were the same bytes.
     :param q: positions of the last sample, rad; empty when none could be decoded.
+    :param began: the same of the first sample.
     :param q_span: the furthest that any joint moved, rad.
     :param driven_span: of commands: the furthest that the target of any joint moved, rad, over
         the commands that drive it (with a position gain, and a mode that obeys).
@@ -114,6 +115,7 @@ class Stream:
     rate: float = 0.0
     identical: bool = False
     q: tuple[float, ...] = ()
+    began: tuple[float, ...] = ()
     q_span: float = 0.0
     driven_span: float = 0.0
     limp_span: float = 0.0

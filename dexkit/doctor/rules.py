@@ -23,6 +23,7 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.topics import nearly, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
+from dexkit.doctor.ways import Course, moves_against, swapped
 from dexkit.hand import Side
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.topics import Role, roles
@@ -254,6 +255,7 @@ def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
         yield from _matches(view)
         yield from _listeners(view, scope)
         yield from _streams(view, scope)
+        yield from _ways(view, scope)
         yield from _limp_clients(view, scope)
         if not scope.dialects:
             yield from _waiting(seen, view)
@@ -525,10 +527,65 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
             yield _finding(
                 "DDS-FROZEN",
                 f"{what}: {stream.samples} identical states while the commands moved by "
-                f"{command.driven_span:.2f} rad",
+                f"{command.driven_span:.2f} {MODELS[dialect.model].unit}",
                 domain=view.number,
                 topic=topic,
             )
+
+
+def _positions(part: _Part, stream: Stream | None, side: Side, at: str) -> tuple[float, ...]:
+    """A side's part of the positions in a stream; empty where they are not known."""
+    if stream is None:
+        return ()
+    first = part.role.dialect.index[side]
+    count = len(MODELS[part.role.dialect.model].joints[side])
+    values: tuple[float, ...] = getattr(stream, at)[first : first + count]
+    return values if len(values) == count else ()
+
+
+def _ways(view: DomainView, scope: Scope) -> Iterator[Finding]:
+    """Hands that move the wrong way, or with the other one's commands."""
+    found: dict[tuple[str, Side], tuple[_Part, Course]] = {}
+    for part in _hands(view, scope):
+        state, command = view.stream(part.endpoint), _command(view, part, scope)
+        for side in part.role.sides:
+            course = Course(
+                *(
+                    _positions(part, stream, side, at)
+                    for stream in (state, command)
+                    for at in ("began", "q")
+                )
+            )
+            if all(course):
+                found[part.role.dialect.name, side] = part, course
+                yield from _reversed(view, part, side, course)
+    for (name, side), (part, mine) in found.items():
+        other = found.get((name, Side.RIGHT))
+        if side is Side.LEFT and other is not None and swapped(mine, other[1]):
+            yield _finding(
+                "DDS-SIDES-SWAPPED",
+                f"{part.endpoint.topic} of {part.who} on domain {view.number}: it moves as the "
+                "right hand is commanded, and the right one as it is",
+                domain=view.number,
+                topic=part.endpoint.topic,
+            )
+
+
+def _reversed(view: DomainView, part: _Part, side: Side, course: Course) -> Iterator[Finding]:
+    spoken = part.role.dialect
+    ranges = [
+        (0.0, spoken.q_open) if spoken.is_gripper else (joint.q_min, joint.q_max)
+        for joint in MODELS[spoken.model].joints[side]
+    ]
+    against = moves_against(course, ranges)
+    if against:
+        yield _finding(
+            "DDS-REVERSED",
+            f"{part.endpoint.topic} of {part.who} on domain {view.number}: {against} of "
+            f"{len(ranges)} joints of the {side} hand moved against their commands",
+            domain=view.number,
+            topic=part.endpoint.topic,
+        )
 
 
 def _limp_clients(view: DomainView, scope: Scope) -> Iterator[Finding]:

@@ -1,8 +1,8 @@
 """Every hand model: those of dexkit, and those of other packages.
 
 A profile (:class:`HandModel`) is all that dexkit knows of a hand. The built-in ones are
-:mod:`~dexkit.models.dex1`, :mod:`~dexkit.models.dex3` and :mod:`~dexkit.models.dex5`. A package
-adds its own under the entry-point group ``dexkit.models``::
+the modules beside this one. A package adds its own under the entry-point group
+``dexkit.models``::
 
     [project.entry-points."dexkit.models"]
     my-hand = "my_package.profile:MY_HAND"
@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from dexkit.errors import ModelBroken, UsageError
 from dexkit.hand import Side
+from dexkit.models.brainco import BRAINCO_REVO2
 from dexkit.models.dex1 import DEX1_1
 from dexkit.models.dex3 import DEX3_1
 from dexkit.models.dex5 import DEX5_1
@@ -34,6 +35,7 @@ from dexkit.models.profile import (
 from dexkit.plugins import entry_points, import_object, origin
 
 __all__ = [
+    "BRAINCO_REVO2",
     "BUILT_IN",
     "DEX1_1",
     "DEX3_1",
@@ -55,10 +57,14 @@ __all__ = [
 ]
 
 GROUP = "dexkit.models"
-BUILT_IN = (DEX1_1, DEX3_1, DEX5_1)
+BUILT_IN = (DEX1_1, DEX3_1, DEX5_1, BRAINCO_REVO2)
 """The models of dexkit itself."""
 
-_HAND_TYPES = ("unitree_hg::msg::dds_::HandCmd_", "unitree_hg::msg::dds_::HandState_")
+_HAND_TYPES = (
+    ("unitree_hg::msg::dds_::HandCmd_", "unitree_hg::msg::dds_::HandState_"),
+    ("unitree_go::msg::dds_::MotorCmds_", "unitree_go::msg::dds_::MotorStates_"),
+)
+"""Types of commands and states of hands of several joints; the latter for position servos."""
 _lock = threading.RLock()
 
 
@@ -147,8 +153,9 @@ def _checked(value: object, name: str) -> HandModel:
     for each in value.dialects:
         require(each.model == name, f"its dialect {each.name} is of {each.model!r}")
         require(
-            each.is_gripper or (each.cmd_type, each.state_type) == _HAND_TYPES,
-            f"its dialect {each.name} has to use the types {' and '.join(_HAND_TYPES)}",
+            each.is_gripper or (each.cmd_type, each.state_type) == _HAND_TYPES[each.position_servo],
+            f"its dialect {each.name} has to use the types "
+            f"{' and '.join(_HAND_TYPES[each.position_servo])}",
         )
     if not value.dialects[0].is_gripper:
         require(value.roles is not None, "it has no joint roles")

@@ -69,6 +69,11 @@ class Dialect:
         (docs/sources/unitree-dex.md#b1).
     :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
     :param torque_units: N·m in one unit of a motor's tau and tau_est; empty where all are in N·m.
+    :param position_servo: each motor goes to q by itself: kp, kd, tau and mode of a command are not
+        used, and dq is no feed-forward.
+    :param speed_units: of position servos, the speed of each joint (the model's unit a second) that
+        is 1 in a motor's dq: in a command the most that it may move with, in a state how fast it
+        moves. Empty where dq is not used, or holds the speed itself.
     """
 
     name: str
@@ -89,6 +94,8 @@ class Dialect:
     zero_is_no_state: bool = False
     low_rate_topic: str = ""
     torque_units: tuple[float, ...] = ()
+    position_servo: bool = False
+    speed_units: tuple[float, ...] = ()
 
     def topics(self, side: Subject) -> tuple[str, str]:
         """(command topic, state topic) of a side or a robot."""
@@ -102,7 +109,14 @@ class Dialect:
     @property
     def gains_are_used(self) -> bool:
         """Whether kp and kd of a command have an effect."""
-        return not self.interface_specification
+        return not (self.interface_specification or self.position_servo)
+
+    @property
+    def command_fields(self) -> tuple[str, ...]:
+        """The numbers of a motor's command that have an effect."""
+        if self.gains_are_used:
+            return ("q", "dq", "tau", "kp", "kd")
+        return ("q", "dq") if self.speed_units else ("q",)
 
 
 @dataclass(frozen=True)
@@ -192,6 +206,9 @@ _FINGER_PROFILES: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = Lazy(
 class HandModel:
     """One hand model.
 
+    :param unit: of q, of its limits and of all that is derived from them.
+    :param torque_unit: of tau_est and tau_max: A, where a hand reports currents.
+
     **On DDS.**
 
     :param state_rate: Hz at which the vendor's service publishes state.
@@ -202,7 +219,8 @@ class HandModel:
     :param client_gains: kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends, to every
         joint that ``joint_gains`` does not name.
     :param joint_gains: those that it sends to some joints, by index.
-    :param rest_q: where a simulated hand rests at first, per side, rad; never all zero, because
+    :param client_dq: dq that it sends to every joint, as it is on the wire.
+    :param rest_q: where a simulated hand rests at first, per side; never all zero, because
         clients wait for a position that is not.
     :param sensors: pressure sensor packets of a state, in order.
     :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
@@ -255,6 +273,9 @@ class HandModel:
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
     low_rate: float = 0.0
+    unit: str = "rad"
+    torque_unit: str = "N m"
+    client_dq: float = 0.0
     joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
     shared_motors: tuple[tuple[int, ...], ...] = ()
     simulator: str = ""

@@ -146,10 +146,7 @@ class DialectMap(ABC):
         self._specs = dict(specs)
         self._state_type = message_type(dialect.state_type)
         self._sequence = message_type(dialect.cmd_type).motor_sequence
-        # one joint: its motor is one element of the sequence; more: they are the sequence
-        self._first = {
-            side: dialect.index[side] if spec.n_joints == 1 else 0 for side, spec in specs.items()
-        }
+        self._first = {side: dialect.index[side] for side in specs}
         self._length = max(
             max(self._first[s] + spec.n_joints for s, spec in specs.items()), dialect.length
         )
@@ -235,6 +232,44 @@ class MotorCmdsMap(DialectMap):
                 m.lost = min(view.missed, _U32)
                 m.reserve = (view.fault[joint] & _U32, 0 if s.measured else 1)
         return unitree_go.MotorStates_(motors)
+
+
+class ServoMap(MotorCmdsMap):
+    """Position servos in ``MotorCmds_`` and ``MotorStates_``: gains and torque of a command are not
+    used, and dq, where it is, limits the speed of the way to q.
+    """
+
+    def command(self, message: Any, side: Side) -> HandCommand | None:
+        """The command for a side: dq is the most that each joint may move with, 0 at least."""
+        command = super().command(message, side)
+        if command is None:
+            return None
+        full = np.array([joint.dq_max for joint in self._specs[side].joints])
+        if self.dialect.speed_units:
+            # a clipped infinity would be a speed
+            asked = np.where(np.isfinite(command.dq), np.clip(command.dq, 0.0, 1.0), math.nan)
+            return replace(command, dq=asked * full)
+        return replace(command, dq=full + command.dq)
+
+    def state(self, views: Mapping[Side, StateView]) -> unitree_go.MotorStates_:
+        """The state message; dq in parts of the full speed."""
+        return super().state({side: self._scaled(view) for side, view in views.items()})
+
+    def _scaled(self, view: StateView) -> StateView:
+        units = self.dialect.speed_units
+        if not units:
+            return view
+        state = view.state
+        return replace(view, state=replace(state, dq=state.dq / units, ddq=state.ddq / units))
+
+    def _feed_forward(self, values: list[float]) -> Floats:
+        return np.array(values) if self.dialect.speed_units else _zero_where_finite(values)
+
+    def _torques(self, values: list[float]) -> Floats:
+        return _zero_where_finite(values)
+
+    def _gains(self, values: list[float], default: float) -> Floats:
+        return _zero_where_finite(values) + default
 
 
 class InterfaceSpecificationMap(DialectMap):

@@ -678,13 +678,14 @@ class HandService:
 
 def _values_beyond_limits(spec: HandSpec, command: HandCommand) -> Iterator[tuple[str, str]]:
     """(joint and field, sentence) of each value of ``command`` that is beyond the limits."""
+    angle, torque = model(spec.model).unit, model(spec.model).torque_unit
     for i, joint in enumerate(spec.joints):
         ranges = {
-            "q": (joint.q_min, joint.q_max, "rad"),
-            "dq": (-joint.dq_max, joint.dq_max, "rad/s"),
-            "tau": (-joint.tau_max, joint.tau_max, "N m"),
-            "kp": (0.0, math.inf, "N m/rad"),
-            "kd": (0.0, math.inf, "N m s/rad"),
+            "q": (joint.q_min, joint.q_max, angle),
+            "dq": (-joint.dq_max, joint.dq_max, f"{angle}/s"),
+            "tau": (-joint.tau_max, joint.tau_max, torque),
+            "kp": (0.0, math.inf, f"{torque}/{angle}"),
+            "kd": (0.0, math.inf, f"{torque} s/{angle}"),
         }
         for name, (low, high, unit) in ranges.items():
             value = float(getattr(command, name)[i])

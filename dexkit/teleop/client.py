@@ -270,14 +270,14 @@ class TeleopClient(ABC):
         return self._control(self.receiver.latest, inputs)
 
     def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
-        return all(any(latest[s]) for s in self.sides)
+        return not self.dialect.zero_is_no_state or all(any(latest[s]) for s in self.sides)
 
     def parting(self, pose: Pose) -> tuple[JointCommand, ...]:
         """A command to hold the pose, with motors locked where the dialect has a mode for it."""
-        gains = model(self.dialect.model).gains
+        hand = model(self.dialect.model)
         return tuple(
-            JointCommand(self._mode(i, JointMode.BRAKE), q, 0.0, 0.0, kp, kd)
-            for i, (q, (kp, kd)) in enumerate(zip(pose, gains, strict=True))
+            JointCommand(self._mode(i, JointMode.BRAKE), q, hand.client_dq, 0.0, kp, kd)
+            for i, (q, (kp, kd)) in enumerate(zip(pose, hand.gains, strict=True))
         )
 
     def _mode(self, index: int, status: JointMode) -> int:
@@ -400,8 +400,9 @@ class FingerClient(TeleopClient):
 
     def __init__(self, spoken: Dialect, sides: Sequence[Side] = tuple(Side)) -> None:
         super().__init__(spoken, sides)
-        self._gains = model(spoken.model).gains
-        self._targets: dict[Side, Pose] = dict.fromkeys(self.sides, (0.0,) * spoken.length)
+        hand = model(spoken.model)
+        self._gains, self._dq = hand.gains, hand.client_dq
+        self._targets = {s: tuple(j.straight for j in hand.joints[s]) for s in self.sides}
 
     def _control(
         self, latest: Mapping[Side, Pose], inputs: Inputs
@@ -411,7 +412,7 @@ class FingerClient(TeleopClient):
             self._targets = {s: value for s, value in given.items() if value is not None}
         return {
             s: tuple(
-                JointCommand(self._mode(i, JointMode.FOC), q, 0.0, 0.0, kp, kd)
+                JointCommand(self._mode(i, JointMode.FOC), q, self._dq, 0.0, kp, kd)
                 for i, (q, (kp, kd)) in enumerate(zip(self._targets[s], self._gains, strict=True))
             )
             for s in self.sides

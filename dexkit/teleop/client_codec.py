@@ -38,7 +38,8 @@ class ClientWire:
             return [(self.command_topics[s], self._payload(c)) for s, c in commands.items()]
         places = [_LIMP] * self._dialect.length
         for side, motors in commands.items():
-            places[self._dialect.index[side]] = motors[0]
+            first = self._dialect.index[side]
+            places[first : first + len(motors)] = motors
         return [(self._dialect.cmd_topic, self._payload(places))] if commands else []
 
     def _payload(self, motors: Sequence[JointCommand]) -> bytes:

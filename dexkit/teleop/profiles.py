@@ -111,7 +111,7 @@ class Operator:
             return (self.dialect.q_open * (1.0 - parts[0]),)
         return tuple(
             # the thumb's base swings both ways; closing a hand does not move it
-            0.0 if not j.closing else part * (j.q_max if j.closing > 0 else j.q_min)
+            j.closed_by(part) if j.closing else 0.0
             for part, j in zip(parts, joints, strict=True)
         )
 

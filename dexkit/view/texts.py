@@ -58,8 +58,10 @@ def hand_table(view: SubjectView, title: str) -> str:
         told += f'<p class="warn">at a limit: {escape(", ".join(near_names[:6]))}{more}</p>'
     return (
         f'{_STYLE}<div class="dk"><h4>{escape(title)}</h4><p>{_ages(view)}</p>{told}'
-        '<table><tr><th>joint</th><th>between its limits</th><th class="n">q rad</th>'
-        '<th class="n">cmd</th><th>torque</th><th class="n">N·m</th><th class="n">°C</th></tr>'
+        '<table><tr><th>joint</th><th>between its limits</th><th class="n">'
+        f"q {view.model.unit}</th>"
+        '<th class="n">cmd</th><th>torque</th><th class="n">'
+        f'{view.model.torque_unit.replace(" ", "·")}</th><th class="n">°C</th></tr>'
         f"{''.join(rows)}</table></div>"
     )
 

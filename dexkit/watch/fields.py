@@ -112,7 +112,15 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
     units = dialect.torque_units or (1.0,) * len(joints)
     first = dialect.index[side]
     fields = list(
-        _motor_fields(type_name, kind, [(first + i, j) for i, j in enumerate(joints)], units)
+        _motor_fields(
+            type_name,
+            kind,
+            [(first + i, j) for i, j in enumerate(joints)],
+            units,
+            hand.unit,
+            hand.torque_unit,
+            dialect.speed_units,
+        )
     )
     if type_name.startswith("unitree_hg") and kind != "cmd":
         fields += [
@@ -142,8 +150,20 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
 
 
 def _motor_fields(
-    type_name: str, kind: str, joints: list[tuple[int, JointSpec]], units: tuple[float, ...]
+    type_name: str,
+    kind: str,
+    joints: list[tuple[int, JointSpec]],
+    units: tuple[float, ...],
+    unit: str = "rad",
+    torque_unit: str = "N m",
+    speeds: tuple[float, ...] = (),
 ) -> Iterator[Field]:
+    """The numbers of motors in a message.
+
+    :param units: N·m in one unit of each joint's torque.
+    :param unit: of q, and that of tau.
+    :param speeds: that of dq, in units of q a second; empty for 1.
+    """
     motors = next(
         f.name
         for f in message_type(type_name).layout.fields
@@ -160,9 +180,19 @@ def _motor_fields(
                 f"{joint.name} {quantity}",
                 quantity,
                 number,
-                _UNITS.get(quantity, ""),
-                units[number] if quantity == "tau" else 1.0,
+                _unit(quantity, unit, torque_unit),
+                units[number]
+                if quantity == "tau"
+                else speeds[number]
+                if speeds and quantity in ("dq", "ddq")
+                else 1.0,
             )
+
+
+def _unit(quantity: str, unit: str, torque_unit: str) -> str:
+    """The unit of a quantity of a hand with these units of q and tau."""
+    found = _UNITS.get(quantity, "").replace("rad", unit)
+    return found.replace("N·m", torque_unit.replace(" ", "·"))
 
 
 def _robot_parts(topic: str, type_name: str) -> Iterator[Part]:

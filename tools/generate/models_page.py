@@ -6,7 +6,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from dexkit.model_facts import describe, gain_groups, indices, names, short_type, torque_units
+from dexkit.model_facts import (
+    describe,
+    gain_groups,
+    indices,
+    names,
+    short_type,
+    speed,
+    torque_units,
+    width,
+)
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 from tools.generate import DOCS
@@ -113,14 +122,20 @@ def _hand(data: dict[str, Any]) -> list[str]:
         [_dialect_row(dialect) for dialect in data["dialects"]],
     )
     left, right = (data["sides"][side]["joints"] for side in ("left", "right"))
-    if left == right:
-        head = ("index", "joint", "range, rad", "range, °", "closes", "rad/s", "N m")
+    if data["unit"] != "rad":
+        unit = data["unit"]
+        head: Sequence[str] = ("index", "joint", f"range, {unit}", "closes", f"{unit}/s")
         rows: list[Sequence[object]] = [
+            (j["index"], f"`{j['name']}`", _rad(j), _closes(j), f"{speed(j):.4g}") for j in left
+        ]
+    elif left == right:
+        head = ("index", "joint", "range, rad", "range, °", "closes", "rad/s", "N m")
+        rows = [
             (j["index"], f"`{j['name']}`", _rad(j), _deg(j), _closes(j), *_limits(j)) for j in left
         ]
     else:
         head = ("index", "joint", "left, rad", "left, °", "closes", "right, rad", "right, °",
-                "closes", "rad/s", "N m")  # type: ignore[assignment]  # fmt: skip
+                "closes", "rad/s", "N m")  # fmt: skip
         rows = [
             (
                 *(j["index"], f"`{j['name']}`", _rad(j), _deg(j), _closes(j)),
@@ -204,6 +219,8 @@ def _robot(data: dict[str, Any]) -> list[str]:
 
 
 def _gains(data: dict[str, Any]) -> str:
+    if "client_gains" not in data:
+        return f"dq {data['client_dq']:g} and no gains"
     groups = gain_groups(data)
     if len(groups) == 1:
         return f"kp {groups[0][1]:g} N m/rad and kd {groups[0][2]:g} N m s/rad"
@@ -212,7 +229,8 @@ def _gains(data: dict[str, Any]) -> str:
 
 
 def _rad(joint: dict[str, Any]) -> str:
-    return f"{joint['q_min_rad']:.5g} .. {joint['q_max_rad']:.5g}"
+    low, high = width(joint)
+    return f"{low:.5g} .. {high:.5g}"
 
 
 def _deg(joint: dict[str, Any]) -> str:
@@ -224,4 +242,4 @@ def _closes(joint: dict[str, Any]) -> str:
 
 
 def _limits(joint: dict[str, Any]) -> tuple[str, str]:
-    return f"{joint['dq_max_rad_s']:g}", f"{joint['tau_max_nm']:g}"
+    return f"{speed(joint):g}", f"{joint['tau_max_nm']:g}"

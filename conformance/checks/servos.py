@@ -1,0 +1,220 @@
+"""Check hands of position servos: speed, grip, rest and silence, by their positions alone.
+
+Such a hand has no gains, and no source says what force its currents are. So a grip shows by where
+the joints stand: at the object, while they are commanded to go on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks.timing import longest_gap
+from dexkit.conformance.stimulus_record import Phase
+from dexkit.hand import Floats
+
+_CONTACT_S = 0.7  # s after which the joints stand at the object
+_TURNS_S = 0.08  # s after which a joint has taken up a new speed
+_STANDS_S = 0.4  # s within which a joint that stands has come to its goal
+
+
+@check("BRAINCO-SPEED-01")
+def slow_command(ctx: Context) -> Outcome:
+    """The fastest that a joint moves while it is commanded to move slowly."""
+    worst: tuple[float, int, tuple[float, float]] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        rows = ctx.states.between(begin + _TURNS_S, end)
+        t, q = ctx.states.t[rows], ctx.states.q[rows]
+        if len(t) < 5:
+            continue
+        for joint in phase.targets.get(ctx.side, {}):
+            part = float(np.ptp(q[:, joint])) / float(t[-1] - t[0]) / ctx.joints[joint].dq_max
+            if worst is None or part > worst[0]:
+                worst = part, joint, (begin, end)
+    if worst is None:
+        return ctx.skipped("no joint was commanded to move slowly")
+    part, joint, span = worst
+    text = ctx.named(f"moved with {part:.0%} of its full speed", joint)
+    if part <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{part:.0%}", text, part=part)
+    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *span), part=part).about(joint)
+
+
+@check("BRAINCO-GRIP-01")
+def keeps_grip(ctx: Context) -> Outcome:
+    """How far a joint that presses on the object opens, while it is commanded to close."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, int, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        for joint, opened, at in _gives_way(ctx, phase, begin + _CONTACT_S, end):
+            if worst is None or opened > worst[0]:
+                worst = opened, joint, at
+        gap = longest_gap(ctx, ctx.tolerance("max_gap_s"), begin, end)
+        if gap.value > gap.limit:
+            text = f"no state for {gap.value:.2f} s while it grips"
+            outcome = ctx.failed(f"{gap.value:.2f} s", text, ctx.at(ctx.states.topic, begin, end))
+            return outcome.resting_on(gap).if_late(gap.value - gap.limit)
+    if worst is None:
+        return ctx.skipped("no joint was held back by the object")
+    opened, joint, at = worst
+    limit = ctx.tolerance("max_back_stroke", joint)
+    text = ctx.named(f"opened by {opened:.3f} {ctx.unit} while it was commanded to grip", joint)
+    if opened <= limit:
+        return ctx.passed(f"{opened:.3f} {ctx.unit}", text, motion_rad=opened).placed(opened, limit)
+    place = ctx.at(ctx.states.topic, at)
+    outcome = ctx.failed(f"{opened:.2f} {ctx.unit}", text, place, motion_rad=opened)
+    return outcome.about(joint).placed(opened, limit).if_late(STROKE_S * opened)
+
+
+def _gives_way(
+    ctx: Context, phase: Phase, begin: float, end: float
+) -> list[tuple[int, float, float]]:
+    """Joint, how far it opens, and when, of each joint that the object holds back."""
+    rows = ctx.states.between(begin, end)
+    t, q = ctx.states.t[rows], ctx.states.q[rows]
+    if len(t) < 5:
+        return []
+    found = []
+    for joint, target in phase.targets.get(ctx.side, {}).items():
+        spec = ctx.joints[joint]
+        closed = q[:, joint] * spec.closing
+        if target * spec.closing - float(closed[0]) < ctx.tolerance("min_held_stroke", joint):
+            continue  # it got there, or nearly
+        opened = np.maximum.accumulate(closed) - closed
+        i = int(np.argmax(opened))
+        found.append((joint, float(opened[i]), float(t[i])))
+    return found
+
+
+@check("BRAINCO-STILL-02")
+def vibrates(ctx: Context) -> Outcome:
+    """The most turns of q a second of a joint whose goal has stayed the same."""
+    worst: tuple[float, int, tuple[float, float], float] | None = None
+    for begin, end in _rests(ctx):
+        rows = ctx.states.between(begin, end)
+        if len(ctx.states.t[rows]) < 10:
+            continue
+        for joint, spec in enumerate(ctx.joints):
+            q = ctx.states.q[rows, joint]
+            q = q[np.isfinite(q)]
+            turns = _turns(q, ctx.requirement.tolerance("min_turn_stroke") * spec.stroke)
+            rate = turns / (end - begin) if turns >= ctx.tolerance("min_turns") else 0.0
+            if worst is None or rate > worst[0]:
+                worst = rate, joint, (begin, end), float(np.ptp(q)) if len(q) else 0.0
+    if worst is None:
+        return ctx.skipped("no joint stood for long enough")
+    rate, joint, span, size = worst
+    text = ctx.named(f"turns {rate:.1f} times a second at rest, over {size:.3f} {ctx.unit}", joint)
+    limit = ctx.tolerance("max_turns_hz")
+    if rate <= limit:
+        return ctx.passed(f"{rate:.1f} /s", text, turns_hz=rate)
+    place = ctx.at(ctx.states.topic, *span)
+    return ctx.failed(f"{rate:.0f} /s", text, place, turns_hz=rate).about(joint)
+
+
+def _rests(ctx: Context) -> list[tuple[float, float]]:
+    """Stretches in which the goal of every joint stays the same, and is reached or blocked."""
+    found = [ctx.span(p) for p in ctx.phases("listen")]
+    # one side grips, and the other holds its pose beside it
+    found += [
+        (begin + _CONTACT_S, end) for begin, end in map(ctx.span, ctx.recording.phases("squeeze"))
+    ]
+    window = ctx.tolerance("window_s")
+    for begin, end in map(ctx.span, ctx.phases()):
+        if end - window >= begin + _STANDS_S:
+            found.append((end - window, end))
+    return found
+
+
+def _turns(q: Floats, least: float) -> int:
+    """How often q turns round by at least so much."""
+    turns, way, extreme = 0, 0, float(q[0]) if len(q) else 0.0
+    for value in q.tolist():
+        if way >= 0 and value < extreme - least:
+            turns, way, extreme = turns + (way > 0), -1, value
+        elif way <= 0 and value > extreme + least:
+            turns, way, extreme = turns + (way < 0), 1, value
+        elif (value - extreme) * (way or 1) > 0:
+            extreme = value
+    return turns
+
+
+@check("BRAINCO-WDOG-01")
+def goes_nowhere_else(ctx: Context) -> Outcome:
+    """How far a joint leaves the way to its last goal, while there are no commands."""
+    worst: tuple[float, int, float] | None = None
+    for begin, end, goal in _silences(ctx):
+        rows = ctx.states.between(begin, end)
+        t, q = ctx.states.t[rows], ctx.states.q[rows]
+        if len(t) < 5:
+            continue
+        here = q[0]
+        low, high = np.minimum(here, goal), np.maximum(here, goal)
+        beyond = np.maximum(low - q, q - high)
+        for joint, spec in enumerate(ctx.joints):
+            i = int(np.nanargmax(beyond[:, joint]))
+            part = float(beyond[i, joint]) / spec.stroke
+            if worst is None or part > worst[0]:
+                worst = part, joint, float(t[i])
+    if worst is None:
+        return ctx.skipped("no pause of commands with states")
+    part, joint, at = worst
+    beyond_rad = max(part, 0.0) * ctx.joints[joint].stroke
+    limit = ctx.tolerance("max_motion_stroke", joint)
+    text = ctx.named(
+        f"left the way to its last goal by {beyond_rad:.3f} {ctx.unit} without a command", joint
+    )
+    if beyond_rad <= limit:
+        met = ctx.passed(f"{beyond_rad:.3f} {ctx.unit}", text, motion_rad=beyond_rad)
+        return met.placed(beyond_rad, limit)
+    place = ctx.at(ctx.states.topic, at)
+    outcome = ctx.failed(f"{beyond_rad:.2f} {ctx.unit}", text, place, motion_rad=beyond_rad)
+    return outcome.about(joint).placed(beyond_rad, limit).if_late(STROKE_S * part)
+
+
+@check("BRAINCO-WDOG-04")
+def stops_in_silence(ctx: Context) -> Outcome:
+    """Whether a joint that was on its way stands still after the time-out."""
+    least = ctx.requirement.tolerance("min_left_stroke")
+    seen = False
+    for begin, end, goal in _silences(ctx):
+        late = begin + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+        q = ctx.states.q[ctx.states.between(late, end)]
+        if len(q) < 5:
+            continue
+        for joint, spec in enumerate(ctx.joints):
+            if abs(goal[joint] - q[0, joint]) < least * spec.stroke:
+                continue
+            moved = float(np.ptp(q[:, joint]))
+            if moved > ctx.tolerance("max_motion_stroke", joint):
+                return ctx.failed(
+                    "goes on",
+                    ctx.named(
+                        f"moved by {moved:.2f} {ctx.unit} more than "
+                        f"{ctx.tolerance('timeout_s'):g} s after the last command",
+                        joint,
+                    ),
+                    ctx.at(ctx.states.topic, late, end),
+                    motion_rad=moved,
+                ).about(joint)
+            seen = True
+    if not seen:
+        return ctx.skipped("no joint was on its way at the time-out")
+    return ctx.passed("stops", "what was on its way stands still after the time-out")
+
+
+def _silences(ctx: Context) -> list[tuple[float, float, Floats]]:
+    """Last good command, end and its q, of each pause of commands."""
+    commands = ctx.commands
+    good = np.flatnonzero(np.isfinite(commands.q).all(axis=1))
+    found = []
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        sent = good[commands.t[good] <= min(begin + 0.05, end)]
+        if len(sent):
+            last = int(sent[-1])
+            found.append((float(commands.t[last]), end, np.asarray(commands.q[last])))
+    return found

@@ -1,0 +1,318 @@
+"""Wrong hands of position servos."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.mutants.any_model import ChokesOnThousands
+from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.virtual import Sample
+from dexkit.conformance.virtual.fingers import FingerHand, Ints
+from dexkit.conformance.virtual.servos import ServoHand, ServoService
+from dexkit.hand import Floats, Side
+
+# ----------------------------------------------------------------------------- state
+
+
+@wrong_hand("BRAINCO-RATE-01")
+class PublishesAt50(ServoService):
+    """Publishes 50 times a second."""
+
+    period = 0.02
+
+
+@wrong_hand("BRAINCO-FIELD-03")
+class Thousandths(ServoService):
+    """Publishes q as the device has it, in thousandths."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["q"] *= 1000.0
+
+    def positions(self, side: Side) -> tuple[float, ...]:
+        return tuple(1000.0 * q for q in super().positions(side))
+
+
+# with an object in one hand, the other one shows that it is held back
+@wrong_hand(
+    "BRAINCO-SIDE-01",
+    also=(
+        *("BRAINCO-LIFE-03", "BRAINCO-MOVE-09", "BRAINCO-SAFE-01"),
+        *("BRAINCO-SAFE-10", "BRAINCO-WDOG-01"),
+    ),
+    sides=BOTH,
+)
+class StatesSwapped(ServoService):
+    """Publishes each side's state as the other's."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        other = Side.LEFT if hand.side is Side.RIGHT else Side.RIGHT
+        super().fill(motors, self.hands[other])
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():  # each state is made when either hand has moved
+            hand.version += 1
+
+    def positions(self, side: Side) -> tuple[float, ...]:
+        return super().positions(Side.LEFT if side is Side.RIGHT else Side.RIGHT)
+
+
+@wrong_hand("BRAINCO-LOAD-01", also=("BRAINCO-RATE-04",))
+class ChokesOnThousandsOfCommands(ChokesOnThousands, ServoService):
+    """Publishes one state in twelve while more than 1000 commands a second arrive."""
+
+    share = 12
+
+
+# ----------------------------------------------------------------------------- motion
+
+
+@wrong_hand("BRAINCO-JOINT-01")
+class OtherOrder(ServoService):
+    """Obeys commands in the opposite order of joints, as another vendor's hand has them."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(side, motors[::-1])
+
+
+class _Reversed(ServoHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        turned = rows.copy()
+        turned[0] = self.low + self.high - rows[0]
+        super().take(turned, mode)
+
+
+@wrong_hand("BRAINCO-MOVE-01")
+class ReversedScale(ServoService):
+    """Takes the q of commands the other way round: 0 closed, 1 open."""
+
+    hand_fault = _Reversed
+
+
+class _Shy(ServoHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        away = 0.08 * (self.high - self.low)
+        self.goal = np.clip(self.goal, self.low + away, self.high - away)
+
+
+@wrong_hand("BRAINCO-MOVE-09")
+class KeepsFromTheEnds(ServoService):
+    """Stays clear of both ends of each joint's range."""
+
+    hand_fault = _Shy
+
+
+class _Shakes(ServoHand):
+    def move(self, dt: float, pull: list[float]) -> None:
+        shake = 0.2 * math.sin(2 * math.pi * 12.0 * self.now)
+        super().move(dt, [p + shake if on else p for p, on in zip(pull, self.law_on, strict=True)])
+
+    def step(self, dt: float) -> None:
+        self.rests = False
+        super().step(dt)
+
+
+@wrong_hand("BRAINCO-STILL-02")
+class Vibrates(ServoService):
+    """Shakes all joints a little, at rest as well."""
+
+    hand_fault = _Shakes
+
+
+class _Wobbles(ServoHand):
+    def move(self, dt: float, pull: list[float]) -> None:
+        if self.law_on[2]:
+            pull[2] += 0.27 * math.sin(2 * math.pi * 8.0 * self.now)
+        super().move(dt, pull)
+
+    def step(self, dt: float) -> None:
+        self.rests = False
+        super().step(dt)
+
+
+@wrong_hand("BRAINCO-MOVE-03", also=("BRAINCO-STILL-02",), whole=True)
+class Wobbles(ServoService):
+    """One joint oscillates about its goal."""
+
+    hand_fault = _Wobbles
+
+
+class _Lazy(ServoHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        self.reach = [0.4 * r for r in self.reach]
+
+
+@wrong_hand("BRAINCO-MOVE-04")
+class SlowServos(ServoService):
+    """Takes 0.4 of each speed that is commanded."""
+
+    hand_fault = _Lazy
+
+
+class _Overshoots(ServoHand):
+    asked: Floats | None = None
+    true_goal: Floats | None = None
+    until = 0.0
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        before = rows[0] if self.asked is None else self.asked
+        jump = np.clip(rows[0], self.low, self.high) - np.clip(before, self.low, self.high)
+        self.asked = rows[0]
+        super().take(rows, mode)
+        if (np.abs(jump) > 0.1).any():
+            self.true_goal, self.until = self.goal, self.now + 0.4
+            beyond = self.goal + np.where(np.abs(jump) > 0.1, 0.08 * np.sign(jump), 0.0)
+            self.goal = np.clip(beyond, self.low, self.high)
+
+    def step(self, dt: float) -> None:
+        if self.true_goal is not None and self.now > self.until:
+            self.goal, self.true_goal = self.true_goal, None
+        super().step(dt)
+
+
+@wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08",))
+class Overshoots(ServoService):
+    """Goes 8 % of the travel too far in a large step, and comes back after 0.4 s."""
+
+    hand_fault = _Overshoots
+
+
+class _Fast(ServoHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        fast = rows.copy()
+        fast[1] = 1.0
+        super().take(fast, mode)
+
+
+@wrong_hand("BRAINCO-SPEED-01")
+class AlwaysFast(ServoService):
+    """Moves at full speed, whatever dq is."""
+
+    hand_fault = _Fast
+
+
+# ------------------------------------------------------------------------------ grip
+
+
+class _LetsGo(ServoHand):
+    pressed = 0.0
+
+    def step(self, dt: float) -> None:
+        presses = max(map(abs, self.tau)) > 0.8 * float(self.most.max()) and max(self.dq) < 0.05
+        self.pressed = self.pressed + dt if presses else 0.0
+        if self.pressed > 1.0:
+            self.goal = np.maximum(self.goal - 0.4, self.low)
+            self.pressed = 0.0
+            self.changed()
+        super().step(dt)
+
+
+@wrong_hand("BRAINCO-GRIP-01", also=("BRAINCO-PATH-01", "BRAINCO-STILL-01"), sides=BOTH, whole=True)
+class LetsGo(ServoService):
+    """Opens after a second of full current, as a protection does that gives up."""
+
+    hand_fault = _LetsGo
+
+
+@wrong_hand("BRAINCO-GRIP-01", also=("BRAINCO-RATE-03",), sides=BOTH, whole=True)
+class SilentUnderLoad(ServoService):
+    """Publishes nothing for half a second while it grips: its device does not answer."""
+
+    quiet = (math.inf, 0.0)
+    free = 0.0
+
+    def publish(self) -> list[Sample]:
+        loaded = any(
+            hand.touches and min(map(abs, hand.tau)) > 0.5 * float(hand.most.max())
+            for hand in self.hands.values()
+        )
+        if not loaded:
+            self.free = self.now
+        if self.now > self.free + 1.2 and self.now > self.quiet[1] + 5.0:
+            self.quiet = self.now, self.now + 0.5
+        return [] if self.quiet[0] <= self.now < self.quiet[1] else super().publish()
+
+
+# --------------------------------------------------------------------------- silence
+
+
+class _Opens(ServoHand):
+    def expire(self) -> None:
+        super().expire()
+        self.goal = np.array([j.straight for j in self.model.joints[self.side]])
+
+
+@wrong_hand("BRAINCO-WDOG-01")
+class OpensInSilence(ServoService):
+    """Opens a second after the last command."""
+
+    hand_fault = _Opens
+
+
+class _GoesOn(ServoHand):
+    def expire(self) -> None:
+        return
+
+
+@wrong_hand("BRAINCO-WDOG-04")
+class GoesOnForEver(ServoService):
+    """Goes on to its last goal without commands."""
+
+    hand_fault = _GoesOn
+
+
+# -------------------------------------------------------------------------- operator
+
+
+class _Smooths(ServoHand):
+    wanted: Floats | None = None
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        before = np.array(self.q) if self.wanted is None else self.goal
+        super().take(rows, mode)
+        self.wanted, self.goal = self.goal, before
+
+    def release(self) -> None:
+        self.wanted = None
+        super().release()
+
+    def expire(self) -> None:
+        self.wanted = None
+        super().expire()
+
+    def step(self, dt: float) -> None:
+        if self.wanted is not None:
+            self.goal = self.goal + (self.wanted - self.goal) * dt / 0.15
+        super().step(dt)
+
+
+@wrong_hand("BRAINCO-OPER-02")
+class SmoothsGoals(ServoService):
+    """Smooths its goals over 0.15 s."""
+
+    hand_fault = _Smooths
+
+
+# ----------------------------------------------------------------------- bad commands
+
+
+@wrong_hand("BRAINCO-ABUSE-01")
+class SlowAfterNan(ServoService):
+    """Moves with a third of each speed since it has got a command that is not finite."""
+
+    slow = False
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(m.q) for m in motors):
+            self.slow = True
+        if self.slow:
+            motors = tuple(replace(m, dq=0.33 * m.dq) for m in motors)
+        super().motors(side, motors)

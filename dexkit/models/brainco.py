@@ -1,0 +1,90 @@
+"""The BrainCo Revo2 hand on Unitree's topics: six position servos."""
+
+from __future__ import annotations
+
+import math
+
+from dexkit.hand import JointSpec, Side
+from dexkit.lazy import Lazy
+from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles
+
+__all__ = ["BRAINCO_REVO2"]
+
+_FULL_SPEED = (
+    # name, travel in rad by the client's scale, full speed in degrees a second by the SDK's default
+    ("thumb", 1.52, 145.0),
+    ("thumb_aux", 1.05, 150.0),
+    ("index", 1.47, 130.0),
+    ("middle", 1.47, 130.0),
+    ("ring", 1.47, 130.0),
+    ("pinky", 1.47, 130.0),
+)
+"""docs/sources/unitree-dex.md#j1."""
+
+
+def _joint(name: str, travel: float, degrees_s: float) -> JointSpec:
+    """A joint in parts of its travel. tau_max is the default current limit, A: no source says how
+    much torque that is.
+    """
+    return JointSpec(
+        name, q_min=0.0, q_max=1.0, dq_max=math.radians(degrees_s) / travel, tau_max=1.0, closing=1
+    )
+
+
+_JOINTS = tuple(_joint(*each) for each in _FULL_SPEED)
+
+BRAINCO_REVO2 = HandModel(
+    name="brainco-revo2",
+    title="BrainCo Revo2 hand",
+    unit="full travel",
+    torque_unit="A",
+    joints=dict.fromkeys(Side, _JOINTS),
+    dialects=(
+        Dialect(
+            name="brainco",
+            model="brainco-revo2",
+            cmd_topic="rt/brainco/{side}/cmd",
+            state_topic="rt/brainco/{side}/state",
+            cmd_type="unitree_go::msg::dds_::MotorCmds_",
+            state_type="unitree_go::msg::dds_::MotorStates_",
+            index={Side.LEFT: 0, Side.RIGHT: 0},
+            length=6,
+            q_open=math.nan,
+            summary="Revo2: q 0 open to 1 closed, dq a part of the full speed, tau_est in A",
+            codec=Lazy("dexkit.service.dialects:ServoMap"),
+            position_servo=True,
+            speed_units=tuple(joint.dq_max for joint in _JOINTS),
+        ),
+    ),
+    state_rate=500.0,  # docs/sources/unitree-dex.md#j1; 100 Hz of the service before
+    min_state_rate=80.0,  # inferred: that of the service before, less a fifth
+    command_rate=100.0,  # docs/sources/unitree-dex.md#j1
+    # dexkit's own: the vendor's service has none (docs/decisions.md)
+    command_timeout=1.0,
+    client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j1, as client_dq
+    client_dq=1.0,
+    rest_q=dict.fromkeys(Side, (0.1, 0.1, 0.15, 0.15, 0.15, 0.15)),
+    requirements=("brainco.toml", "brainco_client.toml"),
+    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
+    reference=Lazy("dexkit.conformance.virtual.brainco:BrainCoService"),
+    quick_seconds=20.0,
+    roles=JointRoles(driven=(), slow=(0, 3)),
+    objects={Side.RIGHT: 60.0},
+    simulator="sim-brainco",
+    # ring and little finger move as the middle one does
+    fingers=("thumb", "thumb", "index", "middle", "middle", "middle"),
+    client_forks=True,
+    layout=HandLayout(
+        centres=(240.0, 640.0),
+        top=466.0,
+        palm=(280.0, 130.0),
+        width=62.0,
+        fingers=(
+            Finger("Index", range(2, 3), (-108.0, -90.0), (0.0, -150.0), tip=1.0),
+            Finger("Middle", range(3, 4), (-36.0, -106.0), (0.0, -150.0), tip=1.0),
+            Finger("Ring", range(4, 5), (36.0, -90.0), (0.0, -150.0), tip=1.0),
+            Finger("Pinky", range(5, 6), (108.0, -66.0), (0.0, -120.0), tip=1.0),
+            Finger("Thumb", range(0, 2), (-167.0, 26.0), (-9.0, -66.0), tip=1.0, root=0.1),
+        ),
+    ),
+)

@@ -1,0 +1,288 @@
+"""Test the BrainCo Revo2: profile, dialect, simulated hand, client, units and the doctor."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.backends import BackendOptions, backend
+from dexkit.cli import cli
+from dexkit.clock import ManualClock
+from dexkit.conformance.checks.servos import _turns
+from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.mutants.registry import mix
+from dexkit.conformance.mutants.servos import StatesSwapped, Vibrates
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.virtual.brainco import BrainCoService
+from dexkit.doctor.ways import Course, moves_against, swapped
+from dexkit.emulators.sim_brainco import SimBrainCo, sim_brainco
+from dexkit.errors import HandLost, UsageError
+from dexkit.hand import Hand, HandCommand, HandState, Side
+from dexkit.messages import message_type, unitree_go
+from dexkit.models import BRAINCO_REVO2, dialect
+from dexkit.service.core import HandCore
+from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.teleop import Operator, client_for, profile
+from dexkit.topics import roles
+from dexkit.watch.fields import parts_of
+from tests.each import each
+
+BRAINCO = dialect("brainco")
+STATES = message_type(BRAINCO.state_type)
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+N = 6
+FULL = np.array([j.dq_max for j in BRAINCO_REVO2.joints[LEFT]])
+RADIANS = re.compile(r"\brad\b|\bradians\b|N m\b|_rad\b")
+
+
+# --------------------------------------------------------------------------------------- the model
+
+
+def test_joints_are_in_client_order_and_of_one_travel() -> None:
+    for side in Side:
+        joints = BRAINCO_REVO2.joints[side]
+        names = ["thumb", "thumb_aux", "index", "middle", "ring", "pinky"]
+        assert [j.name for j in joints] == names
+        assert {(j.q_min, j.q_max, j.closing, j.straight) for j in joints} == {(0.0, 1.0, 1, 0.0)}
+    # 130 degrees a second over 1.47 rad
+    assert FULL[2] == pytest.approx(math.radians(130) / 1.47)
+
+
+def test_topics_belong_to_the_dialect() -> None:
+    (state,) = roles("rt/brainco/left/state")
+    assert (state.kind, state.dialect.name, state.sides) == ("state", "brainco", (LEFT,))
+
+
+def test_nothing_is_told_in_radians() -> None:
+    text = CliRunner().invoke(cli, ["models", "brainco-revo2"]).output
+    assert "full travel/s" in text
+    assert not RADIANS.search(text)
+    data = CliRunner().invoke(cli, ["models", "brainco-revo2", "--json"]).output
+    assert json.loads(data)["models"][0]["unit"] == "full travel"
+    assert not RADIANS.search(data)
+    (part,) = parts_of("rt/brainco/left/state", BRAINCO.state_type)
+    units = {f.quantity: f.unit for f in part.fields}
+    assert (units["q"], units["dq"], units["tau"]) == ("full travel", "full travel/s", "A")
+    for r in catalogue("brainco-revo2", None):
+        for words in (r.title, r.sentence, r.expected):
+            assert not RADIANS.search(words), r.id
+
+
+# --------------------------------------------------------------------------------- simulated hand
+
+
+def opened(side: Side = LEFT, **options: float) -> tuple[SimBrainCo, ManualClock]:
+    clock = ManualClock()
+    hand = SimBrainCo(side, clock=clock, **options)
+    hand.open()
+    return hand, clock
+
+
+def hold(
+    hand: SimBrainCo, clock: ManualClock, q: float, seconds: float, part: float = 1.0
+) -> HandState:
+    command = HandCommand.position([q] * N, dq=part * FULL)
+    state = hand.exchange(command)
+    for _ in range(round(seconds * 100)):
+        clock.advance(0.01)
+        state = hand.exchange(command)
+    return state
+
+
+def test_simulated_hand_implements_hand() -> None:
+    hand = SimBrainCo(RIGHT)
+    assert isinstance(hand, Hand)
+    assert (hand.spec.model, hand.spec.n_joints) == ("brainco-revo2", N)
+    assert hand.spec.simulated
+    assert backend("sim-brainco") is sim_brainco
+    with pytest.raises(HandLost):
+        hand.exchange(HandCommand.brake(N))
+
+
+def test_joints_arrive_and_stand_still() -> None:
+    hand, clock = opened()
+    state = hand.exchange(HandCommand.brake(N))
+    assert state.q.tolist() == list(BRAINCO_REVO2.rest_q[LEFT])
+    for goal in (1.0, 0.0, 0.4567):
+        state = hold(hand, clock, goal, 1.5)
+        assert np.abs(state.q - goal).max() <= 0.0005  # it reports thousandths
+        assert not state.dq.any()
+
+
+def test_speed_of_the_command_is_the_speed() -> None:
+    for part in (1.0, 0.5, 0.1):
+        hand, clock = opened(start=0.0)
+        hold(hand, clock, 1.0, 0.1, part)
+        before = hand.mechanics.q
+        hold(hand, clock, 1.0, 0.1, part)
+        assert np.allclose((hand.mechanics.q - before) / 0.1, part * FULL, rtol=0.02)
+    hand, clock = opened()
+    before = hand.mechanics.q
+    hold(hand, clock, 1.0, 0.5, 0.0)
+    assert (hand.mechanics.q == before).all()
+
+
+def test_object_stops_the_fingers_and_draws_the_current_limit() -> None:
+    hand, clock = opened(RIGHT, object_at=50.0)
+    state = hold(hand, clock, 0.9, 1.0)
+    assert np.allclose(state.q, 0.5)
+    assert np.allclose(state.tau_est, 1.0, atol=0.01)
+    state = hand.exchange(HandCommand.brake(N))
+    clock.advance(0.1)
+    assert np.allclose(hand.exchange(HandCommand.brake(N)).q, 0.5)  # a brake does not let go
+
+
+def test_backend_takes_settings() -> None:
+    hand = sim_brainco.make(BackendOptions(LEFT, settings={"start": "30", "object": "40"}))
+    assert isinstance(hand, SimBrainCo)
+    assert np.allclose(hand.mechanics.q, 0.3)
+    for bad, text in (
+        ({"start": "half"}, "is not a number"),
+        ({"start": "50", "object": "40"}, "inside the object"),
+        ({"object": "0"}, "between 0 and 100"),
+        ({"start": "101"}, "percentage"),
+    ):
+        with pytest.raises(UsageError, match=text):
+            sim_brainco.make(BackendOptions(LEFT, settings=bad))
+
+
+# --------------------------------------------------------------------------------------- dialect
+
+
+def mapping(fill: Fill = Fill.KNOWN, side: Side = LEFT) -> DialectMap:
+    return dialect_map(BRAINCO, {side: BRAINCO_REVO2.spec(side, io_rate=500.0)}, fill)
+
+
+def message(count: int = N, **fields: float) -> unitree_go.MotorCmds_:
+    return unitree_go.MotorCmds_([unitree_go.MotorCmd_(**fields) for _ in range(count)])  # type: ignore[arg-type]
+
+
+@each(("dq", "part"), [(1.0, 1.0), (0.25, 0.25), (0.0, 0.0), (-3.0, 0.0), (7.0, 1.0)])
+def test_dq_is_a_part_of_the_full_speed(dq: float, part: float) -> None:
+    command = mapping().command(message(q=0.5, dq=dq), LEFT)
+    assert command is not None
+    assert np.allclose(command.dq, part * FULL)
+    assert not command.is_limp  # though the client sends no gains
+
+
+@each(("field", "value"), [(f, v) for f in ("q", "dq") for v in (math.nan, math.inf, -math.inf)])
+def test_core_rejects_what_is_not_finite(field: str, value: float) -> None:
+    core = HandCore(BRAINCO_REVO2.spec(LEFT, io_rate=500.0), BRAINCO_REVO2, ManualClock())
+    core.opened(core.spec)
+    command = mapping().command(message(**{"q": 0.5, "dq": 1.0, field: value}), LEFT)
+    assert command is not None
+    assert not core.submit(command)
+
+
+def test_five_joints_hold_no_command_and_more_than_six_do() -> None:
+    assert mapping().command(message(5), LEFT) is None
+    assert mapping().command(message(12, dq=1.0), LEFT) is not None
+
+
+@given(st.lists(st.floats(0, 1), min_size=N, max_size=N), st.sampled_from(Fill))
+@settings(max_examples=30, deadline=None)
+def test_state_has_six_motors_in_the_vendors_units(q: list[float], fill: Fill) -> None:
+    state = HandState.from_values(q, dq=-0.5 * FULL, tau_est=0.3, stamp=0.0)
+    sent = STATES.decode(mapping(fill).encode({LEFT: StateView(state, (0,) * N)}))
+    assert [m.q for m in sent.states] == pytest.approx(q, abs=1e-6)
+    assert [m.dq for m in sent.states] == pytest.approx([-0.5] * N)
+    assert [m.tau_est for m in sent.states] == pytest.approx([0.3] * N)
+
+
+def test_hand_holds_one_second_after_the_last_command() -> None:
+    clock = ManualClock()
+    core = HandCore(BRAINCO_REVO2.spec(LEFT, io_rate=500.0, simulated=True), BRAINCO_REVO2, clock)
+    core.opened(core.spec)
+    command = mapping().command(message(q=0.9, dq=1.0), LEFT)
+    assert command is not None
+    assert core.submit(command)
+    clock.advance(0.98)
+    assert not core.next_command().is_brake
+    clock.advance(0.04)
+    assert core.next_command().is_brake
+
+
+# ----------------------------------------------------------------------------------------- client
+
+
+def test_client_sends_q_and_full_speed_and_waits_for_no_pose() -> None:
+    client = client_for("brainco")
+    open_hands = dict.fromkeys(Side, (0.0,) * N)
+    assert client.step(0.0, {LEFT: open_hands[LEFT]}, {}) == {}
+    assert client.missing == {RIGHT: ""}
+    commands = client.step(0.01, open_hands, {})
+    for motors in commands.values():
+        assert {tuple(m) for m in motors} == {(0, 0.0, 1.0, 0.0, 0.0, 0.0)}
+    commands = client.step(0.02, open_hands, dict.fromkeys(Side, (0.7,) * N))
+    assert {m.q for motors in commands.values() for m in motors} == {0.7}
+    fist = Operator(profile("fist", "brainco-revo2"), BRAINCO)
+    pose = fist.inputs(2.5, Side)[LEFT]
+    assert pose is not None
+    assert max(pose) > 0.6
+
+
+# ------------------------------------------------------------------------------------ conformance
+
+
+def test_vibration_and_swapped_states_are_found_and_told_in_parts_of_the_travel() -> None:
+    plan = replace(plan_for("brainco"), phases=frozenset(["listen", "joint", "step"]))
+    for fault, wanted in ((Vibrates, "BRAINCO-STILL-02"), (StatesSwapped, "BRAINCO-SIDE-01")):
+        result = run_mutant(mix(fault, BrainCoService), plan)
+        failed = {r.requirement.id: r for r in result.results if r.verdict is Verdict.FAIL}
+        assert wanted in failed
+        assert all(not RADIANS.search(r.observed) for r in result.results)
+        assert all(not RADIANS.search(name) for r in result.results for name in r.values)
+    assert any("full travel" in r.observed for r in result.results)
+
+
+@each(
+    ("q", "turns"),
+    [
+        ([0.0, 0.5, 1.0], 0),
+        ([0.0, 0.01, 0.0, 0.01, 0.0], 3),
+        ([0.0, 0.001, 0.0, 0.001], 0),
+        ([0.5, 0.52, 0.51, 0.53, 0.4], 3),
+        ([], 0),
+    ],
+)
+def test_turns_are_counted_by_their_size(q: list[float], turns: int) -> None:
+    assert _turns(np.array(q), 0.005) == turns
+
+
+# ----------------------------------------------------------------------------------------- doctor
+
+UNIT = [(0.0, 1.0)] * N
+
+
+def course(began: float, now: float, first: float, asked: float) -> Course:
+    return Course((began,) * N, (now,) * N, (first,) * N, (asked,) * N)
+
+
+@each(
+    ("seen", "against"),
+    [
+        (course(0.9, 0.1, 0.1, 0.9), 6),  # a reversed scale
+        (course(0.1, 0.9, 0.1, 0.9), 0),
+        (course(0.9, 0.6, 0.1, 0.9), 0),  # on its way: nobody knows
+        (course(0.0, 0.0, 0.0, 1.0), 0),  # does not move
+    ],
+)
+def test_reversed_scale_is_recognised(seen: Course, against: int) -> None:
+    assert moves_against(seen, UNIT) == against
+
+
+def test_swapped_sides_are_recognised() -> None:
+    left, right = course(0.1, 0.1, 0.1, 0.9), course(0.5, 0.9, 0.5, 0.1)
+    assert not swapped(left, right)  # the left one has not moved
+    left = course(0.5, 0.1, 0.5, 0.9)
+    assert swapped(left, right)
+    assert not swapped(course(0.5, 0.9, 0.5, 0.9), course(0.5, 0.1, 0.5, 0.1))
