@@ -223,11 +223,11 @@ def no_new_goal(ctx: Context) -> Outcome:
     _, rad, was, joint, begin, end = worst
     limit = ctx.tolerance("max_motion_stroke", joint)
     text = ctx.named(
-        f"found {rad:.2f} rad from the {was:.2f} rad at which the service ended, where it was not "
-        "going",
+        f"found {rad:.2f} {ctx.unit} from the {was:.2f} {ctx.unit} at which the service ended, "
+        "where it was not going",
         joint,
     )
     if rad <= limit:
-        return ctx.passed(f"{rad:.2f} rad", text, motion_rad=rad).placed(rad, limit)
-    outcome = ctx.failed(f"{rad:.2f} rad", text, ctx.at(ctx.states.topic, begin, end))
+        return ctx.passed(f"{rad:.2f} {ctx.unit}", text, motion_rad=rad).placed(rad, limit)
+    outcome = ctx.failed(f"{rad:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin, end))
     return outcome.about(joint).placed(rad, limit)
