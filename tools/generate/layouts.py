@@ -40,12 +40,12 @@ def files() -> dict[Path, str]:
     made = {}
     for model in BUILT_IN:
         found = curves(model)
-        made[DOCS / "layouts" / f"foxglove-{model.name}.json"] = _foxglove(found)
+        made[DOCS / "layouts" / f"foxglove-{model.name}.json"] = _foxglove(found, model.unit)
         made[DOCS / "layouts" / f"plotjuggler-{model.name}.xml"] = _plotjuggler(found)
     return made
 
 
-def _foxglove(found: Curves) -> str:
+def _foxglove(found: Curves, unit: str) -> str:
     panels: dict[str, object] = {}
     sides = []
     for side, joints in found.items():
@@ -54,7 +54,7 @@ def _foxglove(found: Curves) -> str:
             key = f"Plot!{side}_{name}"
             names.append(key)
             panels[key] = {
-                "title": f"{side} {name}, rad",
+                "title": f"{side} {name}, {unit}",
                 "paths": [
                     {
                         # quoted, because the topics do not begin with a slash
