@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
+from dexkit.models import HandModel
 
 Ranges: TypeAlias = NDArray[np.intp]
 """Rows from the first to before the second, shape (n, 2)."""
@@ -158,6 +159,15 @@ def _soft(ctx: Context) -> list[tuple[float, float, float, float, float, float]]
     return found
 
 
+def _softer(ctx: Context) -> list[tuple[float, float, float, float, float, float]]:
+    """Those of :func:`_soft` with less stiffness than the client's: with more of it, a coarse goal
+    makes a large difference.
+    """
+    hand = ctx.recording.model
+    assert isinstance(hand, HandModel)  # a robot grips nothing
+    return [grip for grip in _soft(ctx) if grip[3] < hand.client_gains[0]]
+
+
 def _usual(ctx: Context) -> float | None:
     """The force of a grip with the client's stiffness, in parts of what is asked for."""
     stiff = []
@@ -177,7 +187,7 @@ def _usual(ctx: Context) -> float | None:
 @check("DEX1-FORCE-12")
 def in_proportion(ctx: Context) -> Outcome:
     """The force of soft grips, compared with that of a stiff one, in parts of what is asked for."""
-    soft = _soft(ctx)
+    soft = _softer(ctx)
     if not soft:
         return ctx.skipped("no grips with little stiffness")
     usual, part = _usual(ctx), ctx.tolerance("max_change_part")
@@ -199,7 +209,7 @@ def in_proportion(ctx: Context) -> Outcome:
 @check("DEX1-FORCE-14")
 def no_more_than_asked(ctx: Context) -> Outcome:
     """The greatest force of soft grips, in parts of what is asked for."""
-    soft, usual = _soft(ctx), _usual(ctx)
+    soft, usual = _softer(ctx), _usual(ctx)
     if not soft or usual is None:
         return ctx.skipped("no grips to compare, one of them with the client's stiffness")
     if abs(usual - 1.0) > ctx.tolerance("max_own_part"):

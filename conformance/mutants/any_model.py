@@ -854,7 +854,7 @@ class DropsOldStamps(Service):
 
 def _too_slow(service: Service) -> int:
     """One state of how many is fewer than clients need: of three for most hands."""
-    return int(1.2 / (service.period * model(service.dialect.model).min_state_rate))
+    return int(1.2 / (service.period * model(service.dialect.model).min_state_rate) + 1e-6)
 
 
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), whole=True)

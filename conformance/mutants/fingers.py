@@ -927,7 +927,7 @@ class _NoLimits(FingerHand):
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
-@wrong_hand("DEX3-SAFE-02")
+@wrong_hand("DEX3-SAFE-02", whole=True)
 class NoLimits(FingerService):
     """Follows goals up to 0.5 rad beyond its limits."""
 
@@ -1147,7 +1147,7 @@ class _FedByNews(FingerHand):
             super().command(motors)
 
 
-@wrong_hand("DEX3-GUARD-02", also=("DEX3-FORCE-05", "DEX3-FORCE-06"), sides=BOTH)
+@wrong_hand("DEX3-GUARD-02", also=("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06"), sides=BOTH)
 class DropsEqualCommands(Dex3Service):
     """Drops commands that equal the last, before they feed the time-out."""
 

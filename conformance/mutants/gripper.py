@@ -1006,7 +1006,7 @@ class _Wraps(ReferenceHand):
         return (self.now - self.heard) % self.wraps > self.timeout
 
 
-@wrong_hand("DEX1-WDOG-01")
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
 class WatchdogWraps(ReferenceService):
     """Releases the brake for a second every three seconds: its counter wraps."""
 
@@ -1054,7 +1054,7 @@ class OldGoalFirst(ReferenceService):
     hand = _OldGoalFirst
 
 
-@wrong_hand("DEX1-STILL-01")
+@wrong_hand("DEX1-STILL-01", also=("DEX1-GAIN-05",))
 class TakesTheOtherSides(ReferenceService):
     """Of commands that come at once it now and then gives the left hand the right one's."""
 
