@@ -366,7 +366,7 @@ class SlowFoam(Dex3Service):
             hand.version += 1
 
 
-@wrong_hand("DEX3-SENS-09", sides=BOTH, whole=True)
+@wrong_hand("DEX3-SENS-09", sides=BOTH)
 class TaresInAGrip(Dex3Service):
     """Takes what each pressure has been for the last second as its zero, as drift."""
 

@@ -164,9 +164,14 @@ class Session:
 
 
 def models_by_joints(count: int) -> list[HandModel]:
-    """The hand models with so many joints."""
+    """The hand models with so many joints, in radians.
+
+    Hands in parts of their travel are not told by their numbers: Inspire's and BrainCo's have six
+    joints from 0 to 1 each, and count in opposite directions.
+    """
     names = dict.fromkeys(d.model for d in DIALECTS.values())
-    return [m for m in map(model, names) if len(m.joints[Side.LEFT]) == count]
+    hands = [m for m in map(model, names) if m.unit == "rad"]
+    return [m for m in hands if len(m.joints[Side.LEFT]) == count]
 
 
 def reference_topic(camera: str) -> str:
