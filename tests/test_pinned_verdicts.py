@@ -21,9 +21,10 @@ def test_every_wrong_hand_is_pinned_with_the_requirements_that_it_breaks() -> No
 
 
 def one_of_each_layer() -> list[Mutant]:
-    found: dict[tuple[str, str], Mutant] = {}
-    for mutant in sorted(mutants(), key=lambda m: (cost(m), m.name)):
-        found.setdefault((mutant.layer, mutant.model), mutant)
+    """The cheapest of each layer; the soak tries all of every model."""
+    found: dict[str, Mutant] = {}
+    for mutant in sorted(mutants(), key=lambda m: (cost(m), m.model, m.name)):
+        found.setdefault(mutant.layer, mutant)
     return list(found.values())
 
 
