@@ -92,9 +92,9 @@ _CAMERA_HZ = 30.0
 """Commands a second of a client that sends one for each picture of a camera."""
 _NUDGE, _NUDGE_SECONDS = 0.6, 0.3
 """A torque that pushes a hand that is held by kp, N m, and for how long, s."""
-_SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (16.0, 0.11))
-"""kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 1.8 N m each. The last
-is beyond what a byte holds in steps of 1/16 and less."""
+_SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (8.0, 0.2))
+"""kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 1.6 N m each. The last
+is beyond what a byte holds in steps of 1/32, and about the lead of xr_teleoperate."""
 _SOFT_SECONDS = 0.5
 _VENDORS_MODE = 1
 """Mode byte of the vendor's test programs; teleoperation sends 0
