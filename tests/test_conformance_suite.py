@@ -328,6 +328,15 @@ def test_signal_to_suite_ends_the_service_cleanly(tmp_path: Path, signum: signal
     assert '"exchanges"' in words[1], words  # its counters, when it has braked
 
 
+@pytest.mark.soak
+def test_emulated_ezgripper_reports_the_force_of_a_squeeze() -> None:
+    """On an idle machine: a service that commands reach late brakes, and lets go."""
+    wanted = [word for i in (1, 3) for word in ("--require", f"DEX1-FORCE-0{i}")]
+    run = suite("conformance/", "--backend", "ezgripper", "--side", "right", *wanted)
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert "2 pass" in run.stdout
+
+
 def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("r.json", "r.html", "r.mcap", "junit.xml")]
     # those that a busy machine leaves open are left out: a late command never drives the gripper

@@ -45,7 +45,7 @@ class _Joint:
     """
 
     @classmethod
-    def of(cls, ctx: Context, joint: int) -> _Joint:
+    def from_context(cls, ctx: Context, joint: int) -> _Joint:
         """A joint; the same for all checks."""
         return ctx.once(("joint", joint), lambda: cls(ctx, joint))
 
@@ -241,7 +241,7 @@ def slope(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        found = _window_error(ctx, _Joint.of(ctx, joint), spec.stroke)
+        found = _window_error(ctx, _Joint.from_context(ctx, joint), spec.stroke)
         if found is not None and (worst is None or found[0] > worst[0]):
             worst = (*found[:2], joint, found[2])
     if worst is None:
@@ -302,7 +302,7 @@ def keeps_up(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float, float, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        x = _Joint.of(ctx, joint)
+        x = _Joint.from_context(ctx, joint)
         if len(x.t) < _FEW:
             continue
         course, dq = _course(ctx, x)

@@ -395,12 +395,12 @@ class _Course:
     steps: Floats
 
     @classmethod
-    def of(cls, ctx: Context, joint: int) -> _Course:
+    def from_context(cls, ctx: Context, joint: int) -> _Course:
         """A joint's; the same for all checks."""
-        return ctx.once(("course", joint), lambda: cls._of(ctx, joint))
+        return ctx.once(("course", joint), lambda: cls._from_states(ctx, joint))
 
     @classmethod
-    def _of(cls, ctx: Context, joint: int) -> _Course:
+    def _from_states(cls, ctx: Context, joint: int) -> _Course:
         t, q = ctx.states.t, ctx.states.q[:, joint]
         good = finite_rows(q)
         t, q = t[good], q[good]
@@ -421,7 +421,7 @@ def not_frozen(ctx: Context) -> Outcome:
     limit = ctx.tolerance("max_frozen_s")
     worst = 0.0
     for joint in range(len(ctx.joints)):
-        course = _Course.of(ctx, joint)
+        course = _Course.from_context(ctx, joint)
         t, q, changes = course.t, course.q, course.changes
         if len(changes) < 2:
             continue
@@ -533,7 +533,7 @@ def fresh(ctx: Context) -> Outcome:
 
 
 def _fresh(ctx: Context, joint: int) -> Outcome:
-    course = _Course.of(ctx, joint)
+    course = _Course.from_context(ctx, joint)
     t, q, changes, size = course.t, course.q, course.changes, course.steps
     if len(q) < 2:
         return ctx.skipped("fewer than two states with a position")
