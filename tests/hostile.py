@@ -173,15 +173,18 @@ def raw(text: str) -> set[str]:
 
 
 def judged_result(folder: Path) -> tuple[dict[str, Any], Path]:
-    """A result file's document, and the recording that was judged."""
+    """The document of a result with a dozen requirements, and the recording that was judged."""
     import json
 
     from dexkit.conformance.judge import judge
     from dexkit.conformance.recording import Recording
+    from dexkit.conformance.requirements import catalogue, select
     from dexkit.traces import open_trace, sample_path
 
     path = sample_path("dex1_hand_dropout")
-    found = judge(Recording.decode(open_trace(path)), subject={"recording": path.name})
+    recording = Recording.decode(open_trace(path))
+    few = select(catalogue(recording.model.name), prefixes=("DEX1-RATE", "DEX1-TRACK"))
+    found = judge(recording, requirements=few, subject={"recording": path.name})
     found.write_json(folder / "good.json")
     return json.loads((folder / "good.json").read_text()), path
 

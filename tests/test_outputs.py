@@ -72,7 +72,9 @@ def _outputs() -> Iterator[tuple[tuple[str, ...], str]]:
 def test_unwritable_output_file_of_any_option_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, recording = hostile.judged_result(tmp_path)
+    _, whole = hostile.judged_result(tmp_path)
+    recording = tmp_path / "short.mcap"
+    assert hostile.run_command(["cut", str(whole), str(recording), "--to", "1"])[0] == 0
     given = {"<result>": str(tmp_path / "good.json"), _SAMPLE: str(recording)}
     (tmp_path / "out").mkdir()
     there = tmp_path / "out" / "there"
