@@ -219,7 +219,7 @@ def test_recording_can_be_played_as_operator_input(dex1: int) -> None:
 
 
 def test_fist_profile_moves_a_dex3(dex3: int) -> None:
-    result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 0.8)
+    result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()
     assert any(line.startswith("left: the client ran at") for line in lines)

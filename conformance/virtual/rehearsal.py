@@ -121,6 +121,12 @@ class Rehearsal:
         """Its length."""
         return max((float(h.t[-1]) for h in self.hands.values() if len(h.t)), default=0.0)
 
+    @property
+    def units(self) -> tuple[str, str]:
+        """Of q and of tau_est."""
+        hand = model(self.plan.dialect.model)
+        return hand.unit, hand.torque_unit
+
     def figures(self) -> Mapping[Side, list[JointFigures]]:
         """By side, of each joint."""
         return {s: h.figures(joint_limits(self.plan.dialect, s).tau) for s, h in self.hands.items()}

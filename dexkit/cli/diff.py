@@ -97,7 +97,7 @@ def _page(found: Comparison, a: Trace, b: Trace) -> str:
             j.part,
             j.kind,
             j.joint,
-            f"rms {j.rms:.4f} rad, worst {j.worst:.4f} rad at {j.worst_at:.3f} s",
+            f"rms {j.rms:.4f}, worst {j.worst:.4f} {j.unit} at {j.worst_at:.3f} s",
         )
         for j in sorted(found.joints, key=lambda j: -j.worst if j.samples else 1.0)
         if j.samples
@@ -154,15 +154,16 @@ def _print(found: Comparison) -> None:
         )
     console.print(table)
     joints = Table(box=None, pad_edge=False, header_style="bold")
-    for heading in ("joint", "what"):
+    for heading in ("joint", "what", "unit"):
         joints.add_column(heading, no_wrap=True)
-    for heading in ("rms rad", "worst rad", "at s", f"first > {found.tolerance:g} at s"):
+    for heading in ("rms", "worst", "at s", f"first > {found.tolerance:g} at s"):
         joints.add_column(heading, justify="right", no_wrap=True)
     for j in found.joints:
         first = "" if j.first_at is None else f"{j.first_at:.3f}"
         joints.add_row(
             escape(j.joint),
             j.kind,
+            j.unit,
             *((f"{j.rms:.4f}", f"{j.worst:.4f}", f"{j.worst_at:.3f}") if j.samples else "---"),
             first if j.samples else "no time in common",
         )

@@ -389,6 +389,7 @@ def _print_rehearsal(rehearsal: Rehearsal) -> None:
     from dexkit.console import Console, markup
 
     machine = rehearsal.machine
+    angle, torque = rehearsal.units
     click.echo(
         f"rehearsed on emulated hands, {rehearsal.seconds:.1f} s: "
         + one_line(machine.reason, REMARK)
@@ -396,8 +397,8 @@ def _print_rehearsal(rehearsal: Rehearsal) -> None:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("joint", no_wrap=True)
     for heading in (
-        *("commanded rad", "moved rad", "rms away", "worst away", "at s"),
-        *("max rad/s", "max N·m", "ripple", "at limit"),
+        *(f"commanded {angle}", f"moved {angle}", "rms away", "worst away", "at s"),
+        *(f"max {angle}/s", f"max {torque}", "ripple", "at limit"),
     ):
         table.add_column(heading, justify="right", no_wrap=True)
     for side, figures in rehearsal.figures().items():
@@ -454,7 +455,8 @@ def _print_end(machine: ReplayMachine) -> int:
         text += f", {done.passes} passes"
     for side, (away, joint, at) in done.farthest.items():
         name = machine.names(side)[joint]
-        text += f"; {side} at most {away:.2f} rad from its command ({name}, {at:.1f} s)"
+        unit = machine.unit(side)
+        text += f"; {side} at most {away:.2f} {unit} from its command ({name}, {at:.1f} s)"
     if done.held > 0.1:
         text += f"; held for {done.held:.1f} s by this machine"
     if done.pauses:

@@ -172,8 +172,12 @@ class ReplayMachine:
         """The joints of a hand."""
         return self._limits[side].names
 
+    def unit(self, side: Side) -> str:
+        """The unit of a hand's q."""
+        return self._limits[side].unit
+
     def farthest_allowed(self, side: Side) -> Values:
-        """Rad that each joint may be away from its command."""
+        """How far each joint, in its unit, may be away from its command."""
         return self._far[side]
 
     # -- what happens
@@ -389,9 +393,9 @@ class ReplayMachine:
             if now - since >= self.guards.distance_time:
                 self.stop(
                     End.DISTANCE,
-                    f"{side} hand: {self._limits[side].names[j]} has been more than {far:.2f} rad "
-                    f"from its command for {now - since:.1f} s: at {q:.2f} instead of "
-                    f"{command.q:.2f} rad",
+                    f"{side} hand: {self._limits[side].names[j]} has been more than {far:.2f} "
+                    f"{self._limits[side].unit} from its command for {now - since:.1f} s: at {q:.2f} instead of "
+                    f"{command.q:.2f}",
                 )
                 return
 

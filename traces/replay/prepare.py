@@ -144,13 +144,19 @@ class Wishes:
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Limits of a hand's joints in a dialect's radians, arrays of shape (joints,)."""
+    """Limits of a hand's joints as a dialect has them, arrays of shape (joints,).
+
+    :param unit: of q, and of dq a second: that of the model.
+    :param torque_unit: of tau.
+    """
 
     names: tuple[str, ...]
     low: Floats
     high: Floats
     dq: Floats
     tau: Floats
+    unit: str
+    torque_unit: str
 
     @property
     def stroke(self) -> Floats:
@@ -160,14 +166,21 @@ class JointLimits:
 
 def joint_limits(spoken: Dialect, side: Side) -> JointLimits:
     """The limits of a side's joints."""
-    joints = model(spoken.model).joints[side]
+    hand = model(spoken.model)
+    joints = hand.joints[side]
     scale = spoken.q_open / joints[0].q_max if spoken.is_gripper else 1.0
+
+    def of_each(attribute: str, by: float) -> Floats:
+        return np.array([getattr(j, attribute) for j in joints]) * by
+
     return JointLimits(
-        tuple(j.name for j in joints),
-        *(
-            np.array([getattr(j, f) for j in joints]) * by
-            for f, by in (("q_min", scale), ("q_max", scale), ("dq_max", scale), ("tau_max", 1.0))
-        ),
+        names=tuple(j.name for j in joints),
+        low=of_each("q_min", scale),
+        high=of_each("q_max", scale),
+        dq=of_each("dq_max", scale),
+        tau=of_each("tau_max", 1.0),
+        unit=hand.unit,
+        torque_unit=hand.torque_unit,
     )
 
 
@@ -509,9 +522,9 @@ class _Preparation:
             tau=np.clip(track.tau, -limits.tau, limits.tau),
         )
         bounds = (
-            ("q", "rad", limits.low - margin, limits.high + margin),
-            ("dq", "rad/s", -limits.dq, limits.dq),
-            ("tau", "N·m", -limits.tau, limits.tau),
+            ("q", limits.unit, limits.low - margin, limits.high + margin),
+            ("dq", f"{limits.unit}/s", -limits.dq, limits.dq),
+            ("tau", limits.torque_unit, -limits.tau, limits.tau),
         )
         for name, unit, low, high in bounds:
             table = getattr(track, name)
@@ -598,8 +611,9 @@ class _Preparation:
         self.judge(
             "jumps",
             f"{_joints(limits, over)} would have to turn faster than they can at "
-            f"{_places(over)}: {limits.names[j]} by {way:.2f} rad in {window * 1e3:.0f} ms at "
-            f"{track.t[i]:.2f} s, at most {limits.dq[j]:.3g} rad/s",
+            f"{_places(over)}: {limits.names[j]} by {way:.2f} {limits.unit} in "
+            f"{window * 1e3:.0f} ms at "
+            f"{track.t[i]:.2f} s, at most {limits.dq[j]:.3g} {limits.unit}/s",
             "--jumps stretch",
             cured=self.wishes.jumps == "stretch",
             where=str(side),
@@ -649,8 +663,9 @@ class _Preparation:
         self.judge(
             "thin-rate",
             f"loud motors: {rate:.3g} commands a second, where the model's client sends "
-            f"{self.model.command_rate:g}; steps of up to {steps[i, j]:.3f} rad at kp "
-            f"{track.kp[i + 1, j]:g} are torque steps of {torque[i, j]:.2f} N·m",
+            f"{self.model.command_rate:g}; steps of up to {steps[i, j]:.3f} {self.model.unit} at "
+            f"kp {track.kp[i + 1, j]:g} are torque steps of {torque[i, j]:.2f} "
+            f"{self.model.torque_unit}",
             f"--resample {self.model.command_rate:g}",
             cured=wished >= least,
             where=str(side),

@@ -40,8 +40,8 @@ class TopicCounts:
 class JointDifference:
     """One joint of both, position.
 
-    :param rms: rad.
-    :param worst: the largest difference, rad, ``worst_at`` seconds after A's first message.
+    :param rms: in ``unit``.
+    :param worst: the largest difference, in ``unit``, ``worst_at`` seconds after A's first message.
     :param first_at: where it first exceeds the tolerance, likewise; None where it never does.
     :param samples: places that were compared; 0: they have no time in common.
     """
@@ -54,6 +54,7 @@ class JointDifference:
     worst_at: float
     first_at: float | None
     samples: int
+    unit: str = "rad"
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Comparison:
     :param offset: seconds by which B's clock is later than A's for the same motion.
     :param alignment: how that was found; None if it was given.
     :param only: topics with messages that only A, and only B, has.
-    :param tolerance: rad.
+    :param tolerance: in the unit of each joint.
     """
 
     offset: float
@@ -199,7 +200,7 @@ def _difference(
     apart: Floats = np.abs(one.q[:, joint] - theirs)
     good = np.flatnonzero(np.isfinite(apart))
     if not len(good):
-        return JointDifference(one.part, one.kind, name, np.nan, np.nan, np.nan, None, 0)
+        return JointDifference(one.part, one.kind, name, np.nan, np.nan, np.nan, None, 0, one.unit)
     values, at = apart[good], (times[good] - first) / 1e9
     worst = int(np.argmax(values))
     beyond = np.flatnonzero(values > tolerance)
@@ -212,6 +213,7 @@ def _difference(
         worst_at=float(at[worst]),
         first_at=float(at[beyond[0]]) if len(beyond) else None,
         samples=len(good),
+        unit=one.unit,
     )
 
 

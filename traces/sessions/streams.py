@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 from dexkit.messages import Columns, message_type
-from dexkit.models import model
+from dexkit.models import MODELS, model
 from dexkit.robots import ROBOTS
 from dexkit.topics import roles
 from dexkit.traces.names import SESSION
@@ -73,6 +73,11 @@ class Stream:
     def q(self) -> Floats:
         """Positions, rad, shape (n, n_joints)."""
         return self.values["q"]
+
+    @property
+    def unit(self) -> str:
+        """The unit of q: that of the hand model, rad for robots and groups without a profile."""
+        return MODELS[self.model].unit if self.model in MODELS else "rad"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,68 @@
+"""Every command that the documents show is accepted by the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import pytest
+
+from dexkit.cli import cli
+from dexkit.errors import DdsSetupError
+from tests.docs_commands import ROOT, shown_commands
+
+
+_OWN = {"my", "my-hand-1"}
+"""The model that docs/other-hands.md shows how to add."""
+
+
+def _parse(words: tuple[str, ...]) -> None:
+    """Parse as ``dexkit WORDS`` would be; nothing runs.
+
+    :raises click.ClickException: it is refused.
+    """
+    command: click.Command = cli
+    context: click.Context | None = None
+    rest, name = list(words), "dexkit"
+    while True:
+        context = command.make_context(name, rest, parent=context)
+        if not isinstance(command, click.Group):
+            return
+        rest = [*context._protected_args, *context.args]
+        found, next_command, rest = command.resolve_command(context, rest)
+        assert found is not None
+        assert next_command is not None
+        name, command = found, next_command
+
+
+def test_every_dexkit_command_in_the_documents_is_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("key").touch()
+    Path("cyclonedds").mkdir()
+    wrong = []
+    shown = [s for s in shown_commands() if s.program == "dexkit" and not _OWN & {*s.words}]
+    for command in shown:
+        for name in command.words:
+            if Path(name).suffix in (".mcap", ".json", ".toml", ".zip", ".pub", ".html"):
+                Path(name).touch()  # what a reader has
+        try:
+            _parse(command.words)
+        except DdsSetupError:  # there is no such interface here
+            if "--interface" not in command.words:
+                raise
+        except click.ClickException as error:
+            wrong.append(f"{command}\n    {error.format_message()}")
+    assert len(shown) > 80
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_make_target_and_module_in_the_documents_exists() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for command in shown_commands():
+        if command.program == "make":
+            assert f"\n{command.words[0]}: " in makefile, command
+        if command.program == "python" and command.words[0] == "-m":
+            module = ROOT / command.words[1].replace(".", "/")
+            assert module.is_dir() or module.with_suffix(".py").is_file(), command
