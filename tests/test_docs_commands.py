@@ -11,7 +11,6 @@ from dexkit.cli import cli
 from dexkit.errors import DdsSetupError
 from tests.docs_commands import ROOT, shown_commands
 
-
 _OWN = {"my", "my-hand-1"}
 """The model that docs/other-hands.md shows how to add."""
 
