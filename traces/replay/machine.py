@@ -394,8 +394,8 @@ class ReplayMachine:
                 self.stop(
                     End.DISTANCE,
                     f"{side} hand: {self._limits[side].names[j]} has been more than {far:.2f} "
-                    f"{self._limits[side].unit} from its command for {now - since:.1f} s: at {q:.2f} instead of "
-                    f"{command.q:.2f}",
+                    f"{self._limits[side].unit} from its command for {now - since:.1f} s: "
+                    f"at {q:.2f} instead of {command.q:.2f}",
                 )
                 return
 
