@@ -134,9 +134,14 @@ def test_small_terminal_without_colours_is_resized_and_interrupted(tmp_path: Pat
         "--domain", domain, columns=80, lines=24, folder=tmp_path, NO_COLOR="1"
     ) as session:  # fmt: skip
         hand = Hand(node)
-        session.until(lambda: "! thumb_1: overcurrent" in session.text, hand)
+        session.until(
+            lambda: (
+                "! thumb_1: overcurrent" in session.text
+                and session.screen.display[23].startswith("q quit")  # drawn last
+            ),
+            hand,
+        )
         assert session.screen.display[0].startswith(f"dexkit monitor  domain {domain} on lo")
-        assert session.screen.display[23].startswith("q quit")
         assert "●" in session.text
         assert not COLOUR.search(session.raw)
         session.resize(120, 40)

