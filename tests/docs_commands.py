@@ -23,11 +23,13 @@ _SYNOPSIS = re.compile(r"\[[-A-Z]|\.\.\.|\||\b[A-Z]{2,}[a-z]*\b(?!=)")
 class Shown:
     """One command of a document.
 
+    :param block: the line at which its block begins.
     :param words: without redirections, pipes and ``&``.
     :param environment: variables before the command.
     """
 
     document: str
+    block: int
     line: int
     program: str
     words: tuple[str, ...]
@@ -55,7 +57,7 @@ def _of_block(document: str, first: int, text: str) -> Iterator[Shown]:
         found = _PROGRAM.match(line.strip())
         if found is not None and not _SYNOPSIS.search(found[3].split("#")[0]):
             words = tuple(_words(found[3].replace("\\\n", " ")))
-            yield Shown(document, number, found[2], words, tuple(found[1].split()))
+            yield Shown(document, first, number, found[2], words, tuple(found[1].split()))
         number += 1 + line.count("\n")
 
 

@@ -116,6 +116,16 @@ def gripper_on(path: str, configuration: GripperSettings) -> Iterator[EZGripper]
         hand.close()
 
 
+def exchange(hand: EZGripper, command: HandCommand) -> HandState:
+    """Exchange, again when this program was not let run: nothing was sent then."""
+    while True:
+        try:
+            return hand.exchange(command)
+        except HandTimeout as error:
+            if "was paused" not in str(error):
+                raise
+
+
 def drive(
     hand: EZGripper,
     command: HandCommand,
@@ -125,7 +135,7 @@ def drive(
     """Exchange until a condition holds; returns the state in which it does."""
     deadline = time.monotonic() + timeout
     while True:
-        state = hand.exchange(command)
+        state = exchange(hand, command)
         if until(state):
             return state
         assert time.monotonic() < deadline, f"not reached: {state}, {hand.phase}"
@@ -380,7 +390,7 @@ def test_invalid_settings_are_refused(wrong: dict[str, str]) -> None:
 def test_gripper_follows_reports_state_and_switches_torque_off(tmp_path: Path) -> None:
     with emulated(start=20.0) as gripper:
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
-            start = hand.exchange(BRAKE)
+            start = exchange(hand, BRAKE)
             assert float(start.q[0]) == pytest.approx(0.2 * 5.4, abs=0.03)
             assert start.measured
             moving = drive(hand, OPEN, lambda s: float(s.dq[0]) > 1.0)
@@ -440,7 +450,7 @@ def test_zero_gains_apply_no_torque_and_brake_holds(tmp_path: Path) -> None:
     with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
         before = travel(gripper)
         for _ in range(100):
-            hand.exchange(LIMP)
+            exchange(hand, LIMP)
         assert not gripper.servo.torque, "limp needs no motor"
         assert travel(gripper) == pytest.approx(before, abs=2)
         drive(hand, OPEN, lambda s: float(s.dq[0]) > 1.0)
@@ -518,7 +528,7 @@ def test_position_is_independent_of_the_servos_turn(tmp_path: Path) -> None:
                 except HandNotFound:
                     assert time.monotonic() < deadline
             assert gripper.servo.get(mx64.PRESENT_POSITION) < 4096
-            again = hand.exchange(BRAKE)
+            again = exchange(hand, BRAKE)
             assert float(again.q[0]) == pytest.approx(float(opened.q[0]), abs=0.05)
             drive(hand, HALF, at(2.7))
 
@@ -530,7 +540,7 @@ def fault_of(hand: EZGripper, command: HandCommand, timeout: float = LONG) -> Ha
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         try:
-            hand.exchange(command)
+            exchange(hand, command)
         except HandFault as fault:
             return fault
     raise AssertionError("no fault was reported")
@@ -540,7 +550,7 @@ def until_recovered(hand: EZGripper, command: HandCommand, timeout: float = LONG
     deadline = time.monotonic() + timeout
     while True:
         try:
-            return hand.exchange(command)
+            return exchange(hand, command)
         except HandFault:
             assert time.monotonic() < deadline, "did not recover"
             time.sleep(0.002)
@@ -606,7 +616,7 @@ def test_servo_in_shutdown_is_rebooted_at_open(tmp_path: Path) -> None:
             time.sleep(0.005)
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
             assert hand.statistics.reboots == 1
-            assert hand.exchange(BRAKE).fault[0] == 0
+            assert exchange(hand, BRAKE).fault[0] == 0
 
 
 def test_cooled_servo_is_rebooted_by_next_driver(tmp_path: Path) -> None:
@@ -625,7 +635,7 @@ def test_cooled_servo_is_rebooted_by_next_driver(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.005)
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
-            assert hand.exchange(BRAKE).fault[0] == 0
+            assert exchange(hand, BRAKE).fault[0] == 0
 
 
 def test_reset_by_supply_dip_is_recovered(tmp_path: Path) -> None:
@@ -913,7 +923,7 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
             ((opening, closing),) = hand.joint_speeds
             assert opening == pytest.approx(min(speeds["opening"], 150) * 0.054)
             assert closing == pytest.approx(min(speeds["closing"], 150) * 0.054)
-            assert float(hand.exchange(BRAKE).q[0]) >= -0.05
+            assert float(exchange(hand, BRAKE).q[0]) >= -0.05
 
 
 def test_estimator_uses_servo_limit_without_measured_speed() -> None:
@@ -980,10 +990,10 @@ def test_lost_link_does_not_repeat_calibration(
     with emulated(start=20.0) as gripper:
         configuration = configured(tmp_path, zero=None, calibrate=Calibrate.YES)
         with gripper_on(gripper.path, configuration) as hand:
-            before = hand.exchange(BRAKE)
+            before = exchange(hand, BRAKE)
             hand.close()  # as the service does with a link that it has lost
             hand.open()
-            again = hand.exchange(BRAKE)
+            again = exchange(hand, BRAKE)
             assert float(again.q[0]) == pytest.approx(float(before.q[0]), abs=0.05)
         assert len(calls) == 1
 
@@ -1095,7 +1105,7 @@ def test_exchange_is_not_faster_than_the_line(tmp_path: Path) -> None:
         started = time.monotonic()
         for _ in range(count):
             before = time.monotonic()
-            hand.exchange(HALF)
+            exchange(hand, HALF)
             assert time.monotonic() - before >= busy
         took = time.monotonic() - started
     assert took >= busy + (count - 1) * exchange_period(busy, 1e-3)
@@ -1117,7 +1127,7 @@ def test_default_latency_timer_is_slow_but_works(tmp_path: Path) -> None:
     ):
         started = time.monotonic()
         for _ in range(20):
-            hand.exchange(BRAKE)
+            exchange(hand, BRAKE)
         # 20 waits of about 16 ms each
         assert time.monotonic() - started > 20 * 0.010
         drive(hand, HALF, at(2.7))
@@ -1131,6 +1141,6 @@ def test_waiting_exchange_uses_little_processor_time(tmp_path: Path) -> None:
         used = time.thread_time()
         started = time.monotonic()
         for _ in range(50):
-            hand.exchange(BRAKE)
+            exchange(hand, BRAKE)
         # the SDK's own loop would use all of it
         assert time.thread_time() - used < 0.3 * (time.monotonic() - started)

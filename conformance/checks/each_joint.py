@@ -352,11 +352,12 @@ def releases(ctx: Context) -> Outcome:
     if free is None or most is None or later is None:
         return ctx.absent("the states hold no sensor packets")
     rise, left = most - free, later - free
-    with np.errstate(invalid="ignore", divide="ignore"):
-        part = np.where(rise > 0, left / rise, 0.0)
-    part = np.nan_to_num(part)
-    if not (rise > 0).any():
+    rise, left = np.nan_to_num(rise), np.nan_to_num(left)
+    # the noise of an element that hardly touches is no pressure of the grip
+    touched = rise > ctx.tolerance("min_rise_part") * rise.max(initial=0.0)
+    if not touched.any():
         return ctx.skipped("no pressure rose at the object")
+    part = np.where(touched, left / np.where(touched, rise, 1.0), 0.0)
     packet, slot = (int(i) for i in np.unravel_index(int(np.argmax(part)), part.shape))
     worst = float(part[packet, slot])
     text = (

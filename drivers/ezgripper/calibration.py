@@ -54,6 +54,9 @@ UNLIMITED = 600.0
 _SEARCH_MARGIN = 1500
 """Ticks beyond one stroke after which the search ends without a stop: the gripper may start open
 wider than its stroke."""
+_LATE_ANSWER = 0.03
+"""Seconds, more than an adapter's latency timer takes: when a later answer was measured is not
+known well enough for a speed."""
 _OPEN_TOLERANCE = 50
 """Ticks (2 %) short of the full stroke at which opening still counts as complete."""
 
@@ -302,7 +305,11 @@ def _measure_run(
 ) -> float:
     # faster than the motor, so the profile does not limit the speed
     track = _stroke(drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled)
-    points = [(s.time, relative_position(s.position, zero)) for s in track.samples]
+    points = [
+        (s.time, relative_position(s.position, zero))
+        for s in track.samples
+        if s.received - s.time < _LATE_ANSWER
+    ]
     if target == 0:
         points = [(t, STROKE - p) for t, p in points]
     low, high = 0.1 * STROKE, 0.9 * STROKE
