@@ -85,6 +85,8 @@ OPTIONAL = (
         ),
     ),
     Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
+    Optional("the package rerun-sdk", _package("rerun"), ("view_forward (soak)",)),
+    Optional("the package foxglove-sdk", _package("foxglove"), ("view_forward (soak)",)),
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
+from dexkit.cli.status_line import StatusLine
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.escaping import REMARK, one_line
 from dexkit.hand import ROBOT, JointSpec, Side
@@ -67,6 +68,18 @@ __all__ = ["command", "recorded"]
     help="Draw the hand of this side by a URDF of yours (boxes, cylinders and spheres; no "
     "meshes); SIDE is left, right or robot; may be repeated.",
 )
+@click.option(
+    "--to",
+    type=click.Choice(["rerun", "foxglove"]),
+    help="Show it in another viewer instead of on dexkit's page: Rerun (see --out), or Foxglove, "
+    "which connects to ws://127.0.0.1:8765 (--host, --port).",
+)
+@click.option(
+    "--out",
+    metavar="FILE.rrd|URL",
+    help="With --to rerun: write this file, or send to a viewer that is running "
+    "(rerun+http://127.0.0.1:9876/proxy).",
+)
 @duration_option()
 def command(
     recordings: tuple[Path, ...],
@@ -79,6 +92,8 @@ def command(
     open_browser: bool | None,
     judge: bool,
     urdfs: tuple[str, ...],
+    to: str | None,
+    out: str | None,
     duration: float | None,
 ) -> None:
     """Show hands and robots on a page in the browser: how they move, what is wrong, and when.
@@ -88,32 +103,77 @@ def command(
     requirements that failed; two are shown side by side. Until Ctrl-C.
 
     Needs the extra 'view': pip install 'dexkit[view]'. The page loads nothing from elsewhere.
+    --to rerun and --to foxglove need the extra of that name instead.
 
     Exit code: 0; 2 wrong usage, an unusable recording, or a missing package.
     """
     if len(recordings) + live > 2:
         raise UsageError("at most two can be shown at once")
-    from dexkit.view.page import Page  # names the extra before anything else is done
+    if (out is None) is (to == "rerun"):
+        raise UsageError("--to rerun and --out go together", hint="--to rerun --out session.rrd")
+    from dexkit.view.forward import forward
+
+    # names the extra before anything else is done
+    if to is None:
+        from dexkit.view.page import Page
+    elif to == "rerun":
+        from dexkit.view.rerun_viewer import RerunViewer
+    else:
+        from dexkit.view.foxglove_viewer import DEFAULT_PORT, FoxgloveViewer
 
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
-        sources: list[Source] = [recorded(path, judge) for path in recordings]
+        sources: list[Source] = [recorded(path, judge and to is None) for path in recordings]
         if live or not recordings:
             sources.insert(0, _live(stack, domain, interface, topics))
         skeletons = _skeletons(urdfs)
-        page = stack.enter_context(Page(sources, host=host, port=port, skeletons=skeletons))
         what = " beside ".join(one_line(s.title) for s in sources)
-        click.echo(f"ready: {what} at {page.url}")
-        if open_browser is None:
-            open_browser = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-        if open_browser and not webbrowser.open(page.url):
-            click.echo("warning: no browser could be opened", err=True)
         if duration is not None:
             timer = threading.Timer(duration, stop.set)
             timer.daemon = True
             timer.start()
-        page.run(stop.event)
+        if to is None:
+            page = stack.enter_context(Page(sources, host=host, port=port, skeletons=skeletons))
+            click.echo(f"ready: {what} at {page.url}")
+            _open(page.url, open_browser)
+            page.run(stop.event)
+        elif out is not None:
+            status = stack.enter_context(contextlib.closing(_Written()))
+            rerun = stack.enter_context(contextlib.closing(RerunViewer(out)))
+            click.echo(f"ready: {what} to {out}")
+            paced = "://" in out
+            forward(
+                sources, rerun, stop.event, skeletons=skeletons, paced=paced, progress=status.show
+            )
+        else:
+            chosen = DEFAULT_PORT if port is None else port
+            foxglove = stack.enter_context(contextlib.closing(FoxgloveViewer(host, chosen)))
+            click.echo(f"ready: {what} at {foxglove.url}")
+            while not stop.event.is_set():  # a recording begins again
+                forward(sources, foxglove, stop.event, skeletons=skeletons)
     click.echo("stopped")
+
+
+class _Written:
+    """How much of a recording is written, on the status line."""
+
+    def __init__(self) -> None:
+        self._line = StatusLine(quiet=False)
+
+    def show(self, at: float, end: float) -> None:
+        if self._line:
+            self._line.show(f"{at:.1f} of {end:.1f} s")
+
+    def close(self) -> None:
+        self._line.clear()
+
+
+def _open(url: str, wished: bool | None) -> None:
+    """Open the page in a browser, if that is wished or there is a display."""
+    if wished is None:
+        wished = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if wished and not webbrowser.open(url):
+        click.echo("warning: no browser could be opened", err=True)
 
 
 def _live(

@@ -2,4 +2,5 @@
 
 The page shows what a :class:`~dexkit.watch.Collector` knows; only :mod:`~dexkit.view.page`,
 :mod:`~dexkit.view.scene` and :mod:`~dexkit.view.charts` touch the library that draws it.
+:mod:`~dexkit.view.forward` shows the same in Rerun or Foxglove.
 """

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from dexkit.errors import ExtraMissing, UsageError
 from dexkit.kinematics import Skeleton
 from dexkit.robots import RobotModel
+from dexkit.view.drawing import places
 from dexkit.view.sources import HISTORY, Source
 from dexkit.view.texts import hand_table, time_strip, topics_table
 from dexkit.view.transport import SPEEDS, Transport
@@ -25,7 +26,7 @@ try:
     import viser
 
     from dexkit.view.charts import Chart, Curve
-    from dexkit.view.scene import Figure, places
+    from dexkit.view.scene import Figure
 except ImportError as error:
     raise ExtraMissing(
         "the page needs the package viser", hint="pip install 'dexkit[view]'"

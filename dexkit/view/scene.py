@@ -3,33 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from dexkit.hand import Floats, Side
+from dexkit.hand import Floats
 from dexkit.kinematics import Skeleton, quaternions, rotation
-from dexkit.models.skeletons import skeleton_of
-from dexkit.robots import RobotModel
+from dexkit.view.drawing import BODY, CALM, GHOST, Colors, Drawing
 from dexkit.watch import SubjectView
 
-__all__ = ["Figure", "drawn_q"]
-
-Colors = NDArray[np.uint8]
-
-_BODY = np.array([151, 160, 170])
-_STALE = np.array([222, 226, 230])
-_NEAR = np.array([247, 163, 37])
-_FAULT = np.array([224, 49, 49])
-_WARM = np.array([247, 103, 7])
-_CALM = np.array([73, 80, 87])
-_GHOST = (51, 154, 240)
-_COLD = np.array([233, 236, 239])
-# from no pressure to the most that was seen
-_PRESSURE = np.array([[208, 235, 255], [81, 207, 102], [252, 196, 25], [240, 62, 62]])
+__all__ = ["Figure"]
 
 
 class Figure:
@@ -51,9 +36,8 @@ class Figure:
         skeleton: Skeleton | None = None,
         row: int = 0,
     ) -> None:
-        self._robot = isinstance(view.model, RobotModel)
-        side = view.subject if isinstance(view.subject, Side) else None
-        self.skeleton = skeleton or skeleton_of(view.model, side)
+        self._drawing = Drawing(view, skeleton)
+        self.skeleton = self._drawing.skeleton
         self._server = server
         scene = server.scene
         mount = quaternions(rotation(self.skeleton.mount)[None])[0]
@@ -70,7 +54,7 @@ class Figure:
             still[:count],
             nowhere[:count],
             batched_scales=sizes,
-            batched_colors=np.tile(_BODY, (count, 1)).astype(np.uint8),
+            batched_colors=np.tile(BODY, (count, 1)).astype(np.uint8),
             lod="off",
         )
         self._ghost = scene.add_batched_meshes_simple(
@@ -80,7 +64,7 @@ class Figure:
             still[:count],
             nowhere[:count],
             batched_scales=sizes * 1.04,
-            batched_colors=_GHOST,
+            batched_colors=GHOST,
             opacity=0.28,
             lod="off",
             cast_shadow=False,
@@ -88,24 +72,20 @@ class Figure:
             visible=False,
         )
         pins = self.skeleton.pins
-        self._pin_joints = np.array([p.joint for p in pins], dtype=int)
-        thick = 0.045 if self._robot else 0.0105
         self._pins = scene.add_batched_meshes_simple(
             f"{name}/joints",
             vertices,
             faces,
             np.tile([1.0, 0.0, 0.0, 0.0], (len(pins), 1)).astype(np.float32),
             np.zeros((len(pins), 3), np.float32),
-            batched_scales=np.array([(p.length, thick, thick) for p in pins], np.float32).reshape(
-                -1, 3
-            ),
-            batched_colors=np.tile(_CALM, (len(pins), 1)).astype(np.uint8),
+            batched_scales=self._drawing.pin_sizes.astype(np.float32),
+            batched_colors=np.tile(CALM, (len(pins), 1)).astype(np.uint8),
             lod="off",
             cast_shadow=False,
         )
         elements = len(self.skeleton.elements)
         self._elements = self._balls(f"{name}/elements", elements, 0.0045) if elements else None
-        bottom = -0.85 if self._robot else -0.05 - 0.026 * row
+        bottom = -0.85 if self._drawing.robot else -0.05 - 0.026 * row
         turn = mount * np.array([1.0, -1.0, -1.0, -1.0])  # labels are placed upright
         self._upright = scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
         self._label = scene.add_label(
@@ -114,13 +94,12 @@ class Figure:
         self._fault = scene.add_label(
             f"{name}/upright/fault",
             "",
-            position=(0.0, 0.0, 0.75 if self._robot else 0.215),
+            position=(0.0, 0.0, 0.75 if self._drawing.robot else 0.215),
             anchor="bottom-center",
             visible=False,
         )
         self._title = title
         self._shown: dict[str, object] = {}
-        self._most_pressure = 1.0
 
     def _balls(self, name: str, count: int, radius: float) -> viser.BatchedMeshHandle:
         vertices, faces = _ball()
@@ -131,30 +110,25 @@ class Figure:
             np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)).astype(np.float32),
             np.zeros((count, 3), np.float32),
             batched_scales=np.full(count, radius, np.float32),
-            batched_colors=np.tile(_CALM, (count, 1)).astype(np.uint8),
+            batched_colors=np.tile(CALM, (count, 1)).astype(np.uint8),
             lod="off",
             cast_shadow=False,
         )
 
     def update(self, view: SubjectView) -> None:
         """Show another state; what has not changed is not sent."""
-        q = drawn_q(view, view.q)
-        poses = self.skeleton.poses(q)
-        self._place(self._bodies, "bodies", self.skeleton.box_poses(poses))
-        if len(self._pin_joints):
-            self._place(self._pins, "pins", self.skeleton.pin_poses(poses))
-            self._color(self._pins, "pin colors", _torque_colors(view)[self._pin_joints])
-        self._color(self._bodies, "body colors", self._body_colors(view))
-        driven = np.isfinite(view.target)
-        self._flag(self._ghost, "visible", bool(driven.any()))
-        if driven.any():
-            target = drawn_q(view, np.where(driven, view.target, view.q))
-            ghost = self.skeleton.box_poses(self.skeleton.poses(target))
-            self._place(self._ghost, "ghost", ghost)
+        drawn = self._drawing.at(view)
+        self._place(self._bodies, "bodies", drawn.bodies)
+        if len(drawn.pins):
+            self._place(self._pins, "pins", drawn.pins)
+            self._color(self._pins, "pin colors", drawn.pin_colors)
+        self._color(self._bodies, "body colors", drawn.body_colors)
+        self._flag(self._ghost, "visible", drawn.ghost is not None)
+        if drawn.ghost is not None:
+            self._place(self._ghost, "ghost", drawn.ghost)
         if self._elements is not None:
-            places = self.skeleton.element_places(poses)
-            self._set(self._elements, "batched_positions", "elements", places)
-            self._color(self._elements, "element colors", self._pressure_colors(view))
+            self._set(self._elements, "batched_positions", "elements", drawn.elements)
+            self._color(self._elements, "element colors", drawn.element_colors)
         self._tell(view)
 
     def remove(self) -> None:
@@ -198,54 +172,6 @@ class Figure:
             self._shown[name] = value
             handle.visible = value
 
-    def _body_colors(self, view: SubjectView) -> Colors:
-        joints = [
-            None if b.segment < 0 else self.skeleton.segments[b.segment].joint
-            for b in self.skeleton.boxes
-        ]
-        base = _STALE if view.stale else _BODY
-        out = np.tile(base, (len(joints), 1))
-        for i, joint in enumerate(joints):
-            if joint is None or view.stale:
-                continue
-            if view.fault[joint]:
-                out[i] = _FAULT
-            elif view.near[joint]:
-                out[i] = _NEAR
-            elif not len(self._pin_joints):  # a gripper's jaws show its torque
-                out[i] = base + (_WARM - base) * float(view.torque_part[joint])
-        return out.astype(np.uint8)
-
-    def _pressure_colors(self, view: SubjectView) -> Colors:
-        values = np.nan_to_num(view.pressure)
-        count = len(self.skeleton.elements)
-        if len(values) != count:
-            return np.tile(_COLD, (count, 1)).astype(np.uint8)
-        self._most_pressure = max(self._most_pressure, float(values.max(initial=0.0)))
-        part = np.clip(values / self._most_pressure, 0.0, 1.0) * (len(_PRESSURE) - 1)
-        low = np.minimum(part.astype(int), len(_PRESSURE) - 2)
-        mix = (part - low)[:, None]
-        colors = _PRESSURE[low] * (1 - mix) + _PRESSURE[low + 1] * mix
-        return np.where(values[:, None] > 0, colors, _COLD).astype(np.uint8)
-
-
-def drawn_q(view: SubjectView, q: Floats) -> Floats:
-    """Q in the radians of the model's skeleton, which a gripper's dialects may scale."""
-    if isinstance(view.model, RobotModel) or not isinstance(view.subject, Side):
-        return q
-    own = view.model.joints[view.subject]
-    scale = np.array(
-        [mine.stroke / told.stroke for mine, told in zip(own, view.joints, strict=True)]
-    )
-    return np.asarray(q * scale)
-
-
-def _torque_colors(view: SubjectView) -> Colors:
-    part = view.torque_part[:, None]
-    warm = np.where(part < 0.5, _CALM + (_NEAR - _CALM) * part * 2,
-                    _NEAR + (_FAULT - _NEAR) * (part * 2 - 1))  # fmt: skip
-    return np.asarray(warm, dtype=np.uint8)
-
 
 @cache
 def _rounded_box() -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
@@ -281,18 +207,3 @@ def _ball() -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """A ball of radius 1, made of a rounded box."""
     vertices, faces = _rounded_box()
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
-
-
-def places(count: int, robots: Mapping[int, bool]) -> list[tuple[float, float, float]]:
-    """Where figures stand: hands in a row, robots behind them.
-
-    :param robots: whether each is a robot.
-    """
-    hands = [i for i in range(count) if not robots[i]]
-    out = []
-    for i in range(count):
-        if robots[i]:
-            out.append((0.0, 2.2, 0.72))
-        else:
-            out.append(((hands.index(i) - (len(hands) - 1) / 2) * 0.22, 0.0, 0.0))
-    return out
