@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from dexkit.hand import MotorError
 from dexkit.threads import Worker
 from dexkit.view.sources import Recorded
 from dexkit.watch import Mark
-from tests.watch_helpers import closing_hands, ns
+from tests.watch_helpers import STATE, closing_hands, dex3_state, ns
 from tools.browser import Browser, chromium
 
 pytest.importorskip("viser")
@@ -125,3 +126,47 @@ def test_numbers_are_charted(seen: Seen) -> None:
     browser.wait(f"document.querySelectorAll('.uplot').length == {before + 1}")
     browser.click("Remove all")
     browser.wait("document.querySelectorAll('.uplot').length == 0")
+
+
+def test_a_fault_of_a_live_hand_shows_and_goes(tmp_path: Path) -> None:
+    pytest.importorskip("cyclonedds")
+    from dexkit.dds import DdsNode
+    from dexkit.messages import message_type
+    from dexkit.view.page import Page
+    from dexkit.view.sources import Live
+    from dexkit.watch import Collector
+    from dexkit.watch.listener import Listener
+    from tests.dds_helpers import free_domain
+
+    domain, stop = free_domain(), threading.Event()
+    with (
+        DdsNode(domain) as hand,
+        DdsNode(domain) as node,
+        Listener(node, Collector(), None) as listener,
+        Page([Live("live", listener)], port=0) as page,
+    ):
+        writer = hand.writer("rt/dex3/left/state", message_type(STATE))
+        faults: dict[int, int] = {}
+
+        def publish() -> None:
+            while not stop.wait(0.01):
+                writer.write_raw(dex3_state([0.2] * 7, faults))
+
+        workers = [Worker("page", page.run, stop), Worker("hand", publish)]
+        for worker in workers:
+            worker.start()
+        try:
+            with Browser(tmp_path, 760, 480) as browser:
+                browser.open(page.url)
+                browser.wait(f"document.body && {TEXT}.includes('thumb_1')")
+                assert not browser.run(f"{TEXT}.includes('overcurrent')")
+                faults[1] = int(MotorError.OVERCURRENT)
+                browser.wait(f"{TEXT}.includes('thumb_1: overcurrent')")
+                faults.clear()
+                browser.wait(f"!{TEXT}.includes('overcurrent')")
+        finally:
+            stop.set()
+            for worker in workers:
+                worker.join()
+    for worker in workers:
+        worker.check()
