@@ -435,6 +435,30 @@ _PROMPT = (
 commands."""
 
 
+@check("DEX1-MOVE-10")
+def dead_zones(ctx: Context) -> Outcome:
+    """How much of a dead zone lies between where the gripper goes there and its end."""
+    worst: tuple[float, float, float, float, float] | None = None
+    reached = {s.target: s.final for p in ctx.phases("ends") for s in steps_of(ctx, p)}
+    for phase in ctx.phases():
+        for step in steps_of(ctx, phase):
+            rows = (ctx.commands.t >= step.begin) & (ctx.commands.t <= step.end)
+            asked = ctx.commands.q[rows, step.joint]
+            if not len(asked) or step.target not in reached:
+                continue
+            zone = abs(float(asked[-1]) - step.target)
+            part = abs(step.final - reached[step.target]) / zone if zone > 0 else 0.0
+            found = (part, float(asked[-1]), step.final, step.begin, step.end)
+            worst = found if worst is None or found > worst else worst
+    if worst is None:
+        return ctx.skipped("no command in a dead zone, or none to its end")
+    part, asked_q, final, begin, end = worst
+    text = f"commanded to {asked_q:g} rad, q ends at {final:.3f} rad: {part:.0%} of the zone short"
+    if part <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{part:.0%}", text, part=part)
+    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
+
+
 @check("DEX1-MOVE-08")
 def ends(ctx: Context) -> Outcome:
     """Distance from fully open and fully closed."""

@@ -606,6 +606,14 @@ class MilliNewtonMetres(_Fields):
         return {**fields, "tau_est": 1e3 * fields["tau_est"]}
 
 
+@wrong_hand("DEX1-MOVE-10", dialect="unitree_hg")
+class NoDeadZones(ReferenceService):
+    """Goes to every q as it is, without the zones that mean fully open and closed."""
+
+    def command(self, side: Side, motor: Motor) -> None:
+        self.hands[side].command(Motor(q=motor.q) if math.isfinite(motor.q) else motor)
+
+
 @wrong_hand("DEX1-FORCE-05", dialect="unitree_hg")
 class SignedForce(_Fields):
     """Publishes the signed torque where the strength of the grip is expected."""

@@ -7,6 +7,8 @@ listen         no commands; state must flow
 approach       slowly to mid stroke
 step           large steps of one side, the others hold
 ends           fully open, and fully closed where there is no object
+dead-zone      where a dialect has them (``unitree_hg``): the inner limits of the zones that mean
+               fully open and fully closed
 fingerprint    steps to compare the ``recover`` steps with
 nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
 range, empty,  stroke, no motor, motors too many, negative gains; and a client of another type on
@@ -63,6 +65,9 @@ __all__ = ["GripperScript"]
 
 # of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)
 LEAD = 0.18 / 5.4
+_CLOSES, _OPENS = 0.09, 6.02
+"""rad, just within the zones of the gripper's DDS interface specification that mean fully closed and
+open: the limits themselves, 0.1 and 6.0, are no exact numbers in a message."""
 _PUSH = (0.25, 1.0)
 """Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
 _LATE = {
@@ -142,6 +147,8 @@ class GripperScript(HandScript):
                 yield from self._steps(side)
         if "ends" in self.plan.phases:
             yield from self._ends()
+        if "dead-zone" in self.plan.phases and self.plan.dialect.interface_specification:
+            yield from self._dead_zones()
         if "fingerprint" in self.plan.phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place())
@@ -231,6 +238,17 @@ class GripperScript(HandScript):
             self._goal.update(dict.fromkeys(free, (0.0,)))
             phase = self._begin("ends", free, targets={s: {0: 0.0} for s in free})
             yield from self._until_settled(phase, free, least=0.6, most=2.8)
+        yield from self._everyone("center", {s: self._home(s) for s in sides})
+
+    def _dead_zones(self) -> Steps:
+        self._report("the zones that mean fully open and fully closed")
+        sides = self.plan.sides
+        free = [s for s in sides if s not in self.plan.objects]
+        for q, end, chosen in ((_OPENS, self._stroke, sides), (_CLOSES, 0.0, free)):
+            if chosen:
+                self._goal.update(dict.fromkeys(chosen, (q,)))
+                phase = self._begin("dead-zone", chosen, targets={s: {0: end} for s in chosen})
+                yield from self._until_settled(phase, chosen, least=0.6, most=2.8)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _bad(self, name: str) -> Steps:
