@@ -134,8 +134,8 @@ def test_every_requirement_has_a_wrong_hand() -> None:
 
 @each("name", models())
 def test_needed_stimuli_exist(name: str) -> None:
-    needed = phases_for(catalogue(name))
     dialect = model(name).dialects[0]
+    needed = phases_for(r for r in catalogue(name) if dialect.name in r.dialects)
     plan = Plan(dialect, tuple(Side), default_objects(dialect, tuple(Side)), phases=needed)
     script = script_class(name)(plan)
     script.length()
