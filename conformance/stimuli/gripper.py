@@ -66,8 +66,8 @@ __all__ = ["GripperScript"]
 # of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)
 LEAD = 0.18 / 5.4
 _CLOSES, _OPENS = 0.09, 6.02
-"""rad, just within the zones of the gripper's DDS interface specification that mean fully closed and
-open: the limits themselves, 0.1 and 6.0, are no exact numbers in a message."""
+"""rad, just within the zones that mean fully closed and open in the gripper's DDS interface
+specification: their limits, 0.1 and 6.0, are no exact numbers in a message."""
 _PUSH = (0.25, 1.0)
 """Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
 _LATE = {
