@@ -41,6 +41,7 @@ class RobotModel:
     :param has_battery: whether its state has the battery, the supply and a frame header.
     :param battery_cells: of the battery, in series.
     :param teleop_name: its name in xr_teleoperate (``--arm``).
+    :param lerobot_name: its name in LeRobot (``--robot.type``), or empty.
     :param requirements: its requirement files, in dexkit's own folder.
     :param script: its stimulus script in the conformance kit.
     :param quick_seconds: seconds of stimulus of a quick conformance run.
@@ -92,6 +93,7 @@ class RobotModel:
     # (docs/sources/unitree-dex.md#b4)
     command_timeout: float = 1.0
     script: Lazy[type[Script[RobotSubject]]] = _SCRIPT
+    lerobot_name: str = ""
     unit: ClassVar[str] = "rad"
     torque_unit: ClassVar[str] = "N m"
 
@@ -280,6 +282,7 @@ G1 = RobotModel(
     has_battery=False,
     battery_cells=13,  # the G1's datasheet
     teleop_name="G1_29",
+    lerobot_name="unitree_g1",
     requirements=("g1.toml",),
     quick_seconds=17.0,
     layout=Lazy("dexkit.robot_layout:G1"),

@@ -162,16 +162,16 @@ class TestArguments:
         ("domain", "hands", "text"),
         [
             (1, "dex3", "--arm=G1_29 --ee=dex3 --sim"),
-            (0, "none", "--arm=G1_29\n"),
+            (0, "none", "--arm=G1_29"),
             (1, "dex5", "321"),
         ],
     )
     def test_command_for_xr_teleoperate_is_printed(
         self, domain: int, hands: str, text: str
     ) -> None:
-        from dexkit.cli.emulate.all import _next_steps
+        from dexkit.cli.emulate.all import _for_xr
 
-        assert text in "\n".join(_next_steps("g1", hands, domain, "lo"))
+        assert text in "\n".join(_for_xr("g1", hands, domain))
 
     def test_hand_settings_without_hands_are_refused(self) -> None:
         result = CliRunner().invoke(cli, ["emulate", "all", "--hands", "none", "--set", "a=b"])

@@ -35,6 +35,11 @@ _DEVICES = {
         "emulate_h1",
         "Emulate the robot of an H1 (rt/lowcmd, rt/lowstate, unitree_go).",
     ),
+    "lerobot-g1": (
+        "dexkit.cli.emulate.lerobot",
+        "emulate_lerobot_g1",
+        "Serve LeRobot's ports (ZeroMQ) for an emulated G1.",
+    ),
     "mx64": (
         "dexkit.cli.emulate.mx64",
         "emulate_mx64",

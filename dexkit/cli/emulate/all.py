@@ -15,6 +15,7 @@ from contextlib import nullcontext
 import click
 
 from dexkit.child_processes import READY_TIMEOUT, Tool
+from dexkit.cli.emulate.lerobot import LOOPBACK, parse_ports, ports_option
 from dexkit.cli.options import (
     DIALECT,
     dds_options,
@@ -35,14 +36,25 @@ __all__ = ["emulate_all"]
 
 _HANDS = {hand.short_name: hand for hand in MODELS.values() if hand.simulator}
 _POLL = 0.05  # seconds between looks whether all parts live
+_XR, _LEROBOT = "xr_teleoperate", "lerobot"
+_XR_HANDS, _LEROBOT_HANDS = "dex3", "dex1"  # each client's own default
 
 
 @click.command("all", context_settings={"show_default": True})
 @click.option(
+    "--for",
+    "client",
+    type=click.Choice([_XR, _LEROBOT]),
+    default=_XR,
+    help="The client: LeRobot's unitree_g1 gets its ports on ZeroMQ (docs/lerobot.md).",
+)
+@click.option(
     "--robot", type=click.Choice(list(reversed(ROBOTS))), default="g1", help="Which robot."
 )
 @click.option(
-    "--hands", type=click.Choice([*_HANDS, "none"]), default="dex3", help="Which hands, both sides."
+    "--hands",
+    type=click.Choice([*_HANDS, "none"]),
+    help="Which hands, both sides.  [default: dex3; dex1 for lerobot]",
 )
 @click.option(
     "--dialect",
@@ -53,17 +65,20 @@ _POLL = 0.05  # seconds between looks whether all parts live
     "Setting of the hands, e.g. object=40; right.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."
 )
-@dds_options()
+@ports_option
+@dds_options(default_domain=None, domain_default_text="1; 0 for lerobot")
 @duration_option()
 @force_option()
 @view_option()
 @quiet_option()
 def emulate_all(
+    client: str,
     robot: str,
-    hands: str,
+    hands: str | None,
     dialect: str | None,
     settings: tuple[str, ...],
-    domain: int,
+    ports: str | None,
+    domain: int | None,
     interface: str,
     duration: float | None,
     force: bool,
@@ -77,10 +92,20 @@ def emulate_all(
       dexkit emulate all
       dexkit emulate all --robot h1 --hands dex1
       dexkit emulate all --set right.object=40 --duration 60
+      dexkit emulate all --for lerobot --hands none
 
     Prints "ready: ..." when all topics are up, and what to start next. Ctrl-C or SIGTERM ends
     it. When one part ends, all do, with its error and exit code.
     """  # noqa: D301  # click wants the backspace itself
+    for_lerobot = client == _LEROBOT
+    hands = hands or (_LEROBOT_HANDS if for_lerobot else _XR_HANDS)
+    domain = domain if domain is not None else 0 if for_lerobot else 1
+    if for_lerobot and not ROBOTS[robot].lerobot_name:
+        raise click.UsageError(f"LeRobot does not know the {robot}")
+    if for_lerobot and interface != "lo":
+        raise click.UsageError("--for lerobot is on loopback: --interface does not go with it")
+    if ports is not None and not for_lerobot:
+        raise click.UsageError("--ports is for --for lerobot")
     if hands == "none" and (dialect or settings):
         raise click.UsageError("--dialect and --set are for hands, and there are none")
     common = ["--domain", str(domain), "--interface", interface]
@@ -90,6 +115,10 @@ def emulate_all(
         own = [option for text in settings for option in ("--set", text)]
         own += ["--dialect", dialect] if dialect else []
         parts["hands"] = ("serve", _HANDS[hands].simulator, "--side", "both", *own, *common)
+    if for_lerobot:
+        places = [] if ports is None else ["--ports", ",".join(map(str, parse_ports(ports)))]
+        more = ["--domain", str(domain), *places, *["--quiet"] * quiet]
+        parts[_LEROBOT] = ("emulate", "lerobot-g1", *more)
     with (
         stop_on_signals() as stop,
         viewer(domain, interface, stop.event, click.echo) if view else nullcontext(),
@@ -101,28 +130,42 @@ def emulate_all(
             if hands != "none":
                 title += f" and two {_HANDS[hands].title}s"
             click.echo(f"ready: {title}, domain {domain}, {interface}")
-            click.echo("\n".join(_next_steps(robot, hands, domain, interface)))
+            for_whom = _for_lerobot(robot) if for_lerobot else _for_xr(robot, hands, domain)
+            click.echo("\n".join([*for_whom, *_next_steps(domain, interface)]))
             sys.stdout.flush()
             processes.watch(stop, duration)
 
 
-def _next_steps(robot: str, hands: str, domain: int, interface: str) -> list[str]:
-    """Return the commands that a user can run next."""
+def _for_xr(robot: str, hands: str, domain: int) -> list[str]:
+    """How xr_teleoperate is started."""
+    if domain not in (0, 1):
+        return ["xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md"]
     end = "" if hands == "none" else f" --ee={hands}"
-    lines = []
-    if domain in (0, 1):
-        sim = " --sim" if domain == 1 else ""
-        lines += [
-            "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
-            f"  python teleop_hand_and_arm.py --arm={ROBOTS[robot].teleop_name}{end}{sim}",
-        ]
-        if hands in _HANDS and _HANDS[hands].client_note:
-            lines.append(f"  ({_HANDS[hands].client_note})")
-    else:
-        lines.append("xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md")
+    sim = " --sim" if domain == 1 else ""
+    lines = [
+        "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
+        f"  python teleop_hand_and_arm.py --arm={ROBOTS[robot].teleop_name}{end}{sim}",
+    ]
+    if hands in _HANDS and _HANDS[hands].client_note:
+        lines.append(f"  ({_HANDS[hands].client_note})")
+    return lines
+
+
+def _for_lerobot(robot: str) -> list[str]:
+    """How LeRobot is started."""
+    name = ROBOTS[robot].lerobot_name
+    return [
+        "next, with LeRobot (docs/lerobot.md):",
+        f"  lerobot-teleoperate --robot.type={name} --robot.is_simulation=false "
+        f"--robot.robot_ip={LOOPBACK} ...",
+        f"  (LeRobot's {name} commands the body only: the hands are on DDS alone)",
+    ]
+
+
+def _next_steps(domain: int, interface: str) -> list[str]:
+    """Return the other commands that a user can run next."""
     where = "" if interface == "lo" else f" --interface {interface}"
     return [
-        *lines,
         f'with Unitree\'s SDK: ChannelFactoryInitialize({domain}, "{interface}")',
         f"who is there: dexkit doctor --domain {domain}{where}",
     ]

@@ -1,0 +1,104 @@
+"""``dexkit emulate lerobot-g1``: LeRobot's ports in front of an emulated G1."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+
+import click
+
+from dexkit.cli.options import DOMAIN, duration_option, quiet_option
+from dexkit.cli.status_line import StatusLine, log_to_stderr
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.robots import G1
+from dexkit.stop_signals import stop_on_signals
+
+__all__ = ["LOOPBACK", "emulate_lerobot_g1", "parse_ports", "ports_option"]
+
+LOOPBACK = "127.0.0.1"
+_PERIOD = 0.5  # seconds between two looks
+_INTERFACE = "lo"
+
+ports_option = click.option(
+    "--ports",
+    metavar="C,S,P",
+    help="TCP ports of commands, states and pictures; 0 lets the system choose. "
+    " [default: LeRobot's, 6000,6001,5555]",
+)
+
+
+@click.command("lerobot-g1", context_settings={"show_default": True})
+@click.option(
+    "--domain", type=DOMAIN, default=0, help="DDS domain of the emulated G1, on loopback."
+)
+@click.option(
+    "--address",
+    default=LOOPBACK,
+    metavar="IP",
+    help="Address to listen on. Another one than of loopback lets other machines command.",
+)
+@ports_option
+@click.option("--no-camera", is_flag=True, help="Send no pictures.")
+@duration_option()
+@quiet_option()
+def emulate_lerobot_g1(
+    domain: int,
+    address: str,
+    ports: str | None,
+    no_camera: bool,
+    duration: float | None,
+    quiet: bool,
+) -> None:
+    """Serve the ports of LeRobot's robot server for an emulated G1.
+
+    What run_g1_server.py is on a real G1: the body's commands and states as JSON over ZeroMQ, and
+    pictures (a test card). 'dexkit emulate all --for lerobot' starts it with robot and hands.
+    Commands count after one second without a gap of more than 0.25 s, from one client.
+
+    Prints "ready: ..." when the ports are open. Ctrl-C or SIGTERM ends it.
+    """
+    from dexkit.dds import DdsNode
+    from dexkit.emulators.lerobot import PORTS, LerobotPorts, Ports
+
+    chosen = PORTS if ports is None else Ports(*parse_ports(ports))
+    status = StatusLine(quiet)
+    log_to_stderr(quiet=True, status=status.on_terminal, always="dexkit.lerobot")
+    with (
+        stop_on_signals() as stop,
+        DdsNode(domain=domain, interface=_INTERFACE) as node,
+        LerobotPorts(node, address=address, ports=chosen, camera=not no_camera) as served,
+    ):
+        open_ports = served.ports
+        pictures = "" if no_camera else f", pictures {open_ports.camera}"
+        click.echo(
+            f"ready: LeRobot's {G1.name} on {address}: commands {open_ports.commands}, states "
+            f"{open_ports.states}{pictures}; domain {domain}, {_INTERFACE}"
+        )
+        sys.stdout.flush()
+        end = None if duration is None else time.monotonic() + duration
+        states = served.counters.states
+        while served.failure is None:
+            left = _PERIOD if end is None else min(_PERIOD, end - time.monotonic())
+            if left <= 0 or stop.wait(left):
+                break
+            rate, states = (served.counters.states - states) / _PERIOD, served.counters.states
+            text = f"LeRobot {served.clients} client(s), {rate:.0f} states/s"
+            status.show(f"{text}; {served.counters.forwarded} commands forwarded", text)
+        status.clear()
+        if served.failure is not None:
+            raise EmulatorError(f"LeRobot's ports died: {served.failure}") from served.failure
+    counted = dataclasses.asdict(served.counters)
+    click.echo(f"stopped: {', '.join(f'{number} {what}' for what, number in counted.items())}")
+
+
+def parse_ports(text: str) -> tuple[int, int, int]:
+    """The three ports of an option.
+
+    :raises UsageError: they are not three numbers below 65536.
+    """
+    words = text.split(",")
+    if len(words) != 3 or not all(w.isdecimal() and int(w) < 65536 for w in words):
+        raise UsageError(f"--ports {text}", hint="three of them, for example 6000,6001,5555")
+    commands, states, camera = map(int, words)
+    return commands, states, camera

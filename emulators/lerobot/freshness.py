@@ -1,0 +1,62 @@
+"""Decide which of a client's commands count when nothing in them says when they were made.
+
+LeRobot's commands bear no time. Its socket keeps the newest command and sends it again to a server
+that comes back, however old it is then; what it sent while the network or this program stood still
+waits in buffers. So nothing counts that may have waited: after a connection, a pause of this
+program or a gap between commands, one has to come after the other for a while.
+"""
+
+from __future__ import annotations
+
+from dexkit.clock import Clock
+from dexkit.command_age import PAUSE, QUIET, PauseWatch
+
+__all__ = ["CommandStream"]
+
+
+class CommandStream:
+    """The commands of whoever is connected. For one thread.
+
+    A command counts if commands have come for more than
+    :data:`~dexkit.command_age.QUIET` seconds without a gap of more than
+    :data:`~dexkit.command_age.PAUSE`, from exactly one client.
+
+    :param clock: :meth:`~dexkit.clock.Clock.since_boot` of it is used.
+
+    :ivar clients: connections that are open.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._watch = PauseWatch(clock)
+        self._began: float | None = None  # of the commands without a gap
+        self._last = 0.0
+        self.clients: set[int] = set()
+
+    def look(self) -> float:
+        """To be called again and again, and before :meth:`counts`.
+
+        :returns: seconds that this program was paused until now, or 0.
+        """
+        away = self._watch.measure_pause()
+        if away:
+            self._began = None
+        return away
+
+    def connected(self, client: int) -> None:
+        """A client has connected; it may send what it has kept."""
+        self.clients.add(client)
+        self._began = None
+
+    def disconnected(self, client: int) -> None:
+        """A client has gone."""
+        self.clients.discard(client)
+        self._began = None
+
+    def counts(self) -> bool:
+        """A command came: whether it counts."""
+        now = self._clock.since_boot()
+        last, self._last = self._last, now
+        if self._began is None or now - last > PAUSE:
+            self._began = now
+        return now - self._began > QUIET and len(self.clients) == 1
