@@ -21,7 +21,7 @@ __all__ = ["lerobot_modules", "make_robot"]
 
 
 @dataclass(kw_only=True)
-class RobotConfig(abc.ABC):
+class RobotConfig:
     id: str | None = None
     calibration_dir: Path | None = None
     choices: ClassVar[dict[str, type]] = {}

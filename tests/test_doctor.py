@@ -374,6 +374,29 @@ def test_known_hashes_are_those_of_cyclonedds_0_10() -> None:
     assert {name: type_hash(name) for name in TYPE_HASHES} == TYPE_HASHES
 
 
+def test_writer_of_an_earlier_layout_is_named_by_its_samples() -> None:
+    domain, kind = free_domain(), "unitree_hg::msg::dds_::HandState_"
+    old = b"\0\1\0\0" + bytes(4) + bytes(56) + bytes(4) + bytes(16)  # 2024-08, nothing in it
+    stop = threading.Event()
+    with DdsNode(domain, "lo") as node, node.writer("rt/dex3/left/state", kind) as writer:
+
+        def publish() -> None:
+            while not stop.wait(0.01):
+                writer.write_raw(old)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            (view,) = doctor_dds.observe_domains([domain], seconds=0.3)
+        finally:
+            stop.set()
+            thread.join()
+    found = [f for f in diagnose(Observations(domains=(view,))) if f.id == "DDS-LAYOUT"]
+    assert len(found) == 1
+    assert "publishes rt/dex3/left/state" in found[0].seen
+    assert "of 2024-08" in found[0].seen
+
+
 def test_observation_leaves_no_reader_behind() -> None:
     domain = free_domain()
     with DdsNode(domain, "lo") as node:

@@ -40,6 +40,8 @@ from dexkit.doctor.observations import (
 from dexkit.doctor.report import as_data, print_report
 from dexkit.doctor.rtps import Data, parse_message, parse_participant
 from dexkit.doctor.topics import is_driven, nearly
+from dexkit.doctor.type_hashes import TYPE_HASHES
+from dexkit.messages.earlier import EARLIER
 from dexkit.models import DIALECTS
 from tests.doctor_packets import FAST_PARTICIPANT
 from tests.each import each
@@ -290,6 +292,28 @@ CASES: dict[str, Observations] = {
 
 def _ids(seen: Observations, scope: Scope | None = None) -> set[str]:
     return {f.id for f in diagnose(seen, scope)}
+
+
+def test_peer_with_an_earlier_layout_is_named_by_its_hash_or_by_its_samples() -> None:
+    first, second = EARLIER[HAND_STATE]
+    now = TYPE_HASHES[HAND_STATE]
+    old_reader = _pair(model="dex3", state_hash=(now, first.type_hash))
+    old_writer = _pair(model="dex3", state_hash=(second.type_hash, now))
+    ros = _pair(model="dex3", undecodable=1000, earlier=first.when)
+    for view, who, when in (
+        (old_reader, "client.py (pid", "reads rt/dex3/left/state on domain 1 with the layout of"),
+        (old_writer, "hand.py (pid", "unitree_hg HandState_ of 2024-12 (unitree_sdk2 from"),
+        (ros, "hand.py (pid", "of 2024-08 (unitree_sdk2 before 2024-12-18"),
+    ):
+        found = [f for f in diagnose(_seen(view)) if f.id == "DDS-LAYOUT"]
+        assert len(found) == 2, view  # one a topic
+        assert who in found[0].seen
+        assert when in found[0].seen
+        assert not {f.id for f in diagnose(_seen(view))} & {"DDS-UNREADABLE", "DDS-CYCLONE-11"}
+    # the wheel of 0.10.2 announces 0.11.0, with an earlier layout, too
+    wheel = _who("client", version="0.11.0")
+    view = _pair(model="dex3", client=wheel, state_hash=(now, first.type_hash))
+    assert _ids(_seen(view)) == {"DDS-LAYOUT"}
 
 
 def test_every_diagnosis_has_a_test() -> None:

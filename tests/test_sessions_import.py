@@ -20,6 +20,8 @@ from dexkit.conformance.recording import Recording
 from dexkit.errors import DexkitError, SessionError
 from dexkit.hand import Side
 from dexkit.messages import message_type
+from dexkit.messages.earlier import EARLIER
+from dexkit.messages.schemas import ros2msg
 from dexkit.messages.unitree_hg import HandState_, MotorState_, PressSensorState_
 from dexkit.traces import Trace, open_trace
 from dexkit.traces.sessions import old_layouts, ros_types
@@ -515,10 +517,9 @@ def bag(
 def test_bags_of_earlier_layouts_are_read(
     tmp_path: Path, storage: StoragePlugin, when: str
 ) -> None:
-    layout = old_layouts.EARLIER[HG][f"of {when}"]
-    types = old_layouts.earlier_layouts(HG)
-    assert set(types) == {"of 2024-08", "of 2024-12"}
-    definition = old_layouts.definition_text(HG, *layout)
+    layouts = {layout.when: layout for layout in EARLIER[HG]}
+    assert set(layouts) == {"2024-08", "2024-12"}
+    definition = ros2msg(layouts[when].struct)
     payloads = [old_state(when, 0.1 * i) for i in range(5)]
     topics = {
         "/dex3/left/state": ("unitree_hg/msg/HandState", definition, payloads),

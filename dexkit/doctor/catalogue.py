@@ -229,10 +229,11 @@ _ALL = (
     Diagnosis(
         "DDS-LAYOUT",
         _E,
-        "two processes use the same type name with different layouts",
+        "a process uses another layout of a type under the same name",
         _WAITS + ", or values are shifted and wrong",
         "Unitree changed the messages in December 2024 and February 2025 without renaming them",
-        "install the same, newest version of unitree_sdk2 or unitree_ros2 on both sides",
+        "install the newest version of unitree_sdk2, unitree_sdk2_python or unitree_ros2 (v0.3.0 or "
+        "later) there, and build it anew (docs/ros2.md)",
     ),
     Diagnosis(
         "DDS-QOS",

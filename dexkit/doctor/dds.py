@@ -25,6 +25,7 @@ from dexkit.doctor.rtps import EndpointData, Locator
 from dexkit.doctor.topics import is_driven, is_hand_topic, is_limp
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
+from dexkit.messages.earlier import layout_of
 from dexkit.topics import roles
 
 __all__ = ["DISCOVERY_SECONDS", "observe_domains"]
@@ -68,6 +69,7 @@ class _Watch:
     limp: dict[int, tuple[float, float]] = field(default_factory=dict)
     nonzero: bool = False
     undecodable: int = 0
+    earlier: str = ""
     decoded_at: float = float("-inf")
     newest: bytes = b""
     delays: list[float] = field(default_factory=list)
@@ -99,6 +101,8 @@ class _Watch:
             motors = getattr(kind.decode(data), kind.motor_sequence)
         except DexkitError:
             self.undecodable += 1
+            known = layout_of(self.endpoint.type_name, data)
+            self.earlier = known.when if known is not None else ""
             return
         q = [float(motor.q) for motor in motors]
         self.nonzero = self.nonzero or any(q)
@@ -136,6 +140,7 @@ class _Watch:
             limp_span=max((high - low for low, high in self.limp.values()), default=0.0),
             nonzero=self.nonzero,
             undecodable=self.undecodable,
+            earlier=self.earlier,
             lost=gaps + 1 - self.samples if self.samples else 0,
             delay_min=percentile(self.delays, 0.0),
             delay_95=percentile(self.delays, 0.95),

@@ -102,6 +102,7 @@ class Stream:
     :param limp_span: of commands: the same over the commands without gains, which leave it limp.
     :param nonzero: some position of some sample was not exactly 0.
     :param undecodable: samples that do not decode as their type.
+    :param earlier: month of the earlier layout that the last of these has, or empty.
     :param lost: sequence numbers that are missing between the first and the last sample.
     :param delay_min: least reception time minus time of writing, seconds, each by its own
         machine's clock; NaN when it is not known.
@@ -121,6 +122,7 @@ class Stream:
     limp_span: float = 0.0
     nonzero: bool = False
     undecodable: int = 0
+    earlier: str = ""
     lost: int = 0
     delay_min: float = float("nan")
     delay_95: float = float("nan")

@@ -25,6 +25,7 @@ from dexkit.doctor.topics import nearly, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.doctor.ways import Course, moves_against, swapped
 from dexkit.hand import Side
+from dexkit.messages.earlier import EARLIER, earlier_by_hash
 from dexkit.models import DIALECTS, MODELS, Dialect
 from dexkit.topics import Role, roles
 from dexkit.wire import dex3_usb, mx64
@@ -253,6 +254,7 @@ def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
     yield from found
     for view in focus:
         yield from _matches(view)
+        yield from _earlier_layouts(view)
         yield from _listeners(view, scope)
         yield from _streams(view, scope)
         yield from _ways(view, scope)
@@ -276,7 +278,9 @@ def _versions(view: DomainView) -> Iterator[Finding]:
             # 0.11.0 is announced by the wheel of 0.10.2 and by builds that crash it; only how
             # they describe a type differs
             typed = any(
-                e.type_hash and TYPE_HASHES.get(e.type_name, e.type_hash) != e.type_hash
+                e.type_hash
+                and TYPE_HASHES.get(e.type_name, e.type_hash) != e.type_hash
+                and earlier_by_hash(e.type_name, e.type_hash) is None
                 for e in ends
             )
             if not typed:
@@ -367,7 +371,8 @@ def _matches(view: DomainView) -> Iterator[Finding]:
         # other versions of CycloneDDS describe the same type differently
         alike = ends[0] and ends[1] and _series(ends[0]) == _series(ends[1])
         hashes = writer.type_hash, reader.type_hash
-        if alike and all(hashes) and hashes[0] != hashes[1]:
+        told = any(earlier_by_hash(writer.type_name, one) for one in hashes)
+        if alike and all(hashes) and hashes[0] != hashes[1] and not told:
             key = ("layout", writer.topic, reader.participant)
             if key not in reported:
                 reported.add(key)
@@ -378,6 +383,34 @@ def _matches(view: DomainView) -> Iterator[Finding]:
                     domain=view.number,
                     topic=writer.topic,
                 )
+
+
+def _earlier_layouts(view: DomainView) -> Iterator[Finding]:
+    """Peers whose types or samples have a layout that Unitree has given up.
+
+    By the hash of the type, which CycloneDDS 0.10 announces, or by the length of the samples: ROS 2
+    Foxy and Humble announce none.
+    """
+    reported: set[tuple[str, str]] = set()
+    for endpoint in view.endpoints:
+        stream = view.stream(endpoint)
+        layouts = EARLIER.get(endpoint.type_name, ())
+        sent = stream.earlier if stream is not None else ""
+        known = earlier_by_hash(endpoint.type_name, endpoint.type_hash) or next(
+            (one for one in layouts if one.when == sent), None
+        )
+        key = (endpoint.participant, endpoint.topic)
+        if known is None or key in reported:
+            continue
+        reported.add(key)
+        verb = "publishes" if endpoint.kind == "writer" else "reads"
+        yield _finding(
+            "DDS-LAYOUT",
+            f"{view.owner(endpoint)} {verb} {endpoint.topic} on domain {view.number} with the "
+            f"layout of {short(endpoint.type_name)} of {known.when} ({known.packages})",
+            domain=view.number,
+            topic=endpoint.topic,
+        )
 
 
 def _series(participant: Participant) -> str:
@@ -503,6 +536,8 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
             )
             continue
         if stream.undecodable and stream.undecodable >= stream.samples:
+            if stream.earlier:  # reported with all streams of one
+                continue
             yield _finding(
                 "DDS-UNREADABLE",
                 f"{what}: {stream.samples} samples are not {short(part.endpoint.type_name)}",

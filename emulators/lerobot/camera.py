@@ -14,7 +14,7 @@ from itertools import cycle
 
 from dexkit.errors import ExtraMissing
 
-__all__ = ["CAMERA", "FPS", "SIZE", "camera_json", "test_cards"]
+__all__ = ["CAMERA", "FPS", "SIZE", "camera_json", "moving_cards"]
 
 CAMERA = "head_camera"
 """The name that LeRobot's server gives to its only camera."""
@@ -27,7 +27,7 @@ _BARS = ("#c0c0c0", "#c0c000", "#00c0c0", "#00c000", "#c000c0", "#c00000", "#000
 _COUNT = 30  # different pictures
 
 
-def test_cards() -> Iterator[str]:
+def moving_cards() -> Iterator[str]:
     """Pictures for ever: JPEG in base64, colour bars with a white column that moves across.
 
     :raises ExtraMissing: Pillow is not installed.

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from dexkit.clock import Clock, Rate, RealClock
 from dexkit.dds import DdsNode
 from dexkit.emulators.lerobot.body import MOST, command_from, state_json
-from dexkit.emulators.lerobot.camera import CAMERA, FPS, camera_json, test_cards
+from dexkit.emulators.lerobot.camera import CAMERA, FPS, camera_json, moving_cards
 from dexkit.emulators.lerobot.freshness import CommandStream
 from dexkit.errors import EmulatorError, ExtraMissing, WireError
 from dexkit.robots import G1
@@ -93,7 +93,7 @@ class LerobotPorts:
         self._node = node
         self._clock: Clock = clock or RealClock()
         self._zmq = _library()
-        self._cards: Iterator[str] | None = test_cards() if camera else None
+        self._cards: Iterator[str] | None = moving_cards() if camera else None
         self._stop = threading.Event()
         self._told: set[str] = set()
         self._stream = CommandStream(self._clock)

@@ -13,6 +13,7 @@ from typing import Any
 
 from dexkit.errors import TraceUnsupported, WireError
 from dexkit.messages import MessageType, message_type
+from dexkit.messages.earlier import EARLIER
 from dexkit.messages.layout import MAX_ELEMENTS, STRUCTS
 from dexkit.messages.layout import Struct as OwnStruct
 from dexkit.messages.schemas import omgidl
@@ -20,10 +21,8 @@ from dexkit.traces import schemas
 from dexkit.traces.names import dds_type
 
 __all__ = [
-    "EARLIER",
     "converter",
     "decode",
-    "definition_text",
     "earlier_layouts",
     "matching_layout",
 ]
@@ -42,50 +41,13 @@ _FORMS = {
     "f64": "d",
 }
 
-_SENSOR = "float32[12] pressure\nfloat32[12] temperature\n"
-_MOTORS = "unitree_hg/MotorState[] motor_state\n"
-_PRESS = "unitree_hg/PressSensorState[] press_sensor_state\n"
-_IMU = "unitree_hg/IMUState imu_state\n"
-_POWER = "float32 power_v\nfloat32 power_a\n"
-_MORE = "float32 system_v\nfloat32 device_v\nuint32[2] error\n"
-_TAIL = "uint32[2] reserve\n"
-
-EARLIER: dict[str, dict[str, tuple[str, str]]] = {
-    "unitree_hg::msg::dds_::HandCmd_": {
-        "of 2024-08": ("unitree_hg/MotorCmd[] motor_cmd\n", ""),
-    },
-    "unitree_hg::msg::dds_::HandState_": {
-        "of 2024-08": (_MOTORS + _IMU + _PRESS + _POWER + _TAIL, _SENSOR),
-        "of 2024-12": (_MOTORS + _PRESS + _IMU + _POWER + _MORE + _TAIL, _SENSOR),
-    },
-}
-"""Layouts before the present one: by type and time, the members, and those of a sensor packet."""
-
 
 def earlier_layouts(type_name: str) -> dict[str, schemas.Struct]:
     """The layouts that a type had before, by their time."""
     return {
-        when: schemas.parse(
-            "ros2msg", STRUCTS[type_name].ros_name, definition_text(type_name, *members)
-        )
-        for when, members in EARLIER.get(type_name, {}).items()
+        f"of {layout.when}": schemas.parse("omgidl", type_name, omgidl(layout.struct))
+        for layout in EARLIER.get(type_name, ())
     }
-
-
-def definition_text(type_name: str, members: str, sensor: str) -> str:
-    """The ``ros2msg`` definition of an earlier layout, with the types that it needs."""
-    text = members
-    for inner in STRUCTS[type_name].depends():
-        package, _, name = inner.ros_name.split("/")
-        body = sensor if name == "PressSensorState" else _own_members(inner)
-        text += f"{'=' * 80}\nMSG: {package}/{name}\n{body}"
-    return text
-
-
-def _own_members(struct_: OwnStruct) -> str:
-    from dexkit.messages.schemas import ros2msg
-
-    return ros2msg(struct_).split("=" * 80)[0]
 
 
 def converter(
