@@ -130,7 +130,8 @@ def test_the_tests_of_the_plug_in_pass_on_lerobot(host: Host, environment: dict[
     out = lerobot(
         host,
         {**environment, "PYTHONPATH": ""},
-        *("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_lerobot_robot.py"),
+        *("-m", "pytest", "-q", "--noconftest", "-p", "no:cacheprovider"),
+        "tests/test_lerobot_robot.py",
     )
     assert " passed" in out
     assert "skipped" not in out

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 from typing import Any
 
 from dexkit.errors import OversizeError, WireError
@@ -19,6 +18,7 @@ __all__ = ["MOST", "command_from", "state_json"]
 
 MOST = 1 << 16
 """Bytes of the longest command that is read; one of LeRobot has some 4000."""
+_LARGEST = float.fromhex("0x1.fffffep127")
 _NUMBERS = ("q", "dq", "kp", "kd", "tau")
 
 
@@ -92,7 +92,6 @@ def _byte(found: Any, name: str) -> int:
 
 def _number(found: Any, name: str) -> float:
     value = _member(found, name, int | float, 0.0)  # type: ignore[arg-type]
-    # what a float32 holds, which is how it goes on
-    if isinstance(value, bool) or not abs(value) < 3.4e38 or math.isnan(value):
+    if isinstance(value, bool) or not abs(value) <= _LARGEST:  # it goes on as a float32
         raise WireError(f"{name} = {str(value)[:20]} is no finite number")
     return float(value)
