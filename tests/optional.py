@@ -90,6 +90,7 @@ OPTIONAL = (
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
+    Optional("pyzmq", _package("zmq"), ("lerobot_ports",)),
     Optional("pyte", _package("pyte"), ("monitor_terminal",)),
     Optional("viser", _package("viser"), ("view", "view_browser", "view_soak")),
     Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),

@@ -269,7 +269,7 @@ def test_g1_moves_by_commands_of_lerobot_and_stops_cleanly() -> None:
         commands, states, pictures = (
             int(words[words.index(w) + 1]) for w in ("commands", "states", "pictures")
         )
-        assert any("--robot.type=unitree_g1" in line for line in whole.lines)
+        wait_until(lambda: any("--robot.type=unitree_g1" in line for line in whole.lines))
         with LerobotClient(commands, states) as client, LerobotClient(0, pictures) as camera:
             machine = client.state()["mode_machine"]
             order = command_json({**dict.fromkeys(G1.used, 0.0), ELBOW: 0.8}, machine=machine)

@@ -232,8 +232,8 @@ _ALL = (
         "a process uses another layout of a type under the same name",
         _WAITS + ", or values are shifted and wrong",
         "Unitree changed the messages in December 2024 and February 2025 without renaming them",
-        "install the newest version of unitree_sdk2, unitree_sdk2_python or unitree_ros2 (v0.3.0 or "
-        "later) there, and build it anew (docs/ros2.md)",
+        "install the newest unitree_sdk2, unitree_sdk2_python or unitree_ros2 (v0.3.0 or later) "
+        "there, and build it anew (docs/ros2.md)",
     ),
     Diagnosis(
         "DDS-QOS",
