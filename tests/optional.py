@@ -72,10 +72,16 @@ def _package(name: str) -> Callable[[], object]:
 
 OPTIONAL = (
     Optional("Chromium", chromium, ("conformance_report_browser", "view_browser", "view_soak")),
-    Optional("user and network namespaces", namespaces, ("dds_multicast", "lan", "networks")),
+    Optional(
+        "user and network namespaces",
+        namespaces,
+        ("dds_multicast", "lan", "lerobot_soak", "networks"),
+    ),
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
-    Optional("CycloneDDS 0.10", _package("cyclonedds"), ("campaign", "demo", "everything on DDS")),
+    Optional(
+        "CycloneDDS 0.10", _package("cyclonedds"), ("campaign", "demo", "ros2", "everything on DDS")
+    ),
     Optional(
         "the package unitree-sdk2",
         _package("unitree_sdk2py"),
