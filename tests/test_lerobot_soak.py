@@ -182,11 +182,14 @@ def record(
 
 def follows(found: Any, joint: int, high: float) -> float:
     """How well a joint's state follows its action, at the best delay: mean error in the range."""
-    state, action = (np.array(found[name])[:, joint] for name in ("state", "action"))
+    # one joint alone is no vector in a dataset
+    columns = (np.array(found[name]) for name in ("state", "action"))
+    state, action = (values.reshape(len(values), -1)[:, joint] for values in columns)
     errors = [
         np.abs(state[delay:] - action[: len(action) - delay]).mean() / high for delay in range(20)
     ]
     assert np.ptp(state) > 0.7 * high
+    print(f"{len(state)} frames, {np.ptp(state):.2f} of {high}, mean error {min(errors):.4f}")
     return float(min(errors))
 
 
