@@ -24,7 +24,7 @@ FPS = 30.0
 """Pictures a second, likewise."""
 
 _BARS = ("#c0c0c0", "#c0c000", "#00c0c0", "#00c000", "#c000c0", "#c00000", "#0000c0")
-_COUNT = 30  # different pictures
+_COUNT = 10  # different pictures
 
 
 def moving_cards() -> Iterator[str]:
