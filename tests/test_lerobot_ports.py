@@ -260,6 +260,48 @@ def test_port_that_is_taken_is_an_error_and_all_are_released(bench: Bench) -> No
 # ------------------------------------------------------------------------ the command
 
 
+class NoProcesses:
+    """Stands for the processes of ``emulate all``: their command lines only."""
+
+    commands: dict[str, tuple[str, ...]]
+
+    def __init__(self, parts: dict[str, tuple[str, ...]], quiet: bool) -> None:
+        type(self).commands = parts
+
+    def __enter__(self) -> NoProcesses:
+        return self
+
+    def __exit__(self, *exc: object) -> None: ...
+    def wait_ready(self, stop: object) -> None: ...
+    def watch(self, stop: object, duration: float | None) -> None: ...
+
+
+def test_parts_of_a_robot_for_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dexkit.cli.emulate.all._Processes", NoProcesses)
+    result = CliRunner().invoke(cli, ["emulate", "all", "--for", "lerobot", "--ports", "1,2,3"])
+    assert result.exit_code == 0, result.output
+    assert NoProcesses.commands == {
+        "g1": ("emulate", "g1", "--domain", "0", "--interface", "lo"),
+        "hands": (*("serve", "sim-dex1", "--side", "both", "--domain", "0", "--interface", "lo"),),
+        "lerobot": ("emulate", "lerobot-g1", "--domain", "0", "--ports", "1,2,3"),
+    }
+    assert "--robot.type=unitree_g1" in result.output
+
+
+def test_command_serves_the_ports_until_its_time_is_up() -> None:
+    domain = str(free_domain())
+    result = CliRunner().invoke(
+        cli,
+        ["emulate", "lerobot-g1", "--domain", domain, "--ports", "0,0,0", "--duration", "0.1"],
+    )
+    assert result.exit_code == 0, result.output
+    ready, stopped = result.output.splitlines()
+    assert ready.startswith("ready: LeRobot's g1 on 127.0.0.1: commands ")
+    assert ready.endswith(f"; domain {domain}, lo")
+    assert stopped.startswith("stopped: 0 states, 0 commands, 0 forwarded, 0 refused, ")
+
+
+@pytest.mark.soak
 def test_g1_moves_by_commands_of_lerobot_and_stops_cleanly() -> None:
     with whole_robot(
         *("--for", "lerobot", "--hands", "none", "--ports", "0,0,0", "--domain", free_domain())

@@ -192,14 +192,16 @@ class LerobotPorts:
                 if self._stream.look():
                     self.counters.pauses += 1
                     self._tell("pause", "this program was paused: commands count again in 1 s")
-                data = self._admit(payload) if payload is not None else None
+                if payload is None:
+                    continue
+                data = self._admit(payload)
                 if data is not None:
                     writer.write_raw(data)
                     self.counters.forwarded += 1
+                self.counters.commands += 1  # last: all else has been counted by then
 
     def _admit(self, payload: bytes) -> bytes | None:
         """The sample of a command that counts."""
-        self.counters.commands += 1
         try:
             data = low_level.encode_with_crc(command_from(payload))
         except WireError as error:
