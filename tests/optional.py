@@ -75,7 +75,7 @@ OPTIONAL = (
     Optional(
         "user and network namespaces",
         namespaces,
-        ("dds_multicast", "lan", "lerobot_soak", "networks"),
+        ("dds_multicast", "docs_run", "lan", "lerobot_soak", "networks"),
     ),
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
