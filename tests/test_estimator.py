@@ -305,23 +305,6 @@ class TestStateEstimator:
         assert state is not None
         assert np.array_equal(state.q, [1.0])
 
-    def test_stall_of_a_hand_without_torque_shows_in_tau_est(self) -> None:
-        e = StateEstimator(self.spec, [(2.0, 2.0)], stall_tau=0.7)
-        e.measure(HandState.from_values(4.0, stamp=0.0), 0.0)
-        e.follow(HandCommand.position(0.0), 0.0)
-        for now, q, tau in ((0.5, 3.0, 0.0), (1.0, 3.0, -0.7), (1.5, 3.0, -0.7)):
-            e.predict(now)
-            e.measure(HandState.from_values(q, stamp=now), now)
-            state = e.predict(now)
-            assert state is not None
-            assert state.tau_est.tolist() == [tau]
-        e.follow(HandCommand.position(5.0), 1.5)  # it turns round
-        state = e.predict(1.6)
-        assert state is not None
-        assert state.tau_est.tolist() == [0.0]
-        with pytest.raises(UsageError, match="stall_tau"):
-            StateEstimator(self.spec, stall_tau=-1.0)
-
     def test_one_pair_of_speeds_a_joint(self) -> None:
         with pytest.raises(UsageError, match="2 pairs"):
             StateEstimator(self.spec, [(1.0, 1.0), (1.0, 1.0)])

@@ -84,7 +84,6 @@ class HandCore:
         self._lock = threading.Lock()
         self._estimator = StateEstimator(spec)
         self._speeds: Sequence[tuple[float, float]] | None = None
-        self._stall_tau = 0.0
         self._following = self._brake  # what the estimator is to follow when it is needed
         self._resyncs = 0  # of estimators before this one
         self._soft_start = not spec.simulated if soft_start is None else soft_start
@@ -148,24 +147,17 @@ class HandCore:
                 self._follow(admitted, now)
         return True
 
-    def opened(
-        self,
-        spec: HandSpec,
-        speeds: Sequence[tuple[float, float]] | None = None,
-        stall_tau: float = 0.0,
-    ) -> None:
+    def opened(self, spec: HandSpec, speeds: Sequence[tuple[float, float]] | None = None) -> None:
         """The link is open. Commands from before do not count any more.
 
         :param spec: the spec of the opened hand; its ``io_rate`` may have become exact.
         :param speeds: calibrated speeds per joint, see
             :class:`~dexkit.service.estimator.StateEstimator`.
-        :param stall_tau: likewise.
         """
         now = self._clock.now()
         self.spec = spec
         with self._lock:
             self._speeds = speeds
-            self._stall_tau = stall_tau
             self._begin_prediction(now)
         self.measured_rate = self.spec.io_rate
         self._slow = self.spec.io_rate < self._min_rate
@@ -386,7 +378,7 @@ class HandCore:
 
     def _begin_prediction(self, now: float) -> None:
         self._resyncs += self._estimator.resyncs
-        self._estimator = StateEstimator(self.spec, self._speeds, self._stall_tau)
+        self._estimator = StateEstimator(self.spec, self._speeds)
         self._estimator.follow(self._following, now)
 
     def _mark_stale(self, view: StateView) -> StateView:

@@ -83,11 +83,6 @@ class JointEstimator:
         """Whether the joint was found stuck on its way to the command."""
         return self._blocked != 0
 
-    @property
-    def blocked(self) -> int:
-        """The direction in which it is stuck: 1 toward larger q, -1 toward smaller, 0 for none."""
-        return self._blocked
-
     def follow(self, target: float | None, now: float) -> None:
         """Take a command; None stands for brake or zero stiffness, which move nothing."""
         self.predict(now)
@@ -176,19 +171,9 @@ class StateEstimator:
     :param spec: of the hand.
     :param speeds: per joint, speeds toward larger and toward smaller q, rad/s; without it each
         joint's ``dq_max`` both ways.
-    :param stall_tau: N·m that tau_est shows while a joint is stalled, for a hand that measures no
-        torque; 0 for none.
     """
 
-    def __init__(
-        self,
-        spec: HandSpec,
-        speeds: Sequence[tuple[float, float]] | None = None,
-        stall_tau: float = 0.0,
-    ) -> None:
-        if not 0 <= stall_tau < math.inf:
-            raise UsageError(f"stall_tau must be 0 or positive, got {stall_tau}")
-        self._stall_tau = stall_tau
+    def __init__(self, spec: HandSpec, speeds: Sequence[tuple[float, float]] | None = None) -> None:
         if speeds is not None and len(speeds) != spec.n_joints:
             raise UsageError(f"{len(speeds)} pairs of speeds for {spec.n_joints} joint(s)")
         self.joints = [
@@ -220,19 +205,15 @@ class StateEstimator:
             joint.measure(float(state.q[i]), now)
 
     def predict(self, now: float) -> HandState | None:
-        """The state at ``now``: q and dq predicted, the rest as last measured but for the torque of
-        a stall; None before the first measurement.
+        """The state at ``now``: q and dq predicted, the rest as last measured; None before
+        the first measurement.
         """
         last = self._last
         if last is None:
             return None
         q = np.array([joint.predict(now) for joint in self.joints])
         dq = np.array([joint.dq for joint in self.joints])
-        found = replace(last, q=q, dq=dq, measured=False)
-        if self._stall_tau and self.stalled:
-            touch = np.array([joint.blocked * self._stall_tau for joint in self.joints])
-            found = replace(found, tau_est=np.where(touch != 0, touch, last.tau_est))
-        return found
+        return replace(last, q=q, dq=dq, measured=False)
 
 
 def _sign(value: float) -> int:

@@ -127,8 +127,6 @@ class HandService:
 
     A hand may have an attribute ``joint_speeds``: per joint its calibrated speeds toward larger
     and toward smaller q, rad/s. The estimator uses them; without it, each joint's ``dq_max``.
-    ``stall_tau`` is the tau_est, N·m, of a joint whose prediction has stalled, for a hand that
-    measures no torque.
     Another is ``reconnect_interval``: seconds at most between attempts to open it again when it
     was lost, for a hand that costs little to look for.
     """
@@ -529,7 +527,7 @@ class HandService:
         """Open the hand and do one exchange, so that there is a state from the first sample on."""
         unit.hand.open()
         speeds = getattr(unit.hand, "joint_speeds", None)
-        unit.core.opened(unit.hand.spec, speeds, getattr(unit.hand, "stall_tau", 0.0))
+        unit.core.opened(unit.hand.spec, speeds)
         unit.watch.restart()
         if unit.core.predicting and speeds is None:
             log.warning("%s: the speed of the hand is not known; predictions will jump", unit.side)
