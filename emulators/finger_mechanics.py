@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from dexkit.emulators.joint_mechanics import Joint, Wall
+from dexkit.emulators.wear import JointWear
 from dexkit.errors import UsageError
 from dexkit.hand import (
     Floats,
@@ -368,6 +369,14 @@ class FingerMechanics:
         """Lock a joint where it is, or free it."""
         self.joints[joint].locked = stuck
         self._motors[joint].rests_at = math.nan
+
+    def wear(self, joint: int, wear: JointWear) -> None:
+        """Wear a joint: friction, top speed, and whether its motor has power."""
+        motor = self._motors[joint]
+        motor.joint.coulomb *= wear.friction
+        motor.droop /= wear.speed
+        if wear.dead:
+            self.power(joint, False)
 
     # -- what can be seen ----------------------------------------------------------------------
 

@@ -11,11 +11,12 @@ Not modelled: gravity, play, a hand that gives way, heat.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dexkit.emulators.finger_mechanics import SETTINGS
+from dexkit.emulators.wear import JointWear
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, HandCommand, HandState, JointMode, JointSpec, Side
 from dexkit.models import HandModel
@@ -47,21 +48,28 @@ class _Servo:
     ddq: float = 0.0
     current: float = 0.0
     still: bool = False
+    friction: float = 1.0
+    """Factor of the current that it takes to move."""
+    dead: bool = False
 
     def step(self, dt: float) -> None:
         """Let ``dt`` seconds pass."""
+        if self.dead:
+            self.still = True
+            return
         full = self.spec.dq_max
+        speed = min(self.speed, full)
         want = 0.0
         if not math.isnan(self.goal):
             way = self.goal - self.q
             # exactly there rather than nearly for ever
             want = way / max(_APPROACH, dt) if abs(way) > 1e-5 else way / dt
-            want = min(max(want, -self.speed), self.speed)
+            want = min(max(want, -speed), speed)
         most = _ACCELERATION * full * dt
         before = self.dq
         self.dq += min(max(want - self.dq, -most), most)
         # never past its goal
-        if want and abs(self.dq) > abs(want) and self.dq * want > 0 and abs(want) < self.speed:
+        if want and abs(self.dq) > abs(want) and self.dq * want > 0 and abs(want) < speed:
             self.dq = want
         q = self.q + dt * self.dq
         blocked = 0.0
@@ -79,7 +87,8 @@ class _Servo:
         if blocked and abs(want) > 0:
             aim = blocked * limit
         else:
-            aim = limit * (_MOVING * self.dq / full + (_IDLE if self.goal > self.q else 0.0))
+            idle = _IDLE if self.goal > self.q else 0.0
+            aim = limit * (_MOVING * self.friction * self.dq / full + idle)
         self.current += (aim - self.current) * min(1.0, dt / _STALL)
         self.still = want == 0.0 == self.dq and abs(aim - self.current) < 1e-4
 
@@ -143,6 +152,13 @@ class ServoMechanics:
             goal = q if mode == JointMode.FOC else math.nan
             if servo.goal != goal or servo.speed != speed:
                 servo.goal, servo.speed, servo.still = goal, speed, False
+
+    def wear(self, joint: int, wear: JointWear) -> None:
+        """Wear a joint: current to move, top speed, and whether it has power."""
+        servo = self._servos[joint]
+        servo.friction *= wear.friction
+        servo.spec = replace(servo.spec, dq_max=servo.spec.dq_max * wear.speed)
+        servo.dead = wear.dead
 
     def brake(self) -> None:
         """Hold every joint where it is."""

@@ -13,7 +13,8 @@ from __future__ import annotations
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.servo_mechanics import SETTINGS, STEP, ServoMechanics
-from dexkit.emulators.simulated import SimulatedHand, number
+from dexkit.emulators.simulated import SimulatedHand, number, worn
+from dexkit.emulators.wear import WEAR_SETTING
 from dexkit.hand import Side
 from dexkit.models import BRAINCO_REVO2
 
@@ -50,14 +51,15 @@ class SimBrainCo(SimulatedHand):
 
 
 def _make(options: BackendOptions) -> SimBrainCo:
-    return SimBrainCo(
+    hand = SimBrainCo(
         options.side, object_at=number(options, "object"), start=number(options, "start")
     )
+    return worn(hand, options)
 
 
 sim_brainco = Backend(
     summary="Simulated BrainCo Revo2 hand: 6 position servos, no device",
     model=BRAINCO_REVO2.name,
     make=_make,
-    settings=SETTINGS,
+    settings={**SETTINGS, **WEAR_SETTING},
 )

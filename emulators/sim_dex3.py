@@ -9,7 +9,8 @@ from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP
-from dexkit.emulators.simulated import SimulatedHand, number
+from dexkit.emulators.simulated import SimulatedHand, number, worn
+from dexkit.emulators.wear import WEAR_SETTING
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 
@@ -45,17 +46,22 @@ class SimDex3(SimulatedHand):
 
 def _make(options: BackendOptions) -> SimDex3:
     supply = number(options, "supply")
-    return SimDex3(
+    hand = SimDex3(
         options.side,
         object_at=number(options, "object"),
         start=number(options, "start"),
         supply_v=24.0 if supply is None else supply,
     )
+    return worn(hand, options)
 
 
 sim_dex3 = Backend(
     summary="Simulated Dex3-1 hand: motors, touch and heat, no device",
     model=DEX3_1.name,
     make=_make,
-    settings={**SETTINGS, "supply": "volts of the supply, 24 to 58 (default: 24)"},
+    settings={
+        **SETTINGS,
+        **WEAR_SETTING,
+        "supply": "volts of the supply, 24 to 58 (default: 24)",
+    },
 )

@@ -5,16 +5,17 @@ The command in force stays in force until the next one, as in a real motor.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE
 from dexkit.emulators.joint_mechanics import FixedSteps
+from dexkit.emulators.wear import JointWear, Wear, Worn, parse_wear
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import HandCommand, HandSpec, HandState
 
-__all__ = ["Mechanics", "SimulatedHand", "number"]
+__all__ = ["Mechanics", "SimulatedHand", "number", "worn"]
 
 
 class Mechanics(Protocol):
@@ -35,6 +36,9 @@ class Mechanics(Protocol):
     def state(self, stamp: float) -> HandState:
         """The state, measured at ``stamp``."""
 
+    def wear(self, joint: int, wear: JointWear) -> None:
+        """Wear a joint, play apart."""
+
 
 class SimulatedHand:
     """A mechanics on a clock.
@@ -54,6 +58,13 @@ class SimulatedHand:
         self._steps = FixedSteps(step, most=0.5)
         self._last = 0.0  # when the last exchange was
         self._open = False
+        self._worn: Worn | None = None
+
+    def wear(self, wear: Wear) -> None:
+        """Wear the hand, once: friction, speed and dead joints multiply."""
+        for index, joint in wear.joints.items():
+            self._mechanics.wear(index, joint)
+        self._worn = Worn(wear, self._spec.n_joints)
 
     @property
     def spec(self) -> HandSpec:
@@ -85,7 +96,21 @@ class SimulatedHand:
         self._last = now
         self._mechanics.step(self._steps.due(now))
         self._mechanics.apply(command)
-        return self._mechanics.state(now)
+        state = self._mechanics.state(now)
+        return state if self._worn is None else self._worn(state)
+
+
+Simulated = TypeVar("Simulated", bound=SimulatedHand)
+
+
+def worn(hand: Simulated, options: BackendOptions) -> Simulated:
+    """The hand, worn as the setting ``wear`` says.
+
+    :raises UsageError: the setting is not understood.
+    """
+    if text := options.settings.get("wear"):
+        hand.wear(parse_wear(text, hand.spec))
+    return hand
 
 
 def number(options: BackendOptions, key: str) -> float | None:

@@ -1,0 +1,398 @@
+"""The order of the tests: at rest, each joint a little, each joint thoroughly, touch.
+
+A joint that does not move, moves the wrong way or moves another joint in a small slow test is not
+driven any more: nothing faster happens before that test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexkit.conformance.selftest import measure
+from dexkit.conformance.selftest.bench import SETTLE, Bench, Series, Setup, Turns
+from dexkit.conformance.selftest.measure import Rest
+from dexkit.hand import Floats, HandCommand, HandState, JointSpec
+from dexkit.models import model
+
+__all__ = ["ElementFound", "Found", "JointFound", "Procedure"]
+
+_STILL = 1.0  # seconds at rest, for noise and temperatures
+_NUDGE = 0.08  # part of the stroke
+_ALIVE = 0.35  # part of that by which a joint has moved
+_ALIEN = 0.1  # part of its stroke by which another joint has moved, too
+_CREEP = 40.0  # seconds for a stroke
+_STARTED = 0.005  # part of the stroke that is motion
+_REPEATS = 3
+_STEP = 0.1  # part of the stroke
+_LAGGED = 0.05  # part of a step that is motion
+_RUN = (0.05, 0.95)  # parts of the range between which speeds are tried
+_FIT = (0.35, 0.65)  # and between which they are measured
+_LEVELS = (0.25, 0.5, 1.0)  # of the speed that is allowed: a faster run only after a good slower one
+_KEPT = 0.9  # part of the speed asked for that a joint reaches
+_OVERSHOT = 0.05  # part of the stroke beyond a goal
+_WATCHED = 0.3  # seconds after a step
+_LAG_PERIODS = 2.5
+_PRESSED = 500.0  # Pa, or ...
+_SIGMAS = 8.0  # ... times the noise, above rest: an element that is pressed
+_TOUCH_PATIENCE = 60.0  # seconds without a new element
+
+
+@dataclass(eq=False)
+class JointFound:
+    """What was found of a joint; NaN where it was not measured.
+
+    :ivar figures: by name (:data:`dexkit.conformance.selftest.figures.KINDS`).
+    :ivar moves: names of the joints that move when it is commanded.
+    :ivar notes: what a reader has to know about its figures.
+    :ivar curves: by name.
+    """
+
+    name: str
+    alive: bool = True
+    sign: int = 1
+    moves: tuple[str, ...] = ()
+    tested: bool = False
+    figures: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    curves: dict[str, Series] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class ElementFound:
+    """What was found of a tactile element.
+
+    :ivar rest: Pa while nothing was touched; ``noise`` its standard deviation; NaN: no value.
+    :ivar peak: most while it was pressed; NaN if it was not tested.
+    """
+
+    packet: int
+    slot: int
+    place: str
+    rest: float = math.nan
+    noise: float = math.nan
+    peak: float = math.nan
+    answered: bool | None = None
+
+
+@dataclass(eq=False)
+class Found:
+    """What a self-test has found so far.
+
+    :ivar touched: the elements were tried.
+    """
+
+    joints: list[JointFound]
+    elements: list[ElementFound] = field(default_factory=list)
+    touched: bool = False
+    asked_speed: Floats = field(default_factory=lambda: np.empty(0))
+
+
+class Procedure:
+    """The tests of a hand.
+
+    :param joints: indices of those to be tested; None for all.
+    :param speed: part of the full speed that is tried at most.
+    :param touch: ask somebody to press the tactile elements.
+    :ivar doing: what it does now; ``part`` how much of it all is done, 0 to 1.
+    :ivar question: what somebody is to do, or empty; :meth:`skip` gives up on it.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        joints: Sequence[int] | None = None,
+        speed: float = 0.5,
+        touch: bool = False,
+    ) -> None:
+        self.setup, self.speed = setup, speed
+        self.bench = Bench(setup)
+        self.chosen = tuple(range(setup.spec.n_joints)) if joints is None else tuple(joints)
+        self.profile = model(setup.spec.model)
+        self.touch = touch and bool(self.profile.sensors)
+        self.found = Found(
+            [JointFound(joint.name) for joint in setup.spec.joints],
+            asked_speed=speed * setup.full,
+        )
+        self.doing, self.part, self.question = "at rest", 0.0, ""
+        self._skipped = False
+
+    def skip(self) -> None:
+        """Go on without what :attr:`question` asks for."""
+        self._skipped = True
+
+    def run(self) -> Generator[HandCommand, HandState, None]:
+        """Everything; yields commands and is sent states."""
+        still = yield from self.bench.watch(_STILL)
+        self._at_rest(still)
+        yield from self._open()
+        for j in self.chosen:
+            self._tell(f"{self._joint(j).name}: which joint moves, and which way", 0.0)
+            yield from self._nudge(j)
+        live = [j for j in self.chosen if self.found.joints[j].alive]
+        for k, j in enumerate(live):
+            yield from self._thoroughly(j, k, len(live))
+        if self.touch:
+            yield from self._feel()
+        self._tell("at rest", 1.0)
+        self._temperatures(still, (yield from self.bench.watch(0.3)))
+
+    def _tell(self, doing: str, part: float) -> None:
+        self.doing, self.part = doing, part
+
+    def _joint(self, j: int) -> JointSpec:
+        return self.setup.spec.joints[j]
+
+    def _open_q(self, j: int) -> float:
+        """Where a joint waits: open, or amid its range where neither end is open."""
+        spec = self._joint(j)
+        return spec.straight if spec.closing else (spec.q_min + spec.q_max) / 2
+
+    def _at(self, j: int, part: float) -> float:
+        """The place in a joint's range, 0 lower to 1 upper end."""
+        spec = self._joint(j)
+        return spec.q_min + part * spec.stroke
+
+    # -- at rest ---------------------------------------------------------------------------------
+
+    def _at_rest(self, states: Sequence[HandState]) -> None:
+        q = np.array([s.q for s in states])
+        for j, joint in enumerate(self.found.joints):
+            joint.figures["noise"] = float(q[:, j].std())
+            self.bench.noise[j] = joint.figures["noise"]
+        pressures = [s.pressure for s in states if s.pressure is not None]
+        values = np.array(pressures) if pressures else None
+        for packet, sensor in enumerate(self.profile.sensors):
+            for slot in sensor.slots:
+                element = ElementFound(packet, slot, sensor.place)
+                if values is not None:
+                    column = values[:, packet, slot]
+                    element.rest, element.noise = float(column.mean()), float(column.std())
+                self.found.elements.append(element)
+
+    def _temperatures(self, first: Sequence[HandState], last: Sequence[HandState]) -> None:
+        before = np.mean([_hottest(s) for s in first], axis=0)
+        after = np.mean([_hottest(s) for s in last], axis=0)
+        for j, joint in enumerate(self.found.joints):
+            joint.figures["temperature"] = float(after[j])
+            joint.figures["rise"] = float(after[j] - before[j])
+
+    def _open(self) -> Turns[None]:
+        """Open the hand slowly, finger by finger, so that no joint is in another's way."""
+        self._tell("opening the hand", 0.0)
+        for j in range(self.setup.spec.n_joints):
+            yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
+
+    # -- which joint, which way ------------------------------------------------------------------
+
+    def _nudge(self, j: int) -> Turns[None]:
+        bench, joint, spec = self.bench, self.found.joints[j], self._joint(j)
+        assert bench.state is not None
+        q = float(bench.state.q[j])
+        direction = 1 if spec.q_max - q > q - spec.q_min else -1
+        way = _NUDGE * spec.stroke
+        slow = float(bench.slow[j])
+        begin = max(bench.mark - 1, 0)
+        moved = yield from bench.move(j, q + direction * way, slow, settle=True)
+        by = bench.moved(begin)
+        shared = next((set(m) for m in self.profile.motors if j in m), {j})
+        strokes = self.setup.stroke
+        joint.moves = tuple(
+            other.name
+            for k, other in enumerate(self.setup.spec.joints)
+            if abs(by[k]) > (_ALIVE * way if k == j else max(_ALIEN * strokes[k], 0.0))
+            and (k == j or k not in shared)
+        )
+        joint.alive = abs(by[j]) > _ALIVE * way
+        joint.sign = -1 if moved.against or direction * by[j] < -_ALIVE * way else 1
+        if not joint.alive or joint.sign < 0 or joint.moves != (joint.name,):
+            joint.alive = False
+            bench.limp.add(j)
+            return
+        yield from bench.move(j, q, slow)
+
+    # -- one joint thoroughly --------------------------------------------------------------------
+
+    def _thoroughly(self, j: int, k: int, of: int) -> Turns[None]:
+        joint = self.found.joints[j]
+        tests = (
+            ("its range", self._range),
+            ("torque to start", self._starts),
+            ("repeatability and play", self._returns),
+            ("lag", self._lags),
+            ("speed", self._speeds),
+        )
+        for n, (title, test) in enumerate(tests):
+            self._tell(f"{joint.name}: {title}", (k + n / len(tests)) / of)
+            yield from test(j)
+        joint.tested = True
+        yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
+
+    def _range(self, j: int) -> Turns[None]:
+        bench, joint, spec = self.bench, self.found.joints[j], self._joint(j)
+        slow = float(bench.slow[j])
+        yield from bench.move(j, spec.q_min, slow, settle=True)
+        begin = bench.mark
+        yield from bench.move(j, spec.q_max, slow, settle=True)
+        high = self._rest(j).q
+        yield from bench.move(j, spec.q_min, slow, settle=True)
+        low = self._rest(j).q
+        joint.curves["sweep"] = bench.series(j, begin)
+        joint.figures |= {"low": low, "high": high, "range": high - low}
+        joint.figures["zero"] = (low - spec.q_min) + (high - spec.q_max)
+
+    def _rest(self, j: int) -> Rest:
+        """Where a joint has just come to rest."""
+        s = self.bench.series(j, -max(3, int(SETTLE / self.setup.period)))
+        return measure.rest(s.q, s.tau)
+
+    def _starts(self, j: int) -> Turns[None]:
+        bench, joint, spec = self.bench, self.found.joints[j], self._joint(j)
+        yield from bench.move(j, self._at(j, 0.5), float(bench.slow[j]), settle=True)
+        found = []
+        for name, direction in (("start+", 1), ("start-", -1)):
+            one = yield from bench.undisturbed(lambda d=direction: self._start(j, d))  # type: ignore[misc]
+            joint.figures[name] = math.nan if one is None else one.torque
+            found += [] if one is None else [one]
+        best = max(found, key=lambda s: s.swing, default=measure.Start(math.nan))
+        joint.figures["stiffness"] = best.stiffness
+
+    def _start(self, j: int, direction: int) -> Turns[measure.Start]:
+        bench, stroke = self.bench, float(self.setup.stroke[j])
+        yield from bench.settle(j)
+        assert bench.state is not None
+        q = float(bench.state.q[j])
+        begin = bench.mark
+        yield from bench.move(j, q + direction * 0.03 * stroke, stroke / _CREEP)
+        s = bench.series(j, begin)
+        self.found.joints[j].curves[f"start{'+' if direction > 0 else '-'}"] = s
+        return measure.start(s.command, s.q, s.tau, direction, _STARTED * stroke)
+
+    def _returns(self, j: int) -> Turns[None]:
+        bench, joint, stroke = self.bench, self.found.joints[j], float(self.setup.stroke[j])
+        goal, slow = self._at(j, 0.5), float(bench.slow[j])
+        rests: dict[int, list[Rest]] = {1: [], -1: []}
+        for _ in range(_REPEATS):
+            for direction, found in rests.items():
+                yield from bench.move(j, goal - direction * 0.1 * stroke, slow)
+                yield from bench.move(j, goal, slow, settle=True)
+                found.append(self._rest(j))
+        joint.figures["repeatability"] = max(measure.spread(r) for r in rests.values())
+        kp = 0.0 if self.setup.servo else float(self.setup.kp[j])
+        joint.figures["play"] = measure.lost_motion(
+            rests[1], rests[-1], kp, joint.figures.get("stiffness", math.nan)
+        )
+
+    def _lags(self, j: int) -> Turns[None]:
+        found = []
+        for direction in (1, -1, 1, -1):
+            value = yield from self.bench.undisturbed(
+                lambda d=direction: self._lag(j, d),  # type: ignore[misc]
+                _LAG_PERIODS,
+            )
+            found.append(math.nan if value is None else value)
+        known = [value for value in found if math.isfinite(value)]
+        self.found.joints[j].figures["lag"] = float(np.median(known)) if known else math.nan
+
+    def _lag(self, j: int, direction: int) -> Turns[float]:
+        bench, stroke = self.bench, float(self.setup.stroke[j])
+        step = _STEP * stroke if self.setup.servo else min(_STEP * stroke, self.setup.lead)
+        # from behind: what play there is has been crossed before
+        origin = self._at(j, 0.5) - direction * step / 2
+        yield from bench.move(j, origin - direction * 0.1 * stroke, float(bench.slow[j]))
+        yield from bench.move(j, origin, float(bench.slow[j]), settle=True)
+        assert bench.state is not None
+        begin = bench.mark
+        yield from bench.turn()
+        sent = yield from bench.step(j, float(bench.state.q[j]) + direction * step)
+        yield from bench.wait(_WATCHED)
+        s = bench.series(j, begin)
+        self.found.joints[j].curves["step"] = s
+        return measure.delay(s.t, s.q, sent, direction, _LAGGED * step)
+
+    def _speeds(self, j: int) -> Turns[None]:
+        """To and fro, faster each time while it keeps up and stops where it should."""
+        bench, joint = self.bench, self.found.joints[j]
+        slow = float(bench.slow[j])
+        reached = {"speed+": math.nan, "speed-": math.nan}
+        going = set(reached)
+        yield from bench.move(j, self._at(j, _RUN[0]), slow, settle=True)
+        for level in _LEVELS:
+            for name, column, begin, goal in (("speed+", 1, *_RUN), ("speed-", 0, *_RUN[::-1])):
+                asked = level * float(self.found.asked_speed[j, column])
+                if name not in going or (asked <= 2 * slow and level < _LEVELS[-1]):
+                    continue
+                found = yield from bench.undisturbed(
+                    lambda a=asked, b=begin, g=goal: self._fast(j, b, g, a),  # type: ignore[misc]
+                    _LAG_PERIODS,
+                )
+                reached[name], beyond = found or (math.nan, 0.0)
+                if not (reached[name] >= _KEPT * asked and beyond <= _OVERSHOT):
+                    going.discard(name)
+                if beyond > _OVERSHOT:
+                    joint.notes.append(
+                        f"{name}: not tried faster: it went {beyond:.0%} of its stroke too far"
+                    )
+        joint.figures |= reached
+
+    def _fast(self, j: int, begin: float, goal: float, speed: float) -> Turns[tuple[float, float]]:
+        """(speed that was reached, part of the stroke by which it went too far)."""
+        bench, spec = self.bench, self._joint(j)
+        assert bench.state is not None
+        at = self._at(j, begin)
+        if abs(float(bench.state.q[j]) - at) > 0.02 * spec.stroke:
+            yield from bench.move(j, at, float(bench.slow[j]), settle=True)
+        mark = bench.mark
+        yield from bench.move(j, self._at(j, goal), speed, fast=True, settle=True)
+        s = bench.series(j, mark)
+        direction = 1 if goal > begin else -1
+        self.found.joints[j].curves[f"speed{'+' if direction > 0 else '-'}"] = s
+        low, high = (self._at(j, part) for part in _FIT)
+        beyond = float((direction * (s.q - self._at(j, goal))).max()) / spec.stroke
+        return measure.speed(s.t, s.q, low, high), beyond
+
+    # -- touch -----------------------------------------------------------------------------------
+
+    def _feel(self) -> Turns[None]:
+        """Wait for somebody to press each element; the hand is at rest."""
+        self.found.touched = True
+        for packet, sensor in enumerate(self.profile.sensors):
+            elements = [e for e in self.found.elements if e.packet == packet]
+            yield from self._feel_packet(packet, sensor.place, elements)
+        self.question = ""
+
+    def _feel_packet(self, packet: int, place: str, elements: list[ElementFound]) -> Turns[None]:
+        bench = self.bench
+        above = dict.fromkeys(range(len(elements)), 0)
+        assert bench.state is not None
+        last, self._skipped = bench.state.stamp, False
+        for element in elements:
+            element.answered, element.peak = False, -math.inf
+        while not self._skipped and bench.state.stamp - last < _TOUCH_PATIENCE:
+            missing = [str(e.slot) for e in elements if not e.answered]
+            if not missing:
+                break
+            self._tell(f"touch: {place}", 1.0)
+            self.question = f"press each element of the {place} (missing: {', '.join(missing)})"
+            (state,) = (yield from bench.watch(0.0))[-1:]
+            if state.pressure is None:
+                break
+            for i, element in enumerate(elements):
+                value = float(state.pressure[packet, element.slot])
+                limit = element.rest + max(_PRESSED, _SIGMAS * element.noise)
+                if value > element.peak:
+                    element.peak = value
+                above[i] = above[i] + 1 if value > limit else 0
+                if above[i] >= 2 and not element.answered:
+                    element.answered, last = True, state.stamp
+
+
+def _hottest(state: HandState) -> Floats:
+    """Of case and winding, per joint."""
+    if state.winding_temperature is None:
+        return state.temperature
+    return np.fmax(state.temperature, state.winding_temperature)

@@ -1,0 +1,113 @@
+"""Wear of an emulated hand: friction, play, slow and dead joints, dead tactile elements.
+
+For trying what finds wear: ``--set wear=friction@index_0=3,play@index_1=0.04,dead@thumb_2``. The
+figures are chosen by who sets them; how a product wears is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dexkit.errors import UsageError
+from dexkit.escaping import one_line
+from dexkit.hand import Floats, HandSpec, HandState
+
+__all__ = ["WEAR_SETTING", "JointWear", "Wear", "Worn", "parse_wear"]
+
+WEAR_SETTING = {
+    "wear": "friction=FACTOR, speed=PART, play=RAD, dead, each of all joints or @JOINT; "
+    "element=PACKET.SLOT (dead); e.g. friction@index_0=3,dead@index_1"
+}
+"""The setting of a backend whose hand can be worn."""
+
+
+@dataclass(frozen=True)
+class JointWear:
+    """Wear of one joint.
+
+    :param friction: factor of its Coulomb friction.
+    :param speed: part of its top speed that is left.
+    :param play: between the motor, which follows the commands, and the reported q; unit of q.
+    :param dead: its motor has no power.
+    """
+
+    friction: float = 1.0
+    speed: float = 1.0
+    play: float = 0.0
+    dead: bool = False
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("friction", 0, 1000), ("speed", 0.01, 1), ("play", 0, 10)):
+            if not low <= getattr(self, name) <= high:
+                raise UsageError(f"wear: {name} must be {low} to {high}")
+
+
+@dataclass(frozen=True)
+class Wear:
+    """Wear of a hand.
+
+    :param joints: by index.
+    :param elements: dead tactile elements: (packet, slot).
+    """
+
+    joints: Mapping[int, JointWear] = field(default_factory=dict)
+    elements: frozenset[tuple[int, int]] = frozenset()
+
+
+def parse_wear(text: str, spec: HandSpec) -> Wear:
+    """Read the setting ``wear``.
+
+    :raises UsageError: it is not of the form that :data:`WEAR_SETTING` shows.
+    """
+    names = [joint.name for joint in spec.joints]
+    joints: dict[int, JointWear] = {}
+    elements = set()
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        what, _, value = item.partition("=")
+        kind, at, name = what.partition("@")
+        if at and name not in names:
+            raise UsageError(f"wear: no joint {one_line(name)!r}", hint=", ".join(names))
+        if kind == "element":
+            packet, _, slot = value.partition(".")
+            if not (packet.isdigit() and slot.isdigit() and int(packet) < spec.n_sensors):
+                raise UsageError(f"wear: {one_line(item)} is not element=PACKET.SLOT of this hand")
+            elements.add((int(packet), int(slot)))
+            continue
+        try:
+            given = {kind: True if kind == "dead" and not value else float(value)}
+            for index in [names.index(name)] if at else range(len(names)):
+                joints[index] = replace(joints.get(index, JointWear()), **given)  # type: ignore[arg-type]
+        except (TypeError, ValueError) as error:
+            if isinstance(error, UsageError):
+                raise
+            raise UsageError(
+                f"wear: {one_line(item)} is not understood", hint=WEAR_SETTING["wear"]
+            ) from None
+    return Wear(joints, frozenset(elements))
+
+
+class Worn:
+    """Turns the states of a hand into those of a worn one: play, and dead elements.
+
+    Play: what is reported follows the motor only when the motor has crossed it.
+    """
+
+    def __init__(self, wear: Wear, n_joints: int) -> None:
+        self._half = np.array([wear.joints.get(i, JointWear()).play / 2 for i in range(n_joints)])
+        self._elements = sorted(wear.elements)
+        self._q: Floats | None = None
+
+    def __call__(self, state: HandState) -> HandState:
+        """The state as the worn hand reports it."""
+        if self._q is None:
+            self._q = state.q.copy()
+        self._q = np.clip(self._q, state.q - self._half, state.q + self._half)
+        pressure = state.pressure
+        if pressure is not None and self._elements:
+            pressure = pressure.copy()
+            for packet, slot in self._elements:
+                pressure[packet, slot] = 0.0
+        return replace(state, q=self._q, pressure=pressure)
