@@ -28,7 +28,10 @@ from dexkit.conformance.scores import Score
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 
-__all__ = ["parse_result", "read_json"]
+__all__ = ["SCHEMA", "parse_result", "read_json", "validate"]
+
+SCHEMA = "result.schema.json"
+"""The schema of a result, beside the reports."""
 
 
 def read_json(path: Path) -> RunResult:
@@ -55,7 +58,7 @@ def parse_result(data: Any, path: object) -> RunResult:
         data = converted(about)
     elif about.get("version") != VERSION:
         raise UsageError(f"{path} is version {one_line(about.get('version'), 40)} of {FORMAT}")
-    _validate(data, path)
+    validate(data, path)
     # files of the first programs that wrote version 3 have no score, and none of a client
     score = {"score": Score.from_dict(data["score"])} if "score" in data else {}
     return RunResult(
@@ -76,21 +79,24 @@ def parse_result(data: Any, path: object) -> RunResult:
 
 
 @cache
-def _validator() -> Any:
+def _validator(schema: str) -> Any:
     import jsonschema
 
-    text = Path(__file__).with_name("report").joinpath("result.schema.json").read_text("utf-8")
+    text = Path(__file__).with_name("report").joinpath(schema).read_text("utf-8")
     return jsonschema.Draft202012Validator(json.loads(text))
 
 
-def _validate(data: Any, path: object) -> None:
-    """Validate a document against the schema that is published with dexkit.
+def validate(data: Any, path: object, schema: str = SCHEMA, page: str = "docs/reports.md") -> None:
+    """Validate a document against a schema that is published with dexkit.
 
+    :param path: what to call the document.
+    :param schema: file beside the reports.
+    :param page: where the document is described.
     :raises UsageError: naming the first place that does not match.
     """
     from jsonschema.exceptions import relevance
 
-    error = min(_validator().iter_errors(data), key=relevance, default=None)
+    error = min(_validator(schema).iter_errors(data), key=relevance, default=None)
     if error is None:
         return
     while error.context:  # of several alternatives: the error of the nearest
@@ -98,8 +104,7 @@ def _validate(data: Any, path: object) -> None:
     where = one_line(error.json_path.removeprefix("$").removeprefix(".") or "the document")
     raise UsageError(
         f"{path}: {where} {_expected(error.validator, error.validator_value, error.instance)}",
-        hint="the file is damaged, or was written by another program; docs/reports.md says what is "
-        "in a result file",
+        hint=f"the file is damaged, or was written by another program; {page} says what is in it",
     )
 
 

@@ -21,11 +21,11 @@ from dexkit.robots import ROBOTS
 from dexkit.traces import Trace
 from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Stream, streams_of
 
-__all__ = ["Recorded", "beside", "over_each_other", "page", "recorded"]
+__all__ = ["STYLE", "Recorded", "beside", "over_each_other", "page", "recorded"]
 
 _WINDOW = 0.5  # seconds over which a rate is counted
 _LEAST = 3  # messages of a topic whose rate is drawn
-_STYLE = (
+STYLE = (
     "<style>.beside{display:grid;gap:0 18px;grid-template-columns:"
     "repeat(auto-fit,minmax(min(290px,100%),1fr))}.beside figure{min-width:0}"
     ".key .other{border-color:var(--open);border-top-style:dashed}</style>"
@@ -82,7 +82,7 @@ def page(recordings: Sequence[Recorded]) -> str:
 
 def beside(recordings: Sequence[Recorded]) -> str:
     """Every joint: a chart for each recording, on equal axes."""
-    sections = [_STYLE, _key()]
+    sections = [STYLE, _key()]
     for part in _parts(recordings):
         joints = _joints(recordings, part)
         sections.append(f"<h2>{escape(_title(part))}</h2>")
@@ -118,7 +118,7 @@ def over_each_other(
     :param order: (part, kind, joint, what is said of it) of each chart.
     """
     sections = [
-        _STYLE + f'<p class="key"><span><i class="state"></i>{escape(one.name)}</span>'
+        STYLE + f'<p class="key"><span><i class="state"></i>{escape(one.name)}</span>'
         f'<span><i class="other"></i>{escape(other.name)}</span></p>'
     ]
     span = 0.0, max(one.seconds, other.seconds)

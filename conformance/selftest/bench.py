@@ -26,7 +26,7 @@ T = TypeVar("T")
 Turns: TypeAlias = Generator[HandCommand, HandState, T]
 
 _HOLD = 0.02
-"""Seconds by which a way goes on at most from turn to turn: after a pause it goes on where it was."""
+"""Seconds by which a way goes on at most a turn: a pause does not make a jump."""
 _STALL = 0.6
 """Seconds without progress after which a joint counts as blocked."""
 _PROGRESS = 0.004
@@ -150,9 +150,7 @@ class Bench:
     # -- what is sent ----------------------------------------------------------------------------
 
     def rest(self) -> HandCommand:
-        """Brake every joint; a position servo stays where it is."""
-        if self.setup.servo and self.state is not None:
-            return self._command(self.state.q, np.zeros(len(self.x)))
+        """Brake every joint."""
         return HandCommand.brake(self.setup.spec.n_joints)
 
     def hold(self) -> HandCommand:
@@ -187,7 +185,7 @@ class Bench:
 
     @property
     def slow(self) -> Floats:
-        """Speed of slow ways: a third of the stroke a second, a quarter of the full speed at most."""
+        """Speed of slow ways: a third of the stroke a second, at most a quarter of the full speed."""
         return np.minimum(self.setup.stroke / 3, self.setup.full.min(axis=1) / 4)
 
     # -- turns -----------------------------------------------------------------------------------

@@ -90,8 +90,8 @@ KINDS = (
          "largest difference of three places of rest for one command, from the same direction"),
     Kind("play", "play", Unit.Q, 1, 0.02, 0.5, 0.004, "how far apart it rests when it comes from "
          "below and from above, without what friction explains"),
-    Kind("lag", "lag", Unit.SECONDS, 1, 0.1, 0.3, 0.02, "from a small step of the command until the "
-         "state shows a twentieth of it"),
+    Kind("lag", "lag", Unit.SECONDS, 1, 0.1, 0.3, 0.02, "from a small step of the command until "
+         "the state shows a twentieth of it"),
     Kind("speed+", "speed, q rising", Unit.SPEED, -1, 0.9, 0.1, 0.0, "reached in mid range"),
     Kind("speed-", "speed, q falling", Unit.SPEED, -1, 0.9, 0.1, 0.0, "likewise"),
     Kind("noise", "noise", Unit.Q, 1, 0.005, 1.0, 0.001, "standard deviation of q at rest"),

@@ -63,6 +63,11 @@ class SelfTest:
             self.end, self.reason = end, reason
             self._run.close()
 
+    def abandon(self, reason: str) -> None:
+        """End at once: the hand cannot be commanded any more."""
+        self.stop(End.FAULT, reason)
+        self.finished = True
+
     def step(self, state: HandState) -> None:
         """Take the state of an exchange, and make the next command."""
         if self._last is None:
@@ -73,8 +78,7 @@ class SelfTest:
         if not np.isfinite(state.q).all():
             self._nonsense += 1
             if self._nonsense >= _NONSENSE:
-                self.stop(End.FAULT, "the hand reports no positions")
-                self.finished = True
+                self.abandon("the hand reports no positions")
             return
         self._nonsense = 0
         if self.end is None and (problem := self._problem(state)):

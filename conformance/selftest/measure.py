@@ -20,6 +20,8 @@ _FEWEST = 4
 """Samples of a joint that stands still under a rising command, from which its stiffness is told."""
 _SWING = 0.3
 """Part of the torque to start by which torque has to rise meanwhile."""
+_RISEN = 0.9
+"""Part of the torque to start up to which torque is taken to rise with the command alone."""
 _FEWEST_MOVING = 3
 _OBEYS = 0.2
 """Part of kp by which a measured stiffness may differ from it, and the joint still follows the law
@@ -78,8 +80,11 @@ def start(command: Floats, q: Floats, tau: Floats, direction: int, threshold: fl
     begin = int(np.argmax(moved))
     before = direction * _steady(tau[: begin + 1])
     torque = float(before.max()) if len(before) else math.nan
-    still = np.abs(q[: begin + 1] - q[0]) < 0.02 * threshold
-    x, y = command[: begin + 1][still], tau[: begin + 1][still]
+    # while its torque rises: then it gives way, and play is crossed before it is seen to move
+    rising = np.flatnonzero(before >= _RISEN * torque) if torque > 0 else np.empty(0)
+    end = int(rising[0]) + 1 if len(rising) else begin + 1
+    still = np.abs(q[:end] - q[0]) < 0.02 * threshold
+    x, y = command[:end][still], tau[:end][still]
     # the state of a turn was measured before the turn's command
     x, y = x[:-1], y[1:]
     swing = float(np.ptp(y)) if len(y) else 0.0
@@ -93,9 +98,7 @@ def spread(rests: Sequence[Rest]) -> float:
     return max(r.q for r in rests) - min(r.q for r in rests)
 
 
-def lost_motion(
-    below: Sequence[Rest], above: Sequence[Rest], kp: float, stiffness: float
-) -> float:
+def lost_motion(below: Sequence[Rest], above: Sequence[Rest], kp: float, stiffness: float) -> float:
     """How far apart a joint rests at one command that it reaches from below and from above.
 
     A motor that follows ``tau = kp (q - q_now)`` rests beside its command by its torque at rest

@@ -31,7 +31,11 @@ _STEP = 0.1  # part of the stroke
 _LAGGED = 0.05  # part of a step that is motion
 _RUN = (0.05, 0.95)  # parts of the range between which speeds are tried
 _FIT = (0.35, 0.65)  # and between which they are measured
-_LEVELS = (0.25, 0.5, 1.0)  # of the speed that is allowed: a faster run only after a good slower one
+_LEVELS = (
+    0.25,
+    0.5,
+    1.0,
+)  # of the speed that is allowed: a faster run only after a good slower one
 _KEPT = 0.9  # part of the speed asked for that a joint reaches
 _OVERSHOT = 0.05  # part of the stroke beyond a goal
 _WATCHED = 0.3  # seconds after a step
@@ -55,7 +59,7 @@ class JointFound:
     alive: bool = True
     sign: int = 1
     moves: tuple[str, ...] = ()
-    tested: bool = False
+    nudged: bool = False
     figures: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     curves: dict[str, Series] = field(default_factory=dict)
@@ -199,6 +203,7 @@ class Procedure:
         begin = max(bench.mark - 1, 0)
         moved = yield from bench.move(j, q + direction * way, slow, settle=True)
         by = bench.moved(begin)
+        joint.nudged = True
         shared = next((set(m) for m in self.profile.motors if j in m), {j})
         strokes = self.setup.stroke
         joint.moves = tuple(
@@ -229,7 +234,6 @@ class Procedure:
         for n, (title, test) in enumerate(tests):
             self._tell(f"{joint.name}: {title}", (k + n / len(tests)) / of)
             yield from test(j)
-        joint.tested = True
         yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
 
     def _range(self, j: int) -> Turns[None]:
@@ -251,7 +255,7 @@ class Procedure:
         return measure.rest(s.q, s.tau)
 
     def _starts(self, j: int) -> Turns[None]:
-        bench, joint, spec = self.bench, self.found.joints[j], self._joint(j)
+        bench, joint = self.bench, self.found.joints[j]
         yield from bench.move(j, self._at(j, 0.5), float(bench.slow[j]), settle=True)
         found = []
         for name, direction in (("start+", 1), ("start-", -1)):

@@ -49,6 +49,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
     "replay": ("dexkit.cli.replay", "Publish the commands of a recording."),
     "report": ("dexkit.cli.report", "Write the reports of a result."),
+    "selftest": ("dexkit.cli.selftest", "Test a hand's joints and sensors; compare for wear."),
     "serve": ("dexkit.cli.serve", "Publish and subscribe Unitree's topics for a hand."),
     "setup-dds": ("dexkit.cli.setup_dds", "Find or build CycloneDDS 0.10 for this Python."),
     "sign": ("dexkit.cli.sign", "Sign a result with its recording as one archive."),

@@ -1,4 +1,4 @@
-"""Keys that stop a program, where it has a terminal."""
+"""Keys that a program with a terminal takes: to stop, or to go on."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["stop_keys"]
+__all__ = ["is_stop", "keys", "stop_keys"]
 
 _STOP = b" q"
+
+
+def is_stop(pressed: bytes) -> bool:
+    """Whether space or q is among the keys."""
+    return any(key in _STOP for key in pressed)
 
 
 @contextmanager
@@ -21,16 +26,26 @@ def stop_keys() -> Iterator[Callable[[], bool]]:
 
     Keys are read only by a program in the foreground of a terminal.
     """
+    with keys() as pressed:
+        yield lambda: is_stop(pressed())
+
+
+@contextmanager
+def keys() -> Iterator[Callable[[], bytes]]:
+    """Yields a function that returns the keys pressed since its last call; it does not wait.
+
+    There are none without a terminal, and in its background.
+    """
     descriptor = _terminal()
     if descriptor is None:
-        yield lambda: False
+        yield lambda: b""
         return
     before = termios.tcgetattr(descriptor)
 
-    def pressed() -> bool:
+    def pressed() -> bytes:
         if not select.select([descriptor], [], [], 0)[0]:
-            return False
-        return any(key in _STOP for key in os.read(descriptor, 64))
+            return b""
+        return os.read(descriptor, 64)
 
     try:
         tty.setcbreak(descriptor, termios.TCSANOW)

@@ -1,0 +1,297 @@
+"""``dexkit selftest``: test the joints and sensors of one hand, and compare with an earlier run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dexkit.cli.options import (
+    DIALECT,
+    FILE,
+    Number,
+    dds_options,
+    force_option,
+    html_option,
+    quiet_option,
+    set_option,
+)
+from dexkit.cli.status_line import StatusLine
+from dexkit.errors import DdsError, UsageError
+from dexkit.escaping import REMARK, one_line
+from dexkit.hand import Hand, Side
+from dexkit.models import Dialect
+from dexkit.models import dialect as dialect_by_name
+from dexkit.models import model as model_by_name
+
+if TYPE_CHECKING:
+    from dexkit.conformance.selftest.machine import SelfTest
+    from dexkit.conformance.selftest.result import SelfTestResult
+    from dexkit.stop_signals import StopRequest
+
+__all__ = ["command"]
+
+_SPEED = 0.5
+"""Part of the full speed; position servos, whose client asks for all of it, are tried at it."""
+
+
+@click.command("selftest")
+@click.argument("backend_name", metavar="[BACKEND]", required=False)
+@click.option("--external", is_flag=True, help="A hand that is served already, on DDS.")
+@click.option(
+    "--side", type=click.Choice([str(s) for s in Side]), required=True, help="Hand to test."
+)
+@click.option("--device", metavar="PATH", help="Path or serial number of the device.")
+@set_option("Setting of the backend; 'dexkit backends' lists them.")
+@click.option(
+    "--dialect",
+    "dialect_name",
+    type=DIALECT,
+    help="With --external: the dialect of the hand.",
+)
+@click.option(
+    "--joint",
+    "joints",
+    multiple=True,
+    metavar="NAME",
+    help="Test only this joint; may be repeated.  [default: all]",
+)
+@click.option(
+    "--speed",
+    type=Number(0.05, 1.0),
+    metavar="PART",
+    help="Part of the full speed that is tried at most.  [default: 0.5; 1 for position servos]",
+)
+@click.option(
+    "--lead",
+    type=Number(0.02, 0.5),
+    default=0.18,
+    show_default=True,
+    metavar="Q",
+    help="A command is never further ahead of its joint, so a motor gives at most kp times this.",
+)
+@click.option(
+    "--touch/--no-touch",
+    default=True,
+    help="Ask for each tactile element to be pressed, where the model has some.  [default: touch]",
+)
+@click.option("--name", default="", metavar="TEXT", help="Name or serial number of the hand.")
+@click.option(
+    "--baseline", type=FILE, metavar="FILE", help="JSON of an earlier run of the same hand."
+)
+@click.option(
+    "--json",
+    "json_path",
+    type=FILE,
+    metavar="FILE",
+    help="Where to write the result.  [default: selftest-MODEL-SIDE-TIME.json]",
+)
+@html_option()
+@dds_options()
+@click.option(
+    "--wait",
+    type=Number(min=0),
+    default=10.0,
+    show_default=True,
+    metavar="S",
+    help="With --external: wait up to S seconds for the hand.",
+)
+@force_option()
+@quiet_option()
+def command(backend_name: str | None, **given: Any) -> int:
+    """Test one hand: its joints one by one, and its tactile elements.
+
+    BACKEND is a name from 'dexkit backends' or package.module:Class; the hand is driven directly.
+    Every joint is moved over its whole range, slowly first: nothing may be in its way. Space, q or
+    Ctrl-C stops and leaves the hand at rest.
+
+    Writes a page and a JSON file. With --baseline it says what has become worse since.
+
+    Exit code: 0 nothing is wrong, 1 something is, is worse than before, or could not be measured,
+    2 it cannot begin, 130 stopped.
+    """
+    if (backend_name is None) == (not given["external"]):
+        raise UsageError(
+            "name one hand: a backend, or --external", hint="'dexkit backends' lists the backends"
+        )
+    if given["external"] and (given["device"] or given["settings"]):
+        raise UsageError("--device and --set are for a backend, not for --external")
+    if backend_name is not None and given["dialect_name"]:
+        raise UsageError("--dialect is for --external: a backend is driven without DDS")
+    if given["external"] and given["dialect_name"] is None:
+        raise UsageError("--external needs --dialect", hint="e.g. --dialect unitree_go")
+    from dexkit.conformance.selftest.bench import Setup
+    from dexkit.conformance.selftest.live import run
+    from dexkit.conformance.selftest.machine import End, SelfTest
+    from dexkit.conformance.selftest.procedure import Procedure
+    from dexkit.conformance.selftest.result import check_baseline, read_result, result_of
+    from dexkit.documents import check_output_paths
+    from dexkit.stop_signals import stop_on_signals
+
+    baseline = None if given["baseline"] is None else read_result(given["baseline"])
+    with ExitStack() as stack:
+        stop = stack.enter_context(stop_on_signals())
+        hand, spoken = _hand(stack, backend_name, given, stop)
+        spec = hand.spec
+        about = {
+            "backend": backend_name or "external",
+            "device": given["device"] or "",
+            "name": given["name"],
+        }
+        if baseline is not None:
+            whose = {"model": spec.model, "side": str(spec.side), **about}
+            check_baseline(baseline, whose, given["baseline"])
+        json_path, page = _outputs(given, spec.model)
+        check_output_paths([json_path, page], [given["baseline"]])
+        joints = _joints([joint.name for joint in spec.joints], given["joints"])
+        touch = _touch(spec.model, given["touch"])
+        hand.open()
+        stack.callback(hand.close)
+        setup = Setup.of(
+            hand.spec,  # opening may have refined its rate
+            dialect=spoken,
+            joint_speeds=getattr(hand, "joint_speeds", None),
+            lead=given["lead"],
+        )
+        speed = given["speed"] or (1.0 if setup.servo else _SPEED)
+        test = SelfTest(Procedure(setup, joints=joints, speed=speed, touch=touch))
+        if not given["quiet"]:
+            count = len(joints) if joints is not None else spec.n_joints
+            click.echo(
+                f"ready: testing {count} joint{'s' if count > 1 else ''} of the {spec.side} "
+                f"{model_by_name(spec.model).title}; space, q or Ctrl-C stops",
+                err=True,
+            )
+        with _turn(stop, given["quiet"]) as turn:
+            run(hand, test, turn=turn)
+    if test.end is End.STOPPED:
+        click.echo("stopped; the hand is at rest, and nothing was written", err=True)
+        return 130
+    result = result_of(test, about, baseline=baseline, baseline_name=str(given["baseline"] or ""))
+    return _finish(result, baseline, json_path, page)
+
+
+def _hand(
+    stack: ExitStack, name: str | None, given: dict[str, Any], stop: StopRequest
+) -> tuple[Hand, Dialect | None]:
+    """The hand, not opened yet, and the dialect that it is commanded in; None for a backend."""
+    side = Side(given["side"])
+    if name is not None:
+        from dexkit.backends import BackendOptions, backend
+
+        settings = {}
+        for text in given["settings"]:
+            key, equals, value = text.partition("=")
+            if not equals or not key:
+                raise UsageError(f"--set {text} is not KEY=VALUE")
+            settings[key] = value
+        return backend(name).create(BackendOptions(side, given["device"], settings)), None
+    from dexkit.conformance.selftest.external import ExternalHand
+    from dexkit.dds import DdsNode
+
+    spoken = dialect_by_name(given["dialect_name"])
+    node = stack.enter_context(DdsNode(domain=given["domain"], interface=given["interface"]))
+
+    def waiting(seconds: float) -> None:
+        if seconds >= given["wait"]:
+            raise DdsError(
+                f"no {side} hand on {spoken.topics(side)[1]}, domain {node.domain}, "
+                f"{node.interface} (waited {given['wait']:g} s)",
+                hint="start it first ('dexkit serve'); check --domain, --interface and --dialect",
+            )
+
+    hand = ExternalHand(node, spoken, side, stop=stop.event, waiting=waiting, force=given["force"])
+    return hand, spoken
+
+
+def _joints(names: list[str], chosen: tuple[str, ...]) -> list[int] | None:
+    """Indices of the joints of ``--joint``; None for all.
+
+    :raises UsageError: there is no such joint.
+    """
+    for name in chosen:
+        if name not in names:
+            raise UsageError(f"no joint {one_line(name)!r}", hint=f"it has {', '.join(names)}")
+    return sorted({names.index(name) for name in chosen}) if chosen else None
+
+
+def _touch(name: str, wanted: bool) -> bool:
+    """Whether elements are to be pressed.
+
+    :raises UsageError: nobody is at a terminal to be asked.
+    """
+    if not wanted or not model_by_name(name).sensors:
+        return False
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise UsageError(
+            f"a {model_by_name(name).title} has tactile elements, and nobody is at a terminal to "
+            "press them",
+            hint="--no-touch tests the joints alone",
+        )
+    return True
+
+
+def _outputs(given: dict[str, Any], model: str) -> tuple[Path, Path]:
+    """Where the result and the page go; never over an earlier run unless a name is given."""
+    stem = f"selftest-{model}-{given['side']}-{datetime.now():%Y%m%d-%H%M%S}"
+    json_path, page = given["json_path"], given["html_path"]
+    if json_path is None:
+        json_path = Path(f"{stem}.json") if page is None else page.with_suffix(".json")
+    return json_path, page or json_path.with_suffix(".html")
+
+
+@contextmanager
+def _turn(stop: StopRequest, quiet: bool) -> Iterator[Callable[[SelfTest], None]]:
+    """Shows progress and questions, and takes keys, in each turn of a test."""
+    from dexkit.cli.stop_keys import is_stop, keys
+    from dexkit.conformance.selftest.machine import End
+
+    status = StatusLine(quiet)
+    said = ""
+    with keys() as pressed:
+
+        def turn(test: SelfTest) -> None:
+            nonlocal said
+            procedure = test.procedure
+            keyed = pressed()
+            if stop or is_stop(keyed):
+                test.stop(End.STOPPED, "stopped")
+            elif procedure.question and any(key in b"\r\n" for key in keyed):
+                procedure.skip()
+            now = procedure.question or procedure.doing
+            if now == said:
+                return
+            said = now
+            text = f"{procedure.part:4.0%}  {now}"
+            if procedure.question:
+                text = f"touch: {now}; Enter goes on without"
+            if status:
+                status.show(one_line(text, REMARK))
+            elif not quiet:
+                click.echo(one_line(text, REMARK), err=True)
+
+        try:
+            yield turn
+        finally:
+            status.clear()
+
+
+def _finish(
+    result: SelfTestResult, baseline: SelfTestResult | None, json_path: Path, page: Path
+) -> int:
+    """Write and print what was found; the exit code."""
+    from dexkit.conformance.report.selftest import print_selftest, render_selftest
+    from dexkit.conformance.selftest.result import Verdict
+    from dexkit.documents import write_file
+
+    result.write_json(json_path)
+    write_file(page, render_selftest(result, baseline))
+    print_selftest(result)
+    click.echo(f"result: {json_path}")
+    click.echo(f"page: {page}")
+    return 0 if result.verdict is Verdict.GOOD else 1
