@@ -40,7 +40,7 @@ SETTLE = 0.15
 _SETTLE_MOST = 2.0
 _STILL = 2e-4
 """Part of the stroke by which a joint at rest may move meanwhile, its noise apart."""
-_PATIENCE = 4
+_PATIENCE = 6
 """Attempts at a measurement that a pause of this machine spoils."""
 
 
@@ -112,6 +112,11 @@ class Series:
     command: Floats
     q: Floats
     tau: Floats
+
+    def gap(self, begin: float = -math.inf, end: float = math.inf) -> float:
+        """Seconds between two samples at most, from a time to a time."""
+        times = self.t[(self.t >= begin) & (self.t <= end)]
+        return float(np.diff(times).max()) if len(times) > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -185,7 +190,7 @@ class Bench:
 
     @property
     def slow(self) -> Floats:
-        """Speed of slow ways: a third of the stroke a second, at most a quarter of the full speed."""
+        """Speed of slow ways: a third of the stroke a second, at most a quarter of the most."""
         return np.minimum(self.setup.stroke / 3, self.setup.full.min(axis=1) / 4)
 
     # -- turns -----------------------------------------------------------------------------------
@@ -327,20 +332,14 @@ class Bench:
             return np.zeros(len(self.x))
         return np.asarray(self._rows[-1][1] - self._rows[begin][1])
 
-    def longest_gap(self, begin: int) -> float:
-        """Seconds between two samples at most, since a place."""
-        times = self.t[max(begin - 1, 0) :]
-        return max(np.diff(times), default=0.0) if len(times) > 1 else math.inf
+    def undisturbed(self, attempt: Callable[[], Turns[T | None]]) -> Turns[T | None]:
+        """Repeat a measurement that returns None until it returns something; None if it never does.
 
-    def undisturbed(self, attempt: Callable[[], Turns[T]], periods: float = 8.0) -> Turns[T | None]:
-        """Repeat a measurement until no pause of this machine falls into it; None if none did.
-
-        :param periods: longest gap between two samples, in periods of the exchange.
+        It returns None when a pause of this machine falls into it (:meth:`Series.gap`).
         """
         for _ in range(_PATIENCE):
-            begin = self.mark
             found = yield from attempt()
-            if self.longest_gap(begin) <= periods * self.setup.period:
+            if found is not None:
                 return found
         self.spoiled += 1
         return None

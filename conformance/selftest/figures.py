@@ -80,7 +80,7 @@ class Kind:
 
 
 KINDS = (
-    Kind("range", "range", Unit.Q, -1, 0.95, 0.0, 0.02, "from end to end, led there slowly"),
+    Kind("range", "range", Unit.Q, -1, 0.95, 0.0, 0.03, "from end to end, led there slowly"),
     Kind("zero", "zero", Unit.Q, 0, 0.05, 0.0, 0.02, "what is missing at the lower end, less that "
          "at the upper one: q is off by so much if it is not 0"),
     Kind("start+", "torque to start, q rising", Unit.TORQUE, 1, 0.5, 0.3, 0.03,
@@ -92,8 +92,8 @@ KINDS = (
          "below and from above, without what friction explains"),
     Kind("lag", "lag", Unit.SECONDS, 1, 0.1, 0.3, 0.02, "from a small step of the command until "
          "the state shows a twentieth of it"),
-    Kind("speed+", "speed, q rising", Unit.SPEED, -1, 0.9, 0.1, 0.0, "reached in mid range"),
-    Kind("speed-", "speed, q falling", Unit.SPEED, -1, 0.9, 0.1, 0.0, "likewise"),
+    Kind("speed+", "speed, q rising", Unit.SPEED, -1, 0.8, 0.1, 0.0, "reached in mid range"),
+    Kind("speed-", "speed, q falling", Unit.SPEED, -1, 0.8, 0.1, 0.0, "likewise"),
     Kind("noise", "noise", Unit.Q, 1, 0.005, 1.0, 0.001, "standard deviation of q at rest"),
     Kind("rise", "temperature rise", Unit.KELVIN, 1, 20.0, 0.5, 5.0,
          "of the hotter of case and winding, from the beginning of the test to its end"),

@@ -75,7 +75,7 @@ def start(command: Floats, q: Floats, tau: Floats, direction: int, threshold: fl
     :param threshold: q by which a joint has moved from where it was.
     """
     moved = direction * (q - np.median(q[:3])) > threshold
-    if not moved.any():
+    if not moved.any() or not tau.any():  # a hand that reports torque in a grip only has none
         return Start(math.nan)
     begin = int(np.argmax(moved))
     before = direction * _steady(tau[: begin + 1])

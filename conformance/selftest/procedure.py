@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexkit.command_age import PAUSE
 from dexkit.conformance.selftest import measure
 from dexkit.conformance.selftest.bench import SETTLE, Bench, Series, Setup, Turns
 from dexkit.conformance.selftest.measure import Rest
@@ -24,7 +25,7 @@ _STILL = 1.0  # seconds at rest, for noise and temperatures
 _NUDGE = 0.08  # part of the stroke
 _ALIVE = 0.35  # part of that by which a joint has moved
 _ALIEN = 0.1  # part of its stroke by which another joint has moved, too
-_CREEP = 40.0  # seconds for a stroke
+_CREEP = 30.0  # seconds for a stroke
 _STARTED = 0.005  # part of the stroke that is motion
 _REPEATS = 3
 _STEP = 0.1  # part of the stroke
@@ -36,10 +37,10 @@ _LEVELS = (
     0.5,
     1.0,
 )  # of the speed that is allowed: a faster run only after a good slower one
-_KEPT = 0.9  # part of the speed asked for that a joint reaches
+_KEPT = 0.8  # part of the speed asked for that a joint reaches
 _OVERSHOT = 0.05  # part of the stroke beyond a goal
 _WATCHED = 0.3  # seconds after a step
-_LAG_PERIODS = 2.5
+_GAP = 2.5  # periods between two samples at most, where a figure depends on them
 _PRESSED = 500.0  # Pa, or ...
 _SIGMAS = 8.0  # ... times the noise, above rest: an element that is pressed
 _TOUCH_PATIENCE = 60.0  # seconds without a new element
@@ -133,11 +134,15 @@ class Procedure:
         """Everything; yields commands and is sent states."""
         still = yield from self.bench.watch(_STILL)
         self._at_rest(still)
-        yield from self._open()
+        everything = set(range(self.setup.spec.n_joints))
         for j in self.chosen:
             self._tell(f"{self._joint(j).name}: which joint moves, and which way", 0.0)
+            # the others brake: one that turns the wrong way would run off while it is held
+            self.bench.limp = everything - {j}
             yield from self._nudge(j)
-        live = [j for j in self.chosen if self.found.joints[j].alive]
+        self.bench.limp = {j for j in everything if not self._usable(j)}
+        yield from self._open()
+        live = [j for j in self.chosen if self._usable(j)]
         for k, j in enumerate(live):
             yield from self._thoroughly(j, k, len(live))
         if self.touch:
@@ -147,6 +152,10 @@ class Procedure:
 
     def _tell(self, doing: str, part: float) -> None:
         self.doing, self.part = doing, part
+
+    def _usable(self, j: int) -> bool:
+        """Whether a joint was tried and does what it should."""
+        return self.found.joints[j].nudged and self.found.joints[j].alive
 
     def _joint(self, j: int) -> JointSpec:
         return self.setup.spec.joints[j]
@@ -189,7 +198,8 @@ class Procedure:
         """Open the hand slowly, finger by finger, so that no joint is in another's way."""
         self._tell("opening the hand", 0.0)
         for j in range(self.setup.spec.n_joints):
-            yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
+            if self._usable(j):
+                yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
 
     # -- which joint, which way ------------------------------------------------------------------
 
@@ -216,7 +226,6 @@ class Procedure:
         joint.sign = -1 if moved.against or direction * by[j] < -_ALIVE * way else 1
         if not joint.alive or joint.sign < 0 or joint.moves != (joint.name,):
             joint.alive = False
-            bench.limp.add(j)
             return
         yield from bench.move(j, q, slow)
 
@@ -265,7 +274,7 @@ class Procedure:
         best = max(found, key=lambda s: s.swing, default=measure.Start(math.nan))
         joint.figures["stiffness"] = best.stiffness
 
-    def _start(self, j: int, direction: int) -> Turns[measure.Start]:
+    def _start(self, j: int, direction: int) -> Turns[measure.Start | None]:
         bench, stroke = self.bench, float(self.setup.stroke[j])
         yield from bench.settle(j)
         assert bench.state is not None
@@ -274,6 +283,8 @@ class Procedure:
         yield from bench.move(j, q + direction * 0.03 * stroke, stroke / _CREEP)
         s = bench.series(j, begin)
         self.found.joints[j].curves[f"start{'+' if direction > 0 else '-'}"] = s
+        if s.gap() > PAUSE:  # hands brake by themselves then
+            return None
         return measure.start(s.command, s.q, s.tau, direction, _STARTED * stroke)
 
     def _returns(self, j: int) -> Turns[None]:
@@ -294,15 +305,12 @@ class Procedure:
     def _lags(self, j: int) -> Turns[None]:
         found = []
         for direction in (1, -1, 1, -1):
-            value = yield from self.bench.undisturbed(
-                lambda d=direction: self._lag(j, d),  # type: ignore[misc]
-                _LAG_PERIODS,
-            )
+            value = yield from self.bench.undisturbed(lambda d=direction: self._lag(j, d))  # type: ignore[misc]
             found.append(math.nan if value is None else value)
         known = [value for value in found if math.isfinite(value)]
         self.found.joints[j].figures["lag"] = float(np.median(known)) if known else math.nan
 
-    def _lag(self, j: int, direction: int) -> Turns[float]:
+    def _lag(self, j: int, direction: int) -> Turns[float | None]:
         bench, stroke = self.bench, float(self.setup.stroke[j])
         step = _STEP * stroke if self.setup.servo else min(_STEP * stroke, self.setup.lead)
         # from behind: what play there is has been crossed before
@@ -316,7 +324,10 @@ class Procedure:
         yield from bench.wait(_WATCHED)
         s = bench.series(j, begin)
         self.found.joints[j].curves["step"] = s
-        return measure.delay(s.t, s.q, sent, direction, _LAGGED * step)
+        lag = measure.delay(s.t, s.q, sent, direction, _LAGGED * step)
+        period = self.setup.period
+        late = s.gap(sent - 2 * period, sent + (lag if math.isfinite(lag) else math.inf))
+        return lag if late <= _GAP * period else None
 
     def _speeds(self, j: int) -> Turns[None]:
         """To and fro, faster each time while it keeps up and stops where it should."""
@@ -331,8 +342,7 @@ class Procedure:
                 if name not in going or (asked <= 2 * slow and level < _LEVELS[-1]):
                     continue
                 found = yield from bench.undisturbed(
-                    lambda a=asked, b=begin, g=goal: self._fast(j, b, g, a),  # type: ignore[misc]
-                    _LAG_PERIODS,
+                    lambda a=asked, b=begin, g=goal: self._fast(j, b, g, a)  # type: ignore[misc]
                 )
                 reached[name], beyond = found or (math.nan, 0.0)
                 if not (reached[name] >= _KEPT * asked and beyond <= _OVERSHOT):
@@ -343,7 +353,9 @@ class Procedure:
                     )
         joint.figures |= reached
 
-    def _fast(self, j: int, begin: float, goal: float, speed: float) -> Turns[tuple[float, float]]:
+    def _fast(
+        self, j: int, begin: float, goal: float, speed: float
+    ) -> Turns[tuple[float, float] | None]:
         """(speed that was reached, part of the stroke by which it went too far)."""
         bench, spec = self.bench, self._joint(j)
         assert bench.state is not None
@@ -356,6 +368,10 @@ class Procedure:
         direction = 1 if goal > begin else -1
         self.found.joints[j].curves[f"speed{'+' if direction > 0 else '-'}"] = s
         low, high = (self._at(j, part) for part in _FIT)
+        passed = direction * (s.q - (high if direction > 0 else low)) > 0
+        left = float(s.t[int(np.argmax(passed))]) if passed.any() else math.inf
+        if s.gap(end=left) > _GAP * self.setup.period:
+            return None
         beyond = float((direction * (s.q - self._at(j, goal))).max()) / spec.stroke
         return measure.speed(s.t, s.q, low, high), beyond
 

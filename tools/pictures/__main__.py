@@ -14,8 +14,18 @@ from pathlib import Path
 from PIL import Image
 
 from dexkit.cli.view import recorded
+from dexkit.clock import ManualClock
 from dexkit.conformance.report.curves import page as curves_page
 from dexkit.conformance.report.curves import recorded as curves_of
+from dexkit.conformance.report.selftest import render_selftest
+from dexkit.conformance.selftest.bench import Setup
+from dexkit.conformance.selftest.live import run
+from dexkit.conformance.selftest.machine import SelfTest
+from dexkit.conformance.selftest.procedure import Procedure
+from dexkit.conformance.selftest.result import SelfTestResult, result_of
+from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.wear import parse_wear
+from dexkit.hand import Side
 from dexkit.threads import Worker
 from dexkit.traces import open_trace, sample_path
 from dexkit.view.page import Page
@@ -95,6 +105,13 @@ def pictures(only: Sequence[str]) -> None:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelectorAll('svg').length > 3")
                 save(browser.picture(), "info")
+        if asked("selftest"):
+            path = folder / "selftest.html"
+            path.write_text(worn_page())
+            with Browser(folder / "f", 1000, 760) as browser:
+                browser.open(path.as_uri())
+                browser.wait("document.querySelectorAll('svg').length > 3")
+                save(browser.picture(), "selftest")
         if asked("monitor"):
             path = folder / "monitor.html"
             path.write_text(monitor_picture(sample_path("dex3_pinch"), 12.2, 100, 30))
@@ -102,6 +119,22 @@ def pictures(only: Sequence[str]) -> None:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelector('pre') !== null")
                 save(browser.picture(), "monitor")
+
+
+def worn_page() -> str:
+    """The page of a gripper that was worn on purpose, on a virtual clock."""
+    results: list[SelfTestResult] = []
+    for wear in ("", "play=0.06,friction=2.5"):
+        clock = ManualClock()
+        hand = SimHand(Side.LEFT, clock=clock)
+        hand.wear(parse_wear(wear, hand.spec))
+        hand.open()
+        test = SelfTest(Procedure(Setup.of(hand.spec), speed=0.25))
+        run(hand, test, clock=clock)
+        about = {"backend": "sim-dex1", "name": "A7"}
+        baseline = results[0] if results else None
+        results.append(result_of(test, about, baseline=baseline, baseline_name="new.json"))
+    return render_selftest(results[1], results[0])
 
 
 def save(png: bytes, name: str) -> None:

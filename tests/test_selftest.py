@@ -1,0 +1,526 @@
+"""The self-test of a hand, on emulated hands and a virtual clock."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dexkit.backends import BackendOptions, backend
+from dexkit.cli import cli
+from dexkit.clock import ManualClock
+from dexkit.conformance.report.selftest import findings, render_selftest
+from dexkit.conformance.selftest import measure
+from dexkit.conformance.selftest.bench import LEAD, Setup
+from dexkit.conformance.selftest.external import HandWire
+from dexkit.conformance.selftest.figures import KINDS
+from dexkit.conformance.selftest.live import run
+from dexkit.conformance.selftest.machine import End, SelfTest
+from dexkit.conformance.selftest.measure import Rest
+from dexkit.conformance.selftest.procedure import Procedure
+from dexkit.conformance.selftest.result import (
+    SCHEMA,
+    Condition,
+    SelfTestResult,
+    Touch,
+    Verdict,
+    check_baseline,
+    read_result,
+    result_of,
+)
+from dexkit.emulators.sim_brainco import SimBrainCo
+from dexkit.emulators.sim_dex3 import SimDex3
+from dexkit.emulators.sim_dex5 import SimDex5
+from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.simulated import SimulatedHand
+from dexkit.emulators.wear import parse_wear
+from dexkit.errors import HandLost, HandTimeout, UsageError
+from dexkit.hand import Hand, HandCommand, HandSpec, HandState, JointMode, MotorError, Side
+from dexkit.messages import message_type
+from dexkit.models import BUILT_IN, Dialect, model
+from dexkit.service.dialects import StateView, dialect_map
+from tests.each import each
+
+WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc)
+HANDS: dict[str, Callable[[ManualClock], SimulatedHand]] = {
+    "dex1": lambda clock: SimHand(Side.LEFT, clock=clock),
+    "dex3": lambda clock: SimDex3(Side.LEFT, clock=clock),
+    "dex5": lambda clock: SimDex5(Side.LEFT, clock=clock),
+    "brainco": lambda clock: SimBrainCo(Side.LEFT, clock=clock),
+}
+
+
+class Over:
+    """A hand around a hand; ``change`` sees every command and state."""
+
+    def __init__(self, inner: Hand, change: Callable[[HandCommand, HandState], HandState]) -> None:
+        self.inner, self.change = inner, change
+        self.commands: list[HandCommand] = []
+
+    @property
+    def spec(self) -> HandSpec:
+        return self.inner.spec
+
+    def open(self) -> None:
+        self.inner.open()
+
+    def close(self) -> None:
+        self.inner.close()
+
+    def exchange(self, command: HandCommand) -> HandState:
+        self.commands.append(command)
+        return self.change(command, self.inner.exchange(command))
+
+
+def same(command: HandCommand, state: HandState) -> HandState:
+    return state
+
+
+class Loaded(ManualClock):
+    """A clock of a machine that often comes back late."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self._random = random.Random(seed)
+
+    def sleep_until(self, deadline: float) -> None:
+        late = 0.0
+        if self._random.random() < 0.01:
+            late = self._random.choice((0.004, 0.02, 0.06, 0.15))
+        super().sleep_until(deadline + late)
+
+
+def examined(
+    name: str,
+    wear: str = "",
+    *,
+    joints: Sequence[int] | None = None,
+    touch: bool = False,
+    clock: ManualClock | None = None,
+    change: Callable[[HandCommand, HandState], HandState] = same,
+    turn: Callable[[SelfTest], object] = lambda test: None,
+) -> tuple[SelfTest, Over]:
+    clock = clock or ManualClock(7.0)
+    inner = HANDS[name](clock)
+    if wear:
+        inner.wear(parse_wear(wear, inner.spec))
+    hand = Over(inner, change)
+    hand.open()
+    setup = Setup.of(hand.spec, rate=100.0)
+    speed = 1.0 if setup.servo else 0.5
+    test = SelfTest(Procedure(setup, joints=joints, speed=speed, touch=touch))
+    run(hand, test, clock=clock, turn=turn)
+    return test, hand
+
+
+@cache
+def good() -> SelfTestResult:
+    return result_of(examined("dex1")[0], {"name": "a"}, now=WHEN)
+
+
+@cache
+def worn(wear: str) -> SelfTestResult:
+    return result_of(examined("dex1", wear)[0], {"name": "a"}, baseline=good(), baseline_name="x")
+
+
+# ------------------------------------------------------------------------------------- hands
+
+
+def test_a_new_gripper_has_nothing_wrong() -> None:
+    result = good()
+    assert result.verdict is Verdict.GOOD
+    assert not findings(result)
+    (joint,) = result.joints
+    figures = {f.name: f.value for f in joint.figures}
+    assert figures["start+"] == pytest.approx(0.09, abs=0.01)  # the emulator's Coulomb friction
+    assert figures["range"] == pytest.approx(5.4, abs=0.02)
+    assert figures["play"] < 0.003
+    assert figures["speed+"] == pytest.approx(12.0, rel=0.05)
+    assert joint.also["stiffness"] == pytest.approx(5.0, rel=0.02)
+
+
+@each(
+    "wear, figures, verdict",
+    [
+        ("friction=3", ["start+", "start-"], Verdict.WORN),
+        ("play=0.05", ["play"], Verdict.WORN),
+        ("speed=0.3", ["speed+", "speed-"], Verdict.FAULTY),
+        ("dead", ["condition"], Verdict.FAULTY),
+    ],
+)
+def test_wear_is_seen_in_exactly_its_figures(
+    wear: str, figures: list[str], verdict: Verdict
+) -> None:
+    result = worn(wear)
+    (joint,) = result.joints
+    assert joint.worn == figures
+    assert result.verdict is verdict
+    if wear.startswith("play"):
+        play = next(f.value for f in joint.figures if f.name == "play")
+        assert play == pytest.approx(0.05, abs=3e-3)
+
+
+def test_no_figure_depends_on_load() -> None:
+    check_load("dex1", 3)
+
+
+def check_load(name: str, seed: int, joints: Sequence[int] | None = None) -> None:
+    """A figure of a machine that is often late is that of an idle one, or there is none."""
+    before = good() if name == "dex1" else result_of(examined(name, joints=joints)[0], {})
+    busy, _ = examined(name, joints=joints, clock=Loaded(seed))
+    after = result_of(busy, {}, baseline=before)
+    assert busy.end is End.DONE
+    for joint in after.joints:
+        assert joint.worn + joint.faulty == [], (seed, joint.name, joint.figures)
+        for f in joint.figures:
+            assert str(f.wear) in ("same", "None"), (seed, joint.name, f)
+    lost = [f for j in after.joints for f in j.figures if math.isnan(f.value)]
+    had = [f for j in before.joints for f in j.figures if math.isnan(f.value)]
+    assert bool(len(lost) > len(had)) <= bool(after.spoiled)
+
+
+def test_no_motor_gives_more_than_its_lead_allows() -> None:
+    setup = Setup.of(SimHand().spec)
+    most = float(setup.kp[0]) * LEAD
+    state: HandState | None = None
+
+    def watch(command: HandCommand, now: HandState) -> HandState:
+        nonlocal state
+        if state is not None and command.mode[0]:
+            # both by where the hand is when the command comes, one period after its last state
+            pull = command.kp[0] * (command.q[0] - now.q[0])
+            assert abs(pull) <= most + command.kp[0] * 0.12
+        state = now
+        return now
+
+    def stop(test: SelfTest) -> None:
+        if test.now - test.begin > 12.0:
+            test.stop(End.STOPPED, "enough")
+
+    test, hand = examined("dex1", change=watch, turn=stop)
+    assert test.end is End.STOPPED
+    assert hand.commands[-1].is_brake, "it is left at rest"
+
+
+def test_a_joint_that_moves_the_wrong_way_is_left_alone() -> None:
+    fast = 0.0
+
+    def mirrored(command: HandCommand, state: HandState) -> HandState:
+        nonlocal fast
+        fast = max(fast, abs(float(state.dq[0])))
+        return replace(state, q=5.4 - state.q, dq=-state.dq)
+
+    test, _ = examined("dex1", change=mirrored)
+    result = result_of(test, {})
+    assert result.joints[0].condition is Condition.REVERSED
+    assert result.verdict is Verdict.FAULTY
+    assert fast < 13.0, "what its client would cause, and not for long"
+
+
+def test_crossed_joints_are_named() -> None:
+    crossed = [1, 0, 2, 3, 4, 5]
+
+    def swap(command: HandCommand, state: HandState) -> HandState:
+        return replace(state, q=state.q[crossed], dq=state.dq[crossed])
+
+    test, _ = examined("brainco", joints=[0, 1], change=swap)
+    result = result_of(test, {})
+    assert [j.condition for j in result.joints[:2]] == [Condition.OTHER] * 2
+    assert result.joints[0].moves == ("thumb_aux",)
+
+
+def test_every_element_is_found_by_touch() -> None:
+    dead = {(5, 8), (7, 0)}
+    test = None
+
+    def remember(now: SelfTest) -> None:
+        nonlocal test
+        test = now
+
+    def pressed(command: HandCommand, state: HandState) -> HandState:
+        assert state.pressure is not None
+        assert test is not None
+        if not test.procedure.question:
+            return state
+        asked = [e for e in test.procedure.found.elements if e.answered is False]
+        missing = [e for e in asked if (e.packet, e.slot) not in dead]
+        if not missing:
+            test.procedure.skip()  # the person presses Enter
+            return state
+        values = state.pressure.copy()
+        values[missing[0].packet, missing[0].slot] += 4000.0
+        return replace(state, pressure=values)
+
+    found, _ = examined("dex3", joints=[], touch=True, change=pressed, turn=remember)
+    result = result_of(found, {})
+    lacking = {(e.packet, e.slot) for e in result.elements if e.touch is Touch.DEAD}
+    assert lacking == dead
+    assert sum(e.touch is Touch.ANSWERS for e in result.elements) == 33 - len(dead)
+    assert {e.before for e in result.elements} == {None}
+    before = replace(
+        result, elements=tuple(replace(e, touch=Touch.ANSWERS) for e in result.elements)
+    )
+    since = result_of(found, {}, baseline=before)
+    assert {(e.packet, e.slot) for e in since.elements if e.worn} == dead
+    assert "index tip, element 5.8" in render_selftest(since, before)
+
+
+# ------------------------------------------------------------------------------------- supervision
+
+
+def _raise(error: Exception) -> HandState:
+    raise error
+
+
+@each(
+    "name, what, reason",
+    [
+        (
+            "fault",
+            lambda s: replace(s, fault=np.array([MotorError.OVERCURRENT], np.uint32)),
+            "gripper reports overcurrent",
+        ),
+        ("hot", lambda s: replace(s, temperature=np.array([95.0])), "gripper is at 95"),
+        ("nan", lambda s: replace(s, q=np.array([math.nan])), "reports no positions"),
+        ("lost", lambda s: _raise(HandLost("unplugged")), "unplugged"),
+        ("silent", lambda s: _raise(HandTimeout("no answer")), "no answer"),
+    ],
+)
+def test_the_hand_is_left_at_rest_whatever_happens(
+    name: str, what: Callable[[HandState], HandState], reason: str
+) -> None:
+    def change(command: HandCommand, state: HandState) -> HandState:
+        return what(state) if state.stamp > 11.0 else state
+
+    test, hand = examined("dex1", change=change)
+    assert test.end is End.FAULT
+    assert reason in test.reason
+    assert result_of(test, {}).verdict is Verdict.FAULTY
+    if name in ("fault", "hot"):
+        assert all(command.is_brake for command in hand.commands[-10:])
+
+
+def test_a_failure_of_the_caller_leaves_the_hand_at_rest() -> None:
+    def fail(test: SelfTest) -> None:
+        if test.now - test.begin > 3.0:
+            raise KeyboardInterrupt
+
+    clock = ManualClock(7.0)
+    hand = Over(HANDS["dex1"](clock), same)
+    hand.open()
+    test = SelfTest(Procedure(Setup.of(hand.spec)))
+    with pytest.raises(KeyboardInterrupt):
+        run(hand, test, clock=clock, turn=fail)
+    assert hand.commands[-1].is_brake
+
+
+# ------------------------------------------------------------------------------------- measuring
+
+
+def test_lost_motion_is_what_friction_does_not_explain() -> None:
+    below, above = [Rest(1.0, 0.1)], [Rest(1.09, -0.1)]
+    assert measure.lost_motion(below, above, 5.0, 5.0) == pytest.approx(0.05)
+    assert measure.lost_motion(below, above, 5.0, math.nan) == pytest.approx(0.09)
+    assert measure.lost_motion(below, above, 5.0, 2.0) == pytest.approx(0.09)
+    assert math.isnan(measure.lost_motion([], above, 5.0, 5.0))
+
+
+def test_start_delay_and_speed_of_made_series() -> None:
+    t = np.arange(200) * 0.01
+    command = 0.1 * t
+    q = np.maximum(command - 0.04, 0.0)  # moves once kp 5 gives 0.2
+    found = measure.start(command, q, 5.0 * np.roll(command - q, 1), 1, 0.01)
+    assert found.torque == pytest.approx(0.2, abs=0.01)
+    assert found.stiffness == pytest.approx(5.0, rel=0.05)
+    assert math.isnan(measure.start(command, 0 * q, q, 1, 0.01).torque)
+    moved = np.where(t > 1.03, 1.0, 0.0)
+    assert measure.delay(t, moved, 1.0, 1, 0.1) == pytest.approx(0.04)
+    assert math.isnan(measure.delay(t, 0 * t, 1.0, 1, 0.1))
+    assert measure.speed(t, 3.0 * t, 1.0, 2.0) == pytest.approx(3.0)
+    assert math.isnan(measure.speed(t, 3.0 * t, 9.0, 9.5))
+
+
+# ------------------------------------------------------------------------------------- the file
+
+
+def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    result = worn("dead")
+    result.write_json(path)
+    again = read_result(path)
+    assert again.as_dict() == json.loads(path.read_text()) == result.as_dict()
+    for change in ({"version": 2}, {"format": "x"}, {"surprise": 1}, {"joints": []}):
+        path.write_text(json.dumps({**result.as_dict(), **change}))
+        with pytest.raises(UsageError):
+            read_result(path)
+
+
+def test_the_schema_names_every_value() -> None:
+    folder = Path(measure.__file__).parent.parent / "report"
+    schema = json.loads((folder / SCHEMA).read_text())
+    defs = schema["$defs"]
+    assert schema["properties"]["verdict"]["enum"] == [str(v) for v in Verdict]
+    assert schema["properties"]["ended"]["enum"] == [str(e) for e in End]
+    assert defs["condition"]["enum"] == [str(c) for c in Condition]
+    assert defs["touch"]["enum"] == [str(t) for t in Touch]
+    names = defs["joint"]["properties"]["figures"]["propertyNames"]["enum"]
+    assert names == [kind.name for kind in KINDS]
+
+
+def test_another_hand_is_no_baseline() -> None:
+    mine = {"model": "dex1-1", "side": "left", "name": "a"}
+    check_baseline(good(), mine, Path("x"))
+    check_baseline(good(), {**mine, "name": ""}, Path("x"))
+    for key, value in {"model": "dex3-1", "side": "right", "name": "b"}.items():
+        with pytest.raises(UsageError, match=key):
+            check_baseline(good(), {**mine, key: value}, Path("x"))
+
+
+def test_figures_under_other_limits_are_not_compared() -> None:
+    result = good()
+    (joint,) = result.joints
+    other = replace(
+        result,
+        joints=(
+            replace(joint, figures=tuple(replace(f, scale=2 * f.scale) for f in joint.figures)),
+        ),
+    )
+    test, _ = examined("dex1", "dead")
+    (again,) = result_of(test, {}, baseline=other).joints
+    assert all(f.wear is None for f in again.figures)
+
+
+def test_nothing_measured_is_not_good() -> None:
+    test, _ = examined("dex1", joints=[], turn=lambda t: None)
+    empty = replace(result_of(test, {}), joints=())
+    assert empty.verdict is Verdict.INCOMPLETE
+    stopped = replace(good(), ended=End.STOPPED)
+    assert stopped.verdict is Verdict.INCOMPLETE
+    assert replace(good(), spoiled=1).verdict is Verdict.INCOMPLETE
+
+
+def test_the_page_says_what_is_worse_and_loads_nothing() -> None:
+    result = worn("play=0.05")
+    page = render_selftest(result, good())
+    assert "Worn" in page
+    assert "play 0.0500 rad, was " in page
+    assert page.count("<svg") == 6
+    assert "http" not in page.replace("http-equiv", "")
+
+
+# ------------------------------------------------------------------------------------- on DDS
+
+
+@each("spoken", [d for m in BUILT_IN for d in m.dialects])
+def test_the_wire_of_every_dialect(spoken: Dialect) -> None:
+    profile = model(spoken.model)
+    spec = profile.spec(Side.LEFT, io_rate=100.0)
+    n = spec.n_joints
+    wire, service = HandWire(spoken, Side.LEFT), dialect_map(spoken, {Side.LEFT: spec})
+    q = spec.q_min + 0.4 * (spec.q_max - spec.q_min)
+    kp, kd = np.array(profile.gains).T
+    dq = 0.2 * np.array([j.dq_max for j in spec.joints])
+    command = replace(HandCommand.position(q, dq=dq, kp=kp, kd=kd), tau=np.zeros(n))
+    sent = message_type(spoken.cmd_type).decode(wire.encode(command, q))
+    got = service.command(sent, Side.LEFT)
+    assert got is not None
+    np.testing.assert_allclose(got.q, q, atol=1e-5, err_msg=spoken.name)
+    if spoken.gains_are_used:
+        np.testing.assert_allclose(got.kp, kp, rtol=1e-5)
+    if "dq" in spoken.command_fields:
+        np.testing.assert_allclose(got.dq, dq, rtol=1e-5)
+    braked = message_type(spoken.cmd_type).decode(wire.encode(HandCommand.brake(n), q))
+    stay = service.command(braked, Side.LEFT)
+    assert stay is not None
+    np.testing.assert_allclose(stay.q, q, atol=1e-5, err_msg="a brake moves nothing")
+    pressure = np.full((spec.n_sensors, 12), math.nan)
+    for row, sensor in zip(pressure, profile.sensors, strict=True):
+        row[list(sensor.slots)] = 1500.0
+    state = HandState.from_values(
+        q,
+        stamp=3.0,
+        dq=dq,
+        tau_est=0.1,
+        temperature=40.0,
+        mode=JointMode.FOC,
+        fault=[int(MotorError.OVERCURRENT)] + [0] * (n - 1),
+        pressure=pressure if spec.n_sensors else None,
+    )
+    view = StateView(state, tuple(state.fault.tolist()))
+    back = wire.decode(service.encode({Side.LEFT: view}), 3.0)
+    assert back is not None
+    np.testing.assert_allclose(back.q, q, atol=1e-5, err_msg=spoken.name)
+    np.testing.assert_allclose(back.dq, dq, rtol=1e-5)
+    np.testing.assert_allclose(back.tau_est, 0.1, rtol=1e-5)
+    np.testing.assert_allclose(back.temperature, 40.0)
+    assert back.fault.tolist() == state.fault.tolist()
+    if spec.n_sensors:
+        np.testing.assert_allclose(np.asarray(back.pressure), pressure)
+
+
+# ------------------------------------------------------------------------------------- as a user
+
+
+LEFT = ["--side", "left"]
+
+
+@each(
+    "arguments, text",
+    [
+        (LEFT, "name one hand"),
+        (["sim-dex1", "--external", *LEFT], "name one hand"),
+        (["sim-dex1"], "--side"),
+        (["--external", *LEFT], "--external needs --dialect"),
+        (["sim-dex1", *LEFT, "--dialect", "unitree_go"], "without DDS"),
+        (["--external", *LEFT, "--dialect", "dex3", "--device", "x"], "for a backend"),
+        (["sim-dex1", *LEFT, "--joint", "thumb"], "no joint 'thumb'"),
+        (["sim-dex3", *LEFT], "nobody is at a terminal"),
+        (["sim-dex1", *LEFT, "--baseline", "other.json"], "its side is right"),
+        (["sim-dex1", *LEFT, "--baseline", "junk.json"], "not a self-test"),
+        (["sim-dex1", *LEFT, "--baseline", "mine.json", "--json", "mine.json"], "an input"),
+        (["sim-dex1", *LEFT, "--speed", "2"], "--speed"),
+        (["sim-dex1", *LEFT, "--set", "wear=rust=1"], "not understood"),
+    ],
+)
+def test_wrong_usage_is_refused_before_anything_moves(
+    arguments: list[str], text: str, tmp_path: Path
+) -> None:
+    good().write_json(tmp_path / "mine.json")
+    replace(good(), hand={**good().hand, "side": "right"}).write_json(tmp_path / "other.json")
+    (tmp_path / "junk.json").write_text("{}")
+    named = [str(tmp_path / a) if a.endswith(".json") else a for a in arguments]
+    found = CliRunner().invoke(cli, ["selftest", *named])
+    assert found.exit_code != 0
+    assert text in found.output + str(getattr(found.exception, "message", found.exception))
+
+
+def test_wear_is_parsed_and_refused() -> None:
+    spec = backend("sim-dex3").create(BackendOptions(Side.LEFT)).spec
+    wear = parse_wear("friction@index_0=3, play=0.01,dead@thumb_2,element=5.2", spec)
+    index, thumb = (next(i for i, j in enumerate(spec.joints) if j.name == n)
+                    for n in ("index_0", "thumb_2"))  # fmt: skip
+    assert wear.joints[index].friction == 3
+    assert wear.joints[index].play == 0.01
+    assert wear.joints[thumb].dead
+    assert wear.elements == {(5, 2)}
+    for text in ("friction@nose=1", "friction=x", "element=99.0", "speed=0", "rust=1"):
+        with pytest.raises(UsageError):
+            parse_wear(text, spec)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", list(HANDS))
+def test_every_emulated_hand_is_good_and_independent_of_load(name: str) -> None:
+    result = result_of(examined(name)[0], {})
+    assert result.verdict is Verdict.GOOD, findings(result)
+    for seed in range(3):
+        check_load(name, seed, joints=[0])
