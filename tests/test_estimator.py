@@ -5,7 +5,7 @@ obstacle.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -193,6 +193,23 @@ def test_an_object_stops_the_prediction_at_the_object() -> None:
     assert not e.stalled
     e.follow(0.0, now)
     assert e.predict(now + 0.1) < contact - 0.02 * STROKE
+
+
+def test_a_stalled_prediction_shows_in_tau_est_if_that_is_wanted() -> None:
+    spec = DEX1_1.spec(Side.LEFT, io_rate=10.0)
+    for wanted, measured, seen in ((0.0, 0.0, 0.0), (0.7, 0.0, -0.7), (0.7, -0.9, -0.9)):
+        e = StateEstimator(spec, [(9.0, 9.0)], stall_tau=wanted)
+        state = HandState.from_values(3.0, tau_est=measured, stamp=0.0)
+        e.measure(state, 0.0)
+        free = e.predict(0.01)
+        assert free is not None
+        assert free.tau_est[0] == measured
+        e.follow(HandCommand.position(0.0), 0.02)
+        for tick in range(1, 4):  # it does not move on its way to 0
+            e.measure(replace(state, stamp=0.2 * tick), 0.2 * tick)
+        stalled = e.predict(0.7)
+        assert stalled is not None
+        assert stalled.tau_est[0] == pytest.approx(seen)
 
 
 @pytest.mark.parametrize("goal", [3.0, 1.0])

@@ -1054,14 +1054,17 @@ def test_calibration_is_not_misled_by_a_pause_of_the_machine(tmp_path: Path) -> 
 
 @pytest.mark.usefixtures("_patient_servo")
 def test_the_force_table_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dexkit.cli.calibrate._FORCE_EFFORTS", (10.0, 30.0))
+    monkeypatch.setattr("dexkit.cli.calibrate._FORCE_EFFORTS", (10.0, 40.0))
     path = tmp_path / "ezgripper.json"
     with emulated(start=80.0, object_pct=50.0) as gripper:
         key = os.path.abspath(gripper.path)
         path.write_text(json.dumps({"calibration": {key: ZERO}}))
         result = CliRunner().invoke(
             calibrate_command,
-            ["--device", gripper.path, "--config", str(path), "--force", "--yes"],
+            [
+                *("--device", gripper.path, "--config", str(path)),
+                *("--force", "--up-to", "30", "--yes"),
+            ],
             input="2\n6\n",
         )
         assert result.exit_code == 0, (result.output, result.exception)

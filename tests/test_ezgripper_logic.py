@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.drivers.ezgripper import block, config, scaling
+from dexkit.drivers.ezgripper import block, calibration, config, scaling
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import MIN_FREE_SPEED, ContactDetector
 from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
@@ -726,3 +726,41 @@ def test_environment_variable_sets_calibration_file(
     assert config.default_path().name == "ezgripper.json"
     assert config.record_key("DA1Z9T40", 1) == "DA1Z9T40"
     assert config.record_key("DA1Z9T40", 3) == "DA1Z9T40#3"
+
+
+# --- calibration
+
+
+class _Answering:
+    """A servo that moves with ``speed`` percent a second, ``late`` seconds after each new goal."""
+
+    def __init__(self, speed: float, late: float) -> None:
+        self.speed, self.late = speed, late
+        self.now, self.position, self.goal, self.since = 0.0, float(ZERO), ZERO, 0.0
+
+    def sample(self) -> Sample:
+        return _sample(self.now, round(self.position))
+
+    def exchange(self, goal: Goal) -> Sample:
+        if goal.position != self.goal:
+            self.goal, self.since = goal.position, self.now
+        self.now += 0.005
+        if self.now - self.since > self.late:
+            way = self.goal - self.position
+            step = self.speed * scaling.TICKS_PER_PERCENT * 0.005
+            self.position += math.copysign(min(abs(way), step), way)
+        return self.sample()
+
+    def engage(self, goal: Goal) -> None:
+        self.exchange(goal)
+
+    def rearm_watchdog(self) -> None:
+        raise AssertionError
+
+
+def test_the_overhead_of_a_move_is_not_its_distance_over_the_speed() -> None:
+    for way in calibration.measure_distances(_Answering(150.0, 0.05), ZERO):
+        assert way.speed == pytest.approx(150.0, rel=0.03)
+        # less the last percent, from which on a move counts as done
+        assert way.overhead == pytest.approx(0.05 - 1 / 150, abs=0.01)
+        assert [percent for percent, _ in way.times] == list(calibration.DISTANCES)

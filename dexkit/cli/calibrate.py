@@ -16,6 +16,7 @@ from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.config import GripperRecord, Store
+from dexkit.drivers.ezgripper.control import ControlSettings
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.gripper import stored_device
 from dexkit.drivers.ezgripper.scaling import amperes
@@ -28,8 +29,8 @@ from dexkit.wire import mx64
 
 __all__ = ["command"]
 
-_FORCE_EFFORTS = (10.0, 15.0, 20.0, 30.0, 40.0)
-"""Percent; more would heat the motor while the gauge is read."""
+_FORCE_EFFORTS = (10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 80.0)
+"""Percent, as far as they are below the most that is asked for."""
 
 
 class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
@@ -91,7 +92,21 @@ class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
     show_default=True,
     help="Strokes each way for --speed.",
 )
+@click.option(
+    "--distances",
+    is_flag=True,
+    help="With --speed: also time moves of several distances, and print the overhead of a move.",
+)
 @click.option("--force", is_flag=True, help="Instead, measure the force table with a gauge.")
+@click.option(
+    "--up-to",
+    type=Number(10, 100),
+    default=ControlSettings().effort,
+    show_default=True,
+    metavar="PCT",
+    help="With --force: the largest effort; that of 'serve --set effort=PCT'. The more, the warmer "
+    "the motor while the gauge is read.",
+)
 @click.option(
     "--set-baudrate",
     type=click.Choice([str(b) for b in mx64.BAUD_RATES.values() if b < 4_500_000]),
@@ -120,7 +135,9 @@ def command(
     effort: float,
     speed: bool,
     runs: int,
+    distances: bool,
     force: bool,
+    up_to: float,
     set_baudrate: str | None,
     config: Path | None,
     dry_run: bool,
@@ -156,6 +173,8 @@ def command(
         )
     if device is None:
         device = stored_device(store, Side(side))
+    if distances and (force or not speed):
+        raise UsageError("--distances is for --speed", hint="give both: --speed --distances")
     console = Console()
     configuration = GripperSettings(
         id=servo_id if isinstance(servo_id, int) else None,
@@ -182,9 +201,11 @@ def command(
                 console.print(f"servo {servo.id} is at {set_baudrate} baud now")
             console.print(f"servo {servo.id} on {servo.bus.path} is set up; key {hand.key}")
             if force:
-                record = GripperRecord(force_table=_force(hand, servo, console, stop))
+                record = GripperRecord(force_table=_force(hand, servo, console, stop, up_to))
             else:
-                record = _zero_and_speed(servo, console, stop, effort, runs if speed else 0)
+                record = _zero_and_speed(
+                    servo, console, stop, effort, runs if speed else 0, distances=distances
+                )
         except calibration.CalibrationFailed:
             if stop:
                 raise click.Abort from None
@@ -208,7 +229,13 @@ def _refuse_foreign(ctx: click.Context, known: set[str], gripper: str) -> None:
 
 
 def _zero_and_speed(
-    servo: Servo, console: Console, stop: StopRequest, effort: float, runs: int
+    servo: Servo,
+    console: Console,
+    stop: StopRequest,
+    effort: float,
+    runs: int,
+    *,
+    distances: bool,
 ) -> GripperRecord:
     def progress(text: str) -> None:
         console.print(text)
@@ -224,17 +251,26 @@ def _zero_and_speed(
         servo, zero, runs=runs, progress=progress, cancelled=cancelled
     )
     console.print(f"speed: opens {result.opening:.0f} %/s, closes {result.closing:.0f} %/s")
+    if distances:
+        ways = calibration.measure_distances(servo, zero, progress=progress, cancelled=cancelled)
+        for verb, way in zip(("open", "close"), ways, strict=True):
+            console.print(
+                f"overhead of a move: {1e3 * way.overhead:.0f} ms to {verb}, beside "
+                f"{way.speed:.0f} %/s; not stored, and in no prediction"
+            )
     return GripperRecord(zero=zero, opening=result.opening, closing=result.closing)
 
 
-def _force(hand: EZGripper, servo: Servo, console: Console, stop: StopRequest) -> ForceTable:
+def _force(
+    hand: EZGripper, servo: Servo, console: Console, stop: StopRequest, up_to: float
+) -> ForceTable:
     zero = hand.record.zero
     if zero is None:
         raise UsageError(
             "the zero is not known yet", hint="run 'dexkit calibrate' without --force first"
         )
     points = [(0.0, 0.0)]
-    for effort in _FORCE_EFFORTS:
+    for effort in (*(e for e in _FORCE_EFFORTS if e < up_to), up_to):
         asked = _Question()
         current = calibration.measure_current(
             servo, zero, effort, asked.holding, cancelled=lambda: bool(stop)

@@ -95,6 +95,14 @@ _LONELY = 10.0  # seconds without a client before a hint
     help="Predict positions between measurements: auto does below 200 measurements a second.",
 )
 @click.option(
+    "--stall-tau",
+    type=Number(0, 100),
+    default=0.0,
+    metavar="NM",
+    help="tau_est of a joint whose prediction has met something, where less is measured: the only "
+    "sense of touch of a hand that reports positions alone.  [default: as measured]",
+)
+@click.option(
     "--fill",
     type=click.Choice([f.value for f in Fill]),
     default=Fill.KNOWN.value,
@@ -119,6 +127,7 @@ def command(
     interface: str,
     state_rate: float | None,
     estimator: str,
+    stall_tau: float,
     fill: str,
     wait_for_device: bool,
     force: bool,
@@ -177,6 +186,7 @@ def command(
                 phase=_PHASE + (1 - _PHASE) * i / len(groups),
                 estimation=Estimation(estimator),
                 fill=Fill(fill),
+                stall_tau=stall_tau,
                 wait_for_device=wait_for_device,
                 force=force,
             )

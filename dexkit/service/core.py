@@ -61,6 +61,7 @@ class HandCore:
     """The state of one served hand.
 
     :param soft_start: limit the velocity of the first motion; by default for real hands only.
+    :param stall_tau: see :class:`~dexkit.service.estimator.StateEstimator`.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class HandCore:
         *,
         estimation: Estimation = Estimation.AUTO,
         soft_start: bool | None = None,
+        stall_tau: float = 0.0,
     ) -> None:
         self.spec = spec
         self.counters = HandCounters()
@@ -82,7 +84,8 @@ class HandCore:
         self._brake = HandCommand.brake(spec.n_joints)
         # guards the estimator, which all three threads touch, and the time-outs, which two do
         self._lock = threading.Lock()
-        self._estimator = StateEstimator(spec)
+        self._stall_tau = stall_tau
+        self._estimator = StateEstimator(spec, stall_tau=stall_tau)
         self._speeds: Sequence[tuple[float, float]] | None = None
         self._following = self._brake  # what the estimator is to follow when it is needed
         self._resyncs = 0  # of estimators before this one
@@ -378,7 +381,7 @@ class HandCore:
 
     def _begin_prediction(self, now: float) -> None:
         self._resyncs += self._estimator.resyncs
-        self._estimator = StateEstimator(self.spec, self._speeds)
+        self._estimator = StateEstimator(self.spec, self._speeds, stall_tau=self._stall_tau)
         self._estimator.follow(self._following, now)
 
     def _mark_stale(self, view: StateView) -> StateView:

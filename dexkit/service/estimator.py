@@ -37,7 +37,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexkit.errors import UsageError
-from dexkit.hand import HandCommand, HandSpec, HandState, JointSpec
+from dexkit.hand import Floats, HandCommand, HandSpec, HandState, JointSpec
 
 __all__ = ["CORRECTION", "STALL_THRESHOLD", "JointEstimator", "StateEstimator"]
 
@@ -77,6 +77,11 @@ class JointEstimator:
     def travelling(self) -> bool:
         """Whether the model is on its way to the command."""
         return self._travelling
+
+    @property
+    def blocked(self) -> int:
+        """Direction in which the joint is stalled, +1 or -1; 0 where it is not."""
+        return self._blocked
 
     @property
     def stalled(self) -> bool:
@@ -171,15 +176,24 @@ class StateEstimator:
     :param spec: of the hand.
     :param speeds: per joint, speeds toward larger and toward smaller q, rad/s; without it each
         joint's ``dq_max`` both ways.
+    :param stall_tau: magnitude of tau_est of a joint that is stalled, N·m, where less was
+        measured; 0 leaves what was measured.
     """
 
-    def __init__(self, spec: HandSpec, speeds: Sequence[tuple[float, float]] | None = None) -> None:
+    def __init__(
+        self,
+        spec: HandSpec,
+        speeds: Sequence[tuple[float, float]] | None = None,
+        *,
+        stall_tau: float = 0.0,
+    ) -> None:
         if speeds is not None and len(speeds) != spec.n_joints:
             raise UsageError(f"{len(speeds)} pairs of speeds for {spec.n_joints} joint(s)")
         self.joints = [
             JointEstimator(joint, speeds[i] if speeds is not None else None)
             for i, joint in enumerate(spec.joints)
         ]
+        self._stall_tau = stall_tau
         self._last: HandState | None = None
 
     @property
@@ -213,7 +227,15 @@ class StateEstimator:
             return None
         q = np.array([joint.predict(now) for joint in self.joints])
         dq = np.array([joint.dq for joint in self.joints])
-        return replace(last, q=q, dq=dq, measured=False)
+        return replace(last, q=q, dq=dq, tau_est=self._torques(last.tau_est), measured=False)
+
+    def _torques(self, measured: Floats) -> Floats:
+        """Those measured, and of stalled joints at least ``stall_tau`` toward their goal."""
+        if not self._stall_tau or not self.stalled:
+            return measured
+        blocked = np.array([joint.blocked for joint in self.joints])
+        least = blocked * self._stall_tau
+        return np.where(np.abs(np.nan_to_num(measured)) < np.abs(least), least, measured)
 
 
 def _sign(value: float) -> int:

@@ -114,6 +114,7 @@ class HandService:
     :param publisher: publishes the state, at its own rate, also for other services.
     :param phase: when in a period the hand is exchanged with, 0 to 1; state is published at 0.
     :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
+    :param stall_tau: N·m of tau_est that a joint whose prediction is stalled has at least.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
     :param force: start, and go on, even if another program publishes the state topic.
     :raises UsageError: hands and dialect do not fit.
@@ -147,6 +148,7 @@ class HandService:
         wait_for_device: bool = False,
         force: bool = False,
         soft_start: bool | None = None,
+        stall_tau: float = 0.0,
         clock: Clock | None = None,
     ) -> None:
         group = list(hands) if isinstance(hands, Sequence) else [hands]
@@ -183,6 +185,7 @@ class HandService:
                     self._clock,
                     estimation=estimation,
                     soft_start=soft_start,
+                    stall_tau=stall_tau,
                 ),
                 self._clock,
             )

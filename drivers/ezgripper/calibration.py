@@ -14,7 +14,7 @@ No I/O of its own: it works on a :class:`Drive` and a clock.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol
@@ -34,11 +34,14 @@ from dexkit.errors import HandError
 from dexkit.wire import mx64
 
 __all__ = [
+    "DISTANCES",
     "CalibrationFailed",
+    "DistanceResult",
     "Drive",
     "SpeedResult",
     "find_zero",
     "measure_current",
+    "measure_distances",
     "measure_speed",
     "move",
 ]
@@ -108,6 +111,21 @@ class SpeedResult:
     opening: float
     closing: float
     runs: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class DistanceResult:
+    """How long moves of several distances take, one way.
+
+    :param speed: of the moves, percent of stroke a second.
+    :param overhead: seconds that each move takes besides its distance over the speed: answer,
+        acceleration, and coming to rest.
+    :param times: (percent of stroke, seconds) of each move.
+    """
+
+    speed: float
+    overhead: float
+    times: tuple[tuple[float, float], ...]
 
 
 def _ignore_progress(text: str) -> None:
@@ -275,6 +293,67 @@ def measure_speed(
         closing=sum(c for _, c in results) / runs,
         runs=tuple(results),
     )
+
+
+DISTANCES = (20.0, 40.0, 60.0, 80.0, 100.0)
+"""Percent of stroke of the moves by which the overhead of a move is measured."""
+
+
+def measure_distances(
+    drive: Drive,
+    zero: int,
+    *,
+    distances: Sequence[float] = DISTANCES,
+    effort: float = 100.0,
+    progress: Progress = _ignore_progress,
+    cancelled: Cancelled = _never_cancelled,
+) -> tuple[DistanceResult, DistanceResult]:
+    """Time moves of several distances; return what opening and what closing takes.
+
+    The overhead is where the straight line through times over distances meets distance 0 (the
+    note on predictive state, "fixed overhead"). A move lasts from its command until the fingers
+    are within a percent of the goal.
+
+    :param zero: ticks, in any turn.
+    :param distances: percent of stroke, two at least; each is opened from closed, and closed again.
+    :raises CalibrationFailed: the fingers do not complete a move.
+    """
+    opening: list[tuple[float, float]] = []
+    closing: list[tuple[float, float]] = []
+    _stroke(drive, zero, 0, effort=EFFORT, speed=SPEED, cancelled=cancelled)
+    for percent in distances:
+        goal = round(percent * TICKS_PER_PERCENT)
+        for target, found in ((goal, opening), (0, closing)):
+            track = _stroke(
+                drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled
+            )
+            found.append((percent, _arrival(track, zero, target)))
+        progress(
+            f"{percent:g} %: opens in {opening[-1][1]:.3f} s, closes in {closing[-1][1]:.3f} s"
+        )
+    return _line(opening), _line(closing)
+
+
+def _arrival(track: Track, zero: int, target: int) -> float:
+    """Seconds from the first exchange of a move until it is within a percent of its goal."""
+    begin = track.samples[0].time
+    for sample in track.samples:
+        if abs(relative_position(sample.position, zero) - target) <= TICKS_PER_PERCENT:
+            return sample.time - begin
+    return track.end.time - begin
+
+
+def _line(times: Sequence[tuple[float, float]]) -> DistanceResult:
+    """The line through (percent, seconds), by least squares."""
+    n = len(times)
+    mean_x, mean_y = (sum(column) / n for column in zip(*times, strict=True))
+    spread = sum((x - mean_x) ** 2 for x, _ in times)
+    slope = sum((x - mean_x) * (y - mean_y) for x, y in times) / spread if spread else 0.0
+    if slope <= 0:
+        raise CalibrationFailed(
+            "longer moves do not take longer", hint="give several distances; try again"
+        )
+    return DistanceResult(1.0 / slope, mean_y - slope * mean_x, tuple(times))
 
 
 def _stroke(
