@@ -17,6 +17,10 @@ from dexkit.hand import Floats, HandSpec, HandState
 
 __all__ = ["WEAR_SETTING", "JointWear", "Wear", "Worn", "parse_wear"]
 
+SLOTS = 12
+"""Values of a packet of tactile elements."""
+_NUMBERS = {"friction": (0, 1000), "speed": (0.01, 1), "play": (0, 10)}
+"""Wear in numbers, and from where to where."""
 WEAR_SETTING = {
     "wear": "friction=FACTOR, speed=PART, play=RAD, dead, each of all joints or @JOINT; "
     "element=PACKET.SLOT (dead); e.g. friction@index_0=3,dead@index_1"
@@ -40,7 +44,7 @@ class JointWear:
     dead: bool = False
 
     def __post_init__(self) -> None:
-        for name, low, high in (("friction", 0, 1000), ("speed", 0.01, 1), ("play", 0, 10)):
+        for name, (low, high) in _NUMBERS.items():
             if not low <= getattr(self, name) <= high:
                 raise UsageError(f"wear: {name} must be {low} to {high}")
 
@@ -71,22 +75,35 @@ def parse_wear(text: str, spec: HandSpec) -> Wear:
         if at and name not in names:
             raise UsageError(f"wear: no joint {one_line(name)!r}", hint=", ".join(names))
         if kind == "element":
-            packet, _, slot = value.partition(".")
-            if not (packet.isdigit() and slot.isdigit() and int(packet) < spec.n_sensors):
-                raise UsageError(f"wear: {one_line(item)} is not element=PACKET.SLOT of this hand")
-            elements.add((int(packet), int(slot)))
+            elements.add(_element(value, spec))
             continue
-        try:
-            given = {kind: True if kind == "dead" and not value else float(value)}
-            for index in [names.index(name)] if at else range(len(names)):
-                joints[index] = replace(joints.get(index, JointWear()), **given)  # type: ignore[arg-type]
-        except (TypeError, ValueError) as error:
-            if isinstance(error, UsageError):
-                raise
+        if kind == "dead" and not value:
+            given: dict[str, float | bool] = {"dead": True}
+        elif kind in _NUMBERS:
+            given = {kind: _number(value)}
+        else:
             raise UsageError(
-                f"wear: {one_line(item)} is not understood", hint=WEAR_SETTING["wear"]
-            ) from None
+                f"wear: {one_line(item, 60)} is not understood", hint=WEAR_SETTING["wear"]
+            )
+        for index in [names.index(name)] if at else range(len(names)):
+            joints[index] = replace(joints.get(index, JointWear()), **given)  # type: ignore[arg-type]
     return Wear(joints, frozenset(elements))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"wear: {one_line(text, 60)!r} is not a number") from None
+
+
+def _element(text: str, spec: HandSpec) -> tuple[int, int]:
+    """(packet, slot) of a tactile element."""
+    for packet in range(spec.n_sensors):
+        for slot in range(SLOTS):
+            if text == f"{packet}.{slot}":
+                return packet, slot
+    raise UsageError(f"wear: {one_line(text, 60)!r} is not PACKET.SLOT of this hand")
 
 
 class Worn:

@@ -39,6 +39,7 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("replay",): [_SAMPLE],
     ("report",): ["<result>"],
     ("sign",): ["<result>", "--key", "<result>"],
+    ("selftest",): ["--external", "--dialect", "unitree_go", "--side", "left"],
     ("serve",): ["sim-dex1", "--side", "left"],
     ("teleop",): ["full-stroke"],
     ("verify",): ["<result>", "--public-key", "<result>"],

@@ -54,7 +54,7 @@ from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.documents import write_file
 from dexkit.escaping import html as escape
 
-__all__ = ["document", "render", "write_html"]
+__all__ = ["document", "render", "utc", "write_html"]
 
 _STYLE = Path(__file__).with_name("report.css")
 _PLOT_BUDGET = 1_000_000
@@ -240,7 +240,7 @@ def _stage(side: str, stage: Stage) -> str:
 def _facts(result: RunResult) -> str:
     about = dict(result.subject)
     rows = [(k.replace("_", " ").replace("sha256", "SHA-256"), v) for k, v in about.items() if v]
-    rows.append(("recorded", f"{_utc(result.recorded_at)}, {result.duration_s:.1f} s"))
+    rows.append(("recorded", f"{utc(result.recorded_at)}, {result.duration_s:.1f} s"))
     if result.claims is not None:
         has = [name for name, claimed in result.claims.items() if claimed]
         lacks = [name for name in CAPABILITIES if name not in has]
@@ -251,7 +251,8 @@ def _facts(result: RunResult) -> str:
     return _definitions(rows)
 
 
-def _utc(text: str) -> str:
+def utc(text: str) -> str:
+    """An ISO time for readers."""
     try:
         return datetime.fromisoformat(text).strftime("%Y-%m-%d %H:%M:%S UTC")
     except ValueError:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dexkit.conformance.report.charts import Level, Line, chart
 from dexkit.conformance.report.curves import STYLE
-from dexkit.conformance.report.html import document
+from dexkit.conformance.report.html import document, utc
 from dexkit.conformance.report.tables import table, unbroken
 from dexkit.conformance.selftest.bench import Series
 from dexkit.conformance.selftest.figures import BY_NAME, KINDS, Figure, Unit, Wear
@@ -155,7 +155,10 @@ def _head(result: SelfTestResult, profile: HandModel) -> str:
     if wrong:
         texts.append(f"{wrong} figure{'s are' if wrong > 1 else ' is'} outside what the model says")
     if worn:
-        texts.append(f"{worn} became worse since {result.baseline['recorded_at']}")
+        texts.append(
+            f"{worn} figure{'s are' if worn > 1 else ' is'} worse than on "
+            f"{utc(result.baseline['recorded_at'])}"
+        )
     if str(result.ended) != "done":
         texts.append(f"the test ended early: {result.reason}")
     if result.spoiled:
@@ -178,10 +181,10 @@ def _facts(result: SelfTestResult) -> str:
     baseline = result.baseline
     rows = {
         "hand": ", ".join(v for k, v in result.hand.items() if v),
-        "recorded": f"{result.recorded_at}, {result.duration_s:.0f} s",
+        "recorded": f"{utc(result.recorded_at)}, {result.duration_s:.0f} s",
         "limits": f"{result.options['speed']:.0%} of the full speed; a command at most "
         f"{result.options['lead']:g} ahead of its joint; {result.options['rate']:.0f} exchanges/s",
-        "compared with": f"{baseline['file']} of {baseline['recorded_at']}"
+        "compared with": f"{baseline['file']} of {utc(baseline['recorded_at'])}"
         if baseline
         else "no earlier run",
         "ended": result.reason,
@@ -207,15 +210,20 @@ def _findings(result: SelfTestResult) -> str:
 
 
 def _joints(result: SelfTestResult, profile: HandModel) -> str:
-    shown = [k for k in KINDS if any(_has(j, k.name) for j in result.joints)]
-    heads = ("joint", "moves", *(escape(k.title) for k in shown))
+    columns: dict[str, list[str]] = {}
+    for kind in KINDS:
+        if any(_has(j, kind.name) for j in result.joints):
+            columns.setdefault(kind.title.partition(",")[0], []).append(kind.name)
     rows = []
     for joint in result.joints:
         css = "bad" if "condition" in joint.faulty else "ok"
-        moves = f'<span class="{css}">{escape(str(joint.condition))}</span>'
-        cells = [_cell(joint, k.name, profile) for k in shown]
+        moves = f'<b class="{css}">{escape(str(joint.condition))}</b>'
+        cells = ["".join(_cell(joint, n, profile) for n in names) for names in columns.values()]
         rows.append((unbroken(escape(joint.name)), moves, *cells))
-    return "<h2>Joints</h2>" + table(heads, rows)
+    both = any(len(names) > 1 for names in columns.values())
+    about = "<p>Of two figures, the first is with q rising.</p>" if both else ""
+    heads = ("joint", "moves", *map(escape, columns))
+    return f"<h2>Joints</h2>{about}" + table(heads, rows)
 
 
 def _has(joint: JointResult, name: str) -> bool:
@@ -225,7 +233,7 @@ def _has(joint: JointResult, name: str) -> bool:
 def _cell(joint: JointResult, name: str, profile: HandModel) -> str:
     figure = next((f for f in joint.figures if f.name == name), None)
     if figure is None or not math.isfinite(figure.value):
-        return '<span class="na">-</span>'
+        return "<div>-</div>"
     bad = not figure.good or figure.wear is Wear.WORN
     css = "bad" if bad else "ok" if figure.wear is Wear.BETTER else ""
     text = unbroken(escape(_value(figure, profile)))
@@ -233,7 +241,7 @@ def _cell(joint: JointResult, name: str, profile: HandModel) -> str:
         text = f'<b class="{css}">{text}</b>'
     if math.isfinite(figure.before):
         text += f"<span>was {unbroken(escape(_value(figure, profile, before=True)))}</span>"
-    return text
+    return f"<div>{text}</div>"
 
 
 def _elements(result: SelfTestResult) -> str:

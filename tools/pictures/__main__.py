@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
 
 from PIL import Image
@@ -108,7 +109,7 @@ def pictures(only: Sequence[str]) -> None:
         if asked("selftest"):
             path = folder / "selftest.html"
             path.write_text(worn_page())
-            with Browser(folder / "f", 1000, 760) as browser:
+            with Browser(folder / "f", 1000, 1000) as browser:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelectorAll('svg').length > 3")
                 save(browser.picture(), "selftest")
@@ -133,7 +134,10 @@ def worn_page() -> str:
         run(hand, test, clock=clock)
         about = {"backend": "sim-dex1", "name": "A7"}
         baseline = results[0] if results else None
-        results.append(result_of(test, about, baseline=baseline, baseline_name="new.json"))
+        when = datetime(2026, 3 + len(results), 4, 10, 15, tzinfo=timezone.utc)
+        results.append(
+            result_of(test, about, baseline=baseline, baseline_name="new.json", now=when)
+        )
     return render_selftest(results[1], results[0])
 
 
