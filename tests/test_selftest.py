@@ -64,7 +64,9 @@ class Over:
 
     def __init__(self, inner: Hand, change: Callable[[HandCommand, HandState], HandState]) -> None:
         self.inner, self.change = inner, change
+        self.alter: Callable[[HandCommand, HandState], HandCommand] | None = None
         self.commands: list[HandCommand] = []
+        self.last: HandState | None = None
 
     @property
     def spec(self) -> HandSpec:
@@ -78,7 +80,10 @@ class Over:
 
     def exchange(self, command: HandCommand) -> HandState:
         self.commands.append(command)
-        return self.change(command, self.inner.exchange(command))
+        if self.alter is not None and self.last is not None:
+            command = self.alter(command, self.last)
+        self.last = self.inner.exchange(command)
+        return self.change(command, self.last)
 
 
 def same(command: HandCommand, state: HandState) -> HandState:
@@ -108,12 +113,14 @@ def examined(
     clock: ManualClock | None = None,
     change: Callable[[HandCommand, HandState], HandState] = same,
     turn: Callable[[SelfTest], object] = lambda test: None,
+    alter: Callable[[HandCommand, HandState], HandCommand] | None = None,
 ) -> tuple[SelfTest, Over]:
     clock = clock or ManualClock(7.0)
     inner = HANDS[name](clock)
     if wear:
         inner.wear(parse_wear(wear, inner.spec))
     hand = Over(inner, change)
+    hand.alter = alter
     hand.open()
     setup = Setup.of(hand.spec, rate=100.0)
     speed = 1.0 if setup.servo else 0.5
@@ -212,18 +219,19 @@ def test_no_motor_gives_more_than_its_lead_allows() -> None:
 
 
 def test_a_joint_that_moves_the_wrong_way_is_left_alone() -> None:
-    fast = 0.0
-
     def mirrored(command: HandCommand, state: HandState) -> HandState:
-        nonlocal fast
-        fast = max(fast, abs(float(state.dq[0])))
         return replace(state, q=5.4 - state.q, dq=-state.dq)
 
-    test, _ = examined("dex1", change=mirrored)
-    result = result_of(test, {})
-    assert result.joints[0].condition is Condition.REVERSED
-    assert result.verdict is Verdict.FAULTY
-    assert fast < 13.0, "what its client would cause, and not for long"
+    def driven_back(command: HandCommand, state: HandState) -> HandCommand:
+        return replace(command, q=2 * state.q - command.q)
+
+    for change, alter in ((mirrored, None), (same, driven_back)):
+        test, hand = examined("dex1", change=change, alter=alter)
+        result = result_of(test, {})
+        assert result.joints[0].condition is Condition.REVERSED
+        assert result.verdict is Verdict.FAULTY
+        driven = [c for c in hand.commands if not c.is_brake and c.kp[0] > 0]
+        assert len(driven) < 120, "it is not driven any more"
 
 
 def test_crossed_joints_are_named() -> None:

@@ -225,6 +225,17 @@ class Bench:
         self.x = self.state.q.copy() if self.state is not None else self.x
         return seen
 
+    def stays(self, joint: int, most: float) -> Turns[bool]:
+        """Tell a joint to stay where it is; False as soon as it has moved by more than ``most``."""
+        assert self.state is not None
+        begin = self.x[joint] = float(self.state.q[joint])
+        end = self.state.stamp + SETTLE
+        while self.state.stamp < end:
+            yield from self.turn()
+            if abs(float(self.state.q[joint]) - begin) > most:
+                return False
+        return True
+
     def settle(self, joint: int) -> Turns[None]:
         """Stay commanded until a joint has come to rest, or does not."""
         assert self.state is not None
@@ -313,6 +324,10 @@ class Bench:
             dt = yield from self.turn(dq)
 
     # -- what was measured -----------------------------------------------------------------------
+
+    def forget(self) -> None:
+        """Drop the samples so far, and with them every mark: a long test need not keep them all."""
+        del self.t[:-2], self._rows[:-2]
 
     @property
     def mark(self) -> int:

@@ -24,7 +24,7 @@ __all__ = ["ElementFound", "Found", "JointFound", "Procedure"]
 _STILL = 1.0  # seconds at rest, for noise and temperatures
 _NUDGE = 0.08  # part of the stroke
 _ALIVE = 0.35  # part of that by which a joint has moved
-_ALIEN = 0.1  # part of its stroke by which another joint has moved, too
+_STAYS = 0.05  # part of the stroke by which a joint that is told to stay may move
 _CREEP = 30.0  # seconds for a stroke
 _STARTED = 0.005  # part of the stroke that is motion
 _REPEATS = 3
@@ -211,6 +211,9 @@ class Procedure:
         way = _NUDGE * spec.stroke
         slow = float(bench.slow[j])
         begin = max(bench.mark - 1, 0)
+        if not (yield from bench.stays(j, _STAYS * spec.stroke)):
+            joint.nudged, joint.alive, joint.sign = True, False, -1
+            return
         moved = yield from bench.move(j, q + direction * way, slow, settle=True)
         by = bench.moved(begin)
         joint.nudged = True
@@ -219,8 +222,7 @@ class Procedure:
         joint.moves = tuple(
             other.name
             for k, other in enumerate(self.setup.spec.joints)
-            if abs(by[k]) > (_ALIVE * way if k == j else max(_ALIEN * strokes[k], 0.0))
-            and (k == j or k not in shared)
+            if abs(by[k]) > _ALIVE * min(way, _NUDGE * strokes[k]) and (k == j or k not in shared)
         )
         joint.alive = abs(by[j]) > _ALIVE * way
         joint.sign = -1 if moved.against or direction * by[j] < -_ALIVE * way else 1
@@ -233,6 +235,7 @@ class Procedure:
 
     def _thoroughly(self, j: int, k: int, of: int) -> Turns[None]:
         joint = self.found.joints[j]
+        self.bench.forget()
         tests = (
             ("its range", self._range),
             ("torque to start", self._starts),

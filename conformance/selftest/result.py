@@ -170,7 +170,8 @@ class SelfTestResult:
     @property
     def verdict(self) -> Verdict:
         """What is said of the hand; never good where something that was asked for is missing."""
-        if any(j.faulty for j in self.joints) or any(e.faulty for e in self.elements):
+        wrong = any(j.faulty for j in self.joints) or any(e.faulty for e in self.elements)
+        if wrong or self.ended is End.FAULT:
             return Verdict.FAULTY
         if any(j.worn for j in self.joints) or any(e.worn for e in self.elements):
             return Verdict.WORN

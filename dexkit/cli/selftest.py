@@ -150,7 +150,12 @@ def command(backend_name: str | None, **given: Any) -> int:
         check_output_paths([json_path, page], [given["baseline"]])
         joints = _joints([joint.name for joint in spec.joints], given["joints"])
         touch = _touch(spec.model, given["touch"])
-        hand.open()
+        try:
+            hand.open()
+        except DdsError:
+            if stop:  # while it waited for the hand
+                return 130
+            raise
         stack.callback(hand.close)
         setup = Setup.of(
             hand.spec,  # opening may have refined its rate
