@@ -86,7 +86,7 @@ def parse_wear(text: str, spec: HandSpec) -> Wear:
                 f"wear: {one_line(item, 60)} is not understood", hint=WEAR_SETTING["wear"]
             )
         for index in [names.index(name)] if at else range(len(names)):
-            joints[index] = replace(joints.get(index, JointWear()), **given)  # type: ignore[arg-type]
+            joints[index] = JointWear(**{**vars(joints.get(index, JointWear())), **given})
     return Wear(joints, frozenset(elements))
 
 

@@ -123,7 +123,7 @@ def examined(
     hand.alter = alter
     hand.open()
     setup = Setup.of(hand.spec, rate=100.0)
-    speed = 1.0 if setup.servo else 0.5
+    speed = 1.0 if setup.servo else 0.25
     test = SelfTest(Procedure(setup, joints=joints, speed=speed, touch=touch))
     run(hand, test, clock=clock, turn=turn)
     return test, hand
@@ -151,7 +151,7 @@ def test_a_new_gripper_has_nothing_wrong() -> None:
     assert figures["start+"] == pytest.approx(0.09, abs=0.01)  # the emulator's Coulomb friction
     assert figures["range"] == pytest.approx(5.4, abs=0.02)
     assert figures["play"] < 0.003
-    assert figures["speed+"] == pytest.approx(12.0, rel=0.05)
+    assert figures["speed+"] == pytest.approx(6.0, rel=0.05)
     assert joint.also["stiffness"] == pytest.approx(5.0, rel=0.02)
 
 
@@ -160,7 +160,7 @@ def test_a_new_gripper_has_nothing_wrong() -> None:
     [
         ("friction=3", ["start+", "start-"], Verdict.WORN),
         ("play=0.05", ["play"], Verdict.WORN),
-        ("speed=0.3", ["speed+", "speed-"], Verdict.FAULTY),
+        ("speed=0.2", ["speed+", "speed-"], Verdict.FAULTY),
         ("dead", ["condition"], Verdict.FAULTY),
     ],
 )

@@ -23,7 +23,7 @@ from dexkit.conformance.selftest.result import (
     Verdict,
 )
 from dexkit.escaping import html as escape
-from dexkit.hand import JointSpec, Side
+from dexkit.hand import Floats, JointSpec, Side
 from dexkit.models import HandModel, model
 
 __all__ = ["Finding", "findings", "print_selftest", "render_selftest"]
@@ -311,7 +311,7 @@ def _effort(
     )
 
 
-def _ways(s: Series | None) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def _ways(s: Series | None) -> list[tuple[str, Floats, Floats]]:
     """(name, q, torque) of the way up and the way down."""
     if s is None or len(s.q) < 3:
         return []
@@ -373,9 +373,10 @@ def _limits(name: str) -> str:
         Unit.SPEED: "of the speed that was asked for",
     }.get(kind.unit)
     word = "at least" if kind.worse < 0 else "at most"
-    scaled = (
-        (lambda v: f"{v:.3g} {kind.unit}") if of is None else (lambda v: f"{100 * v:.3g} % {of}")
-    )
+
+    def scaled(value: float) -> str:
+        return f"{value:.3g} {kind.unit}" if of is None else f"{100 * value:.3g} % {of}"
+
     limit = f"Good: {word} {scaled(kind.limit)}. " if math.isfinite(kind.limit) else ""
     both = [f"{kind.part:.0%} of the earlier figure"] * bool(kind.part)
     both += [scaled(kind.least)] * bool(kind.least)

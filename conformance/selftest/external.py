@@ -95,8 +95,8 @@ class HandWire:
         return HandState.from_values(
             [m.q / self._scale for m in motors],
             stamp=stamp,
-            dq=[m.dq / self._scale for m in motors] * self._speed,
-            tau_est=[m.tau_est for m in motors] * self._torque,
+            dq=np.array([m.dq / self._scale for m in motors]) * self._speed,
+            tau_est=np.array([m.tau_est for m in motors]) * self._torque,
             temperature=temperature[0],
             winding_temperature=temperature[1],
             fault=[int(m.motorstate if full else m.reserve[0]) for m in motors],

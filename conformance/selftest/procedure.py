@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -111,7 +112,7 @@ class Procedure:
         setup: Setup,
         *,
         joints: Sequence[int] | None = None,
-        speed: float = 0.5,
+        speed: float = 0.25,
         touch: bool = False,
     ) -> None:
         self.setup, self.speed = setup, speed
@@ -271,7 +272,7 @@ class Procedure:
         yield from bench.move(j, self._at(j, 0.5), float(bench.slow[j]), settle=True)
         found = []
         for name, direction in (("start+", 1), ("start-", -1)):
-            one = yield from bench.undisturbed(lambda d=direction: self._start(j, d))  # type: ignore[misc]
+            one = yield from bench.undisturbed(partial(self._start, j, direction))
             joint.figures[name] = math.nan if one is None else one.torque
             found += [] if one is None else [one]
         best = max(found, key=lambda s: s.swing, default=measure.Start(math.nan))
@@ -308,7 +309,7 @@ class Procedure:
     def _lags(self, j: int) -> Turns[None]:
         found = []
         for direction in (1, -1, 1, -1):
-            value = yield from self.bench.undisturbed(lambda d=direction: self._lag(j, d))  # type: ignore[misc]
+            value = yield from self.bench.undisturbed(partial(self._lag, j, direction))
             found.append(math.nan if value is None else value)
         known = [value for value in found if math.isfinite(value)]
         self.found.joints[j].figures["lag"] = float(np.median(known)) if known else math.nan
@@ -344,9 +345,7 @@ class Procedure:
                 asked = level * float(self.found.asked_speed[j, column])
                 if name not in going or (asked <= 2 * slow and level < _LEVELS[-1]):
                     continue
-                found = yield from bench.undisturbed(
-                    lambda a=asked, b=begin, g=goal: self._fast(j, b, g, a)  # type: ignore[misc]
-                )
+                found = yield from bench.undisturbed(partial(self._fast, j, begin, goal, asked))
                 reached[name], beyond = found or (math.nan, 0.0)
                 if not (reached[name] >= _KEPT * asked and beyond <= _OVERSHOT):
                     going.discard(name)

@@ -36,8 +36,9 @@ if TYPE_CHECKING:
 
 __all__ = ["command"]
 
-_SPEED = 0.5
-"""Part of the full speed; position servos, whose client asks for all of it, are tried at it."""
+_SPEED = 0.25
+"""Part of the full speed, which needs much less than the torque that is allowed. Position servos,
+whose client asks for all of it, are tried at it."""
 
 
 @click.command("selftest")
@@ -65,7 +66,7 @@ _SPEED = 0.5
     "--speed",
     type=Number(0.05, 1.0),
     metavar="PART",
-    help="Part of the full speed that is tried at most.  [default: 0.5; 1 for position servos]",
+    help="Part of the full speed that is tried at most.  [default: 0.25; 1 for position servos]",
 )
 @click.option(
     "--lead",
