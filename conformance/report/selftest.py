@@ -109,7 +109,8 @@ def _value(figure: Figure, profile: HandModel, *, before: bool = False) -> str:
     if unit is Unit.SPEED:
         return f"{value:.2f} {profile.unit}/s"
     name = profile.torque_unit.replace(" ", "·") if unit is Unit.TORQUE else profile.unit
-    return f"{value + 0.0:.4f} {name}" if abs(value) < 0.1 else f"{value:.3f} {name}"
+    digits = 4 if abs(value) < 0.1 else 3
+    return f"{round(value, digits) + 0.0:.{digits}f} {name}"  # without -0.0000
 
 
 # ---------------------------------------------------------------------------------------- the page
@@ -149,21 +150,20 @@ def _name(result: SelfTestResult) -> str:
 
 def _head(result: SelfTestResult, profile: HandModel) -> str:
     css, title = _TITLES[result.verdict]
-    found = findings(result)
-    worn, wrong = sum(f.worn for f in found), sum(not f.worn for f in found)
+    wrong = sum(len(j.faulty) for j in result.joints) + sum(e.faulty for e in result.elements)
+    worn = sum(len(j.worn) for j in result.joints) + sum(e.worn for e in result.elements)
     texts = []
     if wrong:
-        texts.append(f"{wrong} figure{'s are' if wrong > 1 else ' is'} outside what the model says")
+        texts.append(f"{_count(wrong, 'figure')} outside what the model says")
     if worn:
         texts.append(
-            f"{worn} figure{'s are' if worn > 1 else ' is'} worse than on "
-            f"{utc(result.baseline['recorded_at'])}"
+            f"{_count(worn, 'figure')} worse than on {utc(result.baseline['recorded_at'])}"
         )
     if str(result.ended) != "done":
         texts.append(f"the test ended early: {result.reason}")
     if result.spoiled:
         texts.append(
-            f"{result.spoiled} measurements were spoiled by pauses of the testing machine; "
+            f"{_count(result.spoiled, 'measurement')} spoiled by pauses of the testing machine; "
             "run it again on an idle one"
         )
     if not texts and result.verdict is Verdict.INCOMPLETE:
@@ -175,6 +175,10 @@ def _head(result: SelfTestResult, profile: HandModel) -> str:
         f"<h1>{title}<small>{escape(_name(result))}</small></h1>"
         f"<p>{escape(text[:1].upper() + text[1:])}.</p></header>"
     )
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what} is" if n == 1 else f"{n} {what}s are"
 
 
 def _facts(result: SelfTestResult) -> str:
@@ -215,13 +219,17 @@ def _joints(result: SelfTestResult, profile: HandModel) -> str:
         if any(_has(j, kind.name) for j in result.joints):
             columns.setdefault(kind.title.partition(",")[0], []).append(kind.name)
     rows = []
+    rest = [j.name for j in result.joints if j.condition is Condition.UNTESTED]
     for joint in result.joints:
+        if joint.name in rest:
+            continue
         css = "bad" if "condition" in joint.faulty else "ok"
-        moves = f'<b class="{css}">{escape(str(joint.condition))}</b>'
+        moves = f'<b class="{css}">{unbroken(escape(str(joint.condition)))}</b>'
         cells = ["".join(_cell(joint, n, profile) for n in names) for names in columns.values()]
         rows.append((unbroken(escape(joint.name)), moves, *cells))
     both = any(len(names) > 1 for names in columns.values())
     about = "<p>Of two figures, the first is with q rising.</p>" if both else ""
+    about += f"<p>Not tested: {escape(', '.join(rest))}.</p>" if rest else ""
     heads = ("joint", "moves", *map(escape, columns))
     return f"<h2>Joints</h2>{about}" + table(heads, rows)
 
@@ -258,8 +266,13 @@ def _elements(result: SelfTestResult) -> str:
                 *(_pascal(v) for v in (e.rest, e.noise, e.peak)),
             )
         )
-    about = "" if result.touched else "<p>Nobody was asked to press them.</p>"
-    return f"<h2>Tactile elements</h2>{about}" + table(heads, rows)
+    if not (result.touched or any(e.faulty or e.worn for e in result.elements)):
+        most = max(e.noise for e in result.elements)
+        return (
+            "<h2>Tactile elements</h2><p>Nobody was asked to press them. At rest all "
+            f"{len(rows)} have a value; noise at most {_pascal(most)}.</p>"
+        )
+    return "<h2>Tactile elements</h2>" + table(heads, rows)
 
 
 def _pascal(value: float) -> str:
@@ -436,5 +449,5 @@ def print_selftest(result: SelfTestResult) -> None:
     style = {"ok": "green", "bad": "red", "open": "magenta"}[css]
     why = "" if str(result.ended) == "done" else f": {markup(result.reason)}"
     if result.spoiled:
-        why += f"; {result.spoiled} measurements were spoiled by pauses of this machine"
+        why += f": {_count(result.spoiled, 'measurement')} spoiled by pauses of this machine"
     console.print(f"[bold {style}]{title}[/]{why}", soft_wrap=True)
