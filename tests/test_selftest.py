@@ -210,7 +210,7 @@ def test_no_motor_gives_more_than_its_lead_allows() -> None:
         return now
 
     def stop(test: SelfTest) -> None:
-        if test.now - test.begin > 12.0:
+        if test.now - test.begin > 8.0:
             test.stop(End.STOPPED, "enough")
 
     test, hand = examined("dex1", change=watch, turn=stop)
@@ -307,7 +307,7 @@ def test_the_hand_is_left_at_rest_whatever_happens(
     name: str, what: Callable[[HandState], HandState], reason: str
 ) -> None:
     def change(command: HandCommand, state: HandState) -> HandState:
-        return what(state) if state.stamp > 11.0 else state
+        return what(state) if state.stamp > 9.0 else state
 
     test, hand = examined("dex1", change=change)
     assert test.end is End.FAULT
