@@ -44,7 +44,7 @@ from dexkit.emulators.sim_hand import SimHand
 from dexkit.emulators.simulated import SimulatedHand
 from dexkit.emulators.wear import parse_wear
 from dexkit.errors import HandLost, HandTimeout, UsageError
-from dexkit.hand import Hand, HandCommand, HandSpec, HandState, JointMode, MotorError, Side
+from dexkit.hand import Floats, Hand, HandCommand, HandSpec, HandState, JointMode, MotorError, Side
 from dexkit.messages import message_type
 from dexkit.models import BUILT_IN, Dialect, model
 from dexkit.service.dialects import StateView, dialect_map
@@ -343,8 +343,8 @@ def test_lost_motion_is_what_friction_does_not_explain() -> None:
 
 
 def test_start_delay_and_speed_of_made_series() -> None:
-    t = np.arange(200) * 0.01
-    command = 0.1 * t
+    t: Floats = np.arange(200, dtype=np.float64) / 100
+    command: Floats = 0.1 * t
     q = np.maximum(command - 0.04, 0.0)  # moves once kp 5 gives 0.2
     found = measure.start(command, q, 5.0 * np.roll(command - q, 1), 1, 0.01)
     assert found.torque == pytest.approx(0.2, abs=0.01)
@@ -366,7 +366,13 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
     result.write_json(path)
     again = read_result(path)
     assert again.as_dict() == json.loads(path.read_text()) == result.as_dict()
-    for change in ({"version": 2}, {"format": "x"}, {"surprise": 1}, {"joints": []}):
+    changes: list[dict[str, object]] = [
+        {"version": 2},
+        {"format": "x"},
+        {"surprise": 1},
+        {"joints": []},
+    ]
+    for change in changes:
         path.write_text(json.dumps({**result.as_dict(), **change}))
         with pytest.raises(UsageError):
             read_result(path)

@@ -191,7 +191,8 @@ class Bench:
     @property
     def slow(self) -> Floats:
         """Speed of slow ways: a third of the stroke a second, at most a quarter of the most."""
-        return np.minimum(self.setup.stroke / 3, self.setup.full.min(axis=1) / 4)
+        slow: Floats = np.minimum(self.setup.stroke / 3, self.setup.full.min(axis=1) / 4)
+        return slow
 
     # -- turns -----------------------------------------------------------------------------------
 
