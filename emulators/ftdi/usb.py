@@ -1,0 +1,174 @@
+"""The USB side of an emulated FTDI chip, and a serial line behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from usbip.core import IN, SPEED_FULL, SPEED_HIGH, InterfaceDescriptor, Stall
+from usbip.device import In, Out, USBDevice
+
+from dexkit.clock import Clock, RealClock
+from dexkit.emulators.dex3_mcu.server import Server
+from dexkit.emulators.faults import Fault
+from dexkit.emulators.ftdi.chip import FT232R, ChipModel, FtdiChip
+from dexkit.emulators.serial_line import SerialLine
+
+__all__ = ["FtdiPort", "FtdiUsb"]
+
+_VENDOR_ID = 0x0403
+_IN_ENDPOINT, _OUT_ENDPOINT = 0x81, 0x02
+_VENDOR_CLASS = 0xFF
+_BUSY_TICK = 4e-3  # seconds between looks at devices that move
+
+
+class FtdiUsb:
+    """A USB-serial adapter with devices on its line; plugs into a
+    :class:`~dexkit.emulators.dex3_mcu.server.Server`.
+
+    :param line: with its devices. Its own latency timer is switched off: the chip has one.
+    :param serial: serial number of the adapter.
+    :param check_baudrate: devices at another baud rate than the host's do not understand it.
+
+    A transfer to the host ends with a packet that is not full, as USB has it. Not modelled: the
+    chip's transmit FIFO, which would make a host wait that sends faster than the line.
+    """
+
+    def __init__(
+        self,
+        line: SerialLine,
+        serial: str,
+        *,
+        model: ChipModel = FT232R,
+        clock: Clock | None = None,
+        check_baudrate: bool = True,
+    ) -> None:
+        line.latency_timer = 0.0
+        self.line = line
+        self.serial = serial
+        self._clock: Clock = clock or RealClock()
+        self._check_baudrate = check_baudrate
+        self.chip = FtdiChip(model, self._clock.now())
+        self._transfer = bytearray()
+        self.device: Any = USBDevice(
+            _VENDOR_ID,
+            model.product_id,
+            manufacturer="FTDI",
+            product=f"{model.name} USB UART (emulated)",
+            serial=serial,
+            bcdDevice=model.release,
+        )
+        self.device.set_speed(SPEED_HIGH if model.high_speed else SPEED_FULL)
+        group = self.device.add_group()
+        number = group.claim_interface()
+        triple = (_VENDOR_CLASS, _VENDOR_CLASS, _VENDOR_CLASS)
+        group.add(InterfaceDescriptor(number, 0, 2, *triple).pack())
+        self._in = group.add_endpoint(In(_IN_ENDPOINT, "bulk", model.packet))
+        self._out = group.add_endpoint(Out(_OUT_ENDPOINT, "bulk", model.packet))
+        self._out.on_out = self._received
+        self.device.on_control(None, self._control)
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the adapter is plugged."""
+        return not self.line.unplugged
+
+    def advance(self) -> float | None:
+        """Advance to the present time; return the time of the next event, or None."""
+        now = self._clock.now()
+        self.line.advance_to(now)
+        self.chip.receive(self.line.due(now))
+        self._answer_reads(now)
+        times = [self.line.next_time, self.chip.next_time if self._in._pending else None]
+        if self.line.busy:
+            times.append(now + _BUSY_TICK)
+        return min((time for time in times if time is not None), default=None)
+
+    def attached(self) -> None:
+        """Reset the bus: the chip forgets what the last host had not read."""
+        self._transfer.clear()
+        self.chip = FtdiChip(self.chip.model, self._clock.now())
+        self.device.reset_io()
+
+    def _answer_reads(self, now: float) -> None:
+        pending = self._in._pending  # the package has no question for it
+        size = self.chip.model.packet
+        while pending:
+            packet = self.chip.packet(now)
+            if packet is None:
+                return
+            self._transfer += packet
+            if len(packet) < size or len(self._transfer) + size > pending[0][0]:
+                done = bytes(self._transfer)
+                self._transfer.clear()
+                self._in.write(done)
+
+    def _received(self, endpoint: Any, data: bytes) -> None:
+        now = self._clock.now()
+        if self._check_baudrate:
+            self.line.host_baudrate = self.chip.baudrate
+        self.line.advance_to(now)
+        if self.plugged and not self.chip.breaking:
+            self.line.receive(data, now)
+
+    def _control(self, setup: Any, data: bytes = b"") -> bytes:
+        answer = self.chip.control(setup.bRequest, setup.wValue, setup.wIndex, self._clock.now())
+        if answer is None or (setup.direction == IN and not answer):
+            raise Stall
+        return answer
+
+
+class FtdiPort:
+    """Serves adapters with their lines on USB/IP, in a thread.
+
+    :param adapters: the first is at bus id 1-1, the second at 1-2.
+    :param host: address to bind.
+    :param port: 0 takes any free one.
+    :raises EmulatorError: the port cannot be had.
+    """
+
+    def __init__(
+        self, adapters: Sequence[FtdiUsb], *, host: str = "127.0.0.1", port: int = 0
+    ) -> None:
+        self.adapters = list(adapters)
+        self._server = Server(self.adapters, host=host, port=port)
+        self._server.start()
+
+    @property
+    def url(self) -> str:
+        """``usbip://HOST:PORT``."""
+        return self._server.url
+
+    @property
+    def port(self) -> int:
+        """TCP port of the server."""
+        return self._server.port
+
+    @property
+    def error(self) -> BaseException | None:
+        """What ended the server, or None."""
+        return self._server.error
+
+    @property
+    def failure(self) -> Exception | None:
+        """The first exception on a client's message, which the server has survived, if any."""
+        return self._server.failure
+
+    def inject(self, fault: Fault) -> None:
+        """Have a fault on every line, its time counted from now; from any thread."""
+        for adapter in self.adapters:
+            self._server.call(partial(self._add, adapter, fault))
+
+    def _add(self, adapter: FtdiUsb, fault: Fault) -> None:
+        adapter.line.schedule.add(fault, RealClock().now())
+
+    def close(self) -> None:
+        """Cut clients off and free the port. May be called twice."""
+        self._server.close()
+
+    def __enter__(self) -> FtdiPort:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

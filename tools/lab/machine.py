@@ -1,0 +1,68 @@
+"""The guest: a QEMU process with this machine's files, and nothing but its own network."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+from tools.lab.packages import QEMU, Kernel
+
+__all__ = ["command_line", "run_guest"]
+
+_MEMORY = 2048  # MiB
+_GRACE = 5.0  # seconds to end after being asked
+
+
+def command_line(
+    kernel: Kernel, initramfs: Path, words: Mapping[str, object], *, accelerator: str, cores: int
+) -> list[str]:
+    """QEMU's command line.
+
+    :param words: added to the kernel's command line, as ``lab.NAME=VALUE``.
+    """
+    # The guest has an address and no route: it reaches its host and nothing else.
+    append = ["console=ttyS0", "quiet", "panic=-1", "mitigations=off", "random.trust_cpu=on"]
+    append += [f"lab.{name}={value}" for name, value in words.items()]
+    return [
+        QEMU,
+        *("-accel", "tcg,thread=multi" if accelerator == "tcg" else accelerator),
+        *("-cpu", "max", "-smp", str(cores), "-m", str(_MEMORY)),
+        *("-nodefaults", "-no-reboot", "-display", "none", "-serial", "stdio"),
+        *("-kernel", str(kernel.image), "-initrd", str(initramfs), "-append", " ".join(append)),
+        *("-netdev", "user,id=net", "-device", "virtio-net-pci,netdev=net,romfile="),
+        *("-device", "virtio-rng-pci"),
+        *_share("host", Path("/")),
+        *_share("programs", kernel.programs),
+    ]
+
+
+def _share(name: str, path: Path) -> list[str]:
+    how = f"local,id={name},path={path},security_model=none,readonly=on,multidevs=remap"
+    return ["-fsdev", how, "-device", f"virtio-9p-pci,fsdev={name},mount_tag={name}"]
+
+
+def run_guest(command: list[str], console: Path, patience: float) -> bool:
+    """Run the guest until it switches itself off.
+
+    :param console: gets what it prints.
+    :param patience: seconds after which it is ended.
+    :returns: whether it ended by itself.
+    """
+    with console.open("wb") as output:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+        )
+        try:
+            process.wait(patience)
+            return True
+        except subprocess.TimeoutExpired:
+            return False
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(_GRACE)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()

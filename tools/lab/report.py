@@ -1,0 +1,98 @@
+"""The lab's report: a table for people, JUnit XML for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from dexkit.documents import write_file
+from dexkit.escaping import visible
+
+__all__ = ["REAL", "Case", "junit", "markdown", "write_reports"]
+
+REAL = """\
+What is real: Debian's kernel and its drivers (usbcore, vhci_hcd, usbfs, usbserial, ftdi_sio), its
+device nodes and sysfs, libusb, udev, pyserial, DDS, and dexkit from its checkout.
+
+What is not: the devices (dexkit's emulators, on the host, by USB/IP), the cable (TCP through QEMU's
+user network: no packets on a bus, no bandwidth, no electrical faults), and time in the guest: its
+processor is emulated, several times slower than the host's and shared with it. Rates are
+therefore lower limits for this machine, not figures of a robot's computer.
+"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing that was tried.
+
+    :ivar group: what it is about: ``dex3``, ``ezgripper``, ``dex1``, ...
+    :ivar status: ``passed``, ``failed``, or ``skipped``.
+    :ivar said: the figures, or what went wrong.
+    """
+
+    group: str
+    name: str
+    status: str
+    said: str
+    seconds: float = 0.0
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+def markdown(cases: Sequence[Case], facts: Mapping[str, Any]) -> str:
+    """The report for people."""
+    lines = ["# Lab report", "", REAL, "| | |", "| --- | --- |"]
+    lines += [f"| {name} | {_cell(str(value))} |" for name, value in facts.items()]
+    groups = list(dict.fromkeys(case.group for case in cases))
+    for group in groups:
+        lines += ["", f"## {group}", "", "| what | result | s | |", "| --- | --- | --- | --- |"]
+        lines += [
+            f"| {_cell(c.name)} | {c.status} | {c.seconds:.1f} | {_cell(c.said)} |"
+            for c in cases
+            if c.group == group
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return visible(text).replace("|", "\\|").replace("\n", "<br>")
+
+
+def junit(cases: Sequence[Case], facts: Mapping[str, Any]) -> bytes:
+    """The report for machines."""
+    count = [case.status for case in cases].count
+    suite = ElementTree.Element(
+        "testsuite",
+        name="dexkit lab",
+        tests=str(len(cases)),
+        failures=str(count("failed")),
+        skipped=str(count("skipped")),
+        time=f"{sum(case.seconds for case in cases):.3f}",
+    )
+    properties = ElementTree.SubElement(suite, "properties")
+    for name, value in facts.items():
+        ElementTree.SubElement(properties, "property", name=name, value=visible(str(value)))
+    for case in cases:
+        element = ElementTree.SubElement(
+            suite,
+            "testcase",
+            classname=f"lab.{case.group}",
+            name=visible(case.name),
+            time=f"{case.seconds:.3f}",
+        )
+        if case.status == "failed":
+            ElementTree.SubElement(element, "failure", message=visible(case.said))
+        elif case.status == "skipped":
+            ElementTree.SubElement(element, "skipped", message=visible(case.said))
+        else:
+            ElementTree.SubElement(element, "system-out").text = visible(case.said)
+    return ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
+
+
+def write_reports(folder: Path, cases: Sequence[Case], facts: Mapping[str, Any]) -> None:
+    """Write ``report.md`` and ``junit.xml`` into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_file(folder / "report.md", markdown(cases, facts))
+    write_file(folder / "junit.xml", junit(cases, facts).decode())
