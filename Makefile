@@ -47,7 +47,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak platforms aarch64 wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
+.PHONY: help setup demo test soak platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -75,6 +75,9 @@ platforms: $(STAMP) ## each Python from 3.10 to 3.13: DDS, conformance, both dir
 
 aarch64: $(STAMP) ## dexkit on an emulated aarch64 processor (qemu-user), heard and moved by a client on x86-64
 	$(RUN) python -m tools.aarch64 $(ARGS)
+
+lab: $(STAMP) ## a real kernel in QEMU with the emulated devices plugged in (ARGS="--only dex3"; docs/lab.md)
+	$(RUN) python -m tools.lab $(ARGS)
 
 wheels: $(STAMP) ## self-contained wheels of cyclonedds into dist/wheels: SOURCE=checkout of its C library
 	$(RUN) python -m tools.wheels --source "$(or $(SOURCE),$(error SOURCE must name a checkout: \

@@ -104,6 +104,11 @@ class Port:
         """The pseudo-terminal that the link names now; empty while unplugged."""
         return self._terminal
 
+    @property
+    def place(self) -> str:
+        """What a ready line says of it."""
+        return f"pty={self._terminal}"
+
     # --- plugging
 
     def _apply_plug(self) -> None:

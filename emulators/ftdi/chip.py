@@ -105,13 +105,10 @@ class FtdiChip:
         self.overruns = self.requests = 0
         self._waiting = bytearray()
         self._overrun = False
-        self._tick = start
-        self._reset_settings()
-
-    def _reset_settings(self) -> None:
         self.baudrate = 9600
         self.latency = 16
         self.dtr = self.rts = self.breaking = False
+        self._tick = start + self.latency * 1e-3
 
     # --- the host's requests
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 from usbip.core import IN, SPEED_FULL, SPEED_HIGH, InterfaceDescriptor, Stall
 from usbip.device import In, Out, USBDevice
 
 from dexkit.clock import Clock, RealClock
-from dexkit.emulators.dex3_mcu.server import Server
-from dexkit.emulators.faults import Fault
 from dexkit.emulators.ftdi.chip import FT232R, ChipModel, FtdiChip
 from dexkit.emulators.serial_line import SerialLine
 
-__all__ = ["FtdiPort", "FtdiUsb"]
+__all__ = ["FtdiUsb"]
 
 _VENDOR_ID = 0x0403
 _IN_ENDPOINT, _OUT_ENDPOINT = 0x81, 0x02
@@ -117,58 +113,3 @@ class FtdiUsb:
         if answer is None or (setup.direction == IN and not answer):
             raise Stall
         return answer
-
-
-class FtdiPort:
-    """Serves adapters with their lines on USB/IP, in a thread.
-
-    :param adapters: the first is at bus id 1-1, the second at 1-2.
-    :param host: address to bind.
-    :param port: 0 takes any free one.
-    :raises EmulatorError: the port cannot be had.
-    """
-
-    def __init__(
-        self, adapters: Sequence[FtdiUsb], *, host: str = "127.0.0.1", port: int = 0
-    ) -> None:
-        self.adapters = list(adapters)
-        self._server = Server(self.adapters, host=host, port=port)
-        self._server.start()
-
-    @property
-    def url(self) -> str:
-        """``usbip://HOST:PORT``."""
-        return self._server.url
-
-    @property
-    def port(self) -> int:
-        """TCP port of the server."""
-        return self._server.port
-
-    @property
-    def error(self) -> BaseException | None:
-        """What ended the server, or None."""
-        return self._server.error
-
-    @property
-    def failure(self) -> Exception | None:
-        """The first exception on a client's message, which the server has survived, if any."""
-        return self._server.failure
-
-    def inject(self, fault: Fault) -> None:
-        """Have a fault on every line, its time counted from now; from any thread."""
-        for adapter in self.adapters:
-            self._server.call(partial(self._add, adapter, fault))
-
-    def _add(self, adapter: FtdiUsb, fault: Fault) -> None:
-        adapter.line.schedule.add(fault, RealClock().now())
-
-    def close(self) -> None:
-        """Cut clients off and free the port. May be called twice."""
-        self._server.close()
-
-    def __enter__(self) -> FtdiPort:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()

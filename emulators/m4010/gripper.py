@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from dexkit.clock import RealClock
 from dexkit.emulators.dex1_mechanics import Dex1Mechanics
 from dexkit.emulators.faults import M4010_FAULTS, parse_fault
+from dexkit.emulators.line_port import SCHEME, line_port
 from dexkit.emulators.m4010.bus import Bus
 from dexkit.emulators.m4010.motor import LOCKING, Motor
 from dexkit.emulators.m4010.settings import Firmware
@@ -19,6 +21,9 @@ from dexkit.hand import Side
 from dexkit.models import DEX1_1
 from dexkit.temporary_folder import TemporaryFolder
 
+if TYPE_CHECKING:
+    from dexkit.emulators.ftdi import FtdiPort
+
 __all__ = ["Dex1Motors", "Dex1Process", "emulated_dex1"]
 
 
@@ -27,7 +32,8 @@ class Dex1Motors:
 
     :param sides: whose motors.
     :param links: where each side's line is put; one path for both sides makes one line. None for
-        a name in a temporary directory, and one line.
+        a name in a temporary directory, and one line. ``usbip://HOST:PORT`` puts it behind an
+        emulated FT232H on a USB/IP server of its own.
     :param object_pct: opening at which an object is touched, percent; None for none.
     :param start_pct: opening at first, percent.
     :param zero_error: rad by which the position is reported too large, until calibrated.
@@ -69,9 +75,11 @@ class Dex1Motors:
             )
         lines: dict[str | None, list[Side]] = {}
         for side in sides:
-            link = None if links is None else os.path.abspath(os.fspath(links[side]))
+            link = None if links is None else os.fspath(links[side])
+            if link is not None and not link.startswith(SCHEME):
+                link = os.path.abspath(link)
             lines.setdefault(link, []).append(side)
-        self.ports: dict[Side, Port] = {}
+        self.ports: dict[Side, Port | FtdiPort] = {}
         try:
             for link, together in lines.items():
                 bus = Bus(
@@ -82,7 +90,14 @@ class Dex1Motors:
                     start=now,
                     seed=seed,
                 )
-                port = Port(bus, link, check_baudrate=check_baudrate)
+                # 6 Mbaud is beyond an FT232R
+                port = line_port(
+                    bus,
+                    link,
+                    serial=f"DKM4010{together[0].value[0].upper()}",
+                    fast=True,
+                    check_baudrate=check_baudrate,
+                )
                 self.ports |= dict.fromkeys(together, port)
         except BaseException:
             self.close()
@@ -91,7 +106,7 @@ class Dex1Motors:
             port.start()
 
     @property
-    def _lines(self) -> list[Port]:
+    def _lines(self) -> list[Port | FtdiPort]:
         return list({id(port): port for port in self.ports.values()}.values())
 
     @property
@@ -123,7 +138,7 @@ class Dex1Motors:
             ids = ",".join(str(self.motors[side].number) for side in here)
             names = ",".join(str(side) for side in here)
             rate = self.motors[here[0]].firmware.baudrate
-            lines.append(f"ready: {port.path} {names} id={ids} baudrate={rate} pty={port.terminal}")
+            lines.append(f"ready: {port.path} {names} id={ids} baudrate={rate} {port.place}")
         return lines
 
     def bus(self, side: Side) -> Bus:

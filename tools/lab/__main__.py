@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import compileall
 import platform
+import subprocess
 import sys
 import sysconfig
 import time
@@ -54,7 +55,10 @@ def _session(out: Path, options: argparse.Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     kernel = fetch(out, print)
     _compile()
+    program, why_not = _compile_c(out)
     cases: list[Case] = []
+    if why_not:
+        print(f"no C program: {why_not}")
 
     def told(case: Case) -> None:
         cases.append(case)
@@ -71,6 +75,7 @@ def _session(out: Path, options: argparse.Namespace) -> int:
             "hands": devices.hands.port,
             "adapters": devices.adapters.port,
             "only": options.only,
+            "program": program,
         }
         command = command_line(
             kernel, initramfs, words, accelerator=options.accel, cores=options.cores
@@ -105,6 +110,20 @@ def _compile() -> None:
     """Compile Python's files here: the guest would take several times as long, at each start."""
     for place in (sysconfig.get_path("purelib"), *(str(ROOT / n) for n in _FOLDERS)):
         compileall.compile_dir(place, quiet=2, maxlevels=12)
+
+
+def _compile_c(out: Path) -> tuple[str, str]:
+    """Compile the C program on libusb: its path, or an empty one and why there is none."""
+    path = out / "exchange"
+    source = Path(__file__).with_name("exchange.c")
+    command = ["cc", "-O2", "-Wall", "-o", str(path), str(source), "-l:libusb-1.0.so.0"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+    except OSError:
+        return "", "there is no C compiler (cc)"
+    if done.returncode:
+        return "", f"cc failed: {done.stderr.strip().splitlines()[-1]}"
+    return str(path), ""
 
 
 _FOLDERS = ("dexkit", "drivers", "emulators", "traces", "conformance", "tools")

@@ -102,6 +102,7 @@ class Devices:
                 FtdiUsb(MotorBus([motor], start=now), ADAPTERS[1], model=FT232H),
             ]
         )
+        self.adapters.start()
         self.records = {
             **{str(side): _record_hand(self.hands.device(side).mechanics) for side in Side},
             "mx64": _record_servo(servo),

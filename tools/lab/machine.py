@@ -26,6 +26,7 @@ def command_line(
     append += [f"lab.{name}={value}" for name, value in words.items()]
     return [
         QEMU,
+        *("-name", "dexkit-lab,debug-threads=on"),
         *("-accel", "tcg,thread=multi" if accelerator == "tcg" else accelerator),
         *("-cpu", "max", "-smp", str(cores), "-m", str(_MEMORY)),
         *("-nodefaults", "-no-reboot", "-display", "none", "-serial", "stdio"),

@@ -35,7 +35,8 @@ __all__ = ["emulate_dex1_motor"]
     required=True,
     metavar="PATH",
     help="Link that clients open. With --side both, one for a line with both motors, or "
-    "left=PATH and right=PATH for a line each.",
+    "left=PATH and right=PATH for a line each. usbip://HOST:PORT for an FTDI adapter (FT232H) on "
+    "USB/IP, which has a latency timer of its own.",
 )
 @object_option("Percent of opening at which the jaws touch an object")
 @start_option("Opening at first.", 20.0)

@@ -30,7 +30,13 @@ __all__ = ["emulate_mx64"]
 
 
 @click.command("mx64", context_settings={"show_default": True})
-@click.option("--link", required=True, metavar="PATH", help="Link that clients open.")
+@click.option(
+    "--link",
+    required=True,
+    metavar="PATH",
+    help="Link that clients open; usbip://HOST:PORT for an FTDI adapter (FT232R) on USB/IP, which "
+    "has a latency timer of its own.",
+)
 @click.option(
     "--id",
     "ids",
@@ -100,7 +106,8 @@ def emulate_mx64(
     link.
     """
     from dexkit.emulators.faults import parse_fault
-    from dexkit.emulators.mx64 import Bus, Firmware, GripperMechanics, Physics, Port, Servo
+    from dexkit.emulators.line_port import SCHEME, line_port
+    from dexkit.emulators.mx64 import Bus, Firmware, GripperMechanics, Physics, Servo
     from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 
     plan = [parse_fault(spec) for spec in faults]
@@ -141,7 +148,7 @@ def emulate_mx64(
         if store is not None:
             for servo in servos:
                 servo.on_eeprom = lambda: store.save([s.eeprom for s in servos])
-        with Port(bus, link, check_baudrate=not any_baudrate) as port:
+        with line_port(bus, link, serial="DKMX64", check_baudrate=not any_baudrate) as port:
             if faults_from_stdin:
                 read_faults(lambda spec: port.inject(parse_fault(spec)), request)
             port.start()
@@ -149,7 +156,8 @@ def emulate_mx64(
                 [str(s.id) for s in bus.servos] + [str(s.id) for s in bus.protocol_1]
             )
             rate = servos[0].baudrate if servos else int(baudrate)
-            click.echo(f"ready: {link} id={answering} baudrate={rate} pty={port.terminal}")
+            shown = port.path if link.startswith(SCHEME) else link
+            click.echo(f"ready: {shown} id={answering} baudrate={rate} {port.place}")
             sys.stdout.flush()
             while not request.wait(0.2):
                 if port.error is not None:

@@ -161,6 +161,7 @@ def detach(place: int) -> None:
     """Take a device away from the kernel, as pulling its cable does."""
     _attached.pop(place, None)
     (_VHCI / "detach").write_text(str(place))
+    wait_for(lambda: place not in _used(), "vhci_hcd does not give the port back")
 
 
 def kernel_log(pattern: str) -> list[str]:

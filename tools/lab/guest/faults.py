@@ -1,0 +1,119 @@
+"""A fault on a hand that moves: what is seen, how long it takes, and whether anything strays.
+
+The client commands the hand far away, the fault strikes on the way, and the client falls silent at
+the same moment. From then on the joints may be between where they were and the last command, and
+nowhere else; and after the device is back, no set-point may reach a motor before the client
+commands again. The host's record of the emulated motors says so (:mod:`tools.lab.devices`).
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from tools.lab.guest.bench import Bench, Failed, Serve, wait_for
+from tools.lab.guest.client import Client
+
+__all__ = ["Outcome", "Subject", "table"]
+
+_PAUSE = 0.5  # seconds in which nothing may move
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One fault.
+
+    :ivar lost: seconds until the client saw that the device is gone.
+    :ivar back: seconds from the repair to measured states.
+    :ivar strayed: the largest motion that nobody commanded, in the record's unit.
+    :ivar said: what the service said first.
+    """
+
+    lost: float
+    back: float
+    strayed: float
+    said: str
+
+
+@dataclass
+class Subject:
+    """A served hand, as the faults need it.
+
+    :param device: name of its record on the host.
+    :param near: where it begins, rad.
+    :param far: where it is commanded when the fault strikes, rad.
+    :param per_rad: of the record's unit in one rad, if all joints have the same zero.
+    :param still: the largest change that is no motion, in the record's unit.
+    :param within: how near to a target is there, rad.
+    """
+
+    bench: Bench
+    service: Serve
+    client: Client
+    device: str
+    near: Sequence[float]
+    far: Sequence[float]
+    per_rad: float = 1.0
+    still: float = 0.02
+    within: float = 0.15
+
+    def move(self, target: Sequence[float]) -> float:
+        """Command ``target`` until the hand is there; seconds."""
+        self.client.go(target)
+        return wait_for(
+            lambda: self.client.arrived(target, self.within), f"{self.device} does not obey"
+        )
+
+    def strike(self, fault: Callable[[], object], mend: Callable[[], object]) -> Outcome:
+        """Have ``fault`` while it moves, then ``mend``.
+
+        :raises Failed: it moved uncommanded, or did not come back.
+        """
+        ask, client = self.bench.ask, self.client
+        self.move(self.near)
+        begin = self.service.mark()
+        client.go(self.far)
+        time.sleep(0.15)
+        at = ask(do="now", device=self.device)
+        fault()
+        client.silent()
+        lost = wait_for(lambda: not client.linked, "the loss is not seen")
+        mended = time.monotonic()
+        mend()
+        wait_for(lambda: client.linked, "the device does not come back")
+        back = time.monotonic() - mended
+        goal = [q * self.per_rad for q in self.far]
+        seen = ask(do="since", device=self.device, t=at["t"])
+        astray = max(
+            max(min(q, to) - low, high - max(q, to))
+            for q, to, low, high in zip(at["q"], goal, seen["low"], seen["high"], strict=True)
+        )
+        again = ask(do="now", device=self.device)
+        time.sleep(_PAUSE)
+        after = ask(do="since", device=self.device, t=again["t"])
+        moved = max(high - low for low, high in zip(after["low"], after["high"], strict=True))
+        said = self.service.said(begin, r"WARNING|ERROR")
+        if after["setpoints"] or max(moved, astray) > self.still:
+            raise Failed(
+                f"uncommanded motion: {moved:.3f} and {after['setpoints']} set-points after the "
+                f"return, {astray:.3f} astray before; {said}"
+            )
+        return Outcome(lost, back, max(moved, astray, 0.0), said)
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """The outcomes in a line."""
+    return (
+        f"loss seen by the client after {_spread([o.lost for o in outcomes])} s, measured states "
+        f"{_spread([o.back for o in outcomes])} s after the repair, uncommanded motion "
+        f"{max(o.strayed for o in outcomes):.4f} at most, no set-point before a new command; "
+        f"it says: {outcomes[0].said}"
+    )
+
+
+def _spread(values: Sequence[float]) -> str:
+    if len(values) == 1:
+        return f"{values[0]:.2f}"
+    return f"{statistics.median(values):.2f} (at most {max(values):.2f})"

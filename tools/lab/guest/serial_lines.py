@@ -1,0 +1,337 @@
+"""Emulated FTDI adapters on the guest's USB: ftdi_sio, its latency timer, and who is behind it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import serial
+
+from dexkit.dds import DdsNode
+from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
+from dexkit.drivers.ezgripper.bus import ServoBus
+from dexkit.drivers.serial_port import exchange_period, latency_timer, latency_warning
+from dexkit.hand import HandCommand, Side
+from dexkit.wire import mx64
+from tools.lab.guest.bench import (
+    DEXKIT,
+    Bench,
+    Failed,
+    Serve,
+    Unprivileged,
+    attach,
+    detach,
+    in_child,
+    kernel_log,
+    run,
+    udev,
+    wait_for,
+)
+from tools.lab.guest.client import DOMAIN, Client
+from tools.lab.guest.faults import Subject, table
+
+__all__ = ["run_serial"]
+
+_BUSID = {"mx64": "1-1", "dex1": "1-2"}
+_DIALOUT = 20  # Debian's
+_USBDEVFS_RESET = 0x5514
+_CYCLES = 5
+_RULE = (
+    'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"\n'
+    'SUBSYSTEM=="tty", KERNEL=="ttyUSB*", MODE="0660", GROUP="dialout"\n'
+)
+_PROBES = (b"AT\r\n", b"ATI\r\n", b"\x00\x78\xf0\x7e", b"~\x00x\xf0~")
+_READ = 24  # bytes that an exchange of the driver reads
+
+
+def run_serial(bench: Bench) -> None:
+    """All cases of the serial devices."""
+    lab = _Lines(bench)
+    if not bench.case("adapter", "ftdi_sio makes /dev/ttyUSB0 of the emulated FT232R", lab.plug_in):
+        return
+    for group, name, do in (
+        ("adapter", "an ordinary user who is not in the group dialout", lab.denied),
+        ("ezgripper", "exchanges with the timer at 16 ms", lambda: lab.servo_rate(16)),
+        ("doctor", "dexkit doctor finds the 16 ms and says the cure", lab.doctor),
+        ("ezgripper", "exchanges with the timer at 1 ms", lambda: lab.servo_rate(1)),
+        ("adapter", "the udev rule that dexkit's warning names", lab.rule),
+        ("adapter", "probe bytes at plug-in, as ModemManager sends them", lab.probes),
+        ("ezgripper", "dexkit calibrate ezgripper", lab.calibrate),
+        ("dex1", "6 Mbaud through the emulated FT232H, timer 16 ms", lambda: lab.motor_rate(16)),
+        ("dex1", "6 Mbaud through the emulated FT232H, timer 1 ms", lambda: lab.motor_rate(1)),
+    ):
+        bench.case(group, name, do)
+    for kind in ("ezgripper", "dex1-serial"):
+        if not bench.case(kind, f"dexkit serve {kind}", lambda k=kind: lab.serve(k)):  # type: ignore[misc]
+            continue
+        for name, do in (
+            ("a second process on the port", lab.second_process),
+            ("USB reset", lab.reset),
+            ("driver unbound while moving", lab.unbound),
+            (f"unplugged while moving, {_CYCLES} times", lab.unplugged),
+        ):
+            bench.case(f"{kind} faults", name, do)
+        lab.end()
+    lab.close()
+
+
+class _Lines:
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.places: dict[str, int] = {}
+        self.service: Serve | None = None
+        self.node: DdsNode | None = None
+        self.subject: Subject | None = None
+        self.device = "mx64"
+
+    # --- the adapter
+
+    def plug(self, device: str) -> str:
+        """Attach a device's adapter; its port's path, once it is there."""
+        self.places[device] = attach(self.bench.words["adapters"], _BUSID[device])
+        wait_for(lambda: self._path(device), f"no port for the {device}'s adapter")
+        return self._path(device)
+
+    def _path(self, device: str) -> str:
+        serial_number = {"mx64": "DKLAB001", "dex1": "DKLAB002"}[device]
+        for port in Path("/sys/bus/usb-serial/devices").glob("ttyUSB*"):
+            number = (port.resolve().parents[1] / "serial").read_text().strip()
+            node = Path("/dev") / port.name
+            if number == serial_number and node.exists():
+                return str(node)
+        return ""
+
+    def _interface(self, device: str) -> Path:
+        return (
+            (Path("/sys/bus/usb-serial/devices") / Path(self._path(device)).name).resolve().parent
+        )
+
+    def _set_timer(self, device: str, milliseconds: int) -> None:
+        name = Path(self._path(device)).name
+        Path(f"/sys/bus/usb-serial/devices/{name}/latency_timer").write_text(str(milliseconds))
+
+    def plug_in(self) -> str:
+        started = time.monotonic()
+        path = self.plug("mx64")
+        took = time.monotonic() - started
+        if path != "/dev/ttyUSB0":
+            raise Failed(path)
+        found = kernel_log("ttyUSB0|Detected FT|ftdi_sio 1")
+        return f"{took:.2f} s; timer {latency_timer(path)} ms; " + "; ".join(
+            line.split("] ", 1)[-1] for line in found
+        )
+
+    def denied(self) -> str:
+        path = self._path("mx64")
+        os.chown(path, 0, _DIALOUT)  # as udev's own rules do, which are not loaded yet
+        os.chmod(path, 0o660)
+        said = in_child(lambda: _ping(path), Unprivileged)
+        if "no permission" not in said or "dialout" not in said:
+            raise Failed(said)
+        granted = in_child(lambda: _ping(path), Unprivileged, [_DIALOUT])
+        if "model" not in granted:
+            raise Failed(granted)
+        return f"{said}. In the group: {granted}"
+
+    def doctor(self) -> str:
+        done = _doctor(self._path("mx64"))
+        line = next((text for text in done.splitlines() if "latency timer of" in text), "")
+        cure = "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+        if "16 ms" not in line or cure not in done:
+            raise Failed(done[-800:])
+        return f"{line.strip()}; cure: {cure}"
+
+    def rule(self) -> str:
+        if "ATTR{latency_timer}" not in latency_warning(self._path("mx64")):
+            self._set_timer("mx64", 16)
+        named = latency_warning(self._path("mx64"))
+        if _RULE.splitlines()[0] not in named:
+            raise Failed(f"the warning names another rule: {named}")
+        with udev(_RULE):
+            detach(self.places["mx64"])
+            path = self.plug("mx64")
+            wait_for(lambda: latency_timer(path) == 1, "udev does not set the timer")
+            wait_for(lambda: os.stat(path).st_gid == _DIALOUT, "udev does not set the group")
+            said = in_child(lambda: _ping(path), Unprivileged, [_DIALOUT])
+        if "model" not in said:
+            raise Failed(said)
+        return f"after plugging in: timer 1 ms, group dialout; an ordinary user: {said}"
+
+    def probes(self) -> str:
+        ask = self.bench.ask
+        before = ask(do="now", device="mx64")
+        detach(self.places["mx64"])
+        path = self.plug("mx64")
+        for rate in (9600, 115200, 1_000_000):
+            with serial.Serial(path, rate, timeout=0.02) as port:
+                for probe in _PROBES:
+                    port.write(probe)
+                    port.read(64)
+                port.send_break(0.01)
+        after = ask(do="since", device="mx64", t=before["t"])
+        said = _ping(path)
+        moved = after["high"][0] - after["low"][0]
+        if moved > 0.1 or after["setpoints"]:
+            raise Failed(f"it moved by {moved:.2f} %, {after['setpoints']} set-points")
+        return f"{len(_PROBES)} probes and a break at 3 rates: nothing moved; then {said}"
+
+    # --- rates
+
+    def servo_rate(self, timer: int) -> str:
+        path = self._path("mx64")
+        self._set_timer("mx64", timer)
+        bus = ServoBus(path, 1_000_000, timeout=0.2, retries=0)
+        bus.open()
+        try:
+            rate = _rate(lambda: bus.read(1, mx64.PRESENT_CURRENT.address, _READ), 3.0)
+            # instruction 14 bytes, status 11 and the data, return delay of 500 us (factory)
+            line = bus.wire_time(14 + 11 + _READ) + bus.read_item(1, mx64.RETURN_DELAY_TIME) * 2e-6
+        finally:
+            bus.close()
+        most = 1 / exchange_period(line, timer * 1e-3)
+        if rate > most * 1.02:
+            raise Failed(f"{rate:.0f}/s, more than the {most:.0f} that the timer allows")
+        return f"{rate:.1f}/s at 1 Mbaud; the timer and the line allow {most:.1f}"
+
+    def motor_rate(self, timer: int) -> str:
+        path = self._path("dex1") or self.plug("dex1")
+        self._set_timer("dex1", timer)
+        with Dex1Serial(Side.LEFT, Dex1Settings(device=path, timeout=0.2)) as hand:
+            rate = _rate(lambda: hand.exchange(HandCommand.brake(1)), 3.0)
+            said = f"{hand.line_statistics}"
+        most = 1 / exchange_period(46 * 10 / 6e6, timer * 1e-3)
+        if rate > most * 1.02:
+            raise Failed(f"{rate:.0f}/s, more than the {most:.0f} that the timer allows")
+        return f"{path}: {rate:.1f}/s; the timer and the line allow {most:.1f}; {said}"
+
+    # --- the services
+
+    def calibrate(self) -> str:
+        done = run(
+            DEXKIT, "calibrate", "ezgripper", "--device", self._path("mx64"), "--yes", timeout=180
+        )
+        return " / ".join(done.strip().splitlines()[-3:])
+
+    def serve(self, kind: str) -> str:
+        self.device = "mx64" if kind == "ezgripper" else "dex1"
+        path = self._path(self.device) or self.plug(self.device)
+        self._set_timer(self.device, 1)
+        words = ("--side", "left", "--device", path, "--domain", str(DOMAIN), "--no-real-time")
+        self.service = Serve(kind, *words)
+        self.node = DdsNode(domain=DOMAIN, interface="lo")
+        client = Client(self.node, "unitree_go", Side.LEFT, 5.0, 0.05)
+        per_rad, still = (100 / 5.4, 1.5) if kind == "ezgripper" else (1.0, 0.05)
+        self.subject = Subject(
+            self.bench, self.service, client, self.device, [4.5], [1.0], per_rad, still, 0.3
+        )
+        before, started = self.service.counters()[0], time.monotonic()
+        took = [self.subject.move([q]) for q in (4.5, 1.0, 4.5)]
+        states = client.rate(3.0)
+        after = self.service.counters()[0]
+        seconds = time.monotonic() - started
+        done = {
+            name: after["hands"]["left"][name] - before["hands"]["left"][name]
+            for name in ("exchanges", "exchange_errors")
+        }
+        return (
+            f"{done['exchanges'] / seconds:.0f} exchanges/s, {done['exchange_errors']} errors; "
+            f"state {states:.0f} Hz at the client; strokes of 3.5 rad in "
+            f"{', '.join(f'{t:.1f}' for t in took)} s; ready after {self.service.start_time:.0f} s"
+        )
+
+    def _the_subject(self) -> Subject:
+        if self.subject is None:
+            raise Failed("it is not served")
+        return self.subject
+
+    def _obeys(self) -> str:
+        return f"obeys afterwards ({self._the_subject().move([3.0]):.1f} s)"
+
+    def second_process(self) -> str:
+        path = self._path(self.device)
+        said = in_child(lambda: _ping(path))
+        if "another program is using" not in said:
+            raise Failed(said)
+        return f"{said}; " + self._obeys()
+
+    def reset(self) -> str:
+        subject = self._the_subject()
+        folder = self._interface(self.device).parent
+        numbers = [int((folder / name).read_text()) for name in ("busnum", "devnum")]
+        node = f"/dev/bus/usb/{numbers[0]:03}/{numbers[1]:03}"
+        begin = subject.service.mark()
+
+        def strike() -> None:
+            fd = os.open(node, os.O_WRONLY)
+            try:
+                fcntl.ioctl(fd, _USBDEVFS_RESET)
+            finally:
+                os.close(fd)
+
+        # ftdi_sio has no reset handlers: the kernel unbinds and binds it again
+        outcome = subject.strike(strike, lambda: None)
+        del begin
+        return f"{table([outcome])}; " + self._obeys()
+
+    def unbound(self) -> str:
+        interface = self._interface(self.device).name
+        driver = Path("/sys/bus/usb/drivers/ftdi_sio")
+        outcome = self._the_subject().strike(
+            lambda: (driver / "unbind").write_text(interface),
+            lambda: (driver / "bind").write_text(interface),
+        )
+        return f"{table([outcome])}; " + self._obeys()
+
+    def unplugged(self) -> str:
+        subject = self._the_subject()
+        outcomes = [
+            subject.strike(lambda: detach(self.places[self.device]), lambda: self.plug(self.device))
+            for _ in range(_CYCLES)
+        ]
+        return f"{table(outcomes)}; " + self._obeys()
+
+    def end(self) -> None:
+        if self.subject is not None:
+            self.subject.client.close()
+            self.subject = None
+        if self.node is not None:
+            self.node.close()
+            self.node = None
+        if self.service is not None:
+            self.service.close()
+            self.service = None
+
+    def close(self) -> None:
+        self.end()
+        for place in self.places.values():
+            detach(place)
+
+
+def _ping(path: str) -> str:
+    bus = ServoBus(path, 1_000_000, timeout=0.2, retries=2)
+    bus.open()
+    try:
+        return f"model {bus.ping(1).model} answers on {path}"
+    finally:
+        bus.close()
+
+
+def _doctor(path: str) -> str:
+    words = ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.5", "--device", path)
+    # its exit code says that it has found something
+    done = subprocess.run([DEXKIT, *words], capture_output=True, text=True, timeout=120)
+    return done.stdout + done.stderr
+
+
+def _rate(exchange: Callable[[], object], seconds: float) -> float:
+    """Exchanges a second, back to back."""
+    exchange()
+    count, started = 0, time.monotonic()
+    while time.monotonic() - started < seconds:
+        exchange()
+        count += 1
+    return count / (time.monotonic() - started)
