@@ -77,11 +77,12 @@ def _session(out: Path, options: argparse.Namespace) -> int:
             "only": options.only,
             "program": program,
         }
+        console = out / "console.log"
         command = command_line(
-            kernel, initramfs, words, accelerator=options.accel, cores=options.cores
+            kernel, initramfs, console, words, accelerator=options.accel, cores=options.cores
         )
-        print(f"booting {kernel.release} ({options.accel}); console: {out / 'console.log'}")
-        ended = run_guest(command, out / "console.log", _PATIENCE)
+        print(f"booting {kernel.release} ({options.accel}); console: {console}", flush=True)
+        ended = run_guest(command, _PATIENCE)
     finally:
         control.close()
         devices.close()

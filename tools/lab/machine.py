@@ -15,10 +15,17 @@ _GRACE = 5.0  # seconds to end after being asked
 
 
 def command_line(
-    kernel: Kernel, initramfs: Path, words: Mapping[str, object], *, accelerator: str, cores: int
+    kernel: Kernel,
+    initramfs: Path,
+    console: Path,
+    words: Mapping[str, object],
+    *,
+    accelerator: str,
+    cores: int,
 ) -> list[str]:
     """QEMU's command line.
 
+    :param console: gets what the guest prints.
     :param words: added to the kernel's command line, as ``lab.NAME=VALUE``.
     """
     # The guest has an address and no route: it reaches its host and nothing else.
@@ -29,7 +36,9 @@ def command_line(
         *("-name", "dexkit-lab,debug-threads=on"),
         *("-accel", "tcg,thread=multi" if accelerator == "tcg" else accelerator),
         *("-cpu", "max", "-smp", str(cores), "-m", str(_MEMORY)),
-        *("-nodefaults", "-no-reboot", "-display", "none", "-serial", "stdio"),
+        *("-nodefaults", "-no-reboot", "-display", "none"),
+        # not stdio: QEMU would poll this process's /dev/null without a pause
+        *("-serial", f"file:{console}"),
         *("-kernel", str(kernel.image), "-initrd", str(initramfs), "-append", " ".join(append)),
         *("-netdev", "user,id=net", "-device", "virtio-net-pci,netdev=net,romfile="),
         *("-device", "virtio-rng-pci"),
@@ -43,27 +52,23 @@ def _share(name: str, path: Path) -> list[str]:
     return ["-fsdev", how, "-device", f"virtio-9p-pci,fsdev={name},mount_tag={name}"]
 
 
-def run_guest(command: list[str], console: Path, patience: float) -> bool:
+def run_guest(command: list[str], patience: float) -> bool:
     """Run the guest until it switches itself off.
 
-    :param console: gets what it prints.
     :param patience: seconds after which it is ended.
     :returns: whether it ended by itself.
     """
-    with console.open("wb") as output:
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-        )
-        try:
-            process.wait(patience)
-            return True
-        except subprocess.TimeoutExpired:
-            return False
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                try:
-                    process.wait(_GRACE)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    try:
+        process.wait(patience)
+        return True
+    except subprocess.TimeoutExpired:
+        return False
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(_GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

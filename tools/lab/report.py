@@ -88,7 +88,8 @@ def junit(cases: Sequence[Case], facts: Mapping[str, Any]) -> bytes:
             ElementTree.SubElement(element, "skipped", message=visible(case.said))
         else:
             ElementTree.SubElement(element, "system-out").text = visible(case.said)
-    return ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
+    found: bytes = ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
+    return found
 
 
 def write_reports(folder: Path, cases: Sequence[Case], facts: Mapping[str, Any]) -> None:

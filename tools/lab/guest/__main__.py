@@ -7,7 +7,7 @@ import platform
 from collections.abc import Callable
 from pathlib import Path
 
-from tools.lab.guest.bench import Bench
+from tools.lab.guest.bench import Bench, udevd
 
 _PREFIX = "lab."
 
@@ -24,10 +24,19 @@ def main() -> None:
     bench = Bench(words)
     uptime = Path("/proc/uptime").read_text().split()[0]
     bench.fact(guest=platform.release(), **{"guest ready after": f"{uptime} s"})
-    for name, do in _groups().items():
-        if not words.get("only") or name in words["only"].split(","):
-            bench.case(name, "session", lambda do=do: do(bench) or "done")  # type: ignore[misc]
+    with udevd():
+        for name, do in _groups().items():
+            if not words.get("only") or name in words["only"].split(","):
+                _whole(bench, name, do)
     bench.ask(do="finished")
+
+
+def _whole(bench: Bench, name: str, do: Callable[[Bench], None]) -> None:
+    def all_of_it() -> str:
+        do(bench)
+        return "all cases were tried"
+
+    bench.case(name, "session", all_of_it)
 
 
 def _groups() -> dict[str, Callable[[Bench], None]]:

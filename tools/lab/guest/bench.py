@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import signal
 import socket
@@ -27,10 +26,12 @@ __all__ = [
     "Unprivileged",
     "attach",
     "detach",
-    "in_child",
     "kernel_log",
     "pin_of",
+    "rule",
     "run",
+    "udevd",
+    "use",
     "wait_for",
 ]
 
@@ -245,45 +246,48 @@ class Serve:
         self.close()
 
 
-def in_child(do: Callable[[], str], user: int | None = None, groups: Sequence[int] = ()) -> str:
-    """Do something in a process of its own, as another user if one is given; what it returns.
+def use(*words: str, user: int | None = None, groups: Sequence[int] = ()) -> str:
+    """Use a device in a process of its own, as another user if one is given; what happened.
 
-    An exception of dexkit's becomes its text.
+    :param words: of :mod:`tools.lab.guest.probe`.
     """
-    read, write = os.pipe()
-    child = os.fork()
-    if not child:
-        with contextlib.suppress(BaseException):
-            if user is not None:
-                os.setgroups(list(groups))
-                os.setgid(user)
-                os.setuid(user)
-            try:
-                said = do()
-            except Exception as error:
-                said = _text(error)
-            os.write(write, said.encode())
-        os._exit(0)
-    os.close(write)
-    with os.fdopen(read, "rb") as pipe:
-        said = pipe.read().decode()
-    os.waitpid(child, 0)
-    return said
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.lab.guest.probe", *words],
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        timeout=_START,
+        user=user,
+        group=user,
+        extra_groups=None if user is None else list(groups),
+    )
+    return done.stdout.strip()
 
 
 @contextlib.contextmanager
-def udev(rule: str) -> Iterator[None]:
-    """Systemd's udev daemon, with one rule of the user's."""
-    folder = Path("/etc/udev/rules.d")
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "70-lab.rules"
-    path.write_text(rule)
+def udevd() -> Iterator[None]:
+    """Systemd's udev daemon with Debian's rules. libusb learns from it that a device has come."""
     daemon = subprocess.Popen(["/usr/lib/systemd/systemd-udevd"])
     try:
         wait_for(lambda: Path("/run/udev/control").exists(), "systemd-udevd")
+        run("udevadm", "trigger")
+        run("udevadm", "settle")
+        yield
+    finally:
+        daemon.terminate()
+        daemon.wait(_PATIENCE)
+
+
+@contextlib.contextmanager
+def rule(text: str) -> Iterator[None]:
+    """A udev rule of the user's."""
+    folder = Path("/etc/udev/rules.d")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "70-lab.rules"
+    path.write_text(text)
+    try:
         run("udevadm", "control", "--reload")
         yield
     finally:
         path.unlink()
-        daemon.terminate()
-        daemon.wait(_PATIENCE)
+        run("udevadm", "control", "--reload")

@@ -9,7 +9,8 @@ from typing import Any
 
 from dexkit.dds import DdsNode
 from dexkit.hand import Side
-from dexkit.messages.registry import message_type
+from dexkit.messages import unitree_go as go
+from dexkit.messages import unitree_hg as hg
 from dexkit.models import dialect
 from tools.lab.guest.bench import Failed, wait_for
 
@@ -31,9 +32,8 @@ class Client:
 
     def __init__(self, node: DdsNode, language: str, side: Side, kp: float, kd: float) -> None:
         self._dialect = dialect(language)
-        self._gains = {"kp": kp, "kd": kd}
+        self._gains = kp, kd
         command, state = self._dialect.topics(side)
-        self._type = message_type(self._dialect.cmd_type)
         self._writer = node.writer(command, self._dialect.cmd_type)
         self._reader = node.reader(state, self._dialect.state_type, on_data=self._take)
         self._target: list[float] | None = None
@@ -62,16 +62,12 @@ class Client:
                 self._writer.write(self._message(target))
 
     def _message(self, target: Sequence[float]) -> Any:
+        kp, kd = self._gains
         if self._dialect.cmd_type.endswith("HandCmd_"):
-            from dexkit.messages.unitree_hg import HandCmd_, MotorCmd_
-
-            return HandCmd_(
-                [MotorCmd_(mode=i | 1 << 4, q=q, **self._gains) for i, q in enumerate(target)]
+            return hg.HandCmd_(
+                [hg.MotorCmd_(mode=i | 1 << 4, q=q, kp=kp, kd=kd) for i, q in enumerate(target)]
             )
-        from dexkit.messages.unitree_go import MotorCmd_ as GoMotorCmd_
-        from dexkit.messages.unitree_go import MotorCmds_
-
-        return MotorCmds_([GoMotorCmd_(mode=1, q=q, **self._gains) for q in target])
+        return go.MotorCmds_([go.MotorCmd_(mode=1, q=q, kp=kp, kd=kd) for q in target])
 
     def go(self, target: Sequence[float]) -> None:
         """Command ``target`` (rad), from now on."""

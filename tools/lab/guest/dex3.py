@@ -19,11 +19,11 @@ from tools.lab.guest.bench import (
     Unprivileged,
     attach,
     detach,
-    in_child,
     kernel_log,
     pin_of,
+    rule,
     run,
-    udev,
+    use,
     wait_for,
 )
 from tools.lab.guest.client import DOMAIN, Client
@@ -164,7 +164,7 @@ class _Dex3:
             return f"{_rate(times)}; {hand.statistics}"
 
     def denied(self) -> str:
-        said = in_child(_open_left, Unprivileged)
+        said = use("dex3", user=Unprivileged)
         mode = oct(os.stat(self.node_path(Side.LEFT)).st_mode & 0o777)
         for word in ("HandRefused", "no permission", "udev rule"):
             if word not in said:
@@ -172,13 +172,13 @@ class _Dex3:
         return f"node {mode}: {said}"
 
     def permitted(self) -> str:
-        with udev(_RULE):
+        with rule(_RULE):
             for side in Side:
                 detach(self.places[side])
                 self.plug(side)
             node = self.node_path(Side.LEFT)
             wait_for(lambda: os.stat(node).st_gid == _PLUGDEV, "udev does not apply the rule")
-            said = in_child(_open_left, Unprivileged, [_PLUGDEV])
+            said = use("dex3", user=Unprivileged, groups=[_PLUGDEV])
         if not said.startswith("opened"):
             raise Failed(said)
         mode = oct(os.stat(node).st_mode & 0o777)
@@ -215,7 +215,7 @@ class _Dex3:
         )
 
     def second_process(self) -> str:
-        said = in_child(_open_left)
+        said = use("dex3")
         for word in ("HandRefused", "another program"):
             if word not in said:
                 raise Failed(f"it says: {said}")
@@ -251,7 +251,7 @@ class _Dex3:
         wait_for(lambda: client.arrived(_target(Side.LEFT, 0.4), 0.15), "it does not obey")
         after = self.service.counters()[0] if self.service else {}
         errors = _sum(after, "exchange_errors") - _sum(before, "exchange_errors")
-        said = self.service.said(begin, r"ERROR|WARNING|lost|gone|error") if self.service else ""
+        said = self.service.said(begin, r"^(WARNING|ERROR)") if self.service else ""
         return f"{errors} exchanges failed, the motion went on to its goal; {said or 'no message'}"
 
     def unbound(self) -> str:
@@ -316,9 +316,3 @@ def _rate(times: list[float]) -> str:
     ordered = sorted(times)
     middle, late = ordered[len(ordered) // 2] * 1e3, ordered[len(ordered) * 99 // 100] * 1e3
     return f"{len(times) / sum(times):.0f} exchanges/s, p50 {middle:.2f} ms, p99 {late:.2f} ms"
-
-
-def _open_left() -> str:
-    with Dex3Usb(Side.LEFT, Dex3Settings(local=False)) as hand:
-        hand.exchange(HandCommand.brake(7))
-        return f"opened {hand.spec.side}"

@@ -94,7 +94,7 @@ class Subject:
         time.sleep(_PAUSE)
         after = ask(do="since", device=self.device, t=again["t"])
         moved = max(high - low for low, high in zip(after["low"], after["high"], strict=True))
-        said = self.service.said(begin, r"WARNING|ERROR")
+        said = self.service.said(begin, r"^(WARNING|ERROR)")
         if after["setpoints"] or max(moved, astray) > self.still:
             raise Failed(
                 f"uncommanded motion: {moved:.3f} and {after['setpoints']} set-points after the "

@@ -25,14 +25,15 @@ from tools.lab.guest.bench import (
     Unprivileged,
     attach,
     detach,
-    in_child,
     kernel_log,
+    rule,
     run,
-    udev,
+    use,
     wait_for,
 )
 from tools.lab.guest.client import DOMAIN, Client
 from tools.lab.guest.faults import Subject, table
+from tools.lab.guest.probe import ping
 
 __all__ = ["run_serial"]
 
@@ -40,10 +41,7 @@ _BUSID = {"mx64": "1-1", "dex1": "1-2"}
 _DIALOUT = 20  # Debian's
 _USBDEVFS_RESET = 0x5514
 _CYCLES = 5
-_RULE = (
-    'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"\n'
-    'SUBSYSTEM=="tty", KERNEL=="ttyUSB*", MODE="0660", GROUP="dialout"\n'
-)
+_RULE = 'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
 _PROBES = (b"AT\r\n", b"ATI\r\n", b"\x00\x78\xf0\x7e", b"~\x00x\xf0~")
 _READ = 24  # bytes that an exchange of the driver reads
 
@@ -127,12 +125,11 @@ class _Lines:
 
     def denied(self) -> str:
         path = self._path("mx64")
-        os.chown(path, 0, _DIALOUT)  # as udev's own rules do, which are not loaded yet
-        os.chmod(path, 0o660)
-        said = in_child(lambda: _ping(path), Unprivileged)
+        wait_for(lambda: os.stat(path).st_gid == _DIALOUT, "udev does not set the group")
+        said = use("mx64", path, user=Unprivileged)
         if "no permission" not in said or "dialout" not in said:
             raise Failed(said)
-        granted = in_child(lambda: _ping(path), Unprivileged, [_DIALOUT])
+        granted = use("mx64", path, user=Unprivileged, groups=[_DIALOUT])
         if "model" not in granted:
             raise Failed(granted)
         return f"{said}. In the group: {granted}"
@@ -149,17 +146,13 @@ class _Lines:
         if "ATTR{latency_timer}" not in latency_warning(self._path("mx64")):
             self._set_timer("mx64", 16)
         named = latency_warning(self._path("mx64"))
-        if _RULE.splitlines()[0] not in named:
+        if _RULE not in named:
             raise Failed(f"the warning names another rule: {named}")
-        with udev(_RULE):
+        with rule(_RULE + "\n"):
             detach(self.places["mx64"])
             path = self.plug("mx64")
             wait_for(lambda: latency_timer(path) == 1, "udev does not set the timer")
-            wait_for(lambda: os.stat(path).st_gid == _DIALOUT, "udev does not set the group")
-            said = in_child(lambda: _ping(path), Unprivileged, [_DIALOUT])
-        if "model" not in said:
-            raise Failed(said)
-        return f"after plugging in: timer 1 ms, group dialout; an ordinary user: {said}"
+        return f"after plugging in: timer 1 ms, by {_RULE}"
 
     def probes(self) -> str:
         ask = self.bench.ask
@@ -173,7 +166,7 @@ class _Lines:
                     port.read(64)
                 port.send_break(0.01)
         after = ask(do="since", device="mx64", t=before["t"])
-        said = _ping(path)
+        said = ping(path)
         moved = after["high"][0] - after["low"][0]
         if moved > 0.1 or after["setpoints"]:
             raise Failed(f"it moved by {moved:.2f} %, {after['setpoints']} set-points")
@@ -253,7 +246,7 @@ class _Lines:
 
     def second_process(self) -> str:
         path = self._path(self.device)
-        said = in_child(lambda: _ping(path))
+        said = use("mx64", path)
         if "another program is using" not in said:
             raise Failed(said)
         return f"{said}; " + self._obeys()
@@ -309,15 +302,6 @@ class _Lines:
         self.end()
         for place in self.places.values():
             detach(place)
-
-
-def _ping(path: str) -> str:
-    bus = ServoBus(path, 1_000_000, timeout=0.2, retries=2)
-    bus.open()
-    try:
-        return f"model {bus.ping(1).model} answers on {path}"
-    finally:
-        bus.close()
 
 
 def _doctor(path: str) -> str:
