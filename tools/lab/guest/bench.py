@@ -41,6 +41,7 @@ DEXKIT = str(Path(sys.prefix) / "bin/dexkit")
 _VHCI = Path("/sys/devices/platform/vhci_hcd.0")
 _FREE = 4  # VDEV_ST_NULL of the kernel's usbip_common.h
 _PATIENCE = 30.0
+_TRIES = 5
 _START = 90.0  # seconds for a program to start: Python's imports on an emulated processor
 Unprivileged = 1000
 """User and group id of an ordinary user."""
@@ -152,7 +153,15 @@ def _used() -> set[int]:
 def attach(port: int | str, busid: str) -> int:
     """Have the kernel attach a device of the host's server ``port``; the port of vhci_hcd."""
     before = _used()
-    run("usbip", "--tcp-port", str(port), "attach", "-r", HOST, "-b", busid)
+    # usbip looks at all of the kernel's USB devices, and fails where one goes meanwhile
+    for left in reversed(range(_TRIES)):
+        try:
+            run("usbip", "--tcp-port", str(port), "attach", "-r", HOST, "-b", busid)
+            break
+        except Failed:
+            if not left:
+                raise
+            time.sleep(0.1)
     (place,) = _used() - before
     _attached[place] = busid
     return place
@@ -178,17 +187,19 @@ class Serve:
     """``dexkit serve`` in a process of its own.
 
     :param arguments: of the command.
+
+    With 100 states a second, and at ordinary priority: an emulated processor is too slow for the
+    rates of a robot's computer, and a service that cannot keep its rate would, at real-time
+    priority, keep the kernel's own threads from running, which carry USB/IP.
     """
 
-    def __init__(self, *arguments: str, user: int | None = None) -> None:
+    def __init__(self, *arguments: str) -> None:
         self.log = Path(f"/tmp/serve-{time.monotonic_ns()}.log")
         self._out = self.log.open("wb")
         self.process = subprocess.Popen(
-            [DEXKIT, "serve", *arguments],
+            [DEXKIT, "serve", *arguments, "--no-real-time", "--state-rate", "100"],
             stdout=self._out,
             stderr=subprocess.STDOUT,
-            user=user,
-            group=user,
         )
         started = time.monotonic()
         try:
@@ -237,7 +248,7 @@ class Serve:
                 self.process.kill()
                 self.process.wait()
         self._out.close()
-        print(self.text()[-3000:], flush=True)
+        print(self.text(), flush=True)
 
     def __enter__(self) -> Serve:
         return self

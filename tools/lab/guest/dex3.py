@@ -187,10 +187,8 @@ class _Dex3:
     # --- the service
 
     def serve(self) -> str:
-        # at ordinary priority: an emulated processor is too slow for its rates, and at real-time
-        # priority it would keep the kernel's own threads, which carry USB/IP, from running
         words = ("--side", "both", "--domain", str(DOMAIN), "--set", "usb=system")
-        self.service = Serve("dex3-usb", *words, "--no-real-time")
+        self.service = Serve("dex3-usb", *words)
         self.node = DdsNode(domain=DOMAIN, interface="lo")
         for side in Side:
             self.clients[side] = Client(self.node, "dex3", side, 1.5, 0.2)
