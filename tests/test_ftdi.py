@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +21,9 @@ from dexkit.emulators.ftdi import (
     Request,
     baudrate_of,
 )
+from dexkit.emulators.line_port import line_port
 from dexkit.emulators.mx64 import Bus, Servo
+from dexkit.errors import UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction
 from tests.each import each
@@ -235,3 +238,26 @@ def test_a_client_finds_the_adapter_on_the_server() -> None:
         usb.util.dispose_resources(found)
         assert port.adapters[1].chip.baudrate == 6_000_000
         assert port.failure is None
+
+
+def test_a_line_is_served_where_its_link_says(tmp_path: Path) -> None:
+    now = RealClock().now()
+    with line_port(
+        Bus([Servo(1, now=now)], start=now), "usbip://127.0.0.1:0", serial="DK3"
+    ) as port:
+        assert isinstance(port, FtdiPort)
+        assert port.path == f"usbip://127.0.0.1:{port.port}"
+        assert port.place == "busid=1-1 adapter=FT232R serial=DK3"
+    link = tmp_path / "gripper"
+    with line_port(bus, link, serial="DK3") as pty:
+        assert pty.place.startswith("pty=/dev/pts/")
+        assert link.is_symlink()
+
+
+@each(
+    "link",
+    ["usbip://", "usbip://:1", "usbip://a:x", "usbip://a:99999", "usbip://a/b", "usbip://u@a"],
+)
+def test_other_addresses_are_refused(link: str) -> None:
+    with pytest.raises(UsageError, match="no address of a server"):
+        line_port(Bus([Servo(1)]), link, serial="DK3")

@@ -237,8 +237,9 @@ class _Lines:
         }
         return (
             f"timer {_SERVED} ms: {done['exchanges'] / seconds:.0f} exchanges/s, "
-            f"{done['exchange_errors']} errors; state {states:.0f} Hz at the client; strokes of 3.5 rad in "
-            f"{', '.join(f'{t:.1f}' for t in took)} s; ready after {self.service.start_time:.0f} s"
+            f"{done['exchange_errors']} errors; state {states:.0f} Hz at the "
+            f"client; strokes of 3.5 rad in {', '.join(f'{t:.1f}' for t in took)} s; "
+            f"ready after {self.service.start_time:.0f} s"
         )
 
     def _the_subject(self) -> Subject:
