@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from usbip.core import Stall
 
 from dexkit.clock import ManualClock, RealClock
+from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.ftdi import (
     FT232H,
     FT232R,
@@ -195,6 +197,38 @@ def test_an_answer_of_a_servo_takes_the_line_and_the_timer(
     assert read[1][1] == b"\xb1\x60"
 
 
+@each("timer,rate", [(16, 1_000_000), (1, 1_000_000), (1, 57600), (5, 115_200)])
+def test_exchanges_take_the_period_of_the_formula(timer: int, rate: int) -> None:
+    # tests/test_line_time.py compares the line on a pseudo-terminal with the same formula
+    clock = ManualClock()
+    servo = Servo(1, baudrate=rate)
+    usb = FtdiUsb(Bus([servo]), "DK1", clock=clock)
+    usb._control(_Setup(Request.SET_BAUDRATE, {1_000_000: 3, 115_200: 0x1A, 57600: 0x34}[rate]))
+    usb._control(_Setup(Request.SET_LATENCY, timer))
+    ping, answer = dxl.encode(1, Instruction.PING), dxl.status(1, 0, servo.ping_data)
+    line_time = 10 * (len(ping) + len(answer)) / rate + servo.return_delay
+    times: list[float] = []
+    number = 0
+
+    def done(data: bytes, status: int = 0) -> None:
+        if len(data) > 2:
+            times.append(clock.now())
+
+    while len(times) < 8:
+        known = len(times)
+        usb._out.on_out(usb._out, ping)
+        while len(times) == known:
+            while len(usb._in._pending) < 2:  # as Linux's usb-serial has
+                number += 1
+                usb._in.take_or_park(512, done, number)
+            due = usb.advance()
+            if len(times) == known and due is not None:
+                clock.sleep_until(due)
+    periods = [later - earlier for earlier, later in itertools.pairwise(times)]
+    expected = exchange_period(line_time, timer * 1e-3)
+    assert [round(period, 6) for period in periods[1:]] == [round(expected, 6)] * 6
+
+
 def test_a_transfer_ends_with_a_packet_that_is_not_full(
     adapter: tuple[FtdiUsb, ManualClock],
 ) -> None:
@@ -242,9 +276,8 @@ def test_a_client_finds_the_adapter_on_the_server() -> None:
 
 def test_a_line_is_served_where_its_link_says(tmp_path: Path) -> None:
     now = RealClock().now()
-    with line_port(
-        Bus([Servo(1, now=now)], start=now), "usbip://127.0.0.1:0", serial="DK3"
-    ) as port:
+    bus = Bus([Servo(1, now=now)], start=now)
+    with line_port(bus, "usbip://127.0.0.1:0", serial="DK3") as port:
         assert isinstance(port, FtdiPort)
         assert port.path == f"usbip://127.0.0.1:{port.port}"
         assert port.place == "busid=1-1 adapter=FT232R serial=DK3"

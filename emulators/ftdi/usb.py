@@ -16,6 +16,9 @@ __all__ = ["FtdiUsb"]
 _VENDOR_ID = 0x0403
 _IN_ENDPOINT, _OUT_ENDPOINT = 0x81, 0x02
 _VENDOR_CLASS = 0xFF
+_NOMINAL = (9600, 19200, 38400, 57600, 115_200, 230_400, 460_800, 921_600)
+"""Rates of which a divisor makes 0.2 % more or less: 57692 baud are 57600 for any receiver."""
+_TOLERANCE = 0.02
 _BUSY_TICK = 4e-3  # seconds between looks at devices that move
 
 
@@ -103,7 +106,7 @@ class FtdiUsb:
     def _received(self, endpoint: Any, data: bytes) -> None:
         now = self._clock.now()
         if self._check_baudrate:
-            self.line.host_baudrate = self.chip.baudrate
+            self.line.host_baudrate = _nominal(self.chip.baudrate)
         self.line.advance_to(now)
         if self.plugged and not self.chip.breaking:
             self.line.receive(data, now)
@@ -113,3 +116,8 @@ class FtdiUsb:
         if answer is None or (setup.direction == IN and not answer):
             raise Stall
         return answer
+
+
+def _nominal(rate: int) -> int:
+    """The rate that devices on the line take it for."""
+    return next((r for r in _NOMINAL if abs(rate - r) < _TOLERANCE * r), rate)

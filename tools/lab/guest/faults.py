@@ -72,6 +72,7 @@ class Subject:
         :raises Failed: it moved uncommanded, or did not come back.
         """
         ask, client = self.bench.ask, self.client
+        wait_for(lambda: client.linked, "the device is not there before the fault")
         self.move(self.near)
         begin = self.service.mark()
         client.go(self.far)
@@ -82,7 +83,10 @@ class Subject:
         lost = wait_for(lambda: not client.linked, "the loss is not seen")
         mended = time.monotonic()
         mend()
-        wait_for(lambda: client.linked, "the device does not come back")
+        try:
+            wait_for(lambda: client.linked, "the device does not come back")
+        except Failed as error:
+            raise Failed(f"{error}; {self.service.text(begin)[-600:]}") from error
         back = time.monotonic() - mended
         goal = [q * self.per_rad for q in self.far]
         seen = ask(do="since", device=self.device, t=at["t"])

@@ -38,6 +38,7 @@ from tools.lab.guest.probe import ping
 __all__ = ["run_serial"]
 
 _BUSID = {"mx64": "1-1", "dex1": "1-2"}
+_SERIAL = {"mx64": "DKLAB001", "dex1": "DKLAB002"}  # of tools.lab.devices
 _DIALOUT = 20  # Debian's
 _USBDEVFS_RESET = 0x5514
 _CYCLES = 5
@@ -100,11 +101,10 @@ class _Lines:
         return self._path(device)
 
     def _path(self, device: str) -> str:
-        serial_number = {"mx64": "DKLAB001", "dex1": "DKLAB002"}[device]
         for port in Path("/sys/bus/usb-serial/devices").glob("ttyUSB*"):
             number = (port.resolve().parents[1] / "serial").read_text().strip()
             node = Path("/dev") / port.name
-            if number == serial_number and node.exists():
+            if number == _SERIAL[device] and node.exists():
                 return str(node)
         return ""
 
@@ -216,9 +216,12 @@ class _Lines:
 
     def serve(self, kind: str) -> str:
         self.device = "mx64" if kind == "ezgripper" else "dex1"
-        path = self._path(self.device) or self.plug(self.device)
+        if not self._path(self.device):
+            self.plug(self.device)
         self._set_timer(self.device, _SERVED)
-        words = ("--side", "left", "--device", path, "--domain", str(DOMAIN))
+        # by the adapter's serial number: an adapter that comes back while its old port is still
+        # open becomes another ttyUSB
+        words = ("--side", "left", "--device", _SERIAL[self.device], "--domain", str(DOMAIN))
         self.service = Serve(kind, *words)
         self.node = DdsNode(domain=DOMAIN, interface="lo")
         client = Client(self.node, "unitree_go", Side.LEFT, 5.0, 0.05)
