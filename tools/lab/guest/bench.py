@@ -42,7 +42,7 @@ _VHCI = Path("/sys/devices/platform/vhci_hcd.0")
 _FREE = 4  # VDEV_ST_NULL of the kernel's usbip_common.h
 _PATIENCE = 30.0
 _TRIES = 5
-_START = 90.0  # seconds for a program to start: Python's imports on an emulated processor
+_START = 180.0  # seconds for a program to start: Python's imports on an emulated processor
 Unprivileged = 1000
 """User and group id of an ordinary user."""
 
