@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -1068,3 +1069,47 @@ class TestUsbIpClient:
         finally:
             connection.close()
             server.close()
+
+
+class _DroppingLibUsb:
+    """A libusb that lists a hand only when it is made anew, as after a transfer that failed."""
+
+    made = 0
+
+    def __init__(self, lib: object) -> None:
+        self.lib = lib
+        kind = type(self)
+        kind.made += 1
+        self._devices = ["hand"] if kind.made > 1 else []
+
+    def enumerate_devices(self) -> list[str]:
+        return self._devices
+
+    def get_device_descriptor(self, device: str) -> SimpleNamespace:
+        return SimpleNamespace(idVendor=0x34B7, idProduct=0x1010, bus=1, address=4)
+
+
+def _folder_in_sysfs(folder: Path, devnum: int) -> None:
+    folder.mkdir()
+    values = {"idVendor": "34b7", "idProduct": "1010", "busnum": "1", "devnum": str(devnum)}
+    for name, value in values.items():
+        (folder / name).write_text(value + "\n")
+
+
+def test_a_hand_that_libusb_has_dropped_is_found_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(_DroppingLibUsb, "made", 0)
+    monkeypatch.setattr(usb.backend.libusb1, "_LibUSB", _DroppingLibUsb)
+    monkeypatch.setattr(usb.backend.libusb1, "_lib_object", _DroppingLibUsb(None))
+    monkeypatch.setattr(discovery, "_SYSFS", tmp_path)
+    monkeypatch.setattr(discovery, "_given_up", set())
+    assert discovery._list_on_usb([], []) == []  # there is none
+    assert _DroppingLibUsb.made == 1
+    _folder_in_sysfs(tmp_path / "1-1", 4)
+    (found,) = discovery._list_on_usb([], [])
+    assert found.node == (1, 4)
+    _folder_in_sysfs(tmp_path / "1-2", 5)  # in no list: asked for once
+    for _ in range(3):
+        assert len(discovery._list_on_usb([], [])) == 1
+    assert _DroppingLibUsb.made == 3

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import logging
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -25,6 +27,10 @@ _SIDES = {product: side for side, product in PRODUCT_ID.items()}
 _DEFAULT_PORT = 3240  # the TCP port that IANA registered for USB/IP
 _NO_LIBUSB = "libusb is not installed"
 _INSTALL_LIBUSB = "install it: sudo apt install libusb-1.0-0"
+_SYSFS = Path("/sys/bus/usb/devices")
+_renewing = threading.Lock()
+_replaced: list[Backend] = []
+_given_up: set[tuple[int, int]] = set()  # in sysfs, and in no list of libusb
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,7 @@ class Candidate:
     :param side: from its product id.
     :param where: its place, for messages.
     :param server: the USB/IP server that exports it; None for this machine's USB.
+    :param node: its bus and device number.
     """
 
     backend: Backend
@@ -79,6 +86,7 @@ class Candidate:
     side: Side
     where: str
     server: Server | None = None
+    node: tuple[int, int] = (0, 0)
 
     def __str__(self) -> str:
         return f"the {self.side} Dex3-1 on {self.where}"
@@ -165,7 +173,40 @@ def _list_on_usb(seen: list[str], hints: list[str]) -> list[Candidate]:
         seen.append(_NO_LIBUSB)
         hints.append(_INSTALL_LIBUSB)
         return []
-    return _find_candidates(backend)
+    with _renewing:
+        found = _find_candidates(backend)
+        unlisted = _nodes_of_hands(_SYSFS) - {one.node for one in found} - _given_up
+        if unlisted and isinstance(backend, usb.backend.libusb1._LibUSB):
+            found = _find_candidates(_renew(backend))
+            _given_up.update(unlisted - {one.node for one in found})
+    return found
+
+
+def _renew(backend: Backend) -> Backend:
+    """Libusb with a new list of devices.
+
+    libusb drops a device whose transfer failed, and lists it again only when udev announces it.
+    udev does not when a kernel driver was unbound and bound again, nor where no udev runs. The old
+    list stays in memory, for it may be in use.
+    """
+    log.debug("libusb does not list a hand that the system has; asking it anew")
+    _replaced.append(backend)
+    usb.backend.libusb1._lib_object = type(backend)(backend.lib)
+    return usb.backend.libusb1._lib_object
+
+
+def _nodes_of_hands(sysfs: Path) -> set[tuple[int, int]]:
+    """Bus and device number of each hand in sysfs."""
+    nodes = set()
+    for folder in sysfs.glob("*"):
+        try:
+            vendor, product = (int((folder / n).read_text(), 16) for n in ("idVendor", "idProduct"))
+            if vendor == VENDOR_ID and product in _SIDES:
+                bus, number = (int((folder / n).read_text()) for n in ("busnum", "devnum"))
+                nodes.add((bus, number))
+        except (OSError, ValueError):  # an interface, or a device that goes away meanwhile
+            continue
+    return nodes
 
 
 def _list_on_server(server: Server) -> list[Candidate]:
@@ -182,8 +223,9 @@ def _find_candidates(backend: Backend, server: Server | None = None) -> list[Can
         descriptor = backend.get_device_descriptor(device)
         side = _SIDES.get(descriptor.idProduct)
         if descriptor.idVendor == VENDOR_ID and side is not None:
-            place = f"{where}, bus {descriptor.bus} device {descriptor.address}"
-            found.append(Candidate(backend, device, side, place, server))
+            node = descriptor.bus, descriptor.address
+            place = f"{where}, bus {node[0]} device {node[1]}"
+            found.append(Candidate(backend, device, side, place, server, node))
     return found
 
 

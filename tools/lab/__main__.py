@@ -29,6 +29,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "build/lab", help="folder")
     parser.add_argument("--only", default="", help="groups to run, with commas [default: all]")
     parser.add_argument("--accel", choices=("tcg", "kvm"), default="tcg")
+    parser.add_argument("--patience", type=float, default=_PATIENCE, help="seconds for the guest")
     parser.add_argument("--cores", type=int, default=2, help="of the guest")
     options = parser.parse_args()
     if platform.system() != "Linux" or platform.machine() != "x86_64":
@@ -82,12 +83,12 @@ def _session(out: Path, options: argparse.Namespace) -> int:
             kernel, initramfs, console, words, accelerator=options.accel, cores=options.cores
         )
         print(f"booting {kernel.release} ({options.accel}); console: {console}", flush=True)
-        ended = run_guest(command, _PATIENCE)
+        ended = run_guest(command, options.patience)
     finally:
         control.close()
         devices.close()
     if not (ended and control.finished):
-        why = "the session did not end" if ended else f"it did not end in {_PATIENCE:.0f} s"
+        why = "the session did not end" if ended else f"it did not end in {options.patience:.0f} s"
         told(Case("lab", "the guest's session", "failed", f"{why}; see {out / 'console.log'}"))
     if devices.failure is not None:
         told(Case("lab", "the emulators", "failed", repr(devices.failure)))

@@ -32,7 +32,7 @@ from tools.lab.guest.faults import Subject, table
 __all__ = ["run_dex3"]
 
 _BUSID = {Side.LEFT: "1-1", Side.RIGHT: "1-2"}
-_EXCHANGES = 300
+_EXCHANGES = 100
 _CYCLES = 20
 _BUDGET = 120.0  # seconds for all of them: a busy machine does fewer, and the report says so
 _STILL = 0.02  # rad
