@@ -222,7 +222,8 @@ class _Lines:
         # by the adapter's serial number: an adapter that comes back while its old port is still
         # open becomes another ttyUSB
         words = ("--side", "left", "--device", _SERIAL[self.device], "--domain", str(DOMAIN))
-        self.service = Serve(kind, *words)
+        # the default, 20 or 30 ms, is less than the hiccups of an emulated processor
+        self.service = Serve(kind, *words, "--set", "timeout=0.2")
         self.node = DdsNode(domain=DOMAIN, interface="lo")
         client = Client(self.node, "unitree_go", Side.LEFT, 5.0, 0.05)
         per_rad, still = (100 / 5.4, 1.5) if kind == "ezgripper" else (1.0, 0.05)
