@@ -66,6 +66,11 @@ class Subject:
             lambda: self.client.arrived(target, self.within), f"{self.device} does not obey"
         )
 
+    def _distance(self, place: Sequence[float]) -> float:
+        """How far the joints really are from a place, in the record's unit."""
+        now: list[float] = self.bench.ask(do="now", device=self.device)["q"]
+        return max(abs(q - there) for q, there in zip(now, place, strict=True))
+
     def strike(self, fault: Callable[[], object], mend: Callable[[], object]) -> Outcome:
         """Have ``fault`` while it moves, then ``mend``.
 
@@ -74,9 +79,16 @@ class Subject:
         ask, client = self.bench.ask, self.client
         wait_for(lambda: client.linked, "the device is not there before the fault")
         self.move(self.near)
+        # the states are predicted while there are few exchanges: the host knows where it is
+        near = [q * self.per_rad for q in self.near]
+        wait_for(
+            lambda: self._distance(near) < 2 * self.within * self.per_rad,
+            f"{self.device} does not really get there",
+        )
         begin = self.service.mark()
+        start = ask(do="now", device=self.device)["q"]
         client.go(self.far)
-        time.sleep(0.15)
+        wait_for(lambda: self._distance(start) > 3 * self.still, f"{self.device} does not move")
         at = ask(do="now", device=self.device)
         fault()
         client.silent()
