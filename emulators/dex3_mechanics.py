@@ -119,8 +119,16 @@ class Dex3Mechanics(FingerMechanics):
             raise UsageError(f"the hand takes 24 to 58 V, not {supply_v}")
         self.supply_v = supply_v
         self.fans = False
+        self._presses = [0.0] * len(DEX3_1.sensors)
         self._touched: list[float] = []
         self._felt = _NO_PRESSURE
+
+    def press(self, sensor: int, force: float) -> None:
+        """Press a sensor from outside, as a person does; the joints do not yield.
+
+        :param force: N, on the whole sensor; 0 to let go.
+        """
+        self._presses[sensor] = force
 
     def _step_slowly(self, dt: float) -> None:
         super()._step_slowly(dt)
@@ -168,16 +176,18 @@ class Dex3Mechanics(FingerMechanics):
         the second its tip. An element feels 10 g to 2500 g: less is 0, more is the most.
         """
         torques = [motor.contact() for motor in self._motors]
-        if torques == self._touched:
+        key = torques + self._presses
+        if key == self._touched:
             return self._felt.copy()
         forces = [torques[joint] / lever for joint, lever in _TOUCH]
         palm = sum(forces[i] for i in _ON_PALM) - _PALM_FROM
         forces += [palm if palm > 0.0 else 0.0] * (len(DEX3_1.sensors) - len(forces))
+        forces = [force + press for force, press in zip(forces, self._presses, strict=True)]
         felt: Floats = _SHARES * np.array(forces)[:, np.newaxis]
         np.minimum(felt, _FORCE_MAX, out=felt)
         felt[felt < _FORCE_MIN] = 0.0
         felt /= _ELEMENT_AREA
-        self._touched, self._felt = torques, felt
+        self._touched, self._felt = key, felt
         return felt.copy()
 
     @property

@@ -13,8 +13,14 @@ from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
-from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options
-from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, WireError
+from dexkit.drivers.dex3_usb.settings import (
+    SETTINGS,
+    Dex3Settings,
+    from_options,
+    with_stored,
+)
+from dexkit.drivers.dex3_usb.stored import Store, record_key
+from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError, WireError
 from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, CommandLayout, HandCodec, parse_state
@@ -92,17 +98,55 @@ class Dex3Usb:
         self._reset()
 
     def _reset(self) -> None:
-        configuration = self.configuration
-        self._codec = HandCodec(
-            self._spec.joints,
-            configuration.bus_map,
-            configuration.layout,
-            head=configuration.head,
-        )
+        self._apply(self.configuration)
         self._last: HandState | None = None
         self._tripped: NDArray[np.bool_] | None = None
         self._missed = np.zeros(self._spec.n_joints, np.intp)
         self._any_missed = False
+
+    def _apply(self, effective: Dex3Settings) -> None:
+        """Take over settings that describe the hand.
+
+        :raises UsageError: limits that are not within the model's.
+        """
+        side = self._spec.side
+        joints = effective.joints(side)
+        self._effective = effective
+        self._spec = replace(self._spec, joints=joints)
+        self._limits = None if effective.limits is None else (self._spec.q_min, self._spec.q_max)
+        self._codec = self._make_codec(bool(effective.poll_sensors))
+
+    def _make_codec(self, poll_sensors: bool) -> HandCodec:
+        effective = self._effective
+        return HandCodec(
+            self._spec.joints,
+            effective.bus_map,
+            effective.layout,
+            head=effective.head,
+            mounting=effective.mounting(self._spec.side),
+            poll_sensors=poll_sensors,
+        )
+
+    def _load_stored(self, serial: str) -> None:
+        """Apply the settings that the file holds for this hand."""
+        if self.configuration.config is None:
+            return
+        store, key = Store(self.configuration.config), record_key(serial, self._spec.side)
+        texts = store.section(key, "settings")
+        if not texts:
+            return
+        try:
+            self._apply(with_stored(self.configuration, texts))
+        except UsageError as error:
+            raise UsageError(
+                f"{store.path}: {key}: {error.message}", hint=error.hint or "dexkit bringup"
+            ) from error
+        log.info("settings of hand %s from %s: %s", key, store.path, ", ".join(sorted(texts)))
+
+    @property
+    def settings(self) -> Dex3Settings:
+        """The settings in force: those given, and what the file holds for the open hand."""
+        return self._effective
 
     @property
     def spec(self) -> HandSpec:
@@ -144,7 +188,9 @@ class Dex3Usb:
         )
         self.statistics.link = self._link.statistics
         try:
+            self._load_stored(self._link.serial)
             state = self._await_all_motors(self._link)
+            self._choose_polling(self._link)
         except BaseException:
             self.close()
             raise
@@ -182,12 +228,33 @@ class Dex3Usb:
             raise HandTimeout(
                 problem.message,
                 hint="is its power on? The manual has two sizes of the command frame: "
-                f"try --set frame={_other_layout(self.configuration.layout)}",
+                f"try --set frame={_other_layout(self._effective.layout)}",
             ) from problem
         raise self._missing_motors_error(answer)
 
+    def _choose_polling(self, link: UsbLink) -> None:
+        """Address the sensors if none answers otherwise and some do then."""
+        sensors = len(self._effective.bus_map.sensors)
+        polled = self._effective.poll_sensors
+        if polled is None and len(self._codec.missing_sensors) == sensors:
+            plain, self._codec = self._codec, self._make_codec(True)
+            frame = self._codec.encode(self._brake, False)
+            for _ in range(_OPENING_EXCHANGES):
+                try:
+                    _, self._last = self._transfer(link, frame)
+                except HandTimeout:
+                    continue
+                if len(self._codec.missing_sensors) < sensors:
+                    polled = True
+                    break
+            else:
+                self._codec = plain
+        answer = sensors - len(self._codec.missing_sensors)
+        how = "addressed" if polled else "not addressed"
+        log.info("%s: %d of %d sensors answer, %s", link.name, answer, sensors, how)
+
     def _missing_motors_error(self, answer: bytes) -> HandRefused:
-        motors = self.configuration.bus_map.motors
+        motors = self._effective.bus_map.motors
         silent = ", ".join(
             f"{self._spec.joints[i].name} (bus {motors[i][0]} id {motors[i][1]})"
             for i in self._codec.missing_motors
@@ -196,7 +263,7 @@ class Dex3Usb:
         return HandRefused(
             f"no state of the motor(s) {silent}",
             hint=f"motors that answer (bus.id): {heard or 'none'}; if their places are others, "
-            "say so with --set motors=...",
+            "say so with --set motors=..., or find them: dexkit bringup dex3-usb",
         )
 
     def close(self) -> None:
@@ -255,6 +322,8 @@ class Dex3Usb:
         link = self._link
         if link is None:
             raise HandLost("the hand is not open", hint="call open() first")
+        if self._limits is not None:
+            command = replace(command, q=np.clip(command.q, *self._limits))
         protect, tripped = self._protect, self._tripped
         if tripped is not None:
             # one lock packet with bit 7 = 0 clears a motor's trip

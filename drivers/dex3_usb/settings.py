@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import platformdirs
 
 from dexkit.backends import BackendOptions
 from dexkit.drivers.dex3_usb.discovery import Server, parse_server
 from dexkit.errors import UsageError, WireError
-from dexkit.hand import Side
+from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import (
     COMMAND_1234,
@@ -17,9 +23,29 @@ from dexkit.wire.dex3_usb import (
     DEFAULT_BUS_MAP,
     BusMap,
     CommandLayout,
+    Mounting,
 )
 
-__all__ = ["SETTINGS", "Dex3Settings", "from_options", "parse_places"]
+__all__ = [
+    "OF_THE_HAND",
+    "SETTINGS",
+    "Dex3Settings",
+    "default_path",
+    "format_places",
+    "from_options",
+    "parse_places",
+    "with_stored",
+]
+
+ENVIRONMENT = "DEXKIT_DEX3_CONFIG"
+"""Environment variable with the path of another settings file."""
+_N = len(DEX3_1.joints[Side.LEFT])
+
+
+def default_path() -> Path:
+    """Return ``$DEXKIT_DEX3_CONFIG``, or dex3.json in the user's configuration."""
+    named = os.environ.get(ENVIRONMENT)
+    return Path(named) if named else platformdirs.user_config_path("dexkit") / "dex3.json"
 
 
 @dataclass(frozen=True)
@@ -34,6 +60,16 @@ class Dex3Settings:
     :param head: first two bytes of the command frame, which the manual does not give.
     :param bus_map: bus and id of each motor and sensor; the manual's figure of it is lost
         (docs/sources/unitree-dex.md#c7).
+    :param signs: +1 for each joint whose motor turns as the joint does, else -1.
+    :param offsets: the motor's position where its joint is at 0, rad at the joint.
+    :param ratios: turns of the rotor for one of the joint; None for the model's.
+    :param limits: lowest and highest q of each joint, rad; None for the model's. Commands beyond
+        are clamped by the driver, whatever sends them.
+    :param poll_sensors: whether command frames address the sensors, too; None to poll them if none
+        answers otherwise (docs/dex3-protocol.md).
+    :param config: file with settings of single hands, by serial number (docs/bringup.md); None to
+        read none.
+    :param given: names of settings that those in the file do not replace.
     :param protect: enable the motors' time-out protection, which stops them 1 s after a command.
     :param timeout: seconds to wait for an answer.
     :param send_timeout: seconds that the hand may take to accept a command.
@@ -47,6 +83,13 @@ class Dex3Settings:
     layout: CommandLayout = COMMAND_1234
     head: bytes = COMMAND_HEAD
     bus_map: BusMap = DEFAULT_BUS_MAP
+    signs: tuple[int, ...] = (1,) * _N
+    offsets: tuple[float, ...] = (0.0,) * _N
+    ratios: tuple[float, ...] | None = None
+    limits: tuple[tuple[float, float], ...] | None = None
+    poll_sensors: bool | None = None
+    config: Path | None = None
+    given: frozenset[str] = frozenset()
     protect: bool = True
     timeout: float = 0.1
     send_timeout: float = 0.1
@@ -63,14 +106,48 @@ class Dex3Settings:
                 hint=f"in hex; the default is {COMMAND_HEAD.hex()}",
             )
         for name, places, wanted in (
-            ("motors", self.bus_map.motors, len(DEX3_1.joints[Side.LEFT])),
+            ("motors", self.bus_map.motors, _N),
             ("sensors", self.bus_map.sensors, len(DEX3_1.sensors)),
+            ("signs", self.signs, _N),
+            ("offsets", self.offsets, _N),
+            ("ratios", self.ratios or (1.0,) * _N, _N),
+            ("limits", self.limits or ((0.0, 0.0),) * _N, _N),
         ):
             if len(places) != wanted:
                 raise UsageError(
-                    f"{name}: the hand has {wanted}, here are {len(places)} place(s)",
+                    f"{name}: the hand has {wanted}, here are {len(places)} value(s)",
                     hint=f"{name} is {_PARSERS[name][1]}",
                 )
+        self.mounting(Side.LEFT)  # refuses values that cannot be
+
+    def mounting(self, side: Side) -> Mounting:
+        """Direction, zero and gearing of the motors."""
+        ratios = self.ratios or tuple(joint.gear_ratio for joint in DEX3_1.joints[side])
+        return Mounting(self.signs, self.offsets, ratios)
+
+    def joints(self, side: Side) -> tuple[JointSpec, ...]:
+        """The joints with these limits and ratios.
+
+        :raises UsageError: a limit is not within the model's.
+        """
+        joints = DEX3_1.joints[side]
+        limits = self.limits or tuple((joint.q_min, joint.q_max) for joint in joints)
+        for joint, (low, high) in zip(joints, limits, strict=True):
+            if not joint.q_min - _ROUNDING <= low < high <= joint.q_max + _ROUNDING:
+                raise UsageError(
+                    f"limits: {joint.name} of a {side} hand has {joint.q_min:.4f} to "
+                    f"{joint.q_max:.4f} rad, not {low:g} to {high:g}",
+                    hint="limits may only be narrower than the model's",
+                )
+        return tuple(
+            replace(joint, q_min=low, q_max=high, gear_ratio=ratio)
+            for joint, (low, high), ratio in zip(
+                joints, limits, self.mounting(side).ratios, strict=True
+            )
+        )
+
+
+_ROUNDING = 1e-4  # rad, of limits that were written with four decimals
 
 
 def parse_places(text: str) -> tuple[tuple[int, int], ...]:
@@ -111,7 +188,41 @@ def _parse_address(text: str) -> int:
     return value
 
 
-def _format_places(places: tuple[tuple[int, int], ...]) -> str:
+def _parse_list(part: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    return lambda text: tuple(part(value.strip()) for value in text.split(","))
+
+
+def _parse_sign(text: str) -> int:
+    if text not in _SIGNS:
+        raise ValueError(f"{text!r} is neither + nor -")
+    return _SIGNS[text]
+
+
+_SIGNS = {"+": 1, "+1": 1, "1": 1, "-": -1, "-1": -1}
+
+
+def _parse_number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
+
+
+def _parse_limits(text: str) -> tuple[float, float]:
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise ValueError(f"{text!r} is not LOW:HIGH")
+    return _parse_number(low), _parse_number(high)
+
+
+def _parse_polling(text: str) -> bool | None:
+    if text not in ("auto", "on", "off"):
+        raise ValueError("auto, on or off")
+    return None if text == "auto" else text == "on"
+
+
+def format_places(places: tuple[tuple[int, int], ...]) -> str:
+    """The text that :func:`parse_places` parses."""
     return ",".join(f"{bus}.{number}" for bus, number in places)
 
 
@@ -127,12 +238,34 @@ _PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
     "motors": (
         parse_places,
         "BUS.ID of each motor, in the joints' order "
-        f"(default {_format_places(DEFAULT_BUS_MAP.motors)})",
+        f"(default {format_places(DEFAULT_BUS_MAP.motors)})",
     ),
     "sensors": (
         parse_places,
-        f"BUS.ID of each sensor packet (default {_format_places(DEFAULT_BUS_MAP.sensors)})",
+        f"BUS.ID of each sensor packet (default {format_places(DEFAULT_BUS_MAP.sensors)})",
     ),
+    "signs": (
+        _parse_list(_parse_sign),
+        "+ or - for each joint: does its motor turn as the joint does? (default all +)",
+    ),
+    "offsets": (
+        _parse_list(_parse_number),
+        "rad at the joint: each motor's position where its joint is at 0 (default all 0)",
+    ),
+    "ratios": (
+        _parse_list(_parse_number),
+        "turns of each rotor for one of its joint (default 214, then six times 108)",
+    ),
+    "limits": (
+        _parse_list(_parse_limits),
+        "LOW:HIGH of each joint, rad, within the model's (default the model's)",
+    ),
+    "poll_sensors": (
+        _parse_polling,
+        "on: command frames address the sensors, too; off; auto: if none answers otherwise "
+        "(default auto)",
+    ),
+    "config": (Path, "file with settings of single hands (default the user's)"),
     "out_endpoint": (_parse_address, "address such as 0x02 (default the first bulk OUT)"),
     "in_endpoint": (_parse_address, "address such as 0x81 (default the first bulk IN)"),
 }
@@ -141,6 +274,11 @@ _USB = (
     "only), or usbip://HOST[:PORT] (default auto)"
 )
 
+OF_THE_HAND = (
+    *("frame", "head", "motors", "sensors", "signs", "offsets", "ratios", "limits"),
+    "poll_sensors",
+)
+"""Settings that describe a hand, which the settings file holds for each."""
 SETTINGS: dict[str, str] = {"usb": _USB} | {
     name: meaning for name, (_, meaning) in _PARSERS.items()
 }
@@ -152,28 +290,49 @@ def from_options(options: BackendOptions) -> Dex3Settings:
 
     :raises UsageError: a value cannot be parsed or is out of range, or two contradict each other.
     """
+    texts = {name: text for name, text in options.settings.items() if name != "usb"}
+    values = {"config": default_path()} | _parse_values(texts)
+    return Dex3Settings(**_parse_location(options), given=frozenset(texts), **values)  # type: ignore[arg-type]
+
+
+def with_stored(settings: Dex3Settings, texts: Mapping[str, str]) -> Dex3Settings:
+    """Return the settings with those of a file, which do not replace the given ones.
+
+    :raises UsageError: one is no property of a hand, or cannot be parsed.
+    """
+    for name in texts:
+        if name not in OF_THE_HAND:
+            raise UsageError(
+                f"{name} is no setting of a single hand", hint=f"known: {', '.join(OF_THE_HAND)}"
+            )
+    chosen = {name: text for name, text in texts.items() if name not in settings.given}
+    return replace(settings, **_parse_values(chosen, settings.bus_map))  # type: ignore[arg-type]
+
+
+def _parse_values(
+    texts: Mapping[str, str], bus_map: BusMap = DEFAULT_BUS_MAP
+) -> dict[str, object]:
+    """Fields of :class:`Dex3Settings`.
+
+    :raises UsageError: a value cannot be parsed.
+    """
     values: dict[str, object] = {}
-    for name, text in options.settings.items():
-        if name == "usb":
-            continue
+    for name, text in texts.items():
         parse, meaning = _PARSERS[name]
         try:
             values[name] = parse(text)
         except ValueError as error:
             raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
-    bus_map = DEFAULT_BUS_MAP
     for name in ("motors", "sensors"):
         if name in values:
             try:
                 bus_map = replace(bus_map, **{name: values.pop(name)})  # type: ignore[arg-type]
             except (UsageError, WireError) as error:
                 meaning = f"{name} is {_PARSERS[name][1]}"
-                raise UsageError(
-                    f"{name}={options.settings[name]}: {error}", hint=meaning
-                ) from error
+                raise UsageError(f"{name}={texts[name]}: {error}", hint=meaning) from error
     if "frame" in values:
         values["layout"] = values.pop("frame")
-    return Dex3Settings(bus_map=bus_map, **_parse_location(options), **values)  # type: ignore[arg-type]
+    return values | {"bus_map": bus_map}
 
 
 def _parse_location(options: BackendOptions) -> dict[str, object]:

@@ -6,13 +6,13 @@ The bytes equal those of :meth:`dexkit.wire.dex3_usb.HandCodec.encode_state`, wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from dexkit.emulators.dex3_mcu.wiring import Wiring
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.hand import MotorError
-from dexkit.models import DEX3_1
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import (
     MOTOR_STATE,
@@ -20,7 +20,6 @@ from dexkit.wire.dex3_usb import (
     SENSOR_STATE,
     STATE,
     STATE_BUS_SIZE,
-    BusMap,
     units,
 )
 from dexkit.wire.ris import NUDGE
@@ -33,29 +32,40 @@ _TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 class AnswerWriter:
     """Encodes the state frames of one hand.
 
-    :param bus_map: bus and id of each joint and sensor.
+    :param wiring: bus and id of each joint and sensor, and how the motors are mounted.
     :param model: ``mode[0]`` of the frames.
     """
 
-    def __init__(self, mechanics: Dex3Mechanics, bus_map: BusMap, model: int) -> None:
+    def __init__(self, mechanics: Dex3Mechanics, wiring: Wiring, model: int) -> None:
         self._mechanics = mechanics
-        self._map = bus_map
+        self._map = bus_map = wiring.bus_map
+        mounting = wiring.mounting
         self._model = model
         self._factors = [
             tuple(
-                scale.factor(joint.gear_ratio) * NUDGE
+                sign * scale.factor(ratio) * NUDGE
                 for scale in (units.TORQUE, units.VELOCITY, units.POSITION)
             )
-            for joint in DEX3_1.joints[mechanics.side]
+            for sign, ratio in zip(mounting.signs, mounting.ratios, strict=True)
+        ]
+        self._zeros = [
+            offset * units.POSITION.factor(ratio) * NUDGE
+            for offset, ratio in zip(mounting.offsets, mounting.ratios, strict=True)
         ]
         self._pressure = b""
         self._sensors = [b""] * len(bus_map.sensors)
 
-    def frame(self, motors: Sequence[int], tripped: Sequence[bool]) -> bytes:
+    def frame(
+        self,
+        motors: Sequence[int],
+        tripped: Sequence[bool],
+        sensors: Collection[int] | None = None,
+    ) -> bytes:
         """Encode a state frame with the present state.
 
         :param motors: indices of the motors that answer.
         :param tripped: whether each motor's time-out protection has tripped.
+        :param sensors: indices of the sensors that answer; all by default.
         """
         mechanics = self._mechanics
         buses = [b""] * N_BUSES
@@ -63,8 +73,11 @@ class AnswerWriter:
         for index in motors:
             buses[self._map.motors[index][0]] += packets[index]
         self._renew_sensors()
-        for (bus, _), packet in zip(self._map.sensors, self._sensors, strict=True):
-            buses[bus] += packet
+        for index, ((bus, _), packet) in enumerate(
+            zip(self._map.sensors, self._sensors, strict=True)
+        ):
+            if sensors is None or index in sensors:
+                buses[bus] += packet
         supply, imu = mechanics.supply, mechanics.imu
         data = STATE.pack(
             STATE.head,
@@ -88,9 +101,10 @@ class AnswerWriter:
         volts = units.MOTOR_VOLTAGE.encode(mechanics.motor_v)
         pack = MOTOR_STATE.struct.pack
         packets = []
-        for (_, number), factors, mode, trip, error, case, winding, tau, dq, q in zip(
+        for (_, number), factors, zero, mode, trip, error, case, winding, tau, dq, q in zip(
             self._map.motors,
             self._factors,
+            self._zeros,
             mechanics.mode,
             tripped,
             mechanics.errors,
@@ -110,7 +124,7 @@ class AnswerWriter:
                 volts,
                 _clamp(tau * torque, -0x8000, 0x7FFF),
                 _clamp(dq * speed, -0x8000, 0x7FFF),
-                _clamp(q * position, -0x80000000, 0x7FFFFFFF),
+                _clamp(q * position + zero, -0x80000000, 0x7FFFFFFF),
                 error | _TRIPPED if trip else error,
                 0,
                 0,

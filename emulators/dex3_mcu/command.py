@@ -9,10 +9,9 @@ from __future__ import annotations
 import struct
 from typing import TypeAlias
 
-from dexkit.hand import Side
-from dexkit.models import DEX3_1
+from dexkit.emulators.dex3_mcu.wiring import Wiring
 from dexkit.wire.crc32 import crc32_words
-from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, MOTOR_CMD, N_BUSES, BusMap, units
+from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, MOTOR_CMD, N_BUSES, units
 
 __all__ = ["CommandReader", "MotorCommand"]
 
@@ -27,13 +26,26 @@ _FIRST, _BEHIND = MOTOR_CMD.covered
 class CommandReader:
     """Decodes command frames of one hand."""
 
-    def __init__(self, side: Side, bus_map: BusMap) -> None:
+    def __init__(self, wiring: Wiring) -> None:
         self._layouts = {layout.size: layout for layout in COMMAND_LAYOUTS}
-        scales = (units.POSITION, units.VELOCITY, units.TORQUE, units.STIFFNESS, units.DAMPING)
+        mounting = wiring.mounting
+        turning = (units.POSITION, units.VELOCITY, units.TORQUE)
+        gains = (units.STIFFNESS, units.DAMPING)
         self._motors = {
-            address: (joint, [1.0 / scale.factor(spec.gear_ratio) for scale in scales])
-            for joint, (address, spec) in enumerate(
-                zip(bus_map.motors, DEX3_1.joints[side], strict=True)
+            address: (
+                joint,
+                [sign / scale.factor(ratio) for scale in turning]
+                + [1.0 / scale.factor(ratio) for scale in gains],
+                sign * offset,
+            )
+            for joint, (address, sign, offset, ratio) in enumerate(
+                zip(
+                    wiring.bus_map.motors,
+                    mounting.signs,
+                    mounting.offsets,
+                    mounting.ratios,
+                    strict=True,
+                )
             )
         }
 
@@ -57,13 +69,13 @@ class CommandReader:
                     return None
                 if crc32_words(packet[_FIRST:_BEHIND]) != crc:
                     return None
-                joint, (per_q, per_dq, per_tau, per_kp, per_kd) = motor
+                joint, (per_q, per_dq, per_tau, per_kp, per_kd), zero = motor
                 commands.append(
                     (
                         joint,
                         mode >> 4 & 7,
                         mode > 0x7F,
-                        q * per_q,
+                        q * per_q - zero,
                         dq * per_dq,
                         tau * per_tau,
                         kp * per_kp,

@@ -18,13 +18,14 @@ from dexkit.clock import Clock, RealClock
 from dexkit.emulators.dex3_mcu.answer import AnswerWriter
 from dexkit.emulators.dex3_mcu.command import CommandReader, MotorCommand
 from dexkit.emulators.dex3_mcu.settings import Firmware
+from dexkit.emulators.dex3_mcu.wiring import Wiring
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.faults import Fault, FaultSchedule
 from dexkit.emulators.finger_mechanics import AMBIENT, STEP
 from dexkit.errors import ChecksumError, WireError
 from dexkit.hand import JointMode, MotorError, Side
 from dexkit.models import DEX3_1
-from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP, BusMap, DecodedCommand, HandCodec
+from dexkit.wire.dex3_usb import DecodedCommand, HandCodec
 
 __all__ = ["Counters", "Dex3Mcu"]
 
@@ -58,12 +59,13 @@ class Counters:
 class _Motor:
     """Command and time-out protection of one motor."""
 
-    __slots__ = ("deadline", "silent", "tripped")
+    __slots__ = ("deadline", "driven", "silent", "tripped")
 
     def __init__(self) -> None:
         self.deadline = math.inf  # when the protection trips
         self.tripped = False
         self.silent = False
+        self.driven = False
 
 
 class Dex3Mcu:
@@ -71,11 +73,14 @@ class Dex3Mcu:
 
     :param mechanics: mechanics of the same side; a new one by default.
     :param clock: real time by default; with a manual clock the hand is deterministic.
+    :param wiring: where and how the motors and sensors are mounted; by default as dexkit assumes.
     :param faults: planned faults, times counted from now. Those for the other side are ignored.
     :param seed: seed of the faults' random numbers.
 
     :ivar plugged: whether the USB cable is plugged. The motors have a supply of their own.
     :ivar late: seconds by which the last answer must be delayed.
+    :ivar on_drive: called with the time, a joint, and its command for each command that drives a
+        motor; with None for the command, when the motor stops being driven.
     :ivar on_stall: called with ``"in"`` or ``"out"`` when that endpoint must halt.
     """
 
@@ -86,7 +91,7 @@ class Dex3Mcu:
         mechanics: Dex3Mechanics | None = None,
         clock: Clock | None = None,
         firmware: Firmware | None = None,
-        bus_map: BusMap = DEFAULT_BUS_MAP,
+        wiring: Wiring | None = None,
         faults: Sequence[Fault] = (),
         seed: int = 0,
     ) -> None:
@@ -97,15 +102,20 @@ class Dex3Mcu:
         self.plugged = True
         self.late = 0.0
         self.on_stall: Callable[[str], None] = lambda endpoint: None
-        self._codec = HandCodec(DEX3_1.joints[side], bus_map)
-        self._reader = CommandReader(side, bus_map)
-        self._writer = AnswerWriter(self.mechanics, bus_map, self.firmware.model_code)
+        self.on_drive: Callable[[float, int, MotorCommand | None], None] | None = None
+        self.wiring = wiring or Wiring.assumed(side)
+        self._codec = HandCodec(
+            DEX3_1.joints[side], self.wiring.bus_map, mounting=self.wiring.mounting
+        )
+        self._reader = CommandReader(self.wiring)
+        self._writer = AnswerWriter(self.mechanics, self.wiring, self.firmware.model_code)
         self._clock: Clock = clock or RealClock()
         self._random = random.Random(seed)
         self._motors = [_Motor() for _ in DEX3_1.joints[side]]
         self._origin = self._now = self._clock.now()
         self._steps = 0
         self._hot: dict[int, float] = {}
+        self._polled: set[int] | None = None  # sensors that answer; None for all
         self._overcurrent: set[int] = set()
         self.schedule = FaultSchedule(start=self._origin)
         for fault in faults:
@@ -166,6 +176,7 @@ class Dex3Mcu:
         # without gains FOC is limp
         mode = JointMode.BRAKE if self.firmware.tripped_brakes else JointMode.FOC
         self.mechanics.command(index, mode)
+        self._report_drive(index, None)
 
     def _apply_fault(self, fault: Fault, begins: bool) -> None:
         kind = fault.kind
@@ -211,7 +222,9 @@ class Dex3Mcu:
         self.advance()
         self.counters.frames += 1
         answering: list[int] | None = None
+        self._polled = set() if self.firmware.sensors_polled else None
         try:
+            self._check_firmware(data)
             answering = self._apply_frame(data)
         except ChecksumError:
             self.counters.bad_crc += 1
@@ -222,6 +235,16 @@ class Dex3Mcu:
                 return None
             answering = list(range(len(self._motors)))
         return self._send(self.state(answering))
+
+    def _check_firmware(self, data: bytes) -> None:
+        """Refuse frames that this firmware does not take.
+
+        :raises WireError: it is one.
+        """
+        if self.firmware.frame not in (None, len(data)):
+            raise WireError(f"a frame of {len(data)} bytes")
+        if self.firmware.head not in (None, data[:2]):
+            raise ChecksumError(f"a frame that starts with {data[:2].hex()}")
 
     def _apply_frame(self, data: bytes) -> list[int]:
         """Pass each motor its packet; return the indices of the motors that answer.
@@ -235,6 +258,10 @@ class Dex3Mcu:
             self.counters.damaged_packets += len(decoded.problems)
             silent = set(np.flatnonzero(decoded.silent).tolist())
             self.counters.broadcasts += bool(silent)
+            if self._polled is not None:
+                places = self.wiring.bus_map.sensors
+                asked = {(bus, packet.id) for bus, packet in decoded.frame.sensors}
+                self._polled = {i for i, place in enumerate(places) if place in asked}
             commands = _commands_present(decoded)
         for command in commands:
             if not self._motors[command[0]].silent:
@@ -263,6 +290,15 @@ class Dex3Mcu:
         else:
             motor.deadline = self._now + self.firmware.command_timeout
         self.mechanics.command(index, status if known else JointMode.BRAKE, *setpoint)
+        _, dq, tau, kp, kd = setpoint
+        drives = status == JointMode.FOC and (kp > 0 or tau != 0 or (kd > 0 and dq != 0))
+        self._report_drive(index, (index, status, protect, *setpoint) if drives else None)  # type: ignore[arg-type]
+
+    def _report_drive(self, index: int, command: MotorCommand | None) -> None:
+        motor = self._motors[index]
+        if self.on_drive is not None and (command is not None or motor.driven):
+            self.on_drive(self._now, index, command)
+        motor.driven = command is not None
 
     def state(self, motors: Sequence[int] | None = None) -> bytes:
         """Encode a state frame with the present state.
@@ -271,7 +307,7 @@ class Dex3Mcu:
         """
         which = range(len(self._motors)) if motors is None else motors
         heard = [index for index in which if not self._motors[index].silent]
-        return self._writer.frame(heard, self.tripped)
+        return self._writer.frame(heard, self.tripped, self._polled)
 
     def _send(self, answer: bytes) -> bytes | None:
         chance = self._random.random

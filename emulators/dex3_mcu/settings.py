@@ -34,6 +34,12 @@ class Firmware:
     :param other_status_brakes: a status that is neither lock nor FOC brakes (6, calibration on
         the sibling motor, included); otherwise such a packet is ignored.
     :param model_code: mode[0] of the state, "the model of the hand"; its values are not given.
+    :param sensors_polled: a sensor answers a frame that addresses it only, as the sizes "20*7 3+4"
+        can be read; otherwise all sensors answer every frame, and such packets are ignored.
+    :param frame: bytes of the only command frame that is taken, 1234 or 734; None for both. Others
+        are frames of a wrong size.
+    :param head: the only first two bytes of a command frame that are taken; None for any. Others
+        are frames with a wrong CRC.
     :param answer_time: seconds from a command to its answer. Unknown, below 1 ms at the 1000 Hz
         of the manual; 0 shows what the host's side costs.
     """
@@ -45,6 +51,9 @@ class Firmware:
     tripped_brakes: bool = True
     other_status_brakes: bool = True
     model_code: int = 0
+    sensors_polled: bool = False
+    frame: int | None = None
+    head: bytes | None = None
     answer_time: float = 0.0
 
     def __post_init__(self) -> None:

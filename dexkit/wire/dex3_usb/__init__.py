@@ -19,6 +19,7 @@ from dexkit.wire.dex3_usb.layout import (
     N_BUSES,
     PRODUCT,
     PRODUCT_ID,
+    SENSOR_CMD,
     SENSOR_STATE,
     STATE,
     STATE_BUS_SIZE,
@@ -26,6 +27,7 @@ from dexkit.wire.dex3_usb.layout import (
     VENDOR_ID,
     CommandLayout,
 )
+from dexkit.wire.dex3_usb.mounting import Mounting
 from dexkit.wire.dex3_usb.packets import (
     FROM_HAND,
     TO_HAND,
@@ -33,6 +35,7 @@ from dexkit.wire.dex3_usb.packets import (
     MotorCmd,
     MotorState,
     Problem,
+    SensorCmd,
     SensorState,
     StateFrame,
     pack_command,
@@ -62,6 +65,7 @@ __all__ = [
     "PRODUCT_ID",
     "RIS_MODE",
     "SCALES",
+    "SENSOR_CMD",
     "SENSOR_STATE",
     "STATE",
     "STATE_BUS_SIZE",
@@ -75,8 +79,10 @@ __all__ = [
     "HandCodec",
     "MotorCmd",
     "MotorState",
+    "Mounting",
     "Problem",
     "Scale",
+    "SensorCmd",
     "SensorState",
     "StateFrame",
     "pack_command",

@@ -42,6 +42,7 @@ from dexkit.wire.dex3_usb.layout import (
     STATE_BUS_SIZE,
     CommandLayout,
 )
+from dexkit.wire.dex3_usb.mounting import Mounting
 from dexkit.wire.dex3_usb.packets import (
     FROM_HAND,
     Bytes,
@@ -49,6 +50,7 @@ from dexkit.wire.dex3_usb.packets import (
     MotorCmd,
     MotorState,
     Problem,
+    SensorCmd,
     SensorState,
     StateFrame,
     bus_part,
@@ -71,6 +73,7 @@ _COMMAND_SCALES = (
     units.STIFFNESS,
     units.DAMPING,
 )
+_TURNS = (True, True, True, False, False)
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,8 @@ class HandCodec:
     :param joints: in the order of commands and states, with their gear ratios.
     :param layout: of the command frames that are encoded; both are decoded.
     :param head: of the command frames that are encoded.
+    :param mounting: direction, zero and gearing of the motors; by default :meth:`Mounting.of`.
+    :param poll_sensors: whether the command frames that are encoded address the sensors, too.
 
     After each :meth:`decode`: ``problems``, what was lost of that frame; ``missing_motors`` and
     ``missing_sensors``, the indices without a good packet in it. Since the beginning: ``frames``
@@ -142,15 +147,18 @@ class HandCodec:
         layout: CommandLayout = COMMAND_1234,
         *,
         head: bytes = COMMAND_HEAD,
+        mounting: Mounting | None = None,
+        poll_sensors: bool = False,
     ) -> None:
-        if len(joints) != len(bus_map.motors):
-            raise UsageError(
-                f"{len(joints)} joint(s), but the bus map has {len(bus_map.motors)} motor(s)"
-            )
+        mounting = Mounting.of(joints) if mounting is None else mounting
+        for found, what in ((bus_map.motors, "the bus map"), (mounting.signs, "the mounting")):
+            if len(joints) != len(found):
+                raise UsageError(f"{len(joints)} joint(s), but {what} has {len(found)} motor(s)")
         self.joints = tuple(joints)
         self.bus_map = bus_map
         self.layout = layout
-        self.ratios = tuple(joint.gear_ratio for joint in joints)
+        self.mounting = mounting
+        self.ratios = mounting.ratios
         self.problems: list[Problem] = []
         self.missing_motors: tuple[int, ...] = ()
         self.missing_sensors: tuple[int, ...] = ()
@@ -162,10 +170,17 @@ class HandCodec:
         for joint, (bus, number) in enumerate(bus_map.motors):
             self._joints_at[bus, number] = [joint]
             self._joints_at.setdefault((bus, BROADCAST_ID), []).append(joint)
+        self._zeros = [s * o for s, o in zip(mounting.signs, mounting.offsets, strict=True)]
+        # position, velocity and torque turn round with the sign, the gains do not
         self._command_units = [
-            tuple(1 / scale.factor(ratio) for scale in _COMMAND_SCALES) for ratio in self.ratios
+            tuple(
+                (sign if turns else 1) / scale.factor(ratio)
+                for scale, turns in zip(_COMMAND_SCALES, _TURNS, strict=True)
+            )
+            for sign, ratio in zip(mounting.signs, mounting.ratios, strict=True)
         ]
-        self._encoder = _CommandEncoder(self.ratios, bus_map, layout, head)
+        polled = bus_map.sensors if poll_sensors else ()
+        self._encoder = _CommandEncoder(mounting, bus_map.motors, polled, layout, head)
         self._plan: _StatePlan | None = None
         self._swap = bytearray(STATE.covered[1] - STATE.covered[0])
         self._swap_words = np.frombuffer(self._swap, ">u4")
@@ -243,7 +258,7 @@ class HandCodec:
                     places[owners.index((bus, number))] = base + offset
                     continue
                 problems.append(Problem(bus, offset, error))
-        plan = _StatePlan(self.ratios, self.bus_map, bytes(data[_SIZES]), motors, sensors)
+        plan = _StatePlan(self.mounting, self.bus_map, bytes(data[_SIZES]), motors, sensors)
         return plan, problems
 
     # --- the device's side
@@ -271,7 +286,8 @@ class HandCodec:
                 problems.append(Problem(bus, None, error))
             counts = (packet.pos_des, packet.spd_des, packet.tor_des, packet.k_pos, packet.k_spd)
             for joint in joints:
-                values[joint] = tuple(map(mul, counts, self._command_units[joint]))
+                position, *rest = map(mul, counts, self._command_units[joint])
+                values[joint] = (position - self._zeros[joint], *rest)
                 mode[joint] = packet.status
                 timeout[joint] = packet.timeout
                 silent[joint] = broadcast and (silent[joint] or not present[joint])
@@ -345,7 +361,7 @@ class HandCodec:
         )
 
     def _motor_state(self, state: HandState, i: int, number: int) -> MotorState:
-        ratio = self.ratios[i]
+        ratio, sign = self.ratios[i], self.mounting.signs[i]
         fault = int(state.fault[i])
         winding = (
             state.temperature if state.winding_temperature is None else (state.winding_temperature)
@@ -357,9 +373,9 @@ class HandCodec:
             temp=_encode_or_zero(units.TEMPERATURE, float(state.temperature[i])),
             sensor=_encode_or_zero(units.WINDING_TEMPERATURE, float(winding[i])),
             vol=_encode_or_zero(units.MOTOR_VOLTAGE, float(state.voltage[i])),
-            torque=units.TORQUE.encode(float(state.tau_est[i]), ratio),
-            speed=units.VELOCITY.encode(float(state.dq[i]), ratio),
-            pos=units.POSITION.encode(float(state.q[i]), ratio),
+            torque=units.TORQUE.encode(sign * float(state.tau_est[i]), ratio),
+            speed=units.VELOCITY.encode(sign * float(state.dq[i]), ratio),
+            pos=units.POSITION.encode(self.mounting.motor(i, float(state.q[i])), ratio),
             merror=fault,
         )
 
@@ -372,18 +388,26 @@ class _CommandEncoder:
     """Writes into a frame that is kept, and whose fixed parts never change."""
 
     def __init__(
-        self, ratios: Sequence[float], bus_map: BusMap, layout: CommandLayout, head: bytes
+        self,
+        mounting: Mounting,
+        motors: Sequence[tuple[int, int]],
+        polled: Sequence[tuple[int, int]],
+        layout: CommandLayout,
+        head: bytes,
     ) -> None:
-        n = len(ratios)
+        n = len(motors)
         self._n = n
         # the packets bus by bus; within a bus in the order of the map
-        order = sorted(range(n), key=lambda i: bus_map.motors[i][0])
-        self._ids = [bus_map.motors[i][1] for i in order]
+        order = sorted(range(n), key=lambda i: motors[i][0])
+        self._ids = [motors[i][1] for i in order]
         self._order = None if order == list(range(n)) else np.array(order)
         brake = [MotorCmd(number, 0, False, 0, 0, 0, 0, 0) for number in self._ids]
-        buses: list[list[MotorCmd]] = [[] for _ in range(N_BUSES)]
+        buses: list[list[MotorCmd | SensorCmd]] = [[] for _ in range(N_BUSES)]
         for i, packet in zip(order, brake, strict=True):
-            buses[bus_map.motors[i][0]].append(packet)
+            buses[motors[i][0]].append(packet)
+        driven = [len(packets) for packets in buses]
+        for bus, number in polled:  # behind the motors; these bytes stay as they are
+            buses[bus].append(SensorCmd(number))
         template = pack_command(CommandFrame(buses, head=head), layout)
 
         # two bytes in front, so that the words under the frame's CRC are aligned in memory
@@ -415,8 +439,8 @@ class _CommandEncoder:
         self._copies = []
         done = 0
         block_view = memoryview(self._block)
-        for bus, packets_of_bus in enumerate(buses):
-            length = len(packets_of_bus) * size
+        for bus, count in enumerate(driven):
+            length = count * size
             at = 2 + layout.bus_offset(bus)
             if length:
                 self._copies.append(
@@ -429,8 +453,15 @@ class _CommandEncoder:
         self._flat = self._values.reshape(-1)
         self._ones = np.ones(5 * n)
         self._counts = np.zeros((5, n))
-        ordered = [ratios[i] for i in order]
-        self._factors = np.array([[s.factor(r) * NUDGE for r in ordered] for s in scales])
+        ratios = [mounting.ratios[i] for i in order]
+        self._factors = np.array([[s.factor(r) * NUDGE for r in ratios] for s in scales])
+        for row in (0, 1, 4):  # torque, velocity, position
+            self._factors[row] *= [mounting.signs[i] for i in order]
+        zero = [
+            units.POSITION.factor(r) * mounting.offsets[i] * NUDGE
+            for r, i in zip(ratios, order, strict=True)
+        ]
+        self._zero = np.array(zero) if any(zero) else None
         self._low = np.array([[float(s.low)] * n for s in scales])
         self._high = np.array([[float(s.high)] * n for s in scales])
         self._short_counts = self._counts[:4].reshape(2, 2, n).transpose(2, 0, 1)
@@ -459,6 +490,8 @@ class _CommandEncoder:
         if not math.isfinite(self._flat.dot(self._ones)) and not np.isfinite(values).all():
             raise EncodeError("NaN or infinity in a command cannot be sent")
         np.multiply(values, self._factors, out=counts)
+        if self._zero is not None:
+            counts[4] += self._zero
         np.minimum(counts, self._high, out=counts)
         np.maximum(counts, self._low, out=counts)
         self._shorts[...] = self._short_counts  # toward zero
@@ -531,13 +564,13 @@ class _StatePlan:
 
     def __init__(
         self,
-        ratios: Sequence[float],
+        mounting: Mounting,
         bus_map: BusMap,
         sizes: bytes,
         motors: dict[int, int],
         sensors: dict[int, int],
     ) -> None:
-        n, n_sensors = len(ratios), len(bus_map.sensors)
+        n, n_sensors = len(bus_map.motors), len(bus_map.sensors)
         self.sizes = sizes
         self.missing_motors = tuple(i for i in range(n) if i not in motors)
         self.missing_sensors = tuple(i for i in range(n_sensors) if i not in sensors)
@@ -602,10 +635,13 @@ class _StatePlan:
         # q, dq, tau, temperature, winding temperature, voltage, and ddq, which is not on the wire
         self._units = np.array(
             [
-                *([1 / s.factor(r) for r in ratios] for s in _JOINT_SCALES),
+                *([1 / s.factor(r) for r in mounting.ratios] for s in _JOINT_SCALES),
                 [0.0] * n,
             ]
         )
+        self._units[:3] *= mounting.signs  # position, velocity, torque
+        zero = [s * o for s, o in zip(mounting.signs, mounting.offsets, strict=True)]
+        self._zero = np.array(zero) if any(zero) else None
         self._mode: NDArray[np.uint8] = np.zeros(n, np.uint8)
         self._tripped: NDArray[np.uint32] | None = None
 
@@ -639,6 +675,8 @@ class _StatePlan:
         joints[4] = self._winding
         joints[5] = self._vol
         joints *= self._units
+        if self._zero is not None:
+            joints[0] -= self._zero
         mode = self._mode.copy()
         fault = self._merror.copy() if self._tripped is None else self._merror | self._tripped
         pressure = _PASCAL.take(self._pressure)

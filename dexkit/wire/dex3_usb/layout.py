@@ -24,6 +24,7 @@ __all__ = [
     "N_BUSES",
     "PRODUCT",
     "PRODUCT_ID",
+    "SENSOR_CMD",
     "SENSOR_STATE",
     "STATE",
     "STATE_BUS_SIZE",
@@ -61,6 +62,22 @@ MOTOR_CMD = Structure(
     ),
     (0, 16),
 )
+
+SENSOR_CMD = Structure(
+    "SensorCmd_t",
+    "Command to one sensor, assumed",
+    b"\x7e\xe7",
+    (
+        Field("head", "u8", 2, "7E E7"),
+        Field("mode", "u8", 1, "bits 0-3 id, bits 4-7 status; 0"),
+        Field("reverse", "u8", 13, "reserved; 0"),
+        Field("CRC32", "u32", 1, "checksum"),
+    ),
+    (0, 16),
+)
+"""Not in the manual, which gives only the sizes of a reading in which the host addresses sensors:
+packets of 20 bytes, three motors and four sensors a bus ("140 // 20*7 3+4"). Head and mode byte are
+those of the sensor's answer."""
 
 MOTOR_STATE = Structure(
     "MotorState_t",

@@ -25,6 +25,7 @@ from dexkit.wire.dex3_usb.layout import (
     MOTOR_CMD,
     MOTOR_STATE,
     N_BUSES,
+    SENSOR_CMD,
     SENSOR_STATE,
     STATE,
     STATE_BUS_SIZE,
@@ -37,6 +38,7 @@ __all__ = [
     "MotorCmd",
     "MotorState",
     "Problem",
+    "SensorCmd",
     "SensorState",
     "StateFrame",
     "pack_command",
@@ -124,6 +126,26 @@ class MotorCmd:
         cls, mode: int, res: int, tor: int, spd: int, pos: int, k_pos: int, k_spd: int
     ) -> MotorCmd:
         return cls(mode & 15, mode >> 4 & 7, mode > 127, tor, spd, pos, k_pos, k_spd, res)
+
+
+@dataclass(slots=True)
+class SensorCmd:
+    """``SensorCmd_t``, the assumed packet that asks a sensor for its state."""
+
+    id: int
+    status: int = 0
+
+    def pack(self) -> bytes:
+        """Its 20 bytes.
+
+        :raises EncodeError: a value does not fit.
+        """
+        mode = self.id | self.status << 4
+        return _fill_crc(SENSOR_CMD, SENSOR_CMD.pack(SENSOR_CMD.head, mode, bytes(13), 0))
+
+    @classmethod
+    def _from_fields(cls, mode: int, *rest: int) -> SensorCmd:
+        return cls(mode & 15, mode >> 4)
 
 
 @dataclass(slots=True)
@@ -223,9 +245,9 @@ class SensorState:
         return cls(mode & 15, mode >> 4, values[:12], values[12:], reverse)
 
 
-Packet: TypeAlias = MotorCmd | MotorState | SensorState
+Packet: TypeAlias = MotorCmd | SensorCmd | MotorState | SensorState
 
-TO_HAND = (MOTOR_CMD,)
+TO_HAND = (MOTOR_CMD, SENSOR_CMD)
 """What the buses of a command frame hold."""
 FROM_HAND = (MOTOR_STATE, SENSOR_STATE)
 """What the buses of a state frame hold."""
@@ -320,6 +342,8 @@ def _packet(kind: Structure, data: bytes, offset: int) -> Packet:
     values = kind.struct.unpack_from(data, offset)[1:-1]
     if kind is MOTOR_CMD:
         return MotorCmd._from_fields(*values)
+    if kind is SENSOR_CMD:
+        return SensorCmd._from_fields(*values)
     return (
         MotorState._from_fields(*values)
         if kind is MOTOR_STATE
@@ -361,6 +385,11 @@ class CommandFrame:
     def motors(self) -> list[tuple[int, MotorCmd]]:
         """(bus, packet) of every motor command."""
         return [(b, p) for b, ps in enumerate(self.buses) for p in ps if isinstance(p, MotorCmd)]
+
+    @property
+    def sensors(self) -> list[tuple[int, SensorCmd]]:
+        """(bus, packet) of every sensor that is addressed."""
+        return [(b, p) for b, ps in enumerate(self.buses) for p in ps if isinstance(p, SensorCmd)]
 
 
 @dataclass(slots=True)

@@ -1,0 +1,156 @@
+"""What a driver provides for a bring-up: its motors by address, and the joints that they may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from dexkit.bringup.findings import Findings
+
+__all__ = ["Bench", "Drive", "JointChoice", "Plan", "Reading", "Snapshot"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """State of one motor.
+
+    :param q: position, rad at a joint with the plan's reference ratio, in the motor's direction.
+    :param fault: :class:`~dexkit.hand.MotorError` bits.
+    :param temperature: °C, the highest that the motor reports.
+    """
+
+    q: float
+    fault: int = 0
+    temperature: float = math.nan
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One answer of the hand.
+
+    :param motors: by address; those that are silent are left out.
+    :param pressure: highest value of each sensor, Pa, by address.
+    """
+
+    motors: Mapping[str, Reading]
+    pressure: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Drive one motor towards ``q`` and lock all others; units as of :class:`Reading`."""
+
+    motor: str
+    q: float
+    kp: float
+    kd: float
+
+
+@dataclass(frozen=True)
+class JointChoice:
+    """A joint that a motor may move.
+
+    :param rising: what is seen while q rises; ``falling`` while it falls: one word each.
+    :param ratios: what its gear ratio may be.
+    :param zero: what the joint looks like at q = 0; empty if that is not asked.
+    """
+
+    name: str
+    q_min: float
+    q_max: float
+    rising: str
+    falling: str
+    ratios: tuple[float, ...]
+    zero: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What there is to find on a hand.
+
+    :param joints: in the order in which their travel is measured.
+    :param reference: gear ratio in whose radians motors are read and driven.
+    :param places: where a person can press the hand, one pressure sensor each.
+    :param travel: whether to go to the stops.
+    """
+
+    joints: tuple[JointChoice, ...]
+    reference: float
+    places: tuple[str, ...] = ()
+    travel: bool = True
+
+    @property
+    def widest(self) -> float:
+        """Largest ratio of a possible gearing to the reference: how much stronger a joint may be
+        than its motor's torque says.
+        """
+        return max(r for joint in self.joints for r in joint.ratios) / self.reference
+
+
+class Bench(Protocol):
+    """One hand, prepared for a bring-up.
+
+    ``open`` connects and finds out what answers; it moves nothing. ``facts`` then says on which
+    hand: serial number, versions, what answered. ``exchange`` drives at most one motor and locks
+    all others. ``settings`` turns findings into settings of the backend, ``store`` keeps them.
+    """
+
+    @property
+    def plan(self) -> Plan:
+        """What there is to find."""
+        ...
+
+    @property
+    def motors(self) -> tuple[str, ...]:
+        """Addresses of the motors that answer; after ``open``."""
+        ...
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """Identity of the hand and what its protocol does; after ``open``."""
+        ...
+
+    def open(self) -> None:
+        """Connect, and find what answers. No motion.
+
+        :raises HandError: it is not there, or does not answer as any reading of its manual says.
+        """
+        ...
+
+    def close(self) -> None:
+        """Lock every motor and release the hand."""
+        ...
+
+    def exchange(self, drive: Drive | None) -> Snapshot:
+        """Send one frame and return what the hand answers.
+
+        :param drive: the one motor that may move; None locks all.
+        :raises HandError: as :meth:`dexkit.hand.Hand.exchange`.
+        """
+        ...
+
+    def settings(self, findings: Findings) -> dict[str, str]:
+        """Settings of the backend, as ``--set`` takes them, that follow from the findings."""
+        ...
+
+    @property
+    def where(self) -> str:
+        """Where the settings are stored, for messages."""
+        ...
+
+    def load(self) -> Findings:
+        """What an earlier bring-up of this hand has found; empty if there was none.
+
+        :raises UsageError: the file cannot be read.
+        """
+        ...
+
+    def store(self, findings: Findings) -> None:
+        """Keep findings, and the settings that follow from them.
+
+        :raises UsageError: the file cannot be written.
+        """
+        ...
