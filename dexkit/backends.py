@@ -20,7 +20,7 @@ import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dexkit.errors import (
     BackendBroken,
@@ -30,7 +30,11 @@ from dexkit.errors import (
     UsageError,
 )
 from dexkit.hand import Hand, HandSpec, Side
+from dexkit.lazy import Lazy
 from dexkit.plugins import entry_points, import_object, is_own, origin, where
+
+if TYPE_CHECKING:
+    from dexkit.bringup import Bench
 
 __all__ = ["GROUP", "Backend", "BackendInfo", "BackendOptions", "backend", "list_backends"]
 
@@ -76,6 +80,7 @@ class Backend:
     :param make: makes the hand, without opening it.
     :param needs_device: refuse to start without a device.
     :param settings: name and help of each ``--set`` setting.
+    :param bringup: makes the :class:`~dexkit.bringup.Bench` of ``dexkit bringup``, or None.
     """
 
     summary: str
@@ -84,6 +89,7 @@ class Backend:
     needs: str = ""
     needs_device: bool = False
     settings: dict[str, str] = field(default_factory=dict)
+    bringup: Lazy[Callable[[BackendOptions], Bench]] | None = None
 
     def create(self, options: BackendOptions) -> Hand:
         """Make the hand; nothing is opened yet.

@@ -116,6 +116,12 @@ DEX3_FAULTS = FaultFamily(
         ),
         FaultKind("overcurrent", "a motor reports overcurrent", {}, True, True),
         _STUCK,
+        FaultKind(
+            "press",
+            "a pressure sensor, by its place in the state, is pressed with n newtons",
+            {"sensor": 0.0, "n": 10.0},
+            lasting=True,
+        ),
     ),
     max_id=6,
     sided=True,

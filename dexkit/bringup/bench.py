@@ -113,6 +113,11 @@ class Bench(Protocol):
         """Identity of the hand and what its protocol does; after ``open``."""
         ...
 
+    @property
+    def local_server(self) -> bool:
+        """Whether the open hand is behind a USB/IP server of this machine, as emulated ones are."""
+        ...
+
     def open(self) -> None:
         """Connect, and find what answers. No motion.
 

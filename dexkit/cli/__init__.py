@@ -27,6 +27,7 @@ _COMMANDS: dict[str, tuple[str, str]] = {
     "backends": ("dexkit.cli.backends", "List the backends that can be served."),
     "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
     "bridge": ("dexkit.cli.bridge", "Translate between Dex1 dialects."),
+    "bringup": ("dexkit.cli.bringup", "Find out how a hand is wired, a joint at a time."),
     "calibrate": ("dexkit.cli.calibrate", "Measure and store a gripper's zero and speed."),
     "check": ("dexkit.cli.check", "Check a recording against the requirements."),
     "compare": ("dexkit.cli.compare", "Compare several results."),

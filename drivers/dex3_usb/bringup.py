@@ -11,7 +11,7 @@ from dexkit import __version__
 from dexkit.backends import BackendOptions
 from dexkit.bringup.bench import Drive, JointChoice, Plan, Reading, Snapshot
 from dexkit.bringup.findings import Findings
-from dexkit.drivers.dex3_usb.discovery import find_hand
+from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import UsbLink
 from dexkit.drivers.dex3_usb.probe import Found, Wire, lock, probe
 from dexkit.drivers.dex3_usb.settings import Dex3Settings, format_places, from_options
@@ -33,6 +33,7 @@ _RATIOS = (108.0, 189.0, 214.0)
 _ORDER = ("index_1", "index_0", "middle_1", "middle_0", "thumb_2", "thumb_1", "thumb_0")
 """Outer joints first, fingers before the thumb: each finger is straight before its next joint
 moves, and the thumb has room."""
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 
 
@@ -72,6 +73,7 @@ class Dex3Bench:
         self._link: UsbLink | None = None
         self._found: Found | None = None
         self._facts: dict[str, Any] = {}
+        self._server: Server | None = None
 
     @property
     def motors(self) -> tuple[str, ...]:
@@ -87,6 +89,11 @@ class Dex3Bench:
     def where(self) -> str:
         """Path of the settings file."""
         return str(self._store.path)
+
+    @property
+    def local_server(self) -> bool:
+        """Whether the open hand is behind a USB/IP server of this machine."""
+        return self._server is not None and self._server.host in _LOOPBACK
 
     # --- opening and closing
 
@@ -142,7 +149,7 @@ class Dex3Bench:
             out_endpoint=configuration.out_endpoint,
             in_endpoint=configuration.in_endpoint,
         )
-        self._link = link
+        self._link, self._server = link, candidate.server
         descriptor = candidate.backend.get_device_descriptor(candidate.device)
         version = int(getattr(descriptor, "bcdDevice", 0))
         self._facts = {
@@ -151,9 +158,7 @@ class Dex3Bench:
             "place": candidate.where,
             "endpoints": [f"{link.endpoints.out:#04x}", f"{link.endpoints.into:#04x}"],
         }
-        return lambda frame: link.exchange(
-            frame, configuration.send_timeout, configuration.timeout
-        )
+        return lambda frame: link.exchange(frame, configuration.send_timeout, configuration.timeout)
 
     def close(self) -> None:
         """Lock every motor and release the hand. Failures are logged, not raised."""

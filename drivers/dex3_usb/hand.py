@@ -22,6 +22,7 @@ from dexkit.drivers.dex3_usb.settings import (
 from dexkit.drivers.dex3_usb.stored import Store, record_key
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError, WireError
 from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
+from dexkit.lazy import Lazy
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import COMMAND_LAYOUTS, CommandLayout, HandCodec, parse_state
 
@@ -409,4 +410,5 @@ backend = Backend(
     make=_create_hand,
     needs="--device serial number or usbip://HOST:PORT, if there is more than one hand",
     settings=SETTINGS,
+    bringup=Lazy("dexkit.drivers.dex3_usb.bringup:bench"),
 )

@@ -309,9 +309,7 @@ def with_stored(settings: Dex3Settings, texts: Mapping[str, str]) -> Dex3Setting
     return replace(settings, **_parse_values(chosen, settings.bus_map))  # type: ignore[arg-type]
 
 
-def _parse_values(
-    texts: Mapping[str, str], bus_map: BusMap = DEFAULT_BUS_MAP
-) -> dict[str, object]:
+def _parse_values(texts: Mapping[str, str], bus_map: BusMap = DEFAULT_BUS_MAP) -> dict[str, object]:
     """Fields of :class:`Dex3Settings`.
 
     :raises UsageError: a value cannot be parsed.

@@ -183,6 +183,11 @@ class Dex3Mcu:
         if kind in ("stall", "stall-out"):
             self.on_stall("in" if kind == "stall" else "out")
             return
+        if kind == "press":
+            pressed = {f["sensor"]: f["n"] for f in self.schedule.active_of("press")}
+            for index in range(len(DEX3_1.sensors)):
+                self.mechanics.press(index, pressed.get(index, 0.0))
+            return
         if kind == "unplug":
             self.plugged = not self.schedule.active_of("unplug")
             return

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import json
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
+from typing import IO
 
 from dexkit.clock import Clock, RealClock
+from dexkit.emulators.dex3_mcu.command import MotorCommand
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.dex3_mcu.server import Server
 from dexkit.emulators.dex3_mcu.settings import Firmware
 from dexkit.emulators.dex3_mcu.usb import IN_ENDPOINT, OUT_ENDPOINT, Dex3Usb
+from dexkit.emulators.dex3_mcu.wiring import Wiring
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.faults import DEX3_FAULTS, parse_fault
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.errors import UsageError
+from dexkit.escaping import output_error
 from dexkit.hand import Side
+from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
 
 __all__ = ["Dex3Hands", "Dex3Process", "emulated_dex3"]
@@ -30,7 +38,11 @@ class Dex3Hands:
     :param object_pct: how far the fingers close until they touch an object, percent.
     :param start: how far they are closed at first, percent; None for the pose at rest.
     :param faults: specifications, see :mod:`dexkit.emulators.faults`.
+    :param wiring: of every hand; by default as dexkit assumes.
+    :param log: file that gets a line of JSON for each command that drives a motor, and when the
+        motor stops being driven.
     :raises EmulatorError: the port cannot be had.
+    :raises OutputError: the log cannot be written.
     :raises UsageError: an option that cannot be.
 
     Looking into a device while a client talks to it gives a snapshot of a moving thing.
@@ -49,6 +61,8 @@ class Dex3Hands:
         in_endpoint: int = IN_ENDPOINT,
         faults: Sequence[str] = (),
         firmware: Firmware | None = None,
+        wiring: Wiring | None = None,
+        log: Path | None = None,
         clock: Clock | None = None,
         seed: int = 0,
     ) -> None:
@@ -65,6 +79,7 @@ class Dex3Hands:
                     mechanics=Dex3Mechanics(side, object_at=object_pct, start=start),
                     clock=clock,
                     firmware=firmware,
+                    wiring=wiring,
                     faults=plan,
                     seed=seed + index,
                 ),
@@ -75,6 +90,10 @@ class Dex3Hands:
             )
             for index, side in enumerate(sides)
         }
+        self._log = None if log is None else _open_log(log)
+        if self._log is not None:
+            for side, usb in self._usb.items():
+                usb.mcu.on_drive = partial(_write_log, self._log, side)
         self._server = Server(list(self._usb.values()), host=host, port=port, clock=clock)
         self._server.start()
 
@@ -125,12 +144,38 @@ class Dex3Hands:
     def close(self) -> None:
         """Cut clients off and free the port."""
         self._server.close()
+        if self._log is not None:
+            self._log.close()
 
     def __enter__(self) -> Dex3Hands:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+def _open_log(path: Path) -> IO[str]:
+    try:
+        return path.open("w", encoding="utf-8")
+    except (OSError, ValueError) as error:
+        found = error if isinstance(error, OSError) else OSError(errno.EINVAL, str(error))
+        raise output_error(path, found) from error
+
+
+def _write_log(
+    log: IO[str], side: Side, now: float, joint: int, command: MotorCommand | None
+) -> None:
+    line: dict[str, object] = {"t": round(now, 6), "side": str(side), "motor": joint}
+    line["joint"] = DEX3_1.joints[side][joint].name
+    if command is None:
+        line["driven"] = False
+    else:
+        values = zip(("q", "dq", "tau", "kp", "kd"), command[3:], strict=True)
+        line |= {"driven": True, "protected": command[2]}
+        line |= {name: round(value, 5) for name, value in values}
+    # whoever reads it while the hand runs gets whole lines
+    log.write(json.dumps(line) + "\n")
+    log.flush()
 
 
 class Dex3Process(EmulatorProcess):

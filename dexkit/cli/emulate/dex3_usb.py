@@ -5,11 +5,13 @@ from __future__ import annotations
 import socket
 import sys
 from contextlib import nullcontext
+from pathlib import Path
 
 import click
 
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.cli.options import (
+    FILE,
     fault_options,
     object_option,
     real_time_option,
@@ -63,6 +65,24 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
 @click.option(
     "--in-endpoint", callback=_endpoint, default="0x81", metavar="EP", help="Bulk IN endpoint."
 )
+@click.option(
+    "--wiring",
+    type=click.IntRange(0, 2**32 - 1),
+    metavar="SEED",
+    help="Motors and sensors permuted on the buses, motors mirrored, offset and geared at random.  "
+    "[default: as dexkit assumes]",
+)
+@click.option(
+    "--polled-sensors",
+    is_flag=True,
+    help="Sensors answer only where they are addressed (docs/dex3-protocol.md).",
+)
+@click.option(
+    "--log-commands",
+    type=FILE,
+    metavar="FILE",
+    help="Write a line of JSON for each command that drives a motor.",
+)
 @fault_options("unplug@5s:for=2s, silent:id=3, drop:p=0.05")
 @seed_option("the faults")
 @real_time_option(default=False)
@@ -75,6 +95,9 @@ def emulate_dex3_usb(
     start: float | None,
     out_endpoint: int,
     in_endpoint: int,
+    wiring: int | None,
+    polled_sensors: bool,
+    log_commands: Path | None,
     faults: tuple[str, ...],
     faults_from_stdin: bool,
     seed: int,
@@ -84,7 +107,7 @@ def emulate_dex3_usb(
 
     Prints "ready: URL SIDE ..." for each hand when it can be attached. Ctrl-C or SIGTERM ends it.
     """
-    from dexkit.emulators.dex3_mcu import Dex3Hands
+    from dexkit.emulators.dex3_mcu import Dex3Hands, Firmware, Wiring
     from dexkit.service.realtime import real_time as real_time_priority
 
     with (
@@ -101,6 +124,9 @@ def emulate_dex3_usb(
             out_endpoint=out_endpoint,
             in_endpoint=in_endpoint,
             faults=faults,
+            firmware=Firmware(sensors_polled=polled_sensors),
+            wiring=None if wiring is None else Wiring.random(wiring),
+            log=log_commands,
             seed=seed,
         ) as hands,
     ):

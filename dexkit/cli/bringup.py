@@ -1,0 +1,290 @@
+"""``dexkit bringup``: find out how a hand is wired, one joint at a time."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from dexkit import documents
+from dexkit.backends import BackendOptions, backend
+from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
+from dexkit.bringup.script import describe
+from dexkit.cli.held_key import Terminal
+from dexkit.cli.options import FILE, Number, set_option, side_option
+from dexkit.cli.remarks import remark
+from dexkit.clock import Rate
+from dexkit.errors import HandTimeout, UsageError
+from dexkit.escaping import one_line
+from dexkit.hand import Side
+from dexkit.stop_signals import StopRequest, stop_on_signals
+
+__all__ = ["command"]
+
+_RATE = 100.0
+"""Frames a second while something moves: a released key stops it within a hundredth."""
+_LOST_ANSWERS = 3
+
+
+@click.command("bringup")
+@click.argument("backend_name", metavar="BACKEND")
+@side_option("Hand to bring up.", required=True)
+@click.option("--device", metavar="SERIAL", help="Serial number or address of the device.")
+@set_option("Setting of the backend, e.g. config=FILE; 'dexkit backends' lists the settings.")
+@click.option(
+    "--usb",
+    metavar="URL",
+    help="USB hand on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
+)
+@click.option(
+    "--torque",
+    type=Number(0.01, 0.5),
+    default=Effort.torque,
+    show_default=True,
+    metavar="NM",
+    help="Torque at a joint, at most; motion begins with a quarter of it.",
+)
+@click.option(
+    "--speed",
+    type=Number(0.02, 2.0),
+    default=Effort.speed,
+    show_default=True,
+    metavar="RAD/S",
+    help="Speed of every motion.",
+)
+@click.option("--dry-run", is_flag=True, help="Only print the plan: nothing is opened, or moves.")
+@click.option("--restart", is_flag=True, help="Forget what an earlier bring-up has found.")
+@click.option(
+    "--answers",
+    "answers_path",
+    type=FILE,
+    metavar="FILE",
+    help="Take answers from a file that --save-answers wrote; what it lacks is asked.",
+)
+@click.option(
+    "--save-answers", type=FILE, metavar="FILE", help="Write the answers of this session."
+)
+@click.option(
+    "--unattended",
+    is_flag=True,
+    help="Move without the dead-man key: only a hand on a USB/IP server of this machine, such as "
+    "an emulated one, and only with --answers.",
+)
+def command(
+    backend_name: str,
+    sides: tuple[Side, ...],
+    device: str | None,
+    settings: tuple[str, ...],
+    usb: str | None,
+    torque: float,
+    speed: float,
+    dry_run: bool,
+    restart: bool,
+    answers_path: Path | None,
+    save_answers: Path | None,
+    unattended: bool,
+) -> None:
+    """Find out how a hand is wired, and store it as its settings.
+
+    The hand MOVES, one joint at a time, slowly, and only while you hold the space bar; every other
+    key, or none, stops it. After each motion you are asked what you saw. Run the same command again
+    to go on after a stop. Read docs/first-contact.md before the first real hand.
+    """
+    if len(sides) != 1:
+        raise UsageError("one hand at a time", hint="--side left or --side right")
+    if unattended and answers_path is None:
+        raise UsageError("--unattended needs --answers FILE: nobody is there to be asked")
+    documents.check_output_paths([save_answers], [answers_path])
+    kind = backend(backend_name)
+    if kind.bringup is None:
+        raise UsageError(
+            f"{backend_name} has nothing that a bring-up finds",
+            hint="dex3-usb has; an EZGripper or Dex1-1 is calibrated: dexkit calibrate",
+        )
+    texts = _settings(settings, usb)
+    options = BackendOptions(sides[0], device, texts)
+    options.refuse_unknown(kind.settings)
+    bench: Bench = kind.bringup.load()(options)
+    effort = Effort(torque, speed)
+    if dry_run:
+        _print_plan(bench, effort, ())
+        return
+    known = {} if answers_path is None else _read_answers(answers_path)
+    terminal = None if unattended else Terminal()
+    with stop_on_signals() as stop:
+        try:
+            bench.open()
+            if unattended and not bench.local_server:
+                raise UsageError(
+                    "--unattended is not for this hand: it is not behind a USB/IP server of this "
+                    "machine",
+                    hint="leave it out, and hold the space bar",
+                )
+            findings = Findings() if restart else bench.load()
+            _print_facts(bench)
+            _print_plan(bench, effort, bench.motors)
+            session = Session(bench.plan, bench.motors, findings, effort)
+            _Run(bench, session, terminal, known, stop).run()
+        finally:
+            bench.close()
+    if save_answers is not None:
+        documents.write_file(save_answers, json.dumps(session.findings.answers, indent=2) + "\n")
+    _print_result(bench, session)
+
+
+def _settings(texts: tuple[str, ...], usb: str | None) -> dict[str, str]:
+    values = {}
+    for text in (*texts, *([] if usb is None else [f"usb={usb}"])):
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise UsageError(f"--set {text} is not KEY=VALUE")
+        if key in values:
+            raise UsageError(f"{key} is given twice")
+        values[key] = value
+    return values
+
+
+def _read_answers(path: Path) -> dict[str, str]:
+    """Answers by key.
+
+    :raises UsageError: it is no such file.
+    """
+    content = documents.read_json(path)
+    if not isinstance(content, dict) or not all(isinstance(v, str) for v in content.values()):
+        raise UsageError(
+            f"{path} holds no answers", hint='a JSON object: {"motor 0.0 joint": "thumb_0", ...}'
+        )
+    return content
+
+
+class _Run:
+    """The loop of one bring-up: exchanges at 100 Hz, questions in between."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        session: Session,
+        terminal: Terminal | None,
+        answers: Mapping[str, str],
+        stop: StopRequest,
+    ) -> None:
+        self._bench, self._session = bench, session
+        self._terminal, self._stop = terminal, stop
+        self._answers = dict(answers)
+        self._snapshot = Snapshot({})
+        self._lost = 0
+        self._exchange(None)
+
+    def run(self) -> None:
+        """Until everything is found.
+
+        :raises HandError: a fault, or the hand is gone; what was found is stored.
+        :raises click.Abort: a signal, or the terminal has gone.
+        """
+        session = self._session
+        while not session.done:
+            if session.question is not None:
+                session.answer(self._answer(session.question))
+                self._bench.store(session.findings)
+            else:
+                self._act()
+        self._bench.store(session.findings)
+
+    def _act(self) -> None:
+        """Everything until the next question."""
+        session, rate = self._session, Rate(_RATE)
+        said, moving = "", False
+        with self._keys() as held:
+            while session.question is None and not session.done:
+                rate.wait()
+                self._check_stop()
+                if session.doing != said:
+                    said = session.doing
+                    if said:
+                        how = "hold SPACE: " if session.moves and self._terminal else ""
+                        click.echo(f"{how}{said}")
+                now = time.monotonic()
+                key = held(now)
+                # an old state is none to drive by: after a lost answer all is locked until the next
+                drive = session.step(now, self._snapshot, key) if not self._lost else None
+                if moving and drive is None and session.moves and session.doing == said:
+                    click.echo("  released: locked")
+                moving = drive is not None
+                self._exchange(drive)
+        self._exchange(None)
+
+    def _exchange(self, drive: Drive | None) -> None:
+        try:
+            self._snapshot = self._bench.exchange(drive)
+            self._lost = 0
+        except HandTimeout:
+            self._lost += 1
+            if self._lost >= _LOST_ANSWERS:
+                raise
+
+    @contextmanager
+    def _keys(self) -> Iterator[Callable[[float], bool]]:
+        if self._terminal is None:
+            yield lambda now: True
+            return
+        with self._terminal.keys() as held:
+            yield held
+
+    def _check_stop(self) -> None:
+        if self._stop:
+            raise click.Abort
+
+    def _answer(self, question: Question) -> str:
+        text = self._answers.pop(question.key, None)
+        if text is not None:
+            if text not in question.choices:
+                raise UsageError(
+                    f"{question.key}: {one_line(text, 40)!r} is no answer to that",
+                    hint=f"{question.text} {', '.join(question.choices)}",
+                )
+            click.echo(f"{question.text} {text}")
+            return text
+        if self._terminal is None:
+            raise UsageError(
+                f"no answer to {question.key!r} is left: {question.text}",
+                hint=f"one of {', '.join(question.choices)}",
+            )
+
+        def meanwhile() -> None:
+            self._check_stop()
+            self._exchange(None)
+
+        return self._terminal.ask(question, meanwhile)
+
+
+def _print_facts(bench: Bench) -> None:
+    for name, value in bench.facts.items():
+        shown = ", ".join(map(str, value)) if isinstance(value, list) else value
+        click.echo(f"{name.replace('_', ' ')}: {one_line(shown, 200)}")
+
+
+def _print_plan(bench: Bench, effort: Effort, motors: tuple[str, ...]) -> None:
+    click.echo(
+        f"plan: one joint at a time, at most {effort.torque:g} N·m and {effort.speed:g} rad/s, "
+        "only while SPACE is held"
+    )
+    for number, line in enumerate(describe(bench.plan, motors), 1):
+        click.echo(f"  {number}. {line}")
+    click.echo(f"  what is found goes to {bench.where}")
+
+
+def _print_result(bench: Bench, session: Session) -> None:
+    click.echo("found:")
+    for name, text in bench.settings(session.findings).items():
+        click.echo(f"  {name}={text}")
+    for joint, travel in session.findings.travel.items():
+        if not travel.confirmed:
+            remark("warning", f"the zero of {joint} was not confirmed: correct its offset by hand")
+    skipped = [place for place, address in session.findings.sensors.items() if address is None]
+    if skipped:
+        remark("warning", f"sensors are left as assumed: {', '.join(skipped)} skipped")
+    click.echo(f"stored in {bench.where}; 'dexkit serve' reads it")
