@@ -62,6 +62,11 @@ class Bring:
         self.seen.append(self.mcu.mechanics.q)
         return snapshot
 
+    def cycles(self, count: int) -> None:
+        """Several with the key held."""
+        for _ in range(count):
+            self.cycle()
+
     def until_question(self) -> Question | None:
         """Hold the key until something is asked; None when all is found."""
         while self.session.question is None and not self.session.done:
@@ -74,7 +79,7 @@ class Bring:
         """Press what the session asks for."""
         for i, sensor in enumerate(DEX3_1.sensors):
             pressed = self.session.doing == f"press and hold the {sensor.place} now"
-            self.mcu.mechanics.press(i, 5.0 if pressed else 0.0)
+            self.mcu.mechanics.press(i, 10.0 if pressed else 0.0)
 
     def look(self, question: Question) -> str:
         """What a person who has watched the hand answers."""
