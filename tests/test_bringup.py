@@ -29,6 +29,8 @@ from tests.bringup_helpers import Bring
 from tests.each import each
 
 REPEAT = 0.033
+FAST = Effort(torque=0.5, speed=2.0)
+"""The most that a bring-up may: what takes ten minutes with a person takes a second here."""
 
 
 def hold(key: DeadMan, start: float, seconds: float) -> float:
@@ -116,7 +118,23 @@ def check_wiring(seed: int, tmp_path: Path, effort: Effort) -> None:
 
 @pytest.mark.parametrize("seed", [3])
 def test_it_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
-    check_wiring(seed, tmp_path, Effort(torque=0.5, speed=2.0))
+    check_wiring(seed, tmp_path, FAST)
+
+
+@each("seed", [10, 11])
+def test_it_finds_the_motors_of_random_wirings(seed: int, tmp_path: Path) -> None:
+    wiring = Wiring.random(seed)
+    bring = Bring(tmp_path, wiring=wiring, effort=FAST)
+    findings = bring.session.findings
+    while len(findings.motors) < 7:
+        question = bring.until_question()
+        assert question is not None
+        bring.session.answer(bring.look(question))
+    for joint, sign, (bus, number) in zip(
+        DEX3_1.joints[Side.LEFT], wiring.mounting.signs, wiring.bus_map.motors, strict=True
+    ):
+        assert findings.motor_of(joint.name) == f"{bus}.{number}"
+        assert findings.motors[f"{bus}.{number}"].sign == sign
 
 
 @pytest.mark.soak
@@ -124,7 +142,7 @@ def test_it_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
 def test_it_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
     for seed in range(50 * part, 50 * part + 50):
         (tmp_path / str(seed)).mkdir()
-        check_wiring(seed, tmp_path / str(seed), Effort(speed=1.5))
+        check_wiring(seed, tmp_path / str(seed), FAST)
 
 
 def test_wirings_differ_and_repeat() -> None:
@@ -304,7 +322,7 @@ def test_a_hand_that_answers_nothing_is_named(tmp_path: Path) -> None:
 _SIGN = st.sampled_from((1, -1))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     signs=st.tuples(*[_SIGN] * 7),
     offsets=st.tuples(*[st.floats(-3, 3)] * 7),

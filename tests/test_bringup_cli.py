@@ -11,13 +11,20 @@ import subprocess
 import termios
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dexkit.child_processes import command_line
-from dexkit.emulators.dex3_mcu import Dex3Hands, Wiring
-from dexkit.hand import Side
+from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
+from dexkit.drivers.dex3_usb.discovery import parse_server
+from dexkit.drivers.dex3_usb.settings import format_places
+from dexkit.drivers.dex3_usb.stored import Store
+from dexkit.emulators.dex3_mcu import Dex3Hands, Firmware, Wiring
+from dexkit.errors import HandRefused, UsageError
+from dexkit.hand import HandCommand, Side
 from dexkit.models import DEX3_1
 from tests import hostile
 from tests.patience import PATIENCE
@@ -86,7 +93,7 @@ def test_a_released_key_stops_the_motor(emulated: Dex3Hands, tmp_path: Path) -> 
     config = tmp_path / "dex3.json"
     person = Person(
         "dex3-usb", "--side", "left", "--usb", emulated.url, "--set", f"config={config}", *PATIENT,
-        "--speed", 0.05,
+        "--speed", 0.1,
     )  # fmt: skip
     try:
         person.until(lambda: "hold SPACE" in person.text)
@@ -122,6 +129,40 @@ def test_a_released_key_stops_the_motor(emulated: Dex3Hands, tmp_path: Path) -> 
     assert record["found"]["hand"]["device_version"] == "1.00"
     assert record["answers"] == {"motor 0.0 joint": moved}
     assert emulated.failure is None
+
+
+def test_the_driver_uses_what_was_found(tmp_path: Path) -> None:
+    """A wiring in the file is the one in which the driver drives, whatever it assumes otherwise."""
+    wiring, config = Wiring.random(6), tmp_path / "dex3.json"
+    texts = {
+        "motors": format_places(wiring.bus_map.motors),
+        "sensors": format_places(wiring.bus_map.sensors),
+        "signs": ",".join("+" if sign > 0 else "-" for sign in wiring.mounting.signs),
+        "offsets": ",".join(map(str, wiring.mounting.offsets)),
+        "ratios": ",".join(map(str, wiring.mounting.ratios)),
+        "limits": ",".join(f"{j.q_min:.4f}:{j.q_max / 2:.4f}" for j in DEX3_1.joints[Side.LEFT]),
+    }
+    Store(config).write("2024061800", {"settings": texts})
+    with Dex3Hands(wiring=wiring, firmware=Firmware(sensors_polled=True)) as hands:
+        server = parse_server(hands.url)[0]
+        plain = Dex3Settings(server=server, timeout=5.0, send_timeout=5.0)
+        with Dex3Usb(Side.LEFT, replace(plain, config=config)) as hand:
+            mechanics = hands.device().mechanics
+            state = hand.exchange(HandCommand.brake(7))
+            assert state.q == pytest.approx(mechanics.q, abs=1e-3)
+            assert state.pressure is not None
+            assert np.isfinite(state.pressure).sum() == 33
+            goal = [0.9, 0.4, 0.8, -0.5, -0.6, -0.7, -0.8]
+            end = time.monotonic() + PATIENCE
+            while abs(mechanics.q[0] - 1.0472 / 2) > 0.01 or abs(mechanics.q[6] + 0.8) > 0.01:
+                hand.exchange(HandCommand.position(goal, kp=1.5, kd=0.1))
+                assert time.monotonic() < end
+            assert hand.spec.q_max[0] == pytest.approx(1.0472 / 2)
+        with pytest.raises(HandRefused, match="no state of the motor"):
+            Dex3Usb(Side.LEFT, plain).open()
+        Store(config).write("2024061800", {"settings": {"signs": "+"}})
+        with pytest.raises(UsageError, match=r"dex3\.json: 2024061800: signs"):
+            Dex3Usb(Side.LEFT, replace(plain, config=config)).open()
 
 
 def test_what_is_refused_without_a_person(emulated: Dex3Hands, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ _SAMPLE = "<sample>"
 _FIXED: dict[tuple[str, ...], list[str]] = {
     ("badge",): ["<result>"],
     ("bridge",): ["--from", "unitree_go", "--to", "unitree_hg"],
+    ("bringup",): ["dex3-usb", "--side", "left"],
     ("calibrate",): ["--yes"],
     ("check",): [_SAMPLE],
     ("compare",): ["<result>", "<result>"],

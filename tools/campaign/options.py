@@ -47,6 +47,7 @@ _BASE: dict[tuple[str, ...], tuple[str, ...]] = {
     ("backends",): (),
     ("badge",): ("{result}", "--output", "{scratch}/badge.svg"),
     ("bridge",): ("--from", "unitree_go", "--to", "unitree_hg", "--duration", "0.3"),
+    ("bringup",): ("dex3-usb", "--side", "left", "--usb", "usbip://127.0.0.1:1"),
     ("calibrate",): ("ezgripper", "--device", "/dev/null"),
     ("check",): ("{sample}",),
     ("compare",): ("{result}", "{result}"),
