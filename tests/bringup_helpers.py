@@ -17,7 +17,7 @@ from dexkit.hand import Side
 from dexkit.models import DEX3_1
 
 QUICK = Effort(speed=1.5)
-PERIOD = 0.02
+PERIOD = 0.04
 
 
 class Bring:

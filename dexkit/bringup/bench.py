@@ -56,6 +56,7 @@ class JointChoice:
     :param rising: what is seen while q rises; ``falling`` while it falls: one word each.
     :param ratios: what its gear ratio may be.
     :param zero: what the joint looks like at q = 0; empty if that is not asked.
+    :param first: sign of dq towards the stop that is looked for first: the open one.
     """
 
     name: str
@@ -65,6 +66,7 @@ class JointChoice:
     falling: str
     ratios: tuple[float, ...]
     zero: str = ""
+    first: int = -1
 
 
 @dataclass(frozen=True)

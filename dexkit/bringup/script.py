@@ -151,14 +151,14 @@ def _travel(plan: Plan, joint: JointChoice, findings: Findings) -> _Script:
     # far beyond the stops, whatever the ratio
     reach = 1.5 * (joint.q_max - joint.q_min) * max(joint.ratios) / plan.reference
     while True:
-        ends = []
-        for towards in (-sign, sign):
+        ends = {}
+        for direction in (joint.first, -joint.first):
+            seen = joint.rising if direction > 0 else joint.falling
             start: float = yield Locate(motor)
-            seen = joint.falling if towards == -sign else joint.rising
-            end, q = yield Go(motor, start + towards * reach, f"{joint.name}: {seen}, to its stop")
+            target = start + direction * sign * reach
+            end, ends[direction] = yield Go(motor, target, f"{joint.name}: {seen}, to its stop")
             if end is not End.STALLED:
                 raise HandFault(f"{joint.name} meets no stop", hint="is it the right joint?")
-            ends.append(q)
         free = yield Question(
             f"{joint.name} way free",
             f"Did {joint.name} go from stop to stop, and touch nothing else?",
@@ -166,9 +166,9 @@ def _travel(plan: Plan, joint: JointChoice, findings: Findings) -> _Script:
         )
         if free == "yes":
             break
-    ratio = _ratio(plan, joint, abs(ends[1] - ends[0]))
+    ratio = _ratio(plan, joint, abs(ends[1] - ends[-1]))
     scale = plan.reference / ratio  # from motor radians to the joint's
-    low, high = (end * scale for end in ends)
+    low, high = ends[-1] * scale, ends[1] * scale
     offset = (low + high) / 2 - sign * (joint.q_min + joint.q_max) / 2
     confirmed = True
     if joint.zero:

@@ -54,7 +54,7 @@ def _choice(spec: JointSpec) -> JointChoice:
     words = ("closed", "opened") if spec.closing else ("to-middle", "to-index")
     rising, falling = words if closing > 0 else words[::-1]
     zero = "straight" if spec.closing else "in the middle between index and middle finger"
-    return JointChoice(spec.name, spec.q_min, spec.q_max, rising, falling, _RATIOS, zero)
+    return JointChoice(spec.name, spec.q_min, spec.q_max, rising, falling, _RATIOS, zero, -closing)
 
 
 class Dex3Bench:
