@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.emulators.dex3_mcu import Dex3Mcu, Firmware
+from dexkit.emulators.dex3_mcu import Dex3Mcu, Firmware, Wiring
 from dexkit.emulators.dex3_mcu.command import CommandReader
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.faults import DEX3_FAULTS, grammar, parse_fault
@@ -24,7 +24,6 @@ from dexkit.wire.dex3_usb import (
     BROADCAST_ID,
     COMMAND_734,
     COMMAND_1234,
-    DEFAULT_BUS_MAP,
     N_BUSES,
     CommandFrame,
     CommandLayout,
@@ -204,6 +203,7 @@ def test_answers_are_those_of_the_codec(
     mode=st.lists(st.integers(0, 7), min_size=7, max_size=7),
     protect=st.lists(st.booleans(), min_size=7, max_size=7),
     layout=st.sampled_from([COMMAND_1234, COMMAND_734]),
+    wiring=st.sampled_from([Wiring.assumed(Side.RIGHT), Wiring.random(1)]),
 )
 def test_ordinary_commands_are_read_as_the_codec_reads_them(
     q: Sequence[float],
@@ -214,13 +214,16 @@ def test_ordinary_commands_are_read_as_the_codec_reads_them(
     mode: list[int],
     protect: list[bool],
     layout: CommandLayout,
+    wiring: Wiring,
 ) -> None:
-    codec = HandCodec(DEX3_1.joints[Side.RIGHT], layout=layout)
+    joints = DEX3_1.joints[Side.RIGHT]
+    codec = HandCodec(joints, wiring.bus_map, layout, mounting=wiring.mounting)
     command = HandCommand.position(q, kp=kp, kd=kd, tau=tau, dq=dq)
     command = dataclasses.replace(command, mode=np.array(mode, np.uint8))
     frame = codec.encode(command, np.array(protect))
-    read = CommandReader(Side.RIGHT, DEFAULT_BUS_MAP).read(frame)
+    read = CommandReader(wiring).read(frame)
     assert read is not None
+    read.sort()  # they come bus by bus
     expected = codec.decode_command(frame).command
     assert expected.timeout is not None
     assert [r[0] for r in read] == list(range(7))
