@@ -26,7 +26,7 @@ from dexkit.backends import BackendOptions
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb, Server, backend, discovery, find_hand
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.drivers.dex3_usb.link import UsbLink
-from dexkit.drivers.dex3_usb.settings import from_options, parse_places
+from dexkit.drivers.dex3_usb.settings import default_path, from_options, parse_places
 from dexkit.errors import (
     HandError,
     HandLost,
@@ -132,7 +132,7 @@ class TestSettings:
         return BackendOptions(Side.LEFT, device, settings)
 
     def test_the_defaults(self) -> None:
-        assert from_options(self.options()) == Dex3Settings()
+        assert from_options(self.options()) == Dex3Settings(config=default_path())
 
     def test_all_settings_are_read(self) -> None:
         found = from_options(
@@ -145,6 +145,12 @@ class TestSettings:
                 frame="734",
                 head="eb90",
                 motors="3.0,3.1,3.2,1.0,1.1,2.0,2.1",
+                signs="+,-,+1,-1,1,+,-",
+                offsets="0.1,0,0,0,0,0,-0.2",
+                ratios="189,108,108,108,108,108,108",
+                limits="-0.5:0.5,0:1,0:1,-1:0,-1:0,-1:0,-1:0",
+                poll_sensors="on",
+                config="trial.json",
                 out_endpoint="0x04",
                 in_endpoint="133",
             )
@@ -155,6 +161,12 @@ class TestSettings:
         assert found.head == b"\xeb\x90"
         assert found.bus_map.motors[:2] == ((3, 0), (3, 1))
         assert (found.protect, found.timeout, found.send_timeout) == (False, 0.02, 0.03)
+        assert found.signs == (1, -1, 1, -1, 1, 1, -1)
+        assert found.mounting(Side.LEFT).offsets[6] == -0.2
+        assert found.joints(Side.LEFT)[0].gear_ratio == 189
+        assert found.joints(Side.LEFT)[1].q_max == 1
+        assert (found.poll_sensors, found.config) == (True, Path("trial.json"))
+        assert "signs" in found.given
         assert (found.out_endpoint, found.in_endpoint) == (0x04, 0x85)
 
     @each(
