@@ -82,6 +82,7 @@ class RigOptions:
                 "a device is needed for each side",
                 hint="--side left --device PATH, or --device left=PATH --device right=PATH",
             )
+        self.dialect.check_sides(self.sides)
         for side in self.objects:
             if side not in self.sides:
                 raise UsageError(f"an object for the {side} hand, which is not under test")

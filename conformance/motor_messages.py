@@ -129,6 +129,10 @@ class MotorCodec:
             for topic, motors in self._by_topic(hands).items()
         ]
 
+    def encode_shorter(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
+        """Encode commands without the last motor of the sequence."""
+        return [(t, self._payload(motors[:-1])) for t, motors in self._by_topic(hands).items()]
+
     def encode_foreign(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
         """Encode commands in :attr:`foreign`, another command type of the Dex family."""
         sequence, motor = _SEQUENCE[self.foreign.name]

@@ -478,7 +478,7 @@ class RunResult:
 
 def _result_dict(result: Result) -> dict[str, Any]:
     requirement = asdict(result.requirement)
-    for name in ("negative", "spoils"):  # about the catalogue, no part of the format
+    for name in ("negative", "spoils", "lineage"):  # about the catalogue, no part of the format
         del requirement[name]
     requirement["level"] = str(result.requirement.level)
     requirement["kind"] = str(result.requirement.kind)

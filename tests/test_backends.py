@@ -65,6 +65,7 @@ class TestByName:
             "sim-dex1",
             "sim-dex3",
             "sim-brainco",
+            "sim-inspire-dfx",
             "sim-dex5",
             "dex3-usb",
         } <= names.keys()

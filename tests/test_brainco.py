@@ -6,7 +6,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,9 +22,7 @@ from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.mutants.servos import StatesSwapped, Vibrates
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
-from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.brainco import BrainCoService
-from dexkit.conformance.virtual.service import TopicDevice
 from dexkit.doctor.ways import Course, moves_against, swapped
 from dexkit.emulators.sim_brainco import SimBrainCo, sim_brainco
 from dexkit.errors import HandLost, UsageError
@@ -38,6 +35,7 @@ from dexkit.teleop import Operator, client_for, profile
 from dexkit.topics import roles
 from dexkit.watch.fields import parts_of
 from tests.each import each
+from tests.emulated_service import EmulatedService
 
 BRAINCO = dialect("brainco")
 STATES = message_type(BRAINCO.state_type)
@@ -247,53 +245,8 @@ def test_vibration_and_swapped_states_are_found_and_told_in_parts_of_the_travel(
     assert any("full travel" in r.observed for r in result.results)
 
 
-class Emulated(Service):
-    """The simulated hands with dexkit's own limits, time-out and messages, on the virtual clock."""
-
-    tick = period = 0.002
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.clock = ManualClock()
-        self.hands, self.maps, self.cores = {}, {}, {}
-        for s in self.sides:
-            hand = SimBrainCo(s, clock=self.clock, object_at=args[2].get(s))
-            hand.open()
-            self.hands[s] = hand
-            self.maps[s] = dialect_map(BRAINCO, {s: hand.spec})
-            self.cores[s] = HandCore(hand.spec, BRAINCO_REVO2, self.clock)
-            self.cores[s].opened(hand.spec)
-
-    def take_over(self, before: TopicDevice) -> None:
-        assert isinstance(before, Emulated)
-        self.clock, self.hands = before.clock, before.hands
-        for s, hand in self.hands.items():
-            self.cores[s] = HandCore(hand.spec, BRAINCO_REVO2, self.clock)
-            self.cores[s].opened(hand.spec)
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        message = message_type(BRAINCO.cmd_type).decode(payload)
-        for s in self.sides:
-            if self.codec.command_topics[s] == topic:
-                command = self.maps[s].command(message, s)
-                if command is not None:
-                    self.cores[s].submit(command)
-
-    def live(self, dt: float) -> None:
-        self.clock.advance(dt)
-        for s, core in self.cores.items():
-            core.measured(self.hands[s].exchange(core.next_command()))
-
-    def positions(self, side: Side) -> tuple[float, ...]:
-        return tuple(self.hands[side].mechanics.q.tolist())
-
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        view = self.cores[sides[0]].view()
-        if view is None:  # before the first exchange
-            self.live(0.0)
-            view = self.cores[sides[0]].view()
-            assert view is not None
-        return self.maps[sides[0]].encode({sides[0]: view})
+class Emulated(EmulatedService):
+    simulated = SimBrainCo
 
 
 @pytest.mark.soak

@@ -32,6 +32,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         ("dex5", LEFT),  # both hands of many joints take long
         pytest.param("dex5", BOTH, marks=pytest.mark.soak),
         pytest.param("brainco", BOTH, marks=pytest.mark.soak),
+        pytest.param("inspire_dfx", BOTH, marks=pytest.mark.soak),
     ],
 )
 def test_reference_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
@@ -97,6 +98,7 @@ def test_every_wrong_hand_has_a_summary() -> None:
         ("dds", "dex3-1"),
         ("dds", "dex5-1"),
         ("dds", "brainco-revo2"),
+        ("dds", "inspire-dfx"),
         ("robot", "h1"),
         ("robot", "g1"),
     ],

@@ -352,14 +352,14 @@ def check(*requirement_ids: str) -> Callable[[CheckT], CheckT]:
 
 
 def check_of(requirement: Requirement) -> Check:
-    """The check that is registered for a requirement, else for the one that it is ``like``.
+    """The check that is registered for a requirement, else for the nearest that it is ``like``.
 
     Modules of checks are imported one after the other until one registers it.
 
     :raises KeyError: there is none.
     """
     modules = CHECK_MODULES[requirement.layer]
-    for name in filter(None, (requirement.id, requirement.like)):
+    for name in (requirement.id, *requirement.lineage):
         for module in modules:
             if name in REGISTRY:
                 return REGISTRY[name]

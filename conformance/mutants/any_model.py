@@ -82,15 +82,17 @@ class SilentUntilCommanded(Service):
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
 @wrong_hand("BRAINCO-RATE-02")
 class SlowPublisher(Service):
-    """Publishes at 125 Hz."""
+    """Publishes at 125 Hz, or at 1.6 times the least rate where that is less."""
 
-    period = 0.008
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.period = max(0.008, 0.625 / model(self.dialect.model).min_state_rate)
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
 @wrong_hand("BRAINCO-RATE-01")
 class SlowsDown(Service):
-    """Publishes at 60 Hz from 6 s on, as if it is throttled when warm."""
+    """Publishes at 60 Hz or less from 6 s on, as if it is throttled when warm."""
 
     due = 6.0
 
@@ -98,7 +100,7 @@ class SlowsDown(Service):
         samples = super().publish()
         if self.now < self.due:
             return samples if self.now < 6.0 else []
-        self.due += 1 / 60
+        self.due += max(1 / 60, 4 / 3 / model(self.dialect.model).min_state_rate)
         return samples
 
     def end(self) -> list[Sample]:
@@ -106,7 +108,15 @@ class SlowsDown(Service):
         return super().end()
 
 
-@wrong_hand(("DEX1-RATE-02", "DEX3-RATE-02"))
+def _needs_many_states(hand: HandModel) -> bool:
+    return hand.min_state_rate >= 200.0
+
+
+def _publishes_hundreds(hand: HandModel) -> bool:
+    return hand.state_rate >= 400.0
+
+
+@wrong_hand(("DEX1-RATE-02", "DEX3-RATE-02"), where=_publishes_hundreds)
 class HalfRate(Service):
     """Publishes at 222 Hz: enough for clients, but slower than the vendor's service."""
 
@@ -880,10 +890,6 @@ class StuttersUnderLoad(Service):
             for times in self.came.values()
         )
         return [] if busy and self.cycle % _too_slow(self) else super().publish()
-
-
-def _needs_many_states(hand: HandModel) -> bool:
-    return hand.min_state_rate >= 200.0
 
 
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), where=_needs_many_states)

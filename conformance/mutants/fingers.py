@@ -944,8 +944,9 @@ class FillsUpWithZeros(FingerService):
         dq = self.hand.model.client_dq
         for side in self.sides:
             mine = self.codec.command_topics[side] == topic
-            if mine and 0 < len(sequence) < self.codec.joints:
-                given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence]
+            first = self.dialect.index[side]
+            if mine and 0 < len(sequence) < first + self.codec.joints:
+                given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence[first:]]
                 missing = range(len(given), self.codec.joints)
                 self.motors(
                     side, (*given, *(Motor(dq=dq, mode=self.codec.mode(i)) for i in missing))

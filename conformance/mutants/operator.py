@@ -197,8 +197,8 @@ class _OpenEnd(_PerJoint):
         spec = model(self.dialect.model).joints[side][index]
         if not spec.closing:
             return q
-        closed = spec.q_max if spec.closing > 0 else spec.q_min
-        return closed * self.close(joint, q / closed, here / closed)
+        opened, span = spec.straight, spec.closed_by(1.0) - spec.straight
+        return opened + span * self.close(joint, (q - opened) / span, (here - opened) / span)
 
     def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
         """The obeyed closing in place of ``goal``, 0 to 1."""

@@ -9,7 +9,8 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -143,19 +144,14 @@ def _mutants(
     declared: _Declaration, every: tuple[Requirement, ...], references: _References
 ) -> Iterator[Mutant]:
     base = _base(declared.made, references)
-    by_id = {r.id: r for r in every}
-    elsewhere = {
-        (by_id[name].layer, by_id[name].model)
-        for other in _declared
-        if other.made is declared.made
-        for name in other.kills
-    }
+    names = [name for other in _declared if other.made is declared.made for name in other.kills]
     for i, name in enumerate(declared.kills):
         for requirement in every:
             place = requirement.layer, requirement.model
-            if not _is_like(requirement, name, by_id):
+            if _steps(requirement, name) == math.inf:
                 continue
-            if requirement.id != name and place in elsewhere:
+            # the id of a model, or of one that it is more like, has precedence
+            if len(names) > 1 and _steps(requirement, name) > _nearest(names, place, every):
                 continue
             if declared.where and not declared.where(model(requirement.model)):
                 continue
@@ -170,7 +166,7 @@ def _mutants(
                     r.id
                     for other in declared.also
                     for r in every
-                    if (r.layer, r.model) == place and _is_like(r, other, by_id)
+                    if (r.layer, r.model) == place and _steps(r, other) < math.inf
                 ),
                 declared.sides or reference.fault_sides,
                 declared.dialect,
@@ -179,13 +175,18 @@ def _mutants(
             )
 
 
-def _is_like(requirement: Requirement, name: str, by_id: Mapping[str, Requirement]) -> bool:
-    """Whether a requirement is the named one, or is derived from it by ``like``."""
-    while requirement.id != name:
-        if not requirement.like:
-            return False
-        requirement = by_id[requirement.like]
-    return True
+def _nearest(
+    names: Iterable[str], place: tuple[str, str], every: tuple[Requirement, ...]
+) -> float:
+    """The least number of steps of ``like`` from a model's requirements to one of these ids."""
+    mine = [r for r in every if (r.layer, r.model) == place]
+    return min((_steps(r, name) for name in names for r in mine), default=math.inf)
+
+
+def _steps(requirement: Requirement, name: str) -> float:
+    """Steps of ``like`` from a requirement to the named one, infinite where there is none."""
+    names = (requirement.id, *requirement.lineage)
+    return names.index(name) if name in names else math.inf
 
 
 def _base(made: type[Any], references: _References) -> type[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,18 @@ from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
 from dexkit.hand import Floats, Side
+from dexkit.models import model
 
 # ----------------------------------------------------------------------------- state
 
 
 @wrong_hand("BRAINCO-RATE-01")
-class PublishesAt50(ServoService):
-    """Publishes 50 times a second."""
+class PublishesTooRarely(ServoService):
+    """Publishes at five eighths of the least rate."""
 
-    period = 0.02
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.period = 1.6 / model(self.dialect.model).min_state_rate
 
 
 @wrong_hand("BRAINCO-FIELD-03")
@@ -206,10 +208,12 @@ class _LetsGo(ServoHand):
     pressed = 0.0
 
     def step(self, dt: float) -> None:
-        presses = max(map(abs, self.tau)) > 0.8 * float(self.most.max()) and max(self.dq) < 0.05
+        closing = np.array([j.closing for j in self.model.joints[self.side]])
+        stands = float((np.array(self.dq) * closing).max()) < 0.05
+        presses = max(map(abs, self.tau)) > 0.8 * float(self.most.max()) and stands
         self.pressed = self.pressed + dt if presses else 0.0
         if self.pressed > 1.0:
-            self.goal = np.maximum(self.goal - 0.4, self.low)
+            self.goal = np.clip(self.goal - 0.4 * closing, self.low, self.high)
             self.pressed = 0.0
             self.changed()
         super().step(dt)
@@ -304,15 +308,21 @@ class SmoothsGoals(ServoService):
 # ----------------------------------------------------------------------- bad commands
 
 
+class _SlowAfterNan(ServoHand):
+    slow = False
+
+    def command(self, motors: tuple[Motor, ...]) -> None:
+        self.slow = self.slow or not all(math.isfinite(m.q) for m in motors)
+        super().command(motors)
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        if self.slow:
+            self.reach = [0.33 * r for r in self.reach]
+
+
 @wrong_hand("BRAINCO-ABUSE-01")
 class SlowAfterNan(ServoService):
     """Moves with a third of each speed since it has got a command that is not finite."""
 
-    slow = False
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(m.q) for m in motors):
-            self.slow = True
-        if self.slow:
-            motors = tuple(replace(m, dq=0.33 * m.dq) for m in motors)
-        super().motors(side, motors)
+    hand_fault = _SlowAfterNan

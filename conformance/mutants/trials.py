@@ -67,12 +67,13 @@ def plan_for(
     right hand.
 
     :param name: of a dialect or a robot.
-    :param sides: by default both hands, or the robot.
+    :param sides: by default both hands, or the robot; both where no command can leave one alone.
     """
     if name in ROBOTS:
         every = run.requirements(catalogue(name, "robot"))
         return Plan(robot_dialect(name), (ROBOT,), phases=phases_for(every))
-    chosen, sides = dialect(name), tuple(sides or Side)
+    chosen = dialect(name)
+    sides = tuple(Side) if sides is None or chosen.commands_both else tuple(sides)
     return Plan(
         dialect=chosen,
         sides=sides,

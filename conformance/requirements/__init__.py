@@ -187,6 +187,7 @@ class Requirement:
     :param plots: what shows a failure, unless its check names other plots.
     :param like: the requirement of another model that it is taken from, and whose check judges
         it; empty if it stands for itself.
+    :param lineage: that one, the one which it is like, and so on.
     :param spoils: of a requirement about the client, how the ids begin of those requirements of
         the hand that cannot be judged where the client does not meet it.
     :param kind: drop-in, unless the catalogue says safety.
@@ -216,6 +217,7 @@ class Requirement:
     negative: bool = False
     repeat: int = 1
     like: str = ""
+    lineage: tuple[str, ...] = ()
     plots: tuple[Plot, ...] = ()
     spoils: tuple[str, ...] = ()
     kind: Kind = Kind.DROP_IN
@@ -311,11 +313,21 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
             return [ours(v) for v in value] if isinstance(value, list) else value
 
         taken = {key: ours(value) for key, value in origins.items()}
-        taken["source"] = f"as {entry['like']}: {origins['source']}"
+        source = origins["source"]
+        taken["source"] = source if "like" in origins else f"as {entry['like']}: {source}"
         taken["confidence"] = "inferred"
         tolerances = {**origins.get("tolerances", {}), **entry.get("tolerances", {})}
         found.append({**taken, **entry, **({"tolerances": tolerances} if tolerances else {})})
     return found
+
+
+def _lineage(entry: Mapping[str, Any], others: Mapping[str, Any]) -> tuple[str, ...]:
+    """Ids of the requirement that this one is like, of the one which that is like, and so on."""
+    found: list[str] = []
+    while "like" in entry:
+        found.append(entry["like"])
+        entry = others[entry["like"]]
+    return tuple(found)
 
 
 def _check_types(entry: Any, origin: str) -> None:
@@ -455,6 +467,7 @@ def _parse(
             negative=bool(entry.get("negative", False)),
             repeat=entry.get("repeat", 1),
             like=entry.get("like", ""),
+            lineage=_lineage(entry, others),
             plots=_plots(entry["plots"], where) if "plots" in entry else _PLOTS[layer],
             spoils=tuple(entry.get("spoils", ())),
             kind=kind,
@@ -513,17 +526,36 @@ def _document(name: str) -> Mapping[str, Any]:
 
 
 @cache
+def _homes() -> Mapping[str, tuple[str, Mapping[str, Any]]]:
+    """File and entry, as it is written, of each requirement of dexkit's own, by id."""
+    found = {}
+    for file in _own_files():
+        prefix = str(_document(file).get("prefix", ""))
+        for entry in _document(file)["requirement"]:
+            like = entry.get("like", "")
+            inferred = renamed(like, like.partition("-")[0], prefix)
+            found[str(entry.get("id", inferred))] = file, entry
+    return found
+
+
+def _ancestors(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that this one is like, the nearest last, each with all that it takes."""
+    name = str(entry.get("like", ""))
+    if name not in _homes():
+        return {}
+    file, theirs = _homes()[name]
+    found = _ancestors(theirs)
+    document = {**_document(file), "requirement": [theirs]}
+    return {**found, name: _entries(document, found, file)[0]}
+
+
+@cache
 def _requirements(name: str) -> tuple[Requirement, ...]:
     """Those of one file; the others are read only if it takes something from them."""
     document = _document(name)
-    others = {}
-    if any("like" in entry for entry in document["requirement"]):
-        others = {
-            entry["id"]: entry
-            for other in _own_files()
-            for entry in _document(other)["requirement"]
-            if "like" not in entry
-        }
+    others: dict[str, Any] = {}
+    for entry in document["requirement"]:
+        others |= _ancestors(entry)
     return _parse(document, name, others)
 
 

@@ -67,7 +67,7 @@ from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
-from dexkit.conformance.stimuli.script import NOT_FINITE, Pose, Steps
+from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Pose, Steps
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointMode, Side
 from dexkit.models import JointRoles
@@ -285,10 +285,8 @@ class FingerScript(HandScript):
             yield from self._bad_commands(name, self.plan.sides, far, 0.3)
         else:
             for alone in self._each_alone():
-                kinds_by_side = {s: self._malformed(name, s) for s in alone}
-                for i in range(len(kinds_by_side[alone[0]])):
-                    kind = {s: kinds_by_side[s][i] for s in alone}
-                    yield from self._bad_commands(name, alone, [kind], 0.25)
+                for malformed in self._malformed(name, alone):
+                    yield from self._bad_commands(name, alone, [malformed], 0.25)
         group = next((names for names in _TOGETHER if name in names), (name,))
         these = [n for n in group if n in self.plan.phases]
         if name != these[-1]:
@@ -300,19 +298,33 @@ class FingerScript(HandScript):
     def _at(self, side: Side, q: Sequence[float]) -> Motors:
         return [replace(m, q=x) for m, x in zip(self._motors(side, tuple(q)), q, strict=True)]
 
-    def _malformed(self, name: str, side: Side) -> list[Motors]:
-        """The bad commands of a phase to one side."""
-        good = self._motors(side, self._goal[side])
+    def _malformed(
+        self, name: str, sides: Sequence[Side]
+    ) -> Sequence[Mapping[Side, Motors] | Payloads]:
+        """The bad commands of a phase to these sides, whole messages where they share one."""
+        good = {s: self._motors(s, self._goal[s]) for s in sides}
+        surplus = replace(good[sides[0]][0], q=1.0)
+        if self._codec.shared and name == "empty":
+            return [self._codec.encode_empty(sides)]
+        if self._codec.shared and name == "short":
+            return [self._codec.encode_shorter(good)]
+        if self._codec.shared and name == "long":
+            return [self._codec.encode_longer(good, [surplus] * more) for more in (1, 13)]
         if name == "empty":
-            return [[]]
+            return [{s: [] for s in sides}]
         if name == "short":
-            return [good[:-1]]
+            return [{s: motors[:-1] for s, motors in good.items()}]
         if name == "long":
-            return [[*good, *[replace(good[0], q=1.0)] * more] for more in (1, 13)]
+            return [
+                {s: [*m, *[replace(m[0], q=1.0)] * more] for s, m in good.items()}
+                for more in (1, 13)
+            ]
         if name == "negative":
-            near = self._motors(side, self._aside(side, 0.1))
-            return [[replace(m, kp=-m.kp, kd=-m.kd) for m in near]]
-        return [self._crossed(side, good)]
+            near = {s: self._motors(s, self._aside(s, 0.1)) for s in sides}
+            return [
+                {s: [replace(m, kp=-m.kp, kd=-m.kd) for m in motors] for s, motors in near.items()}
+            ]
+        return [{s: self._crossed(s, motors) for s, motors in good.items()}]
 
     def _with_status(self, side: Side, first: int) -> Motors:
         """Far goals with statuses that have no meaning, another one in each joint."""
@@ -348,7 +360,7 @@ class FingerScript(HandScript):
         for name in ("empty", "short", "long", "negative"):
             if name in self.plan.phases:
                 yield from self._hold(BETWEEN)
-                bad = {s: self._malformed(name, s)[0] for s in sides}
+                bad = self._malformed(name, sides)[0]
                 yield from self._bad_commands(name, sides, [bad], 0.15)
         yield from self._far_away(1000.0, 0.2)
         yield from self._everyone(

@@ -279,7 +279,7 @@ class FingerService(Service):
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
         self._blank: dict[int, tuple[bytearray, Any, Any]] = {}
         self._sent: dict[tuple[Side, ...], tuple[object, bytes]] = {}
-        units = dialect.torque_units or (1.0,) * dialect.length
+        units = dialect.torque_units or (1.0,) * self.codec.joints
         self.torque_units: Floats = np.array(units)
 
     def take_over(self, before: TopicDevice) -> None:

@@ -129,7 +129,9 @@ def _hand(console: Console, data: dict[str, Any]) -> None:
         motors = f"{dialect['length']} motor{'s' if dialect['length'] > 1 else ''} in a message"
         first = {side: dialect["sides"][side]["first_index"] for side in _SIDES}
         if first["left"] != first["right"]:
-            motors += f": {first['left']} is the left one, {first['right']} the right one"
+            count = len(data["sides"]["left"]["joints"])
+            mine = {s: indices(range(i, i + count)) for s, i in first.items()}
+            motors += f": {mine['left']} left, {mine['right']} right"
         console.print(f"  {motors}")
         for which, unit in torque_units(dialect):
             console.print(f"  torques in units of {unit:g} N m: joints {which}")

@@ -94,7 +94,7 @@ class _Watch:
             self.decode(data)
 
     def decode(self, data: bytes) -> None:
-        if self.endpoint.topic in AWAITED:
+        if not is_hand_topic(self.endpoint.topic, self.endpoint.type_name):
             return  # that they come is enough
         try:
             kind = message_type(self.endpoint.type_name)

@@ -23,6 +23,7 @@ from dexkit.models.brainco import BRAINCO_REVO2
 from dexkit.models.dex1 import DEX1_1
 from dexkit.models.dex3 import DEX3_1
 from dexkit.models.dex5 import DEX5_1
+from dexkit.models.inspire import INSPIRE_DFX
 from dexkit.models.profile import (
     Dialect,
     Finger,
@@ -42,6 +43,7 @@ __all__ = [
     "DEX5_1",
     "DIALECTS",
     "GROUP",
+    "INSPIRE_DFX",
     "MODELS",
     "Dialect",
     "Finger",
@@ -57,7 +59,7 @@ __all__ = [
 ]
 
 GROUP = "dexkit.models"
-BUILT_IN = (DEX1_1, DEX3_1, DEX5_1, BRAINCO_REVO2)
+BUILT_IN = (DEX1_1, DEX3_1, DEX5_1, BRAINCO_REVO2, INSPIRE_DFX)
 """The models of dexkit itself."""
 
 _HAND_TYPES = (

@@ -8,13 +8,14 @@ client, stimulus script, reference service, wrong hands) is named by a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from dexkit.errors import UsageError
 from dexkit.hand import HandSpec, JointSpec, Side, Subject
 from dexkit.lazy import Lazy
 
@@ -105,6 +106,28 @@ class Dialect:
     def is_gripper(self) -> bool:
         """Whether its hand has one joint, whose q runs from 0, closed, to :attr:`q_open`."""
         return not math.isnan(self.q_open)
+
+    @property
+    def shared(self) -> bool:
+        """Whether both hands are in one message."""
+        return len({self.topics(side) for side in Side}) < len(Side)
+
+    @property
+    def commands_both(self) -> bool:
+        """Whether every command moves both hands: no value leaves a position servo alone."""
+        return self.shared and self.position_servo
+
+    def check_sides(self, sides: Collection[Subject]) -> None:
+        """Check that these hands can be commanded without the others.
+
+        :raises UsageError: a command would move the other hand.
+        """
+        if self.commands_both and set(sides) != set(Side):
+            raise UsageError(
+                f"a command on {self.cmd_topic} moves both hands, and has no value that leaves "
+                "one alone",
+                hint="choose both sides",
+            )
 
     @property
     def gains_are_used(self) -> bool:

@@ -42,6 +42,7 @@ __all__ = [
     "JointCommand",
     "Pose",
     "Release",
+    "RightHandClient",
     "StateReceiver",
     "StickyFilter",
     "TeleopClient",
@@ -206,6 +207,7 @@ class TeleopClient(ABC):
     def __init__(self, spoken: Dialect, sides: Sequence[Side] = tuple(Side)) -> None:
         if not sides:
             raise UsageError("a client needs a side")
+        spoken.check_sides(sides)
         self.dialect = spoken
         self.sides = tuple(s for s in (Side.LEFT, Side.RIGHT) if s in sides)
         self.rate = model(spoken.model).command_rate
@@ -237,7 +239,7 @@ class TeleopClient(ABC):
         found = {s: "" for s in self.sides if s not in latest}
         if found:
             return found
-        return {s: "every q is exactly 0" for s in self.sides if not any(latest[s])}
+        return {s: "every q is exactly 0" for s in self._awaited if not any(latest[s])}
 
     def begin_again(self) -> None:
         """Forget every state, and what was made of them; the operator's targets stay.
@@ -269,8 +271,13 @@ class TeleopClient(ABC):
             return {}
         return self._control(self.receiver.latest, inputs)
 
+    @property
+    def _awaited(self) -> Sequence[Side]:
+        """The sides whose q must not be all 0, where that is taken for no state."""
+        return self.sides
+
     def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
-        return not self.dialect.zero_is_no_state or all(any(latest[s]) for s in self.sides)
+        return not self.dialect.zero_is_no_state or all(any(latest[s]) for s in self._awaited)
 
     def parting(self, pose: Pose) -> tuple[JointCommand, ...]:
         """A command to hold the pose, with motors locked where the dialect has a mode for it."""
@@ -417,6 +424,16 @@ class FingerClient(TeleopClient):
             )
             for s in self.sides
         }
+
+
+class RightHandClient(FingerClient):
+    """A client that looks at the right hand alone to see whether states come
+    (docs/sources/unitree-dex.md#j2).
+    """
+
+    @property
+    def _awaited(self) -> Sequence[Side]:
+        return (Side.RIGHT,)
 
 
 def client_for(

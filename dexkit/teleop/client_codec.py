@@ -32,8 +32,11 @@ class ClientWire:
     def encode(self, commands: Mapping[Side, Sequence[JointCommand]]) -> list[tuple[str, bytes]]:
         """(topic, payload), left before right; one message where both share a topic.
 
-        There the place of a side that is not given is sent without force.
+        There the place of a side that is not given is sent without force; where that is not
+        possible, nothing is sent.
         """
+        if self._dialect.commands_both and len(commands) < len(Side):
+            return []
         if len(set(self.command_topics.values())) == len(Side):
             return [(self.command_topics[s], self._payload(c)) for s, c in commands.items()]
         places = [_LIMP] * self._dialect.length

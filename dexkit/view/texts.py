@@ -61,7 +61,7 @@ def hand_table(view: SubjectView, title: str) -> str:
         '<table><tr><th>joint</th><th>between its limits</th><th class="n">'
         f"q {view.model.unit}</th>"
         '<th class="n">cmd</th><th>torque</th><th class="n">'
-        f'{view.model.torque_unit.replace(" ", "·")}</th><th class="n">°C</th></tr>'
+        f'{view.model.torque_unit.replace("N m", "N·m")}</th><th class="n">°C</th></tr>'
         f"{''.join(rows)}</table></div>"
     )
 

@@ -192,7 +192,7 @@ def _motor_fields(
 def _unit(quantity: str, unit: str, torque_unit: str) -> str:
     """The unit of a quantity of a hand with these units of q and tau."""
     found = _UNITS.get(quantity, "").replace("rad", unit)
-    return found.replace("N·m", torque_unit.replace(" ", "·"))
+    return found.replace("N·m", torque_unit.replace("N m", "N·m"))
 
 
 def _robot_parts(topic: str, type_name: str) -> Iterator[Part]:

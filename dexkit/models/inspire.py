@@ -1,0 +1,77 @@
+"""Inspire's hands on Unitree's topics: six position servos a side."""
+
+from __future__ import annotations
+
+import math
+
+from dexkit.hand import JointSpec, Side
+from dexkit.lazy import Lazy
+from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles
+
+__all__ = ["INSPIRE_DFX"]
+
+_FULL_TRAVEL_S = 0.8  # docs/sources/unitree-dex.md#j2
+_NAMES = ("pinky", "ring", "middle", "index", "thumb_bend", "thumb_rotation")
+
+_JOINTS = tuple(
+    # 1 is open; the limit of force is 1000 of its register, and sources differ on how much that is
+    JointSpec(name, 0.0, 1.0, dq_max=1.0 / _FULL_TRAVEL_S, tau_max=1.0, closing=-1, straight=1.0)
+    for name in _NAMES
+)
+
+INSPIRE_DFX = HandModel(
+    name="inspire-dfx",
+    title="Inspire DFX hand",
+    unit="full travel",
+    torque_unit="full force",
+    joints=dict.fromkeys(Side, _JOINTS),
+    dialects=(
+        Dialect(
+            name="inspire_dfx",
+            model="inspire-dfx",
+            cmd_topic="rt/inspire/cmd",
+            state_topic="rt/inspire/state",
+            cmd_type="unitree_go::msg::dds_::MotorCmds_",
+            state_type="unitree_go::msg::dds_::MotorStates_",
+            index={Side.LEFT: 6, Side.RIGHT: 0},
+            length=12,
+            q_open=math.nan,
+            summary="RH56DFX: 6 motors right, 6 left; q 0 closed to 1 open, nothing else counts",
+            codec=Lazy("dexkit.service.dialects:ServoMap"),
+            position_servo=True,
+            zero_is_no_state=True,
+        ),
+    ),
+    # docs/sources/unitree-dex.md#j2: the loop of Unitree's service, which it cannot keep while it
+    # is commanded; derived: its four exchanges take up to 25 ms; less a fifth
+    state_rate=100.0,
+    min_state_rate=32.0,
+    command_rate=100.0,  # docs/sources/unitree-dex.md#j2
+    command_timeout=1.0,  # docs/sources/unitree-dex.md#j2
+    client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j2
+    client=Lazy("dexkit.teleop.client:RightHandClient"),
+    rest_q=dict.fromkeys(Side, (0.85, 0.85, 0.85, 0.85, 0.9, 0.9)),
+    requirements=("inspire_dfx.toml", "inspire_dfx_client.toml"),
+    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
+    reference=Lazy("dexkit.conformance.virtual.inspire:InspireService"),
+    quick_seconds=20.0,
+    roles=JointRoles(driven=(), slow=(1, 3)),
+    objects={Side.RIGHT: 60.0},
+    simulator="sim-inspire-dfx",
+    # ring and little finger move as the middle one does
+    fingers=("middle", "middle", "middle", "index", "thumb", "thumb"),
+    client_forks=True,
+    layout=HandLayout(
+        centres=(240.0, 640.0),
+        top=466.0,
+        palm=(280.0, 130.0),
+        width=62.0,
+        fingers=(
+            Finger("Index", range(3, 4), (-108.0, -90.0), (0.0, -150.0), tip=1.0),
+            Finger("Middle", range(2, 3), (-36.0, -106.0), (0.0, -150.0), tip=1.0),
+            Finger("Ring", range(1, 2), (36.0, -90.0), (0.0, -150.0), tip=1.0),
+            Finger("Pinky", range(0, 1), (108.0, -66.0), (0.0, -120.0), tip=1.0),
+            Finger("Thumb", range(4, 6), (-167.0, 26.0), (-9.0, -66.0), tip=1.0, root=0.1),
+        ),
+    ),
+)

@@ -1,0 +1,318 @@
+"""Test Inspire's DFX hands: profile, one message of both, simulated hand, client and the doctor."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.backends import BackendOptions, backend
+from dexkit.cli import cli
+from dexkit.clock import ManualClock
+from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.motor_messages import Motor, MotorCodec
+from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.mutants.registry import mix
+from dexkit.conformance.mutants.servos import ReversedScale
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.virtual.inspire import InspireService
+from dexkit.doctor import Observations, diagnose
+from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
+from dexkit.emulators.sim_inspire import SimInspireDfx, sim_inspire_dfx
+from dexkit.errors import HandLost, UsageError
+from dexkit.hand import Hand, HandCommand, HandState, Side
+from dexkit.messages import message_type, unitree_go
+from dexkit.models import INSPIRE_DFX, dialect
+from dexkit.service.core import HandCore
+from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.teleop import Operator, client_for, profile
+from dexkit.teleop.client_codec import ClientWire
+from dexkit.topics import roles
+from dexkit.watch.fields import parts_of
+from tests.each import each
+from tests.emulated_service import EmulatedService
+
+DFX = dialect("inspire_dfx")
+STATES, COMMANDS = message_type(DFX.state_type), message_type(DFX.cmd_type)
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+N = 6
+RADIANS = re.compile(r"\brad\b|\bradians\b|N m\b|_rad\b")
+
+
+# --------------------------------------------------------------------------------------- the model
+
+
+def test_one_is_open_and_the_right_hand_comes_first() -> None:
+    for side in Side:
+        joints = INSPIRE_DFX.joints[side]
+        names = ["pinky", "ring", "middle", "index", "thumb_bend", "thumb_rotation"]
+        assert [j.name for j in joints] == names
+        assert {(j.q_min, j.q_max, j.closing, j.straight) for j in joints} == {(0.0, 1.0, -1, 1.0)}
+        assert [j.closed_by(0.25) for j in joints] == [0.75] * N
+    assert (DFX.index[RIGHT], DFX.index[LEFT], DFX.length) == (0, 6, 12)
+    assert DFX.shared
+    assert DFX.commands_both
+    assert not dialect("brainco").shared
+    assert not dialect("unitree_actuator").commands_both  # a motor without gains is limp
+
+
+def test_one_topic_is_of_both_sides() -> None:
+    (state,) = roles("rt/inspire/state")
+    assert (state.kind, state.dialect.name, set(state.sides)) == ("state", "inspire_dfx", set(Side))
+
+
+def test_nothing_is_told_in_radians() -> None:
+    text = CliRunner().invoke(cli, ["models", "inspire-dfx"]).output
+    assert "12 motors in a message: 6 to 11 left, 0 to 5 right" in text
+    assert not RADIANS.search(text)
+    data = CliRunner().invoke(cli, ["models", "inspire-dfx", "--json"]).output
+    assert json.loads(data)["models"][0]["unit"] == "full travel"
+    assert not RADIANS.search(data)
+    parts = parts_of("rt/inspire/state", DFX.state_type)
+    assert {p.subject for p in parts} == set(Side)
+    for part in parts:
+        units = {f.quantity: f.unit for f in part.fields}
+        assert (units["q"], units["dq"], units["tau"]) == (
+            "full travel", "full travel/s", "full force",
+        )  # fmt: skip
+        first = DFX.index[Side(part.subject)]
+        assert next(f.path for f in part.fields if f.quantity == "q") == f"states[{first}].q"
+    for r in catalogue("inspire-dfx", None):
+        for words in (r.title, r.sentence, r.expected):
+            assert not RADIANS.search(words), r.id
+
+
+# --------------------------------------------------------------------------------- simulated hand
+
+
+def opened(side: Side = LEFT, **options: float) -> tuple[SimInspireDfx, ManualClock]:
+    clock = ManualClock()
+    hand = SimInspireDfx(side, clock=clock, **options)
+    hand.open()
+    return hand, clock
+
+
+def hold(hand: SimInspireDfx, clock: ManualClock, q: float, seconds: float) -> HandState:
+    command = HandCommand.position([q] * N, dq=[j.dq_max for j in hand.spec.joints])
+    state = hand.exchange(command)
+    for _ in range(round(seconds * 100)):
+        clock.advance(0.01)
+        state = hand.exchange(command)
+    return state
+
+
+def test_simulated_hand_implements_hand() -> None:
+    hand = SimInspireDfx(RIGHT)
+    assert isinstance(hand, Hand)
+    assert (hand.spec.model, hand.spec.n_joints) == ("inspire-dfx", N)
+    assert backend("sim-inspire-dfx") is sim_inspire_dfx
+    with pytest.raises(HandLost):
+        hand.exchange(HandCommand.brake(N))
+
+
+def test_only_the_position_is_measured_and_the_full_travel_takes_0_8_s() -> None:
+    hand, clock = opened(start=0.0)
+    state = hold(hand, clock, 0.0, 0.4)
+    assert np.allclose(state.q, 0.5, atol=0.04)
+    assert not state.dq.any()
+    assert not state.tau_est.any()
+    for goal in (0.0, 1.0, 0.4567):
+        assert np.abs(hold(hand, clock, goal, 1.5).q - goal).max() <= 0.0005
+
+
+def test_object_stops_the_fingers_on_their_way_to_0() -> None:
+    hand, clock = opened(RIGHT, object_at=60.0)
+    assert np.allclose(hold(hand, clock, 0.1, 1.0).q, 0.4)
+    hand.exchange(HandCommand.brake(N))
+    clock.advance(0.1)
+    assert np.allclose(hand.exchange(HandCommand.brake(N)).q, 0.4)  # a brake does not let go
+    made = sim_inspire_dfx.make(BackendOptions(LEFT, settings={"start": "30", "object": "40"}))
+    assert isinstance(made, SimInspireDfx)
+    assert np.allclose(made.mechanics.q, 0.7)
+
+
+# --------------------------------------------------------------------------------------- dialect
+
+
+def mapping(fill: Fill = Fill.KNOWN, sides: tuple[Side, ...] = tuple(Side)) -> DialectMap:
+    return dialect_map(DFX, {s: INSPIRE_DFX.spec(s, io_rate=100.0) for s in sides}, fill)
+
+
+def message(*q: float, **fields: float) -> unitree_go.MotorCmds_:
+    return unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=x, **fields) for x in q])  # type: ignore[arg-type]
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=12, max_size=12))
+@settings(max_examples=30, deadline=None)
+def test_each_hand_gets_its_half_of_a_command(q: list[float]) -> None:
+    sent = COMMANDS.decode(COMMANDS.encode(message(*q, dq=0.3, kp=2.0, tau=-1.0)))
+    for side, half in ((RIGHT, q[:N]), (LEFT, q[N:])):
+        command = mapping().command(sent, side)
+        assert command is not None
+        assert command.q.tolist() == half
+        assert command.dq.tolist() == [1.25] * N  # as fast as it can, whatever dq is
+        assert not command.tau.any()
+        assert not command.is_limp
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=12, max_size=12), st.sampled_from(Fill))
+@settings(max_examples=30, deadline=None)
+def test_both_hands_are_in_one_state(q: list[float], fill: Fill) -> None:
+    views = {
+        side: StateView(HandState.from_values(half, stamp=0.0), (0,) * N)
+        for side, half in ((RIGHT, q[:N]), (LEFT, q[N:]))
+    }
+    sent = STATES.decode(mapping(fill).encode(views))
+    assert [m.q for m in sent.states] == q
+    assert not any((m.dq, m.ddq, m.tau_est) != (0.0, 0.0, 0.0) for m in sent.states)
+
+
+def test_one_served_hand_leaves_the_other_ones_places_0() -> None:
+    view = StateView(HandState.from_values([0.5] * N, stamp=0.0), (0,) * N)
+    sent = STATES.decode(mapping(sides=(LEFT,)).encode({LEFT: view}))
+    assert [m.q for m in sent.states] == [0.0] * N + [0.5] * N
+
+
+@each("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_rejects_one_hand_alone(value: float) -> None:
+    commands = message(*[0.3] * 5, value, *[0.6] * N)
+    for side, good in ((RIGHT, False), (LEFT, True)):
+        core = HandCore(INSPIRE_DFX.spec(side, io_rate=100.0), INSPIRE_DFX, ManualClock())
+        core.opened(core.spec)
+        command = mapping().command(commands, side)
+        assert command is not None
+        assert core.submit(command) is good
+
+
+def test_eleven_motors_are_a_command_to_the_right_hand_alone() -> None:
+    assert mapping().command(message(*[0.3] * 11), RIGHT) is not None
+    assert mapping().command(message(*[0.3] * 11), LEFT) is None
+    assert mapping().length == 12
+
+
+# ----------------------------------------------------------------------------------------- clients
+
+
+def test_client_waits_for_the_right_hand_and_begins_open() -> None:
+    client = client_for("inspire_dfx")
+    closed, half = (0.0,) * N, (0.5,) * N
+    client.receive(0.0, {LEFT: half, RIGHT: closed})
+    assert client.step(0.01, {}, {}) == {}
+    assert client.missing == {RIGHT: "every q is exactly 0"}
+    client.receive(0.02, {LEFT: closed, RIGHT: half})
+    commands = client.step(0.03, {}, {})
+    assert {tuple(m) for motors in commands.values() for m in motors} == {(0, 1.0, 0, 0, 0, 0)}
+    fist = Operator(profile("fist", "inspire-dfx"), DFX).inputs(2.5, Side)[LEFT]
+    assert fist is not None
+    assert min(fist) < 0.4
+
+
+def test_one_hand_alone_is_not_commanded() -> None:
+    for attempt in (
+        lambda: client_for("inspire_dfx", (LEFT,)),
+        lambda: RigOptions("external", (RIGHT,), DFX, 0).check(),
+    ):
+        with pytest.raises(UsageError, match="moves both hands") as caught:
+            attempt()
+        assert caught.value.hint == "choose both sides"
+    wire, client = ClientWire(DFX), client_for("inspire_dfx")
+    client.receive(0.0, dict.fromkeys(Side, (0.5,) * N))
+    commands = client.step(0.01, {}, {})
+    assert wire.encode({LEFT: commands[LEFT]}) == []
+    ((topic, payload),) = wire.encode(commands)
+    assert (topic, len(COMMANDS.decode(payload).cmds)) == ("rt/inspire/cmd", 12)
+
+
+def test_malformed_messages_are_whole_ones() -> None:
+    codec = MotorCodec(DFX)
+    hands = {RIGHT: [Motor(0.1)] * N, LEFT: [Motor(0.2)] * N}
+
+    def sent(encoded: list[tuple[str, bytes]]) -> list[float]:
+        ((topic, payload),) = encoded
+        assert topic == "rt/inspire/cmd"
+        return [round(m.q, 6) for m in COMMANDS.decode(payload).cmds]
+
+    assert sent(codec.encode(hands)) == [0.1] * N + [0.2] * N
+    assert sent(codec.encode_shorter(hands)) == [0.1] * N + [0.2] * 5
+    assert sent(codec.encode_longer(hands, [Motor(1.0)])) == [0.1] * N + [0.2] * N + [1.0]
+
+
+# ------------------------------------------------------------------------------------ conformance
+
+
+def test_requirements_and_wrong_hands_come_from_the_nearest_relative() -> None:
+    by_id = {r.id: r for r in catalogue("inspire-dfx")}
+    assert by_id["DFX-MOVE-02"].lineage == ("BRAINCO-MOVE-02", "DEX3-MOVE-02")
+    assert by_id["DFX-START-02"].lineage == ("DEX3-START-02",)
+    assert by_id["DFX-STILL-02"].tolerances == catalogue_of("brainco-revo2")["BRAINCO-STILL-02"]
+
+
+def catalogue_of(model: str) -> dict[str, object]:
+    return {r.id: r.tolerances for r in catalogue(model)}
+
+
+def test_reversed_scale_is_found_and_told_in_parts_of_the_travel() -> None:
+    plan = replace(plan_for("inspire_dfx"), phases=frozenset(["listen", "joint", "short", "long"]))
+    result = run_mutant(mix(ReversedScale, InspireService), plan)
+    failed = {r.requirement.id: r for r in result.results if r.verdict is Verdict.FAIL}
+    assert "DFX-MOVE-01" in failed
+    assert all(not RADIANS.search(r.observed) for r in result.results)
+    assert any("full travel" in r.observed for r in result.results)
+
+
+class Emulated(EmulatedService):
+    simulated = SimInspireDfx
+
+
+@pytest.mark.soak
+def test_emulated_hands_meet_every_requirement() -> None:
+    result = run_mutant(Emulated, plan_for("inspire_dfx"))
+    bad = [
+        r.explain()
+        for r in result.results
+        if r.verdict not in (Verdict.PASS, Verdict.NOT_APPLICABLE)
+    ]
+    assert not bad, "\n".join(bad)
+    passed = {r.requirement.id for r in result.results if r.verdict is Verdict.PASS}
+    assert passed == {r.id for r in catalogue("inspire-dfx")}
+
+
+# ----------------------------------------------------------------------------------------- doctor
+
+
+@each(
+    ("state", "expected"),
+    [
+        # each from right to left, as both are commanded from 0.9 to 0.1 and from 0.3 to 0.7
+        ((0.9, 0.3, 0.1, 0.7), set()),
+        ((0.1, 0.7, 0.9, 0.3), {"DDS-REVERSED"}),
+        ((0.3, 0.9, 0.7, 0.1), {"DDS-SIDES-SWAPPED"}),
+    ],
+)
+def test_doctor_sees_each_half_of_the_message(
+    state: tuple[float, float, float, float], expected: set[str]
+) -> None:
+    def stream(name: str, right: float, left: float, now_right: float, now_left: float) -> Stream:
+        began, q = ((a,) * N + (b,) * N for a, b in ((right, left), (now_right, now_left)))
+        return Stream(f"rt/inspire/{name}", name, 2.0, 200, 100.0, q=q, began=began, nonzero=True)
+
+    ends = (
+        Endpoint("rt/inspire/state", DFX.state_type, "writer", "state", "hand"),
+        Endpoint("rt/inspire/cmd", DFX.cmd_type, "reader", "reads", "hand"),
+        Endpoint("rt/inspire/cmd", DFX.cmd_type, "writer", "cmd", "client"),
+        Endpoint("rt/inspire/state", DFX.state_type, "reader", "shows", "client"),
+    )
+    streams = (stream("state", *state), stream("cmd", 0.9, 0.3, 0.1, 0.7))
+    people = tuple(
+        Participant(key, version="0.10.5", process="python") for key in ("hand", "client")
+    )
+    found = {f.id for f in diagnose(Observations((DomainView(1, people, ends, streams),)))}
+    assert found & {"DDS-REVERSED", "DDS-SIDES-SWAPPED"} == expected
