@@ -78,7 +78,8 @@ class LowRateOnlyWhenDriven(Dex3Service):
 class _Zero(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
-        self.q = [0.0] * len(self.q)
+        # not inside an object: 0 is closed in some hands
+        self.q = np.clip(0.0, self.floor, self.ceiling).tolist()
 
 
 @wrong_hand("DEX3-START-02")

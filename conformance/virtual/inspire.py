@@ -22,6 +22,7 @@ class InspireService(ServoService):
     """Both hands in one message."""
 
     hand = InspireHand
+    tick = period = 0.003
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         """Fill in q, the only member that is measured."""
