@@ -25,7 +25,9 @@ from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.inspire import InspireService
 from dexkit.doctor import Observations, diagnose
-from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
+from dexkit.doctor.dds import _Watch
+from dexkit.doctor.observations import DomainView, Endpoint, Participant, Policies, Stream
+from dexkit.doctor.rtps import EndpointData
 from dexkit.emulators.sim_inspire import SimInspireDfx, sim_inspire_dfx
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, Side
@@ -316,3 +318,14 @@ def test_doctor_sees_each_half_of_the_message(
     )
     found = {f.id for f in diagnose(Observations((DomainView(1, people, ends, streams),)))}
     assert found & {"DDS-REVERSED", "DDS-SIDES-SWAPPED"} == expected
+
+
+def test_doctor_reads_positions_of_a_topic_that_clients_wait_for() -> None:
+    kind = EndpointData(bytes(16), "rt/inspire/state", DFX.state_type, Policies(), "")
+    watch = _Watch(kind, 0.0, 1, 0.0, 1)
+    for i, q in enumerate((0.9, 0.1)):
+        watch.take(i + 1, STATES.encode(unitree_go.MotorStates_(
+            [unitree_go.MotorState_(q=q) for _ in range(12)]
+        )), float(i), 0.0)  # fmt: skip
+    stream = watch.stream(2.0, 0.0)
+    assert (len(stream.q), round(stream.began[0], 3), round(stream.q[0], 3)) == (12, 0.9, 0.1)
