@@ -61,6 +61,7 @@ INSPIRE_DFX = HandModel(
     # ring and little finger move as the middle one does
     fingers=("middle", "middle", "middle", "index", "thumb", "thumb"),
     client_forks=True,
+    client_option="inspire_dfx",
     layout=HandLayout(
         centres=(240.0, 640.0),
         top=466.0,

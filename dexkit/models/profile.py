@@ -259,6 +259,7 @@ class HandModel:
     :param client_forks: its client sends from a forked process, which a reader that starts later
         does not receive.
     :param client_note: what a user of its client has to know, or empty.
+    :param client_option: its name in the client's ``--ee``; empty if that is the short name.
 
     **Conformance kit.**
 
@@ -307,6 +308,7 @@ class HandModel:
     fingers: tuple[str, ...] = ()
     client_forks: bool = False
     client_note: str = ""
+    client_option: str = ""
     roles: JointRoles | None = None
     objects: Mapping[Side, float] = field(default_factory=dict)
     session: str | Path = ""

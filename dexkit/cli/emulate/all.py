@@ -140,7 +140,7 @@ def _for_xr(robot: str, hands: str, domain: int) -> list[str]:
     """How xr_teleoperate is started."""
     if domain not in (0, 1):
         return ["xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md"]
-    end = "" if hands == "none" else f" --ee={hands}"
+    end = "" if hands == "none" else f" --ee={_HANDS[hands].client_option or hands}"
     sim = " --sim" if domain == 1 else ""
     lines = [
         "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
