@@ -204,7 +204,7 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX5-GAIN-03",), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX5-GAIN-03", "DFX-SIDE-01"), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -275,7 +275,7 @@ class FreezesOnce(Service):
     ),
     whole=True,
 )
-@wrong_hand("BRAINCO-FRESH-03", also=("BRAINCO-MOVE-06",), whole=True)
+@wrong_hand("BRAINCO-FRESH-03", also=("BRAINCO-MOVE-06", "DFX-STILL-02", "DFX-WDOG-01"), whole=True)
 class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 
@@ -374,6 +374,8 @@ class Swapped(Service):
     ),
 )
 @wrong_hand("BRAINCO-MOVE-06", also=("BRAINCO-PATH-01", "BRAINCO-WDOG-03"))
+# slower: it does not come far meanwhile
+@wrong_hand("DFX-MOVE-06", also=("DFX-WDOG-03",))
 @wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-WDOG-03"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
@@ -867,7 +869,7 @@ def _too_slow(service: Service) -> int:
     return int(1.2 / (service.period * model(service.dialect.model).min_state_rate) + 1e-6)
 
 
-@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), whole=True)
+@wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), also=("DFX-RATE-04",), whole=True)
 class StuttersUnderLoad(Service):
     """Publishes too few states while four commands of one client come within 11 ms."""
 

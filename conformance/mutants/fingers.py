@@ -569,7 +569,7 @@ class _Creeps(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04",))
+@wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04", "DFX-CMD-01"))
 @wrong_hand("DEX5-MOVE-07")
 class Creeps(FingerService):
     """One joint moves the last part of the way to its goal slowly."""

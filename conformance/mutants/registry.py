@@ -175,9 +175,7 @@ def _mutants(
             )
 
 
-def _nearest(
-    names: Iterable[str], place: tuple[str, str], every: tuple[Requirement, ...]
-) -> float:
+def _nearest(names: Iterable[str], place: tuple[str, str], every: tuple[Requirement, ...]) -> float:
     """The least number of steps of ``like`` from a model's requirements to one of these ids."""
     mine = [r for r in every if (r.layer, r.model) == place]
     return min((_steps(r, name) for name in names for r in mine), default=math.inf)

@@ -14,7 +14,7 @@ from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
 from dexkit.hand import Floats, Side
-from dexkit.models import model
+from dexkit.models import HandModel, model
 
 # ----------------------------------------------------------------------------- state
 
@@ -65,7 +65,11 @@ class StatesSwapped(ServoService):
         return super().positions(Side.LEFT if side is Side.RIGHT else Side.RIGHT)
 
 
-@wrong_hand("BRAINCO-LOAD-01", also=("BRAINCO-RATE-04",))
+def _one_in_twelve_is_too_few(hand: HandModel) -> bool:
+    return hand.min_state_rate > 1.0 / (12 * ChokesOnThousands.period)
+
+
+@wrong_hand("BRAINCO-LOAD-01", also=("BRAINCO-RATE-04",), where=_one_in_twelve_is_too_few)
 class ChokesOnThousandsOfCommands(ChokesOnThousands, ServoService):
     """Publishes one state in twelve while more than 1000 commands a second arrive."""
 
@@ -180,7 +184,7 @@ class _Overshoots(ServoHand):
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08",))
+@wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08", "DFX-WDOG-01"))
 class Overshoots(ServoService):
     """Goes 8 % of the travel too far in a large step, and comes back after 0.4 s."""
 
@@ -321,7 +325,7 @@ class _SlowAfterNan(ServoHand):
             self.reach = [0.33 * r for r in self.reach]
 
 
-@wrong_hand("BRAINCO-ABUSE-01")
+@wrong_hand("BRAINCO-ABUSE-01", also=("DFX-MOVE-08",))
 class SlowAfterNan(ServoService):
     """Moves with a third of each speed since it has got a command that is not finite."""
 

@@ -282,7 +282,10 @@ class FingerScript(HandScript):
                     for s, joints in self._joints.items()
                 }
                 far.append({s: self._at(s, ends[s]) for s in self.plan.sides})
-            yield from self._bad_commands(name, self.plan.sides, far, 0.3)
+            # long enough for the fastest joint to leave its range from anywhere
+            travel = min(j.stroke / j.dq_max for joints in self._joints.values() for j in joints)
+            each = max(0.3, 0.7 * travel)
+            yield from self._bad_commands(name, self.plan.sides, far, each)
         else:
             for alone in self._each_alone():
                 for malformed in self._malformed(name, alone):
