@@ -99,6 +99,7 @@ def wrong_hand(
     """Declare a class to be a wrong hand, robot, USB device or client.
 
     A second decorator on the same class is for another model, where it fails other requirements.
+    For a model that is like several of those that are named, the nearest one counts.
 
     :param kills: the id of the requirement that must find the fault; where catalogues number it
         differently, one id for each. Requirements that are ``like`` it are meant as well.

@@ -1,7 +1,8 @@
 """The requirements as data: TOML files in this folder, read into :class:`Requirement`.
 
 What one model has in common with another is written once: an entry with ``like = "DEX3-RATE-01"``
-inherits all keys that it does not give from that requirement of another file. Its id is the same
+inherits all keys that it does not give from that requirement of another file, which may be like a
+third one. Its id is the same
 with this model's prefix, unless it gives another; ids and topics of the other model in the texts
 are turned into this model's; tolerances are taken one by one. Where it names no source of its
 own, it is an inference from the other's.
