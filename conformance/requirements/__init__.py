@@ -2,10 +2,9 @@
 
 What one model has in common with another is written once: an entry with ``like = "DEX3-RATE-01"``
 inherits all keys that it does not give from that requirement of another file, which may be like a
-third one. Its id is the same
-with this model's prefix, unless it gives another; ids and topics of the other model in the texts
-are turned into this model's; tolerances are taken one by one. Where it names no source of its
-own, it is an inference from the other's.
+third one. Its id is the same with this model's prefix, unless it gives another; ids and topics of
+the other model in the texts are turned into this model's; tolerances are taken one by one. Where it
+names no source of its own, it is an inference from the other's.
 
 All other parts take them from here: checks (which read their tolerances), pytest ids,
 selection, reports and the catalogue in docs/conformance.md.
