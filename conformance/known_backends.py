@@ -45,6 +45,7 @@ EMULATED: dict[str, Emulation] = {
     ),
     "dex1-serial": Emulation(("dex1-motor", "--side", "{side}"), True, {"timeout": "0.3"}),
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
+    "inspire-serial": Emulation(("rh56", "--side", "{side}"), True, {"timeout": "0.3"}),
 }
 """Backends whose device the kit can start itself."""
 

@@ -14,7 +14,7 @@ itself; ``id`` picks one servo of several, or one motor of a hand, and ``side`` 
 Chance is seeded, so a run can be repeated.
 
 Each family of devices has its kinds: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`,
-:data:`M4010_FAULTS`.
+:data:`M4010_FAULTS`, :data:`RH56_FAULTS`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ __all__ = [
     "FAULT_KINDS",
     "M4010_FAULTS",
     "MX64_FAULTS",
+    "RH56_FAULTS",
     "Fault",
     "FaultFamily",
     "FaultKind",
@@ -161,6 +162,19 @@ M4010_FAULTS = FaultFamily(
 )
 """Faults of the Dex1-1's motor; ``id`` is its own, 0 right, 1 left. ``short``, ``pause`` and
 ``stray`` are those that put the vendor's library out of step (docs/sources/unitree-dex.md#g)."""
+
+RH56_FAULTS = FaultFamily(
+    "rh56",
+    (
+        _DROP,
+        _CORRUPT,
+        _DELAY,
+        _UNPLUG,
+        FaultKind("locked", "every joint reports a locked rotor until that is cleared"),
+    ),
+    max_id=0,
+)
+"""Faults of an emulated Inspire RH56."""
 
 FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kinds}
 """The kinds of the MX-64 by name."""

@@ -40,6 +40,11 @@ _DEVICES = {
         "emulate_lerobot_g1",
         "Serve LeRobot's ports (ZeroMQ) for an emulated G1.",
     ),
+    "rh56": (
+        "dexkit.cli.emulate.rh56",
+        "emulate_rh56",
+        "Emulate an Inspire RH56DFX hand on a pseudo-terminal.",
+    ),
     "mx64": (
         "dexkit.cli.emulate.mx64",
         "emulate_mx64",

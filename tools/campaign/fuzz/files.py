@@ -40,7 +40,13 @@ from dexkit.drivers.dex3_usb import discovery as dex3_discovery
 from dexkit.drivers.dex3_usb import settings as dex3_settings
 from dexkit.drivers.ezgripper import settings as ezgripper_settings
 from dexkit.drivers.ezgripper.config import Store
-from dexkit.emulators.faults import DEX3_FAULTS, M4010_FAULTS, MX64_FAULTS, parse_fault
+from dexkit.emulators.faults import (
+    DEX3_FAULTS,
+    M4010_FAULTS,
+    MX64_FAULTS,
+    RH56_FAULTS,
+    parse_fault,
+)
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import message_type
@@ -266,7 +272,7 @@ def _faults(rng: random.Random, scratch: Path) -> Target:
         words,
         rng,
     )
-    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS)
+    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS, RH56_FAULTS)
 
     def run(given: str) -> None:
         for family in families:
