@@ -94,7 +94,7 @@ class _Reversed(ServoHand):
         super().take(turned, mode)
 
 
-@wrong_hand("BRAINCO-MOVE-01")
+@wrong_hand("BRAINCO-MOVE-01", also=("DFX-JOINT-01",))
 class ReversedScale(ServoService):
     """Takes the q of commands the other way round: 0 closed, 1 open."""
 
