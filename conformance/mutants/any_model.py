@@ -359,6 +359,7 @@ class EmptyNowAndThen(Service):
     also=("BRAINCO-LIFE-03", "BRAINCO-SAFE-01", "BRAINCO-SAFE-10", "BRAINCO-WDOG-01"),
     sides=BOTH,
 )
+@wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-SAFE-10"), sides=BOTH)
 class Swapped(Service):
     """Each side obeys the other side's commands."""
 

@@ -49,6 +49,7 @@ class Thousandths(ServoService):
     ),
     sides=BOTH,
 )
+@wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-MOVE-09", "DFX-SAFE-10"), sides=BOTH)
 class StatesSwapped(ServoService):
     """Publishes each side's state as the other's."""
 
