@@ -246,7 +246,9 @@ class Bench:
             yield from self.wait(SETTLE)
             after = self.t[-1] - SETTLE
             q = self._recent(joint, after)
-            if max(q) - min(q) <= still:
+            # a pause of this machine leaves too few samples to tell
+            enough = len(q) >= SETTLE / self.setup.period / 3
+            if enough and max(q) - min(q) <= still:
                 return
 
     def _recent(self, joint: int, after: float) -> list[float]:

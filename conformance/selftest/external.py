@@ -10,12 +10,12 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dexkit.clock import Clock, RealClock
-from dexkit.command_age import PAUSE
 from dexkit.errors import DdsError, HandTimeout, WireError
 from dexkit.hand import Floats, HandCommand, HandSpec, HandState, JointMode, Side
 from dexkit.messages import message_type
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 __all__ = ["ExternalHand", "HandWire"]
 
 _NAP = 0.05
+_RATE_TIME = 0.5
+"""Seconds in which the rate of the states is counted."""
+_SLOWEST = 5.0
+_SILENT = 1.0
 
 
 class HandWire:
@@ -184,10 +188,20 @@ class ExternalHand:
             self._sole.poll()
             self._read()
             if self._writer.matched and self._last is not None:
+                self._measure_rate()
                 return
             self._waiting(time.monotonic() - begin)
             self._stop.wait(_NAP)
         raise DdsError("stopped while waiting for the hand")
+
+    def _measure_rate(self) -> None:
+        """Exchange no faster than states come."""
+        begin, states = self._clock.now(), 0
+        while self._clock.now() < begin + _RATE_TIME:
+            states += self._read()
+            self._clock.sleep_until(self._clock.now() + 1e-3)
+        rate = max(states / (self._clock.now() - begin), _SLOWEST)
+        self._spec = replace(self._spec, io_rate=min(rate, self._spec.io_rate))
 
     def close(self) -> None:
         """Nothing more is sent: the service's time-out brakes what is not at rest."""
@@ -195,7 +209,7 @@ class ExternalHand:
     def exchange(self, command: HandCommand) -> HandState:
         """Publish a command, and return the newest state.
 
-        :raises HandTimeout: no state for a quarter of a second.
+        :raises HandTimeout: no state for a second: hand and test share a machine that may pause.
         :raises TopicConflict: another program commands the hand now.
         """
         self._sole.poll()
@@ -205,16 +219,17 @@ class ExternalHand:
         now_ns = time.time_ns()
         self._writer.write_raw(self._wire.encode(command, self._last.q), now_ns)
         silent = self._clock.now() - self._last.stamp
-        if silent > PAUSE:
-            self._read()
-            if self._clock.now() - self._last.stamp > PAUSE:
-                raise HandTimeout(f"no state of the hand for {silent:.1f} s")
+        if silent > _SILENT:
+            raise HandTimeout(f"no state of the hand for {silent:.1f} s")
         return self._last
 
-    def _read(self) -> None:
+    def _read(self) -> int:
+        """Take what has come; how many states it was."""
         now = self._clock.now()
-        for sample in self._reader.take()[-1:]:
+        samples = self._reader.take()
+        for sample in samples[-1:]:
             with contextlib.suppress(WireError):
                 state = self._wire.decode(sample.data, now)
                 if state is not None:
                     self._last = state
+        return len(samples)

@@ -292,19 +292,32 @@ class Procedure:
         return measure.start(s.command, s.q, s.tau, direction, _STARTED * stroke)
 
     def _returns(self, j: int) -> Turns[None]:
-        bench, joint, stroke = self.bench, self.found.joints[j], float(self.setup.stroke[j])
-        goal, slow = self._at(j, 0.5), float(bench.slow[j])
+        figures = self.found.joints[j].figures
         rests: dict[int, list[Rest]] = {1: [], -1: []}
         for _ in range(_REPEATS):
             for direction, found in rests.items():
-                yield from bench.move(j, goal - direction * 0.1 * stroke, slow)
-                yield from bench.move(j, goal, slow, settle=True)
-                found.append(self._rest(j))
-        joint.figures["repeatability"] = max(measure.spread(r) for r in rests.values())
+                one = yield from self.bench.undisturbed(partial(self._return, j, direction))
+                if one is None:
+                    return
+                found.append(one)
+        figures["repeatability"] = max(measure.spread(r) for r in rests.values())
         kp = 0.0 if self.setup.servo else float(self.setup.kp[j])
-        joint.figures["play"] = measure.lost_motion(
-            rests[1], rests[-1], kp, joint.figures.get("stiffness", math.nan)
-        )
+        stiffness = figures.get("stiffness", math.nan)
+        figures["play"] = measure.lost_motion(rests[1], rests[-1], kp, stiffness)
+
+    def _return(self, j: int, direction: int) -> Turns[Rest | None]:
+        """Where a joint rests amid its range, coming in ``direction``."""
+        bench, stroke = self.bench, float(self.setup.stroke[j])
+        goal, slow = self._at(j, 0.5), float(bench.slow[j])
+        yield from bench.move(j, goal - direction * 0.1 * stroke, slow, settle=True)
+        begin = bench.mark
+        yield from bench.move(j, goal, slow, settle=True)
+        s = bench.series(j, begin)
+        there = np.flatnonzero(np.abs(s.command - goal) < 1e-9)
+        arrived = float(s.t[there[0]]) if len(there) else math.inf
+        # a command that jumps after a pause lets the joint swing to another place of rest
+        disturbed = s.gap(end=arrived + SETTLE) > _GAP * self.setup.period
+        return None if disturbed else self._rest(j)
 
     def _lags(self, j: int) -> Turns[None]:
         found = []
