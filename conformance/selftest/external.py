@@ -214,12 +214,13 @@ class ExternalHand:
         """
         self._sole.poll()
         assert self._last is not None
-        self._read()
+        asked, fresh = self._clock.now(), self._read()
         # stamped first: a command that a stop holds back here is old, and is seen to be
         now_ns = time.time_ns()
         self._writer.write_raw(self._wire.encode(command, self._last.q), now_ns)
-        silent = self._clock.now() - self._last.stamp
-        if silent > _SILENT:
+        # by when it was read: a stop of this program since then is no silence of the hand
+        silent = asked - self._last.stamp
+        if not fresh and silent > _SILENT:
             raise HandTimeout(f"no state of the hand for {silent:.1f} s")
         return self._last
 
