@@ -188,7 +188,7 @@ class Serve:
 
     :param arguments: of the command.
 
-    With 100 states a second, and at ordinary priority: an emulated processor is too slow for the
+    With 20 states a second, and at ordinary priority: an emulated processor is too slow for the
     rates of a robot's computer, and a service that cannot keep its rate would, at real-time
     priority, keep the kernel's own threads from running, which carry USB/IP.
     """
@@ -197,7 +197,7 @@ class Serve:
         self.log = Path(f"/tmp/serve-{time.monotonic_ns()}.log")
         self._out = self.log.open("wb")
         self.process = subprocess.Popen(
-            [DEXKIT, "serve", *arguments, "--no-real-time", "--state-rate", "100"],
+            [DEXKIT, "serve", *arguments, "--no-real-time", "--state-rate", "20"],
             stdout=self._out,
             stderr=subprocess.STDOUT,
         )

@@ -66,6 +66,18 @@ class Subject:
             lambda: self.client.arrived(target, self.within), f"{self.device} does not obey"
         )
 
+    def _settle(self) -> None:
+        """Wait until nothing moves. The host says so: states are predicted in between."""
+
+        def still() -> bool:
+            begin = self.bench.ask(do="now", device=self.device)["t"]
+            time.sleep(_PAUSE)
+            seen = self.bench.ask(do="since", device=self.device, t=begin)
+            spans = [high - low for low, high in zip(seen["low"], seen["high"], strict=True)]
+            return max(spans) < self.still / 2 and not seen["setpoints"]
+
+        wait_for(still, f"{self.device} does not come to rest")
+
     def _distance(self, place: Sequence[float]) -> float:
         """How far the joints really are from a place, in the record's unit."""
         now: list[float] = self.bench.ask(do="now", device=self.device)["q"]
@@ -79,12 +91,7 @@ class Subject:
         ask, client = self.bench.ask, self.client
         wait_for(lambda: client.linked, "the device is not there before the fault")
         self.move(self.near)
-        # the states are predicted while there are few exchanges: the host knows where it is
-        near = [q * self.per_rad for q in self.near]
-        wait_for(
-            lambda: self._distance(near) < 2 * self.within * self.per_rad,
-            f"{self.device} does not really get there",
-        )
+        self._settle()
         begin = self.service.mark()
         start = ask(do="now", device=self.device)["q"]
         client.go(self.far)
