@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli import cli
-from dexkit.cli.emulate.all import _next_steps
+from dexkit.cli.emulate.all import _for_xr
 from dexkit.clock import ManualClock
 from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.motor_messages import Motor, MotorCodec
@@ -333,6 +333,6 @@ def test_doctor_reads_positions_of_a_topic_that_clients_wait_for() -> None:
 
 
 def test_next_step_names_the_clients_own_option() -> None:
-    lines = _next_steps("g1", "inspire", 1, "lo")
+    lines = _for_xr("g1", "inspire", 1)
     assert any("--ee=inspire_dfx --sim" in line for line in lines)
-    assert any("--ee=brainco" in line for line in _next_steps("g1", "brainco", 1, "lo"))
+    assert any("--ee=brainco" in line for line in _for_xr("g1", "brainco", 1))

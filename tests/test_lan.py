@@ -541,6 +541,8 @@ _KNOWN = {
     "dexkit/domains.py": {"bind"},  # reserves a port of DDS and reads nothing from it
     "dexkit/doctor/dds.py": {"bind"},
     "dexkit/view/page.py": {"bind"},  # tries whether a port is free; the page has an address
+    "dexkit/view/foxglove_viewer.py": {"start_server"},  # likewise, by the library
+    "emulators/lerobot/ports.py": {"bind"},  # loopback only
     "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address
     "emulators/dex3_mcu/server.py": {"bind", "listen"},
 }

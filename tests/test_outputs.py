@@ -36,6 +36,8 @@ _INPUTS = {
     "--recording",
     "--eeprom",
     "--config",
+    "--answers",
+    "--baseline",
     "--from-source",
     "--key",
     "--page",
@@ -46,6 +48,10 @@ _INPUTS = {
 _ELSEWHERE = {
     ("audit", "--out"),  # a folder: tests/test_audit.py
     ("export", "--out"),  # one, too: tests/test_sessions_export.py
+    ("bringup", "--save-answers"),  # at the end of a session: tests/test_bringup_cli.py
+    ("emulate", "--log-commands"),  # lines are added while it runs
+    ("selftest", "--json"),  # after the test of a hand, as others write
+    ("selftest", "--report"),
     ("demo", "--out"),  # a folder, made before anything starts
     ("install-service", "--directory"),  # tests/test_install_service.py
     ("monitor", "--log"),  # a key begins it: tests/test_monitor_terminal.py

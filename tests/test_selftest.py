@@ -434,7 +434,13 @@ def test_the_page_says_what_is_worse_and_loads_nothing() -> None:
 # ------------------------------------------------------------------------------------- on DDS
 
 
-@each("spoken", [d for m in BUILT_IN for d in m.dialects])
+def test_a_dialect_that_commands_both_hands_is_refused() -> None:
+    for spoken in (d for m in BUILT_IN for d in m.dialects if d.commands_both):
+        with pytest.raises(UsageError, match="moves both hands"):
+            HandWire(spoken, Side.LEFT)
+
+
+@each("spoken", [d for m in BUILT_IN for d in m.dialects if not d.commands_both])
 def test_the_wire_of_every_dialect(spoken: Dialect) -> None:
     profile = model(spoken.model)
     spec = profile.spec(Side.LEFT, io_rate=100.0)

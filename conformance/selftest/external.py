@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dexkit.clock import Clock, RealClock
-from dexkit.errors import DdsError, HandTimeout, WireError
+from dexkit.errors import DdsError, HandTimeout, UsageError, WireError
 from dexkit.hand import Floats, HandCommand, HandSpec, HandState, JointMode, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, ModeByte, model
@@ -40,9 +40,17 @@ _SILENT = 1.0
 
 
 class HandWire:
-    """Commands to one side of a dialect, and its states, in the model's units."""
+    """Commands to one side of a dialect, and its states, in the model's units.
+
+    :raises UsageError: a command of this dialect moves both hands.
+    """
 
     def __init__(self, spoken: Dialect, side: Side) -> None:
+        if spoken.commands_both:
+            raise UsageError(
+                f"a command of {spoken.name} moves both hands, and a self-test one",
+                hint="test it where it is driven: dexkit selftest BACKEND",
+            )
         self.dialect, self.side = spoken, side
         profile = model(spoken.model)
         self._joints = profile.joints[side]
