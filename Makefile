@@ -57,7 +57,7 @@ setup: $(STAMP) ## create the environment (PYTHON_VERSION=3.12 for another Pytho
 demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
 	@$(RUN) dexkit demo --out demo-out
 
-test: $(STAMP) ## the tests, five workers for two cores (ARGS="-k name" is passed on)
+test: $(STAMP) ## the tests, six workers for two cores (ARGS="-k name" is passed on)
 	$(RUN) pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
 soak: $(STAMP) ## the long tests

@@ -11,7 +11,10 @@ from tests import surroundings
 from tests.optional import header
 
 # A machine that is busy with something else makes examples slow, not wrong.
-settings.register_profile("dexkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# Half of the usual number of examples: the campaign goes on where the tests end.
+settings.register_profile(
+    "dexkit", deadline=None, max_examples=50, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("dexkit")
 
 
@@ -20,8 +23,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Five workers for two cores: a test waits for other processes for half of its time."""
-    return 5 * (os.cpu_count() or 1) // 2
+    """Six workers for two cores: a test waits for other processes for half of its time."""
+    return 3 * (os.cpu_count() or 1)
 
 
 def pytest_report_header() -> str | None:

@@ -111,7 +111,7 @@ def command(
     bench: Bench = kind.bringup.load()(options)
     effort = Effort(torque, speed)
     if dry_run:
-        _print_plan(bench, effort, ())
+        _print_plan(bench, effort, (), attended=not unattended)
         return
     known = {} if answers_path is None else _read_answers(answers_path)
     terminal = None if unattended else Terminal()
@@ -126,14 +126,14 @@ def command(
                 )
             findings = Findings() if restart else bench.load()
             _print_facts(bench)
-            _print_plan(bench, effort, bench.motors)
+            _print_plan(bench, effort, bench.motors, attended=not unattended)
             session = Session(bench.plan, bench.motors, findings, effort)
             _Run(bench, session, terminal, known, stop).run()
+            _print_result(bench, session)
         finally:
             bench.close()
     if save_answers is not None:
         documents.write_file(save_answers, json.dumps(session.findings.answers, indent=2) + "\n")
-    _print_result(bench, session)
 
 
 def _settings(texts: tuple[str, ...], usb: str | None) -> dict[str, str]:
@@ -267,10 +267,11 @@ def _print_facts(bench: Bench) -> None:
         click.echo(f"{name.replace('_', ' ')}: {one_line(shown, 200)}")
 
 
-def _print_plan(bench: Bench, effort: Effort, motors: tuple[str, ...]) -> None:
+def _print_plan(bench: Bench, effort: Effort, motors: tuple[str, ...], *, attended: bool) -> None:
+    condition = ", only while SPACE is held" if attended else ""
     click.echo(
-        f"plan: one joint at a time, at most {effort.torque:g} N·m and {effort.speed:g} rad/s, "
-        "only while SPACE is held"
+        f"plan: one joint at a time, at most {effort.torque:g} N·m and {effort.speed:g} rad/s"
+        f"{condition}"
     )
     for number, line in enumerate(describe(bench.plan, motors), 1):
         click.echo(f"  {number}. {line}")
