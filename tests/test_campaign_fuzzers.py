@@ -9,7 +9,6 @@ import pytest
 from tools.campaign.case import Batch, Case
 from tools.campaign.fuzz import devices, drivers, recordings
 
-
 CASES = [*devices.cases(), *drivers.cases(), *recordings.cases()]
 _SLOW = {"fuzz:mcap"}  # 'make campaign-sample' runs it, too
 
