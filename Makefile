@@ -35,7 +35,7 @@ $(UV):
 
 $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
 	$(UNSUPPORTED)
-	@$(UV) sync --frozen --quiet $(FOR_PYTHON)
+	@$(UV) sync --frozen --quiet --compile-bytecode $(FOR_PYTHON)
 ifneq ($(DDS),no)
 	@.venv/bin/python -c 'import cyclonedds.core' 2>/dev/null || .venv/bin/dexkit setup-dds || { \
 		echo "  or without DDS: make setup DDS=no" >&2; exit 2; }

@@ -61,11 +61,11 @@ def name_of(given: Mutant) -> str:
 
 # one of each check: shared checks are tried with the first model
 HAND = {r.id: r for r in catalogue()}
-# not those that need a whole run of two hands of many joints: the soak tries them
+# not those that need a whole run of a hand of many joints: the soak tries them
 OF_EACH_CHECK = {
     check_of(HAND[t.kills]): t
     for t in reversed(ESSENTIAL)
-    if t.layer == "dds" and not (t.whole and cost(t) > 6)
+    if t.layer == "dds" and not (t.whole and cost(t) >= 6)
 }
 
 

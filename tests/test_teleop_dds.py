@@ -218,6 +218,7 @@ def test_recording_can_be_played_as_operator_input(dex1: int) -> None:
     assert "ready: dex1_pick_place on unitree_go" in result.stderr
 
 
+@pytest.mark.soak
 def test_fist_profile_moves_a_dex3(dex3: int) -> None:
     result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
     assert result.exit_code == 0, result.output
