@@ -10,6 +10,7 @@ TOOLS := .tools
 UV := $(TOOLS)/bin/uv
 STAMP := .venv/.synced
 CHOSEN := .venv/.python-version
+COLLECTED := .venv/.tests-compiled
 
 LAST_VERSION := $(shell cat $(CHOSEN) 2>/dev/null)
 PYTHON_VERSION ?= $(or $(LAST_VERSION),$(shell cat .python-version))
@@ -35,7 +36,7 @@ $(UV):
 
 $(STAMP): pyproject.toml uv.lock .python-version | $(UV)
 	$(UNSUPPORTED)
-	@$(UV) sync --frozen --quiet --compile-bytecode $(FOR_PYTHON)
+	@$(UV) sync --frozen --quiet $(FOR_PYTHON)
 ifneq ($(DDS),no)
 	@.venv/bin/python -c 'import cyclonedds.core' 2>/dev/null || .venv/bin/dexkit setup-dds || { \
 		echo "  or without DDS: make setup DDS=no" >&2; exit 2; }
@@ -57,7 +58,13 @@ setup: $(STAMP) ## create the environment (PYTHON_VERSION=3.12 for another Pytho
 demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
 	@$(RUN) dexkit demo --out demo-out
 
-test: $(STAMP) ## the tests, six workers for two cores (ARGS="-k name" is passed on)
+# Otherwise each worker rewrites the assertions of every test module.
+$(COLLECTED): $(STAMP) $(wildcard tests/*.py)
+	@echo "compiling the tests"
+	@$(RUN) pytest --collect-only --quiet >/dev/null || true
+	@touch $@
+
+test: $(STAMP) $(COLLECTED) ## the tests, six workers for two cores (ARGS="-k name" is passed on)
 	$(RUN) pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
 soak: $(STAMP) ## the long tests
