@@ -90,12 +90,18 @@ def test_state_comes_at_500_hz(service: HandService, client: Client) -> None:
     def deadlines() -> int:
         return counters.published + counters.publish_misses
 
-    begin, before, published = time.monotonic(), deadlines(), counters.published
-    take_until(client.states, lambda s: len(s) >= 600)
-    # one that is less than a period late is made up for
-    assert counters.published - published <= 500.0 * (time.monotonic() - begin) + 2
-    # those missed while it stood still are counted as soon as it goes on
-    wait_until(lambda: deadlines() - before >= 500.0 * (time.monotonic() - begin) - 5)
+    for _ in range(20):
+        begin, before, published = time.monotonic(), deadlines(), counters.published
+        pauses = counters.pauses
+        take_until(client.states, lambda s: len(s) >= 600)
+        # one that is less than a period late is made up for
+        assert counters.published - published <= 500.0 * (time.monotonic() - begin) + 2
+        # those missed while it stood still are counted as soon as it goes on
+        if deadlines() - before >= 500.0 * (time.monotonic() - begin) - 5:
+            return
+        # a pause of the whole program is counted as such
+        assert counters.pauses > pauses or deadlines() - before >= 400.0
+    raise AssertionError("deadlines are lost without being counted")
 
 
 def test_commands_move_and_silence_brakes(service: HandService, client: Client) -> None:
