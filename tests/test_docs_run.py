@@ -32,7 +32,7 @@ pytestmark = pytest.mark.soak
 
 SERVICES = {"serve", "emulate", "bridge", "record", "monitor", "view"}
 """Commands that print ``ready:`` and run until they are stopped."""
-WITH_FINDINGS = {"check", "compare", "diff", "doctor", "audit"}
+WITH_FINDINGS = {"check", "compare", "diff", "doctor", "audit", "selftest"}
 """Commands whose exit code 1 is a finding."""
 ELSEWHERE = (
     (r"\bmy_?(package|pkg|hand|-|\b)", "the reader's own hand: tests/test_vendor_examples.py"),
@@ -42,7 +42,7 @@ ELSEWHERE = (
     (r"--peer|--interface (wlan0|192)", "other machines: tests/test_networks.py"),
     (r"^mutants", "minutes: tests/test_mutants.py"),
     (
-        r"ttyUSB1|dex1-serial .*--device /dev|^calibrate dex1",
+        r"ttyUSB1|(dex1|inspire)-serial .*--device /dev|(calibrate|selftest) dex1",
         "other devices: tests/test_dex1_serial.py",
     ),
     (r"^serve (dex1-serial|dex3-usb) --side (left|both)$", "looks for a device of this machine"),
@@ -176,6 +176,8 @@ def _adapted(words: Sequence[str], folder: Path, device: str) -> list[str]:
     adapted = [w.replace("/dev/ttyUSB0", device) for w in adapted]
     if words[0] == "record":
         adapted[1] = f"new-{words[1]}"  # the reader's own is in use
+    if tuple(words[:2]) == ("serve", "ezgripper") and "--device" in words:
+        adapted += ["--set", "calibrate=yes"]
     if words[0] == "calibrate" and "--dry-run" not in words:
         adapted.append("--yes")
     return adapted

@@ -160,7 +160,7 @@ def test_failed_requirements_are_marked_where_they_show() -> None:
 # -- the page, without a browser -------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def page() -> Iterator[Page]:
     marks = (Mark(ns(0), ns(1), "phase", "step left"), Mark(ns(1), ns(1), "fail", "DEX3-X-01 left"))
     recording = Recorded("one", closing_hands(2.0), marks)
