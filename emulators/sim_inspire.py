@@ -12,42 +12,20 @@ latency of the serial line.
 from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
-from dexkit.clock import Clock
-from dexkit.emulators.servo_mechanics import SETTINGS, STEP, ServoMechanics
-from dexkit.emulators.simulated import SimulatedHand, number
-from dexkit.hand import HandCommand, HandState, Side
+from dexkit.emulators.servo_mechanics import SETTINGS
+from dexkit.emulators.simulated_servos import SimulatedServos, make_servos
+from dexkit.emulators.wear import WEAR_SETTING
+from dexkit.hand import HandCommand, HandState
 from dexkit.models import INSPIRE_DFX
 
 __all__ = ["SimInspireDfx", "sim_inspire_dfx"]
 
-_RESOLUTION = 1e-3
 
+class SimInspireDfx(SimulatedServos):
+    """A simulated RH56DFX."""
 
-class SimInspireDfx(SimulatedHand):
-    """A simulated RH56DFX.
-
-    :param side: which hand.
-    :param object_at: how far the fingers close until they touch an object, percent; None for no
-        object.
-    :param start: how far they are closed at ``open``, percent; None for a relaxed pose.
-    :param clock: real time unless given; with a manual clock the hand is deterministic.
-    :raises UsageError: a parameter is out of range.
-    """
-
-    def __init__(
-        self,
-        side: Side = Side.LEFT,
-        *,
-        object_at: float | None = None,
-        start: float | None = None,
-        clock: Clock | None = None,
-    ) -> None:
-        model = INSPIRE_DFX
-        self.mechanics = ServoMechanics(
-            model, side, object_at=object_at, start=start, resolution=_RESOLUTION
-        )
-        spec = model.spec(side, io_rate=model.state_rate, simulated=True)
-        super().__init__(spec, self.mechanics, STEP, clock)
+    model = INSPIRE_DFX
+    resolution = 1e-3
 
     def exchange(self, command: HandCommand) -> HandState:
         """Advance to now under the last command, apply this one, and return what is measured.
@@ -59,14 +37,12 @@ class SimInspireDfx(SimulatedHand):
 
 
 def _make(options: BackendOptions) -> SimInspireDfx:
-    return SimInspireDfx(
-        options.side, object_at=number(options, "object"), start=number(options, "start")
-    )
+    return make_servos(SimInspireDfx, options)
 
 
 sim_inspire_dfx = Backend(
     summary="Simulated Inspire RH56DFX hand: 6 position servos, no device",
     model=INSPIRE_DFX.name,
     make=_make,
-    settings=SETTINGS,
+    settings={**SETTINGS, **WEAR_SETTING},
 )
