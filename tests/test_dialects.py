@@ -129,6 +129,7 @@ class TestHgCommand:
         ("q", "percent"),
         [
             (0.1, 0.0),
+            (float(np.float32(0.1)), 0.0),  # as it arrives
             (0.1001, 0.1001 / math.tau * 100),
             (math.pi, 50.0),
             (5.9999, None),

@@ -332,7 +332,8 @@ class InterfaceSpecificationMap(DialectMap):
     def _q_in(self, q: float, joint: JointSpec) -> float:
         if not math.isfinite(q):
             return q  # for the gate to reject: minus infinity is not "closed"
-        closed, opened = self.dialect.ends
+        # The wire carries float32, and 0.1 as float32 is above 0.1 as a double.
+        closed, opened = (float(np.float32(end)) for end in self.dialect.ends)
         if q <= closed:
             return 0.0
         if q >= opened:
