@@ -28,8 +28,9 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         pytest.param("unitree_go", LEFT, marks=pytest.mark.soak),
         ("unitree_hg", BOTH),
         ("unitree_actuator", BOTH),
-        ("dex3", BOTH),
-        ("dex5", LEFT),  # both hands of many joints take long
+        ("dex3", LEFT),  # both hands of many joints take long
+        pytest.param("dex3", BOTH, marks=pytest.mark.soak),
+        ("dex5", LEFT),
         pytest.param("dex5", BOTH, marks=pytest.mark.soak),
         pytest.param("brainco", BOTH, marks=pytest.mark.soak),
         pytest.param("inspire_dfx", BOTH, marks=pytest.mark.soak),

@@ -401,7 +401,7 @@ def stop_live(tries: int, *backends: str) -> None:
 
 
 def test_sigstop_in_motion_and_sigcont_do_not_move_the_hand_back() -> None:
-    stop_live(2, "ezgripper", "sim-dex3")
+    stop_live(1, "ezgripper", "sim-dex3")
 
 
 @pytest.mark.soak
