@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.backend_processes import Tool
@@ -103,7 +103,6 @@ def test_usb_commands_are_decoded_by_the_codec(size: int) -> None:
     assert ours == theirs
 
 
-@settings(max_examples=100)
 @given(st.binary(max_size=1400), st.booleans())
 def test_reading_any_bytes_raises_no_exception(data: bytes, filled: bool) -> None:
     frame = ReferenceDevice(Side.LEFT).frame()

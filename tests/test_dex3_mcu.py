@@ -298,7 +298,7 @@ _GOOD = HandCodec(DEX3_1.joints[Side.LEFT]).encode(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     data=st.one_of(
         st.binary(max_size=3000),
@@ -318,7 +318,7 @@ def test_invalid_input_moves_no_motor(data: bytes) -> None:
     assert state.q == pytest.approx(bench.rest, abs=1e-5)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(bit=st.integers(0, 8 * 20 - 1), sizes=st.lists(st.integers(0, 300), min_size=5, max_size=5))
 def test_damage_inside_a_good_frame_reaches_no_motor(bit: int, sizes: list[int]) -> None:
     bench = Bench()

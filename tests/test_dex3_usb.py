@@ -240,7 +240,7 @@ def test_any_order() -> None:
     assert not problems
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.one_of(motor_states, sensor_states), max_size=5), st.data())
 def test_one_damaged_packet_is_lost_alone(packets: list[Any], data: st.DataObject) -> None:
     parts = [p.pack() for p in packets]
@@ -412,7 +412,7 @@ def test_a_damaged_packet_in_a_good_frame() -> None:
     assert [(p.bus, p.offset) for p in frame.problems] == [(0, 26)]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     st.binary(max_size=400),
     st.lists(st.integers(0, 2**32 - 1), min_size=5, max_size=5),

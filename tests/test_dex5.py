@@ -171,7 +171,7 @@ def message(modes: list[int], **fields: float) -> unitree_hg.HandCmd_:
 
 
 @given(st.lists(st.integers(0, 255), min_size=N, max_size=N))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_only_mode_1_drives(modes: list[int]) -> None:
     command = mapping().command(message(modes), LEFT)
     assert command is not None

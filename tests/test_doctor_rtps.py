@@ -172,7 +172,7 @@ _REAL = [
     st.lists(st.tuples(st.integers(0, 500), st.integers(0, 255)), min_size=1, max_size=8),
     st.integers(0, 600),
 )
-@settings(max_examples=200)
+@settings(max_examples=100)
 def test_damaged_packet_is_ignored(
     packet: bytes, damage: list[tuple[int, int]], length: int
 ) -> None:
@@ -300,7 +300,6 @@ _SUBMESSAGES = st.one_of(
 
 
 @given(st.lists(st.one_of(_SUBMESSAGES, st.floats(0.0, 0.5), st.sampled_from(_REAL)), max_size=12))
-@settings(max_examples=100)
 def test_observer_sends_only_valid_packets_for_any_input(
     events: list[bytes | float],
 ) -> None:

@@ -23,7 +23,7 @@ from dexkit.wire import mx64
 from dexkit.wire.mx64 import HardwareError
 from tests.each import each
 
-fast = settings(max_examples=100, deadline=None)
+fast = settings(max_examples=50, deadline=None)
 fewer = settings(max_examples=40, deadline=None)
 
 # --- scaling

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, Rate
@@ -117,7 +117,6 @@ def test_the_formula_is_what_the_emulated_line_does() -> None:
         _check(*case, phase=0.37e-3)
 
 
-@settings(max_examples=100)
 @given(
     baudrate=st.sampled_from(BAUD_RATES),
     timer=st.integers(0, 20).map(lambda ms: ms * 1e-3),
@@ -131,7 +130,6 @@ def test_the_formula_at_any_point(
     _check(baudrate, timer, delay, host, phase)
 
 
-@settings(max_examples=100)
 @given(
     baudrate=st.sampled_from(BAUD_RATES),
     timer=st.integers(0, 20).map(lambda ms: ms * 1e-3),

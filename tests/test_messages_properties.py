@@ -73,7 +73,6 @@ def test_big_endian_decodes_to_the_same_message(pair: tuple[str, Any]) -> None:
     assert decode(name, _swapped(name, encode(message))) == message
 
 
-@settings(max_examples=50)
 @given(any_message)
 def test_every_shortened_sample_is_truncated(pair: tuple[str, Any]) -> None:
     name, message = pair
@@ -83,7 +82,7 @@ def test_every_shortened_sample_is_truncated(pair: tuple[str, Any]) -> None:
             decode(name, data[:size])
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.sampled_from(NAMES), st.binary(max_size=300), st.booleans())
 def test_random_bytes_raise_nothing_but_wire_errors(
     name: str, data: bytes, plausible: bool
@@ -96,7 +95,7 @@ def test_random_bytes_raise_nothing_but_wire_errors(
         pass
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(any_message, st.data())
 def test_damaged_samples_raise_nothing_but_wire_errors(
     pair: tuple[str, Any], data: st.DataObject

@@ -47,7 +47,7 @@ def damaged(payload: bytes, at: int, value: int) -> bytes:
     return payload[:at] + bytes([value]) + payload[at + 1 :]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(st.lists(st.binary(max_size=9), max_size=12), st.data())
 def test_payloads_are_given_as_they_were_put_in(payloads: list[bytes], data: st.DataObject) -> None:
     cuts = data.draw(st.lists(st.integers(0, 12), max_size=4))

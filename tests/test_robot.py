@@ -214,7 +214,6 @@ def test_non_finite_value_rejects_the_command(
 
 
 @both
-@settings(max_examples=100)
 @given(st.data())
 def test_command_with_a_flipped_bit_is_rejected(model: RobotModel, data: Any) -> None:
     bench = Bench(model)
@@ -231,7 +230,6 @@ def test_command_with_a_flipped_bit_is_rejected(model: RobotModel, data: Any) ->
 
 
 @both
-@settings(max_examples=50)
 @given(st.binary(max_size=1100))
 def test_garbage_is_rejected(model: RobotModel, data: bytes) -> None:
     bench = Bench(model)
@@ -451,7 +449,6 @@ def test_unknown_remote_key_is_refused(text: str) -> None:
         Remote.parse(text)
 
 
-@settings(max_examples=50)
 @given(st.sampled_from(LOW_LEVEL_TYPES), st.binary(min_size=2100, max_size=2100))
 def test_structs_and_samples(name: str, noise: bytes) -> None:
     """To a sample and back loses nothing but what lies in the gaps."""

@@ -238,7 +238,7 @@ class TestState:
 
     anything = st.floats(allow_nan=True, allow_infinity=True)
 
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=50, deadline=None)
     @given(
         st.lists(anything, min_size=6, max_size=6),
         st.lists(st.integers(0, 2**32 - 1), min_size=N, max_size=N),

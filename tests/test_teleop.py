@@ -97,7 +97,6 @@ def test_left_state_is_old_after_silence_of_the_right_side() -> None:
     assert receiver.latest == {LEFT: (2.0,), RIGHT: (5.0,)}
 
 
-@settings(max_examples=100)
 @given(
     st.lists(st.tuples(st.floats(0.0, 0.004), st.sampled_from([LEFT, RIGHT]), angles), max_size=60)
 )
@@ -140,7 +139,6 @@ def test_filter_is_updated_for_both_hands_when_one_moves() -> None:
     assert out[0] == pytest.approx(2.0)
 
 
-@settings(max_examples=100)
 @given(st.lists(st.tuples(angles, angles), min_size=1, max_size=40))
 def test_the_filter_stays_between_the_last_three_different_values(
     values: list[tuple[float, float]],
@@ -254,7 +252,6 @@ def test_one_sided_client_waits_for_that_side_only() -> None:
     assert set(client.step(0.0, {RIGHT: (0.3,)}, {})) == {RIGHT}
 
 
-@settings(max_examples=100)
 @given(st.lists(st.tuples(angles, angles, pinches, pinches), min_size=1, max_size=40))
 def test_a_command_is_within_the_lead_of_the_last_three_states(
     steps: list[tuple[float, float, float, float]],
