@@ -252,6 +252,7 @@ def test_driver_reports_errors_and_clears_them_when_it_opens(emulated: Rh56Hand)
 def test_lost_and_damaged_answers_cost_one_exchange(fault: str) -> None:
     with Rh56Hand() as emulated, driver(emulated, timeout=0.05) as hand:
         emulated.inject(fault)
+        before = hand.statistics.timeouts  # of opening it on a busy machine
         good = failed = 0
         ends = time.monotonic() + 60.0
         while (good < 5 or failed < 2) and time.monotonic() < ends:
@@ -262,7 +263,7 @@ def test_lost_and_damaged_answers_cost_one_exchange(fault: str) -> None:
                 failed += 1
         assert good >= 5
         assert failed >= 2
-        assert hand.statistics.timeouts == failed
+        assert hand.statistics.timeouts - before == failed
 
 
 def test_a_port_that_goes_away_is_told_and_found_again(emulated: Rh56Hand) -> None:
