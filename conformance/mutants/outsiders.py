@@ -201,7 +201,11 @@ def _outsiders(made: type[Any]) -> Iterator[Outsider]:
         known = [r.id for r in catalogue(each.model)]
         lost = [e for e in declared.expects if not any(r.startswith(e) for r in known)]
         if lost and (named or len(lost) == len(declared.expects)):
-            raise ConformanceError(f"{made.__name__} expects {lost[0]}: {each.model} has none")
+            areas = dict.fromkeys(i.rsplit("-", 1)[0] for i in known)
+            raise ConformanceError(
+                f"{made.__name__} expects {', '.join(lost)}: {each.model} has none",
+                hint=f"it has {', '.join(areas)}",
+            )
         name = made.__name__ if len(spoken) == 1 else f"{made.__name__} ({each.name})"
         reference: type[Any] = model(each.model).reference.load()
         yield Outsider(name, mix(made, reference), each, declared.grade, declared.expects)
