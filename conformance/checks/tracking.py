@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.checks.motion import speed_of, steps_of
+from dexkit.conformance.rows import Selected, finite_rows
 from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
 
@@ -22,8 +23,10 @@ _TOLERANCES = (
 """Tolerances that the figures depend on."""
 _SAME = 1e-12
 """Part of a sum of squares by which sums in another order differ at most."""
-_ROUNDING = 1e-12
-"""Part of the sums of squares by which sums of products by Fourier transforms are off at most."""
+_ROUNDING = 1e-11
+"""Part of the sums of squares by which a sum is off at most."""
+_STEPS = (16, 4)
+"""Every so many delays are tried, before each of those that are left."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +91,10 @@ class _Rows:
         """Row of the newest state; -1 before the first."""
         return self._find(self._states, times, ())
 
-    def of_commands(self, times: Floats, good: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def of_commands(self, times: Floats, good: Selected) -> NDArray[np.intp]:
         """Row of the newest command among the good ones, or the first of them."""
-        return np.clip(self._find(self._commands[good], times, (good.tobytes(),)), 0, None)
+        which = b"" if isinstance(good, slice) else good.tobytes()
+        return np.clip(self._find(self._commands[good], times, (which,)), 0, None)
 
     def _find(self, t: Floats, times: Floats, which: tuple[object, ...]) -> NDArray[np.intp]:
         key = (*which, len(times), *times[:1].tolist())  # times lie on a grid
@@ -103,16 +107,16 @@ def _measure(
     ctx: Context, joint: int, span: tuple[float, float], search: float, rows: _Rows
 ) -> Tracking | str:
     begin, end = span
-    good = np.isfinite(ctx.commands.q[:, joint])
-    ct, cq = ctx.commands.t[good], ctx.commands.q[good, joint]
-    if len(ct) < 2 or len(ctx.states) < 2:
+    good = finite_rows(ctx.commands.q[:, joint])
+    cq = ctx.commands.q[:, joint][good]
+    if len(cq) < 2 or len(ctx.states) < 2:
         return "too few commands or states"
     grid: Floats = np.asarray(np.arange(begin + search + 0.1, end, _GRID))
     if len(grid) * _GRID < ctx.tolerance("min_session_s") - search - 0.2:
         return f"the session is shorter than {ctx.tolerance('min_session_s'):g} s"
     at = rows.of_states(grid)
     grid, at = grid[at >= 0], at[at >= 0]
-    q = ctx.states.q[at, joint]
+    q = ctx.states.q[:, joint][at]
     goal = cq[rows.of_commands(grid, good)]
     if not len(grid) or float(np.ptp(goal)) < ctx.tolerance("min_travel_stroke", joint):
         return "the commands hardly move in this recording"
@@ -134,16 +138,19 @@ def _measure(
     late = sliding_window_view(asked, n)[::-1]  # by delay
     best = _best_delay(seen, asked, free)
     # a hand that is faster at times than it showed lies between what it reaches and the command
-    reached, wanted = late[best][at_work], commanded[most - best : most - best + n][at_work]
-    low, high = np.minimum(reached, wanted), np.maximum(reached, wanted)
-    error = np.abs(seen[at_work] - np.clip(seen[at_work], low, high))
+    error = seen[at_work] - late[best][at_work]
+    if top_speed is not None:
+        reached, wanted = late[best][at_work], commanded[most - best : most - best + n][at_work]
+        low, high = np.minimum(reached, wanted), np.maximum(reached, wanted)
+        error = seen[at_work] - np.clip(seen[at_work], low, high)
+    error = np.abs(error)
     worst = int(np.argmax(error))
     return Tracking(
         joint=joint,
         begin=begin,
         end=end,
         delay=best * _GRID,
-        rms=math.sqrt(mean((seen - late[best])[at_work] ** 2 if top_speed is None else error**2)),
+        rms=math.sqrt(mean(error**2)),
         peak=float(error[worst]),
         peak_at=float(grid[at_work][worst]),
         raw=math.sqrt(mean((seen - late[0])[at_work] ** 2)),
@@ -160,44 +167,37 @@ def _best_delay(seen: Floats, asked: Floats, free: NDArray[np.bool_]) -> int:
     """
     n, delays = len(seen), len(asked) - len(seen) + 1
     squared = asked**2
+    late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, squared))
     # einsum, for BLAS would start threads for this
     own = float(np.einsum("i,i", seen, seen))
-    if free.all():
+    some = None if free.all() else free.astype(np.float64)
+    if some is None:
         sums = np.concatenate(([0.0], np.cumsum(squared)))
-        squares = about = (sums[n:] - sums[:-n])[::-1]
-        some = None
-        most = 0.0
-    else:
-        some = free.astype(np.float64)
-        about = _products(some, squared)
-        most = float(free.sum()) * float(squared.max())
-    # transforms round otherwise than sums, but tell which delays are worth a sum
-    about = own + about - 2.0 * _products(seen, asked)
-    most += own + float(np.einsum("i,i", asked, asked))
-    same = _SAME * own  # sums of two machines differ by less
-    near = np.flatnonzero(about <= max(float(about.min()), 0.0) + same + _ROUNDING * most)
-    late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, squared))
+        squares = (sums[n:] - sums[:-n])[::-1]
 
     def errors(of: slice) -> Floats:
         """The sums of squares at some delays; of two or more, for one alone adds up otherwise."""
         wanted = squares[of] if some is None else np.einsum("ki,i->k", late2[of], some)
         return np.asarray(own + wanted - 2.0 * np.einsum("ki,i->k", late[of], seen))
 
-    if delays < 2 or not 0 < 4 * len(near) <= delays:
-        near, found = np.arange(delays), errors(slice(None))
-    else:
-        pairs = np.minimum(near, delays - 2)
-        found = np.array([errors(slice(i, i + 2))[k - i] for i, k in zip(pairs, near, strict=True)])
-    return int(near[np.argmax(found <= max(float(found.min()), 0.0) + same)])
-
-
-def _products(short: Floats, long: Floats) -> Floats:
-    """The sums of products of a column with a longer one, for every delay of the longer one."""
-    size = 1 << (len(long) - 1).bit_length()
-    if size * 3 // 4 >= len(long):
-        size = size * 3 // 4  # transforms of such a length are as fast
-    spectrum = np.conj(np.fft.rfft(short, size)) * np.fft.rfft(long, size)
-    return np.fft.irfft(spectrum, size)[: len(long) - len(short) + 1][::-1]
+    same = _SAME * own  # sums of two machines differ by less
+    off = _ROUNDING * (own + float(np.einsum("i,i", asked, asked)))
+    # from one delay to the next the root of the sum changes no more than the command does
+    change = math.sqrt(float(np.einsum("i,i", *[np.diff(asked)] * 2))) * (1 + _ROUNDING)
+    first, last = 0, delays - 1
+    for step in _STEPS:
+        if last - first <= 2 * step:
+            continue
+        tried, every = np.arange(first, last + 1, step), np.arange(first, last + 1)
+        found = errors(slice(first, last + 1, step))
+        most = math.sqrt(max(float(found.min()), 0.0) + same + 2 * off)
+        beyond = np.sqrt(np.maximum(found - off, 0.0)) - most
+        larger = (np.abs(every[:, None] - tried) * change < beyond).any(axis=1)
+        left = every[~larger]
+        first, last = int(left[0]), int(left[-1])
+    first = max(0, min(first, last - 1))
+    found = errors(slice(first, max(last, first + 1) + 1))
+    return first + int(np.argmax(found <= max(float(found.min()), 0.0) + same))
 
 
 def _top_speed(ctx: Context, joint: int) -> float | None:
@@ -236,14 +236,16 @@ def _free(ctx: Context, joint: int, at: NDArray[np.intp], goal: Floats) -> NDArr
     For a gripper the object's position is known from the run's settings. Otherwise a joint that
     presses and does not move is blocked.
     """
-    q, dq, tau = (c[at, joint] for c in (ctx.states.q, ctx.states.dq, ctx.states.tau))
+    states = ctx.states
     if ctx.recording.stimulus is not None:
         if ctx.object_at is None:
             return np.ones(len(at), dtype=np.bool_)
         if len(ctx.joints) == 1:
+            q = states.q[:, joint][at]
             return np.asarray((goal > ctx.object_at + 0.2) | (q > ctx.object_at + 0.3))
-    presses = np.abs(tau) >= ctx.tolerance("blocked_tau_nm")
-    return np.asarray(~(presses & (np.abs(dq) < ctx.tolerance("blocked_speed_rad_s"))))
+    presses = np.abs(states.tau[:, joint]) >= ctx.tolerance("blocked_tau_nm")
+    stands = np.abs(states.dq[:, joint]) < ctx.tolerance("blocked_speed_rad_s")
+    return np.asarray(~(presses & stands)[at])
 
 
 @check("DEX1-TRACK-01", "DEX3-TRACK-01")
