@@ -7,6 +7,7 @@ fast, for those alone whose blocks of measurements leave room for more than a gi
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -49,6 +50,8 @@ class Course:
     :param part: of ``path`` that q may move beyond.
     :param longest: seconds; windows with a longer step between two measurements do not count.
     :param barred: begin and end, seconds, of what no window may overlap.
+    :param exactly: works out ``said`` and ``path`` as a window's excess is to be worked out from
+        them, where these differ from those that are given, by no more than sums round.
     """
 
     def __init__(
@@ -62,12 +65,39 @@ class Course:
         part: float,
         longest: float,
         barred: list[tuple[float, float]],
+        exactly: Callable[[], tuple[Floats, Floats]] | None = None,
     ) -> None:
-        self._times, self.t = times, times.t
-        self.q, self.said, self.path = q, said, path
+        self.times, self.t = times, times.t
+        self.q, self.rough, self._exactly = q, (said, path), exactly
         self._lag, self._part, self._barred = lag, part, barred
+        self._known: dict[float, Floats] = {}
         gap = np.diff(self.t) > longest
         self._gaps = np.concatenate(([0], np.cumsum(gap))) if gap.any() else None
+
+    @cached_property
+    def _integrals(self) -> tuple[Floats, Floats]:
+        return self.rough if self._exactly is None else self._exactly()
+
+    @property
+    def said(self) -> Floats:
+        """The integral of dq, exactly."""
+        return self._integrals[0]
+
+    @property
+    def path(self) -> Floats:
+        """The integral of its size, exactly."""
+        return self._integrals[1]
+
+    def bound(self, lengths: Sequence[float]) -> float:
+        """What the excess of no window of these lengths, seconds, is above; infinite if unknown."""
+        return max(float(self._bounds(s).max()) for s in lengths) if self._blocks else np.inf
+
+    def _bounds(self, seconds: float) -> Floats:
+        """As :meth:`_Blocks.bounds`, worked out once."""
+        assert self._blocks is not None
+        if seconds not in self._known:
+            self._known[seconds] = self._blocks.bounds(seconds)
+        return self._known[seconds]
 
     def worst(self, seconds: float, above: float) -> Excess | None:
         """The window of that length with the largest excess, the first of several.
@@ -78,14 +108,14 @@ class Course:
         blocks = self._blocks
         starts = None
         if blocks is not None:
-            bounds = blocks.bounds(seconds)
+            bounds = self._bounds(seconds)
             if above == -np.inf:  # an excess that is there leaves few places for a larger one
                 first = self._worst_in(blocks.rows(int(np.argmax(bounds))), seconds)
                 above = -np.inf if first is None else first.rad
             if above > -np.inf:
                 starts = blocks.rows(*np.flatnonzero(bounds >= above).tolist())
         if starts is None or len(starts) * _MANY > len(self.t):
-            ends = self._times.shifted(seconds)
+            ends = self.times.shifted(seconds)
             return self._worst_of(np.arange(len(ends)), ends, seconds)
         return self._worst_in(starts, seconds)
 
@@ -128,8 +158,8 @@ class Course:
     @cached_property
     def _around(self) -> tuple[Floats, Floats]:
         """The least and greatest of ``said`` within the lag of each row."""
-        first = self._times.shifted(-self._lag)
-        return extremes(self.said, first, self._times.shifted(self._lag, "right"))
+        first = self.times.shifted(-self._lag)
+        return extremes(self.said, first, self.times.shifted(self._lag, "right"))
 
     @cached_property
     def _blocks(self) -> _Blocks | None:
@@ -155,8 +185,9 @@ class _Blocks:
             table = padded.reshape(count, size).T.copy()  # long rows are compared much faster
             return table.min(axis=0), table.max(axis=0)
 
+        said, path = course.rough
         q_low, q_high = bounds(course.q)
-        said_low, said_high = bounds(course.said)
+        said_low, said_high = bounds(said)
         # around every row of a block lie the blocks beside it, if they are near enough; if not
         # even the block itself does, the row does
         begins, ends = course.t[first], course.t[last]
@@ -170,12 +201,13 @@ class _Blocks:
         most[:-1] = np.where(beside, np.maximum(most[:-1], said_high[1:]), most[:-1])
         alone = ends - begins > near
         least[alone], most[alone] = said_high[alone], said_low[alone]
-        before, after = part * course.path[first], part * course.path[last]
+        before, after = part * path[first], part * path[last]
         # of what ends in a block, and of what begins in one; see :meth:`bounds`
         self._end_up, self._end_down = q_high - most - before, q_low - least + before
         self._start_up, self._start_down = q_low - least - after, q_high - most + after
         largest = max(float(np.abs(v).max()) for v in (q_low, q_high, said_low, said_high))
-        self._slack = _ROUNDING * (1 + largest + abs(float(course.path[-1])))
+        rounding = _ROUNDING + 4 * n * float(np.finfo(np.float64).eps)
+        self._slack = rounding * (1 + largest + abs(float(path[-1])))
 
     def bounds(self, seconds: float) -> Floats:
         """What the excess of no window is above that begins in a block, for each block."""

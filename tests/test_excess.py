@@ -66,6 +66,20 @@ def test_the_largest_excess_is_that_of_all_windows(kind: str) -> None:
         assert course.worst(seconds, wanted.rad) == wanted
         lower = course.worst(seconds, wanted.rad + 1e-9)
         assert lower is None or lower.rad <= wanted.rad
+        # the same from integrals that differ as sums round, and no more is said to be possible
+        rough = Course(
+            course.times,
+            course.q,
+            course.said * (1 + 1e-13),
+            course.path * (1 - 1e-13),
+            exactly=lambda: (course.said, course.path),
+            lag=LAG,
+            part=PART,
+            longest=LONGEST,
+            barred=barred,
+        )
+        assert rough.bound([seconds]) >= wanted.rad
+        assert rough.worst(seconds, -np.inf) == rough.worst(seconds, wanted.rad) == wanted
 
 
 def test_a_course_of_few_or_rare_measurements_has_its_windows() -> None:

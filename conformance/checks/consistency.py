@@ -74,19 +74,31 @@ class _Joint:
         whole = (gaps[ends] == gaps[starts]) & (self.t[ends] - self.t[starts] < 2 * seconds)
         return starts[whole], ends[whole]
 
-    @cached_property
+    @property
     def said(self) -> Floats:
         """The integral of dq up to each measurement, rad."""
-        return self.integral(self.dq)
+        return self._integrals[0]
 
-    def integral(self, speeds: Floats) -> Floats:
-        """The integral of speeds up to each measurement, rad."""
-        found = np.zeros(len(speeds))
-        steps = speeds[1:] + speeds[:-1]
-        steps /= 2
-        steps *= self._steps
-        np.cumsum(steps, out=found[1:])
-        return found
+    @property
+    def path(self) -> Floats:
+        """The integral of the size of dq up to each measurement, rad."""
+        return self._integrals[1]
+
+    @cached_property
+    def _integrals(self) -> tuple[Floats, Floats]:
+        return self.integrals(self.dq)
+
+    def integrals(self, speeds: Floats) -> tuple[Floats, Floats]:
+        """The integrals of speeds and of their size up to each measurement, rad."""
+        found = np.zeros(len(speeds), dtype=np.complex128)
+        for part, column in ((found.real, speeds), (found.imag, np.abs(speeds))):
+            steps = column[1:] + column[:-1]
+            steps /= 2
+            steps *= self._steps
+            part[1:] = steps
+        # complex numbers are added as fast as others, so that both sums take the time of one
+        np.cumsum(found[1:], out=found[1:])
+        return found.real.copy(), found.imag.copy()
 
 
 def _measurements(ctx: Context, joint: int) -> Rows:
@@ -183,11 +195,12 @@ def alternates(ctx: Context) -> Outcome:
         ctx.tolerance("cell_s"),
         round(ctx.tolerance("window_s") / ctx.tolerance("cell_s")),
     )
+    fought = [ctx.span(p) for n in _FOUGHT_OVER for p in ctx.phases(n)]
     worst: tuple[int, float, int, float] | None = None
     for joint in range(len(ctx.joints)):
-        good = np.isfinite(ctx.states.q[:, joint])
-        t, q = ctx.states.t[good], ctx.states.q[good, joint]
-        for begin, end in (ctx.span(p) for n in _FOUGHT_OVER for p in ctx.phases(n)):
+        good = finite_rows(ctx.states.q[:, joint])
+        t, q = ctx.states.t[good], ctx.states.q[:, joint][good]
+        for begin, end in fought:
             kept = (t < begin) | (t > end)
             t, q = t[kept], q[kept]
         if len(t) < _FEW:
@@ -300,20 +313,25 @@ def keeps_up(ctx: Context) -> Outcome:
     """How far q moved beyond what dq, up to 40 ms earlier or later, allows, in the worst window."""
     if not _filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
+    joints = [_Joint.from_context(ctx, joint) for joint in range(len(ctx.joints))]
+    courses = {i: _course(ctx, x) for i, x in enumerate(joints) if len(x.t) >= _FEW}
+    lengths = (_LAGS * ctx.tolerance("max_lag_s")).tolist()
+
+    def bound(joint: int) -> float:
+        return courses[joint][0].bound(lengths) / ctx.joints[joint].stroke
+
     worst: tuple[float, float, int, float, float, float] | None = None
-    for joint, spec in enumerate(ctx.joints):
-        x = _Joint.from_context(ctx, joint)
-        if len(x.t) < _FEW:
-            continue
-        course, dq = _course(ctx, x)
-        for seconds in _LAGS * ctx.tolerance("max_lag_s"):
-            above = -math.inf if worst is None else worst[0] * spec.stroke
-            most = course.worst(float(seconds), above)
+    # the worst joint comes first, as far as one can tell: of the others little is looked at then
+    for joint in sorted(courses, key=bound, reverse=True):
+        x, (course, factor), stroke = joints[joint], courses[joint], ctx.joints[joint].stroke
+        for seconds in lengths:
+            above = -math.inf if worst is None else worst[0] * stroke
+            most = course.worst(seconds, above)
             if most is None:
                 continue
-            speed = float(np.abs(dq[most.start : most.end + 1]).max())
+            speed = float(np.abs(factor * x.dq[most.start : most.end + 1]).max())
             begin, end = float(x.t[most.start]), float(x.t[most.end])
-            found = (most.rad / spec.stroke, most.rad, joint, begin, end, speed)
+            found = (most.rad / stroke, most.rad, joint, begin, end, speed)
             if worst is None or found > worst:
                 worst = found
     if worst is None:
@@ -336,22 +354,22 @@ def keeps_up(ctx: Context) -> Outcome:
     return outcome.about(joint).placed(excess, limit).if_late(late)
 
 
-def _course(ctx: Context, x: _Joint) -> tuple[Course, Floats]:
-    """A joint's course, and its dq without a constant factor."""
+def _course(ctx: Context, x: _Joint) -> tuple[Course, float]:
+    """A joint's course, without a constant factor of its dq, and that factor."""
     lag = ctx.tolerance("max_lag_s")
     factor = _factor(x, x.said, lag)
-    dq = factor * x.dq
     course = Course(
         x.times,
         x.q,
-        x.said if factor == 1.0 else x.integral(dq),
-        x.integral(np.abs(dq)),
+        factor * x.said,
+        abs(factor) * x.path,
+        exactly=None if factor == 1.0 else lambda: x.integrals(factor * x.dq),
         lag=lag,
         part=ctx.tolerance("max_part"),
         longest=0.5 * lag,
         barred=_unstable(ctx),
     )
-    return course, dq
+    return course, factor
 
 
 def _unstable(ctx: Context) -> list[tuple[float, float]]:
@@ -367,7 +385,7 @@ def _factor(x: _Joint, c: Floats, lag: float) -> float:
     :param c: the integral of dq.
     """
     starts, ends = x.windows(4 * lag, 0.5 * lag)
-    said, moved = c[ends] - c[starts], x.q[ends] - x.q[starts]
+    said, moved = c.take(ends) - c[starts], x.q.take(ends) - x.q[starts]
     reach = float(np.ptp(x.q))
     moving = np.abs(said) > 0.05 * reach
     if int(moving.sum()) < _FEW or not reach:
