@@ -130,7 +130,8 @@ class Words:
         # nothing
         self._tables: list[NDArray[np.uint32]] = []
         self._begins: list[int] = []  # the first sample of each table
-        self._like_first = b""  # the first sample, again and again
+        # samples that are like the first but for their changing words, for comparison
+        self._like_first = bytearray()
         self._limits: dict[np.dtype[Any], tuple[NDArray[Any], NDArray[Any]]] = {}
 
     def __len__(self) -> int:
@@ -139,24 +140,20 @@ class Words:
     def put_alike(self, piece: NDArray[np.uint32]) -> bool:
         """Add samples in which only words change that have changed before.
 
-        :param piece: written to, and restored.
         :returns: whether they are; if not, none is added.
         """
         kept = piece.take(self._changing, axis=1)
-        piece[:, self._changing] = self._row[self._changing]
-        try:
-            # comparing memory takes a tenth of the time that arrays of differences do
-            step = max(1, _COMPARED // piece.shape[1])
-            wanted = 4 * min(step, len(piece)) * piece.shape[1]
-            if len(self._like_first) < wanted:
-                self._like_first = np.tile(self._row, wanted // (4 * piece.shape[1])).tobytes()
-            if not all(
-                self._like_first.startswith(piece[at : at + step].data)
-                for at in range(0, len(piece), step)
-            ):
+        # comparing memory takes a tenth of the time that arrays of differences do
+        width = piece.shape[1]
+        step = max(1, _COMPARED // width)
+        if len(self._like_first) < 4 * width * min(step, len(piece)):
+            self._like_first = bytearray(np.tile(self._row, min(step, len(piece))).tobytes())
+        alike = np.frombuffer(self._like_first, dtype=np.uint32).reshape(-1, width)
+        for at in range(0, len(piece), step):
+            some = piece[at : at + step]
+            alike[: len(some), self._changing] = kept[at : at + step]
+            if not self._like_first.startswith(some.data):
                 return False
-        finally:
-            piece[:, self._changing] = kept
         self._add(kept)
         return True
 
