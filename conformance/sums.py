@@ -51,12 +51,12 @@ def _in_bulk(values: Floats) -> float | None:
         high = rest + edge
         high -= edge
         parts.append(float(high.sum()))
-        rest = rest - high
         exponent += spare - 53
         left = n * math.ldexp(1.0, exponent)  # the low parts add up to this at most
         low, top = math.fsum([*parts, -left]), math.fsum([*parts, left])
         if low == top:
             return low
+        rest = rest - high
     return None
 
 

@@ -117,13 +117,17 @@ class _Snapshot:
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._size = file, size
+        self._at = file.tell()
 
     def seek(self, at: int) -> int:
+        self._at = at  # to ask the file for it takes as long as a read
         return self._file.seek(at)
 
     def read(self, count: int = -1) -> bytes:
-        left = max(0, self._size - self._file.tell())
-        return self._file.read(left if count < 0 else min(count, left))
+        left = max(0, self._size - self._at)
+        data = self._file.read(left if count < 0 else min(count, left))
+        self._at += len(data)
+        return data
 
 
 class Container:

@@ -202,8 +202,9 @@ def _windows(times: Times, window: float) -> Windows:
 
 def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     states = ctx.states
-    good = finite_rows(states.q[:, joint], states.dq[:, joint])
-    t, q, dq = states.clock[good], states.q[good, joint], states.dq[good, joint]
+    q, dq = states.q[:, joint], states.dq[:, joint]
+    good = finite_rows(q, dq)
+    t, q, dq = states.clock[good], q[good], dq[good]
     if len(t) < 10 or float(t[-1] - t[0]) <= 0:
         return ctx.skipped("too few states")
     if not (dq[:10].any() or dq.any()):
@@ -218,17 +219,19 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     starts, ends, span = known[which]
     if not len(starts):
         return ctx.skipped("the states are too far apart to derive a velocity")
-    slope = (q[ends] - q[starts]) / span
+    slope = (q.take(ends) - q.take(starts)) / span
     moving = np.flatnonzero(np.abs(slope) > 0.5)
     if len(moving) < 50:
         return ctx.skipped("the hand hardly moves in this recording")
     cumulated = np.concatenate(([0.0], np.cumsum((dq[1:] + dq[:-1]) / 2 * np.diff(t))))
 
     def mean(rows: NDArray[np.intp]) -> Floats:
-        return np.asarray((cumulated[ends[rows]] - cumulated[starts[rows]]) / span[rows])
+        passed = cumulated.take(ends[rows]) - cumulated.take(starts[rows])
+        return np.asarray(passed / span[rows])
 
-    size = math.sqrt(sums.mean(slope[moving] ** 2))
-    error = math.sqrt(sums.mean((mean(moving) - slope[moving]) ** 2)) / size
+    slopes, means = slope[moving], mean(moving)
+    size = math.sqrt(sums.mean(slopes**2))
+    error = math.sqrt(sums.mean((means - slopes) ** 2)) / size
     text = ctx.named(
         f"dq differs from the slope of q by {error:.0%} of its size ({size:.2f} {ctx.unit}/s RMS)",
         joint,
@@ -236,7 +239,7 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     if error <= ctx.tolerance("max_relative_rms"):
         return ctx.passed(f"{error:.0%} off", text, relative_rms=error)
     worst = starts[np.argmax(np.abs(mean(np.arange(len(ends))) - slope))]
-    turned = sums.mean(mean(moving) * slope[moving]) < 0
+    turned = sums.mean(means * slopes) < 0
     return (
         ctx.failed(
             f"{error:.0%} off",

@@ -153,7 +153,7 @@ def _bend(t: Floats, x: Floats, window: float) -> Floats:
 def acceleration(ctx: Context) -> Outcome:
     """Compare ddq with the second difference of q over a window."""
     states = ctx.states
-    if not np.nan_to_num(states.ddq).any():
+    if not ((states.ddq != 0) & ~np.isnan(states.ddq)).any():
         return ctx.absent("ddq is not filled (0 throughout)")
     window = ctx.tolerance("window_s")
     worst = (1.0, 0)

@@ -405,7 +405,7 @@ class _Course:
         good = finite_rows(q)
         t, q = t[good], q[good]
         steps = np.diff(q)
-        rows = np.flatnonzero(steps)
+        rows = np.flatnonzero(steps != 0)  # of bits: several times as fast
         return cls(t, q, rows + 1, steps[rows])
 
     def held(self, samples: float, which: NDArray[np.bool_]) -> bool:
