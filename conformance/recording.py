@@ -393,18 +393,20 @@ def _states(
     if columns is None:
         columns = codec.state.columns(samples.payloads)
 
-    def column(name: str) -> Floats:
-        return _joints(columns, codec, side, codec.state_sequence, name)
+    def column(name: str, unit: tuple[float, ...] = ()) -> Floats:
+        values = _joints(columns, codec, side, codec.state_sequence, name)
+        return np.asarray(values * unit) if unit else values
 
+    speeds, torques = codec.dialect.speed_units, codec.dialect.torque_units
     return States(
         topic=topic,
         t=_seconds(samples.log_time_ns, origin),
         sent=_sent(samples, origin),
         length=columns.count(codec.state_sequence),
         q=column("q"),
-        dq=column("dq") * (codec.dialect.speed_units or 1.0),
-        ddq=column("ddq") * (codec.dialect.speed_units or 1.0),
-        tau=column("tau_est") * (codec.dialect.torque_units or 1.0),
+        dq=column("dq", speeds),
+        ddq=column("ddq", speeds),
+        tau=column("tau_est", torques),
         mode=column("mode"),
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
