@@ -45,7 +45,8 @@ def finite(ctx: Context) -> Outcome:
     if not there.any():
         return ctx.skipped("no sample holds this hand's motor")
     columns = {"q": states.q, "dq": states.dq, "ddq": states.ddq, "tau_est": states.tau}
-    bad = {n: np.flatnonzero(there & ~np.isfinite(c).all(axis=1)) for n, c in columns.items()}
+    good = {name: np.isfinite(column) for name, column in columns.items()}
+    bad = {n: np.flatnonzero(there & ~g.all(axis=1)) for n, g in good.items() if not g.all()}
     bad = {name: rows for name, rows in bad.items() if len(rows)}
     if not bad:
         return ctx.passed("all finite", f"{int(there.sum())} samples")
@@ -75,7 +76,7 @@ def in_stroke(ctx: Context) -> Outcome:
     widest: tuple[float, Outcome] | None = None
     for joint, spec in enumerate(ctx.joints):
         column = states.q[:, joint]
-        q = column[np.isfinite(column)]
+        q = column[finite_rows(column)]
         if not len(q):
             continue
         low, high = float(q.min()), float(q.max())
