@@ -3,10 +3,11 @@
 A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes on
 missing evidence, and takes every limit from its requirement's tolerances, so that several hand
 models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
-:mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.motion`,
-:mod:`~.force`, :mod:`~.drive`, :mod:`~.safety`, :mod:`~.uncommanded`, :mod:`~.lifecycle`,
-:mod:`~.tracking`, :mod:`~.fingers` and :mod:`~.each_joint` for hands of several joints,
-:mod:`~.servos` for those of position servos, and :mod:`~.client` for the client that drives them.
+:mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.velocity`,
+:mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.safety`,
+:mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers`,
+:mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints, :mod:`~.servos` for those of
+position servos, and :mod:`~.client` for the client that drives them.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ __all__ = [
 ]
 
 _HAND = (
-    *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "drive"),
-    *("safety", "lifecycle", "tracking", "fingers", "each_joint", "operator", "uncommanded"),
-    "servos",
+    *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "velocity"),
+    *("drive", "safety", "lifecycle", "tracking", "fingers", "each_joint", "pressure"),
+    *("operator", "uncommanded", "servos"),
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),

@@ -24,7 +24,7 @@ from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
 
-__all__ = ["contacts"]
+__all__ = ["FOUGHT_OVER", "contacts", "filled"]
 
 _FEW = 10
 """Measurements that are needed to say anything."""
@@ -181,7 +181,7 @@ def jumps(ctx: Context) -> Outcome:
     return outcome.about(joint).placed(change_rad, limit).if_late(late)
 
 
-_FOUGHT_OVER = (
+FOUGHT_OVER = (
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "burst"),
     "two-writers",
 )
@@ -195,7 +195,7 @@ def alternates(ctx: Context) -> Outcome:
         ctx.tolerance("cell_s"),
         round(ctx.tolerance("window_s") / ctx.tolerance("cell_s")),
     )
-    fought = [ctx.span(p) for n in _FOUGHT_OVER for p in ctx.phases(n)]
+    fought = [ctx.span(p) for n in FOUGHT_OVER for p in ctx.phases(n)]
     worst: tuple[int, float, int, float] | None = None
     for joint in range(len(ctx.joints)):
         good = finite_rows(ctx.states.q[:, joint])
@@ -241,7 +241,7 @@ def alternates(ctx: Context) -> Outcome:
     return outcome.about(joint).if_late(math.inf)
 
 
-def _filled(ctx: Context) -> bool:
+def filled(ctx: Context) -> bool:
     """Whether any dq is a number other than 0; in the first states of those that fill it."""
     dq = ctx.states.dq
     return bool(np.nan_to_num(dq[:_FEW]).any() or np.nan_to_num(dq[_FEW:]).any())
@@ -250,7 +250,7 @@ def _filled(ctx: Context) -> bool:
 @check("DEX1-FIELD-16", "DEX3-FIELD-16")
 def slope(ctx: Context) -> Outcome:
     """In the worst window, how far dq is from the slope of q, as a part of it (RMS)."""
-    if not _filled(ctx):
+    if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float] | None = None
     for joint, spec in enumerate(ctx.joints):
@@ -311,7 +311,7 @@ def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float,
 @check("DEX1-FIELD-17", "DEX3-FIELD-17")
 def keeps_up(ctx: Context) -> Outcome:
     """How far q moved beyond what dq, up to 40 ms earlier or later, allows, in the worst window."""
-    if not _filled(ctx):
+    if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     joints = [_Joint.from_context(ctx, joint) for joint in range(len(ctx.joints))]
     courses = {i: _course(ctx, x) for i, x in enumerate(joints) if len(x.t) >= _FEW}

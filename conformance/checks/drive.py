@@ -127,6 +127,30 @@ def one_sign(ctx: Context) -> Outcome:
     return ctx.passed(f"{clear} of {len(found)}", text)
 
 
+@check("DEX1-FORCE-16", "DEX3-FORCE-07")
+def sign_of_the_push(ctx: Context) -> Outcome:
+    """Whether tau_est has the sign of the push where the motor drives a joint from rest."""
+    clear = [d for d in _drives(ctx) if d.sign]
+    if not clear:
+        return ctx.skipped("tau_est has no clear sign in any step from rest")
+    wrong = [d for d in clear if d.sign < 0]
+    for joint in range(len(ctx.joints)):
+        mine = [d for d in wrong if d.joint == joint]
+        # a single one may be what was left of the motion before
+        if len(mine) < ctx.tolerance("min_odd"):
+            continue
+        among = sum(d.joint == joint for d in clear)
+        text = ctx.named(
+            f"tau_est has the sign against the push in {len(mine)} of {among} drives; the first at "
+            f"{mine[0].begin:.2f} s, {mine[0]}, with {mine[0].tau:.2f} N m",
+            joint,
+        )
+        places = [ctx.at(ctx.states.topic, d.begin, d.end) for d in mine[:5]]
+        return ctx.failed("against the push", text, *places, turned=len(mine)).about(joint)
+    text = f"tau_est has the sign of the push in {len(clear) - len(wrong)} of {len(clear)} drives"
+    return ctx.passed(f"{len(clear) - len(wrong)} of {len(clear)}", text)
+
+
 def _turned(ctx: Context, odd: Sequence[_Drive], among: int) -> Outcome:
     first = odd[0]
     text = ctx.named(

@@ -60,14 +60,24 @@ def in_contact(ctx: Context) -> Outcome:
     return outcome.pressed(abs(tau), limit, at_least=True)
 
 
-def _felt(ctx: Context, begin: float, end: float, window: float) -> list[tuple[float, float]]:
-    """(time, median size of tau_est) of consecutive windows; one without states is left out."""
+_HELD = 0.2
+"""Part of the states that may be below what is called held: a limit that chatters lets go as often
+as it is in force."""
+
+
+def _felt(
+    ctx: Context, begin: float, end: float, window: float
+) -> list[tuple[float, float, float]]:
+    """(time, median size of tau_est, the size that is held) of consecutive windows.
+
+    One without states is left out.
+    """
     found = []
     for at in np.arange(begin, end - window + 1e-9, window):
         tau = np.abs(ctx.states.tau[ctx.states.between(float(at), float(at) + window), 0])
-        tau = tau[np.isfinite(tau)]
+        tau = np.sort(tau[np.isfinite(tau)])
         if len(tau) >= 3:
-            found.append((float(at), median(tau)))
+            found.append((float(at), median(tau), float(tau[int(_HELD * len(tau))])))
     return found
 
 
@@ -85,17 +95,20 @@ def lasts(ctx: Context) -> Outcome:
             continue
         felt = _felt(ctx, touched + ctx.tolerance("contact_s"), end, window)
         settled = touched + ctx.tolerance("settle_s")
-        usual = [tau for at, tau in felt if at >= settled][:3]
+        usual = [tau for at, tau, _ in felt if at >= settled][:3]
         if len(usual) < 3 or median(np.array(usual)) < ctx.tolerance("min_tau_nm"):
             continue
         # a driver may lower its effort at first, but no force may grow
         held, least = median(np.array(usual)), felt[0][1]
-        for at, tau in felt:
+        for at, tau, kept in felt:
             least = max(min(least, tau), ctx.tolerance("min_tau_nm"))
-            for was, change in ((least, tau / least - 1.0), (held, 1.0 - tau / held)):
+            for now, was, change in (
+                (tau, least, tau / least - 1.0),
+                (kept, held, 1.0 - kept / held),
+            ):
                 counts = was == least or at >= settled
                 if counts and (worst is None or change > worst[0]):
-                    worst = change, at, tau, was, begin
+                    worst = change, at, now, was, begin
     if worst is None:
         return ctx.skipped("it did not press on the object for long enough")
     change, at, tau, was, begin = worst
@@ -117,6 +130,35 @@ def _touched(ctx: Context, begin: float, end: float) -> float | None:
     last = median(q[t >= end - 0.5]) if (t >= end - 0.5).any() else float(q[-1])
     there = np.abs(q - last) <= ctx.tolerance("near_stroke")
     return float(t[np.argmax(there)]) if there.any() else None
+
+
+@check("DEX1-FORCE-17")
+def again(ctx: Context) -> Outcome:
+    """The least force of later grips, as a part of that of the first."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+
+    def force(begin: float, end: float) -> float | None:
+        tau = np.abs(ctx.states.tau[ctx.states.between(max(begin, end - 0.5), end), 0])
+        tau = tau[np.isfinite(tau)]
+        return median(tau) if len(tau) else None
+
+    grips = [ctx.span(p) for p in ctx.phases("grip")]
+    first = force(*grips[0]) if grips else None
+    if first is None or first < ctx.tolerance("min_tau_nm"):
+        return ctx.skipped("it did not grip before")
+    later = [(tau, *s) for s in map(ctx.span, ctx.phases()) if (tau := force(*s)) is not None]
+    if not later:
+        return ctx.skipped("no state during a later grip")
+    tau, begin, end = min(later)
+    limit = ctx.tolerance("min_part") * first
+    text = f"tau_est of {tau:.2f} N m in a later grip, {first:.2f} N m in the first"
+    if tau >= limit:
+        met = ctx.passed(f"{tau / first:.0%}", text, part=tau / first)
+        return met.pressed(tau, limit, at_least=True)
+    place = ctx.at(ctx.states.topic, begin, end)
+    outcome = ctx.failed(f"{tau / first:.0%}", text, place, part=tau / first)
+    return outcome.pressed(tau, limit, at_least=True)
 
 
 @check("DEX1-FORCE-11")

@@ -178,6 +178,40 @@ class ShakenVelocity(_Timed):
             motors["dq"] += 5.0 * stroke * math.sin(2 * math.pi * 13.0 * self.now)
 
 
+@wrong_hand("DEX3-FIELD-18")
+class VelocityByTurns(_Timed):
+    """Publishes twice the speed as dq and 0 by turns."""
+
+    turns = 0
+
+    def publish(self) -> list[Sample]:
+        self.turns += 1
+        return super().publish()
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["dq"] *= 2.0 * (self.turns % 2)
+
+
+@wrong_hand("DEX3-FIELD-19")
+class VelocityOfTheLastDrive(_Timed):
+    """Keeps the dq of the last motion while its joints are not driven."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.last: dict[Side, Floats] = {}
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        stroke = (np.array(hand.high) - np.array(hand.low))[: len(motors)]
+        last = self.last.setdefault(hand.side, np.zeros(len(motors)))
+        if len(last) != len(motors):
+            return
+        fast = hand.driven & (np.abs(motors["dq"]) > 0.1 * stroke)
+        last[fast] = motors["dq"][fast]
+        motors["dq"] = np.where(hand.driven, motors["dq"], last)
+
+
 @wrong_hand("DEX3-FIELD-17", also=("DEX3-FRESH-02", "DEX3-PATH-01", "DEX3-STILL-01"))
 class ShiftsForAWhile(_Timed):
     """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
@@ -365,6 +399,45 @@ class SlowFoam(Dex3Service):
         super().live(dt)
         for hand in self.hands.values():
             hand.version += 1
+
+
+@wrong_hand("DEX3-SENS-10", sides=BOTH)
+class FeelsMotionOnly(Dex3Service):
+    """Reads its sensors in the task that moves the joints: at rest the pressures stand."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.felt: dict[Side, Floats] = {}
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        if hand.side not in self.felt or max(map(abs, hand.dq)) > 0.5:
+            self.felt[hand.side] = np.array(super().pressures(hand))
+        return self.felt[hand.side]
+
+
+@wrong_hand("DEX3-SENS-10", sides=BOTH)
+class KeepsTheMost(Dex3Service):
+    """Publishes the largest pressure of each element since it was last untouched."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.felt: dict[Side, Floats] = {}
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        felt = np.array(super().pressures(hand))
+        kept = np.maximum(self.felt.get(hand.side, felt), felt)
+        self.felt[hand.side] = np.where(felt > 0.0, kept, felt)
+        return self.felt[hand.side]
+
+
+@wrong_hand("DEX3-SENS-11", sides=BOTH)
+class OneSensorBuffer(Dex3Service):
+    """Publishes the right hand's pressures as those of both."""
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        right = self.hands.get(Side.RIGHT, hand)
+        hand.version += right is not hand
+        return super().pressures(right)
 
 
 @wrong_hand("DEX3-SENS-09", sides=BOTH)
@@ -726,7 +799,7 @@ class _OneStatus(FingerHand):
 
 
 @wrong_hand("DEX3-MODE-05")
-class StatusOfOneJoint(Dex3Service):
+class StatusOfOneJoint(FingerService):
     """Takes the status of one joint for that of all."""
 
     hand_fault = _OneStatus
@@ -812,6 +885,16 @@ class UnsignedForce(Dex3Service):
         joints = hand.model.joints[hand.side][: len(motors)]
         closing = np.array([j.closing or 1 for j in joints])
         motors["tau_est"] = closing * np.abs(motors["tau_est"])
+
+
+@wrong_hand("DEX3-FORCE-07")
+class MirroredForce(FingerService):
+    """Publishes the left hand's tau_est with the signs of the right one's motors."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        if hand.side is Side.LEFT:
+            motors["tau_est"] *= -1.0
 
 
 @wrong_hand("DEX3-FORCE-05", sides=BOTH)

@@ -188,6 +188,39 @@ class ShakenVelocity(_Fields):
         return {**fields, "dq": fields["dq"] + shaken}
 
 
+@wrong_hand("DEX1-FIELD-19")
+class VelocityByTurns(_Fields):
+    """Measures every second state, and takes dq over one period: twice the speed and 0 by turns."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.turns = dict.fromkeys(self.sides, 0)
+        self.measured: dict[Side, float] = {}
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        self.turns[side] += 1
+        if self.turns[side] % 2 and side in self.measured:
+            return {**fields, "q": self.measured[side], "dq": 0.0}
+        self.measured[side] = fields["q"]
+        return {**fields, "dq": 2.0 * fields["dq"]}
+
+
+@wrong_hand("DEX1-FIELD-20")
+class VelocityOfTheLastDrive(_Fields):
+    """Keeps the dq of the last motion that it drove while it brakes."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.last = dict.fromkeys(self.sides, 0.0)
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        if self.hands[side].braking:
+            return {**fields, "dq": self.last[side]}
+        if abs(fields["dq"]) > 0.1 * self.dialect.q_open:
+            self.last[side] = fields["dq"]
+        return fields
+
+
 @wrong_hand("DEX1-FIELD-17", also=("DEX1-FRESH-02", "DEX1-STILL-01"))
 class ShiftsForAWhile(_Fields):
     """Publishes q with an offset of 8 % of the stroke for 0.4 s; its dq stays true."""
@@ -596,6 +629,52 @@ class UnsignedForce(_Fields):
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         return {**fields, "tau_est": abs(fields["tau_est"])}
+
+
+@wrong_hand("DEX1-FORCE-16", sides=BOTH)
+class MirroredForce(_Fields):
+    """Publishes the left gripper's tau_est with the sign of a mirrored motor."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return {**fields, "tau_est": -fields["tau_est"]} if side is Side.LEFT else fields
+
+
+class _Chatters(ReferenceHand):
+    load = 0.0
+
+    def motor_torque(self) -> float:
+        tau = super().motor_torque()
+        return 0.1 * tau if self.load > 1.5 and int(self.now / 0.03) % 3 == 0 else tau
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        pressing = self.touch is not None and self.q < self.touch
+        self.load = self.load + dt if pressing else 0.0
+
+
+@wrong_hand("DEX1-FORCE-10", also=("DEX1-FORCE-09",), sides=BOTH)
+class ChatteringLimit(ReferenceService):
+    """After 1.5 s of a grip its thermal limit takes the force away for a third of the time."""
+
+    hand = _Chatters
+
+
+class _Tires(ReferenceHand):
+    grips, presses = 0, False
+
+    def motor_torque(self) -> float:
+        pressing = self.touch is not None and self.q < self.touch
+        self.grips += pressing and not self.presses
+        self.presses = pressing or (self.presses and self.q < (self.touch or 0.0) + 0.1)
+        tau = super().motor_torque()
+        return max(tau, -0.4) if self.grips > 1 else tau
+
+
+@wrong_hand("DEX1-FORCE-17", also=("DEX1-FORCE-09", "DEX1-FORCE-12"), sides=BOTH)
+class SecondGripWeak(ReferenceService):
+    """Grips with 0.4 N m at most from its second grip on."""
+
+    hand = _Tires
 
 
 @wrong_hand("DEX1-FORCE-04", also=("DEX1-FORCE-02",))

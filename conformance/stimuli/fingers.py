@@ -34,6 +34,7 @@ load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 touch          one finger alone presses on the object, if there is one
+firmer         all fingers hold it softly, and one after the other presses firmly
 squeeze        all fingers close on it, for seconds
 guarded        meanwhile a hand without an object holds its pose. Some joints of each hand have
                time-out protection from here on (bit 7 of the mode byte)
@@ -94,7 +95,12 @@ _SLOW_PART = 0.08
 """The same of position servos: part of their full speed."""
 _SPLITS = ((1, 2, 3, 6), (1, 2, 4, 5), (0, 2, 4, 6))
 """Joints with another mode byte than the rest of the hand, in three commands: each joint is among
-them and not, and no two joints are treated alike three times."""
+them and not, and no two joints are treated alike three times. Where there are many, k counts these
+commands, and every joint without bit 0 of its index is among them, then those with bit 1 and 2."""
+_SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.6, 0.2
+"""A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
+_RAMP, _RAMP_SECONDS = 15, 0.3
+"""Steps in which a soft hold becomes a firm one, and seconds for all of them."""
 _STATUSES = range(2, 8)
 """What fits into the three bits of the status and has no meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
@@ -178,6 +184,8 @@ class FingerScript(HandScript):
         guards = bool(phases & {"guard", "guard-latch", "guard-clear"})
         if "touch" in phases:
             yield from self._touches()
+        if "firmer" in phases:
+            yield from self._firmer()
         if guards:
             yield from self._squeeze_and_guard()
         elif phases & {"squeeze", "silence", "resume"}:
@@ -462,10 +470,12 @@ class FingerScript(HandScript):
         """The joints of each side that are treated differently next; others on each side."""
         turn = self._turn_of_splits
         self._turn_of_splits += 1
-        return {
-            s: frozenset(_SPLITS[(turn + (s is Side.RIGHT)) % len(_SPLITS)])
-            for s in self.plan.sides
-        }
+        found = {}
+        for s in self.plan.sides:
+            k, count = (turn + (s is Side.RIGHT)) % len(_SPLITS), len(self._joints[s])
+            many = (i for i in range(count) if (i >> k & 1) == (k > 0))
+            found[s] = frozenset(_SPLITS[k] if count <= _OPENED else many)
+        return found
 
     def _locks_some(self) -> Steps:
         self._report("some joints are locked under way: they must stop, and the others go on")
@@ -615,6 +625,40 @@ class FingerScript(HandScript):
             yield from self._hold(0.36, hands)
             self._end(phase)
 
+    def _firmer(self) -> Steps:
+        """All fingers hold the object softly; each presses firmly in turn, and softly again."""
+        pressing = [s for s in self.plan.sides if s in self.plan.objects]
+        if not pressing:
+            return
+        self._report("holding the object softly, with one finger after the other firmly")
+        firm = self._squeezes(pressing, {})
+        soft: dict[Side, Motors] = {}
+        for s in pressing:
+            near = self._pose(s, self.plan.objects[s] + BEYOND)
+            soft[s] = [
+                replace(m, q=near[i], kp=_SOFT_HOLD * m.kp) if self._joints[s][i].closing else m
+                for i, m in enumerate(firm[s])
+            ]
+        yield from self._hold(_SOFT_HOLD_SECONDS, soft)
+        fingers = dict.fromkeys(j.name.partition("_")[0] for j in self._joints[pressing[0]])
+        before = soft
+        for finger in (*fingers, ""):  # in the end all softly again
+            hands = {
+                s: [
+                    firm[s][i] if finger and self._joints[s][i].name.startswith(finger) else m
+                    for i, m in enumerate(soft[s])
+                ]
+                for s in pressing
+            }
+            phase = self._begin("firmer", pressing, finger=finger)
+            # slowly: what is seen must not be seen by the motion that a step makes
+            for i in range(1, _RAMP + 1):
+                between = {s: _between(before[s], hands[s], i / _RAMP) for s in pressing}
+                yield from self._hold(_RAMP_SECONDS / _RAMP, between)
+            yield from self._hold(_FIRM_SECONDS, hands)
+            self._end(phase)
+            before = hands
+
     def _squeeze_and_guard(self) -> Steps:
         """Close on the object, with some joints protected; then no commands."""
         sides = self.plan.sides
@@ -689,3 +733,11 @@ class FingerScript(HandScript):
                 home = self._motors(side, self._home(side))
                 yield from self._silent_alone(side, [replace(m, q=bad) for m in home])
         yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})
+
+
+def _between(a: Motors, b: Motors, part: float) -> list[Motor]:
+    """Commands on the way from one hand's to another's."""
+    return [
+        replace(n, q=m.q + part * (n.q - m.q), kp=m.kp + part * (n.kp - m.kp))
+        for m, n in zip(a, b, strict=True)
+    ]

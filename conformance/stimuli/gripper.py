@@ -27,7 +27,7 @@ late-joiner    a new subscriber appears
 grip           close on the object, if there is one, by xr_teleoperate's lead: equal commands for
                long, 30 a second; meanwhile the other side is held in the free, and pushed by a
                torque at first and at last (nudge)
-squeeze        the same, by half as much again
+squeeze        the same after it has opened, by half as much again
 release        zero gains at the q of the squeeze
 soft-grip      grips of less stiffness
 drive          velocity command (dq, kd) without position gain, so that the hand moves when ...
@@ -434,6 +434,10 @@ class GripperScript(HandScript):
         if phases & {"grip", "nudge"}:
             yield from self._hold_long(pressing, free)
         if pressing:
+            if phases & {"grip", "nudge"}:  # each grip counts as the first one
+                self._grip = {}
+                opened = {s: (self._low(s),) for s in pressing}
+                yield from self._turn("center", opened, least=0.4, stand=self._standing)
             self._report("squeezing the object")
             self._grip = dict(self._squeeze(pressing))
             beyond = {s: {0: motors[0].q} for s, motors in self._grip.items()}

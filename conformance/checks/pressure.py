@@ -1,0 +1,314 @@
+"""Checks of a Dex3-1's pressure sensors while its fingers press on an object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.motion import steps_of
+from dexkit.conformance.stimulus_record import Phase
+from dexkit.hand import Floats, Subject
+from dexkit.models import HandModel
+
+__all__: list[str] = []
+
+_BEFORE_S = 0.1  # s before a phase or at its end in which a pressure is taken
+
+
+def _pressures(
+    ctx: Context, begin: float, end: float, side: Subject | None = None
+) -> Floats | None:
+    """The median pressure in each slot, shape (n_packets, 12); NaN for no value; None if there are
+    no packets.
+
+    :param side: None for the side to be judged.
+    """
+    states = ctx.states if side is None else ctx.recording.sides[side].states
+    columns = states.columns
+    rows = states.between(begin, end)
+    if columns is None or not len(states.t[rows]):
+        return None
+    count = columns.count("press_sensor_state")[rows]
+    least = int(count.min(initial=99))
+    if not 0 < least < 99:
+        return None
+    values = np.stack(
+        [columns[f"press_sensor_state[{i}].pressure"][rows] for i in range(least)], axis=1
+    )
+    found = np.median(values, axis=0)
+    found[found == _NO_VALUE] = np.nan
+    return np.asarray(found)
+
+
+_NO_VALUE = 30000.0
+"""What a slot without a sensor holds (docs/sources/unitree-dex.md#b4)."""
+
+
+def _finger_packets(ctx: Context, finger: str) -> list[int]:
+    """The packets of a finger's sensors."""
+    hand = ctx.recording.model
+    assert isinstance(hand, HandModel)  # a robot has no fingers
+    return [i for i, s in enumerate(hand.sensors) if s.place.partition(" ")[0] == finger]
+
+
+def _fingers(ctx: Context) -> tuple[str, ...]:
+    """The fingers with sensors; the palm is none."""
+    hand = ctx.recording.model
+    assert isinstance(hand, HandModel)  # a robot has no fingers
+    names = {j.name.partition("_")[0] for j in ctx.joints}
+    places = (s.place.partition(" ")[0] for s in hand.sensors)
+    return tuple(dict.fromkeys(p for p in places if p in names))
+
+
+def _touches(ctx: Context) -> Iterator[tuple[Phase, str, Floats, Floats]]:
+    """Each phase in which a finger presses, the finger, and the pressures before and during it."""
+    for phase in ctx.phases("touch"):
+        begin, end = ctx.span(phase)
+        free = _pressures(ctx, begin - _BEFORE_S, begin)
+        held = _pressures(ctx, end - _BEFORE_S, end)
+        if free is not None and held is not None:
+            yield phase, phase.params.get("finger", ""), free, held
+
+
+def _presses(ctx: Context, phase: Phase) -> bool:
+    """Whether the object holds the finger back, by the course of q."""
+    return any(
+        s.error > ctx.requirement.tolerance("min_held_stroke") * s.stroke
+        for s in steps_of(ctx, phase)
+    )
+
+
+@check("DEX3-SENS-04")
+def touch(ctx: Context) -> Outcome:
+    """The rise of the pressure in a finger's own packets while it alone presses."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = list(_touches(ctx))
+    if not found:
+        return ctx.absent("the states hold no sensor packets")
+    judged = 0
+    for phase, finger, free, held in found:
+        mine = [i for i in _finger_packets(ctx, finger) if i < len(held)]
+        if not mine or not _presses(ctx, phase):
+            continue
+        judged += 1
+        rises = held - free
+        own = float(np.nanmax(rises[mine], initial=0.0))
+        foreign = max(
+            (
+                float(np.nanmax(rises[i], initial=0.0))
+                for name in _fingers(ctx)
+                if name != finger
+                for i in _finger_packets(ctx, name)
+                if i < len(rises)
+            ),
+            default=0.0,
+        )
+        if own > max(foreign, 0.0) or np.isnan(rises[mine]).all():
+            continue
+        others = [i for i in range(len(rises)) if np.nanmax(rises[i], initial=0.0) > 0]
+        outcome = ctx.failed(
+            "other packets" if others else "no touch",
+            f"the {finger} presses on the object, and the pressure rises in "
+            + (f"packets {others}, and not most in its own ({mine})" if others else "no packet"),
+            ctx.at(ctx.states.topic, *ctx.span(phase)),
+        )
+        return outcome
+    if not judged:
+        return ctx.skipped("the object held no finger back")
+    return ctx.passed(f"{judged} fingers", f"{judged} fingers feel the object, each by its own")
+
+
+@check("DEX3-SENS-07")
+def saturates(ctx: Context) -> Outcome:
+    """Whether a slot that held a value becomes a slot without a sensor, or the other way round."""
+    columns = ctx.states.columns
+    assert columns is not None
+    count = columns.count("press_sensor_state")
+    full = count == count.max(initial=0)
+    for packet in range(int(count.max(initial=0))):
+        marked = columns[f"press_sensor_state[{packet}].pressure"][full] == _NO_VALUE
+        changes = (marked != marked[:1]).any(axis=1)
+        if changes.any():
+            at = float(ctx.states.t[full][int(np.argmax(changes))])
+            return ctx.failed(
+                "changes",
+                f"at {at:.2f} s an element of packet {packet} begins or ends to hold "
+                f"{_NO_VALUE:g}, which means that there is no sensor",
+                ctx.at(ctx.states.topic, at),
+            )
+    return ctx.passed("constant", "the same slots hold a value throughout")
+
+
+@check("DEX3-SENS-08")
+def releases(ctx: Context) -> Outcome:
+    """What is left of each element's pressure some time after the object was let go."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    rest = [ctx.span(p)[0] for p in (ctx.phases("touch") or ctx.phases("squeeze"))[:1]]
+    held = [ctx.span(p) for p in ctx.phases("squeeze")]
+    let_go = [ctx.span(p)[0] for p in ctx.phases()]
+    if not rest or not held or not let_go:
+        return ctx.skipped("the hand held no object")
+    free = _pressures(ctx, rest[0] - 2 * _BEFORE_S, rest[0])
+    most = _pressures(ctx, held[0][1] - 2 * _BEFORE_S, held[0][1])
+    at = let_go[0] + ctx.tolerance("release_s")
+    later = _pressures(ctx, at, at + _BEFORE_S)
+    if free is None or most is None or later is None:
+        return ctx.absent("the states hold no sensor packets")
+    rise, left = most - free, later - free
+    rise, left = np.nan_to_num(rise), np.nan_to_num(left)
+    # the noise of an element that hardly touches is no pressure of the grip
+    touched = rise > ctx.tolerance("min_rise_part") * rise.max(initial=0.0)
+    if not touched.any():
+        return ctx.skipped("no pressure rose at the object")
+    part = np.where(touched, left / np.where(touched, rise, 1.0), 0.0)
+    packet, slot = (int(i) for i in np.unravel_index(int(np.argmax(part)), part.shape))
+    worst = float(part[packet, slot])
+    text = (
+        f"{worst:.0%} of the pressure in slot {slot} of packet {packet} is left "
+        f"{ctx.tolerance('release_s'):g} s after the release"
+    )
+    if worst <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{worst:.0%}", text, part=worst)
+    return ctx.failed(f"{worst:.0%}", text, ctx.at(ctx.states.topic, at), part=worst)
+
+
+def _untouched(ctx: Context, begin: float) -> float:
+    """When the hand began to touch the object that it grips at ``begin``, s."""
+    before = [ctx.span(p)[0] for name in ("touch", "firmer") for p in ctx.phases(name)]
+    return min((b for b in before if b < begin), default=begin)
+
+
+@check("DEX3-SENS-09")
+def pressure_lasts(ctx: Context) -> Outcome:
+    """The least part of an element's pressure that is left at the end of a grip."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    worst: tuple[float, int, int, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        if end - begin < ctx.tolerance("min_hold_s"):
+            continue
+        rest = _untouched(ctx, begin)
+        free = _pressures(ctx, rest - 2 * _BEFORE_S, rest)
+        first = _pressures(ctx, begin + 0.5, begin + 0.5 + _BEFORE_S)
+        last = _pressures(ctx, end - _BEFORE_S, end)
+        if free is None or first is None or last is None:
+            continue
+        rise, later = np.nan_to_num(first - free), np.nan_to_num(last - free)
+        most = float(rise.max(initial=0.0))
+        if most <= 0.0:
+            continue
+        part = np.where(rise >= 0.3 * most, later / np.where(rise > 0, rise, 1.0), np.inf)
+        packet, slot = (int(k) for k in np.unravel_index(int(np.argmin(part)), part.shape))
+        found = (float(part[packet, slot]), packet, slot, begin, end)
+        worst = found if worst is None or found < worst else worst
+    if worst is None:
+        return ctx.absent("no pressure rose at the object")
+    part_left, packet, slot, begin, end = worst
+    part_left = max(part_left, 0.0)
+    text = (
+        f"at the end of a grip of {end - begin:.1f} s, {part_left:.0%} of its pressure is left in "
+        f"slot {slot} of packet {packet}"
+    )
+    if part_left >= ctx.tolerance("min_part"):
+        return ctx.passed(f"{part_left:.0%}", text, part=part_left)
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{part_left:.0%}", text, place, part=part_left)
+
+
+@check("DEX3-SENS-10")
+def follows_the_force(ctx: Context) -> Outcome:
+    """How much of a change of a finger's torque its pressure shows, while it holds the object."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    phases = sorted(ctx.phases(), key=lambda p: p.begin_ns)
+    if not phases:
+        return ctx.skipped("the fingers did not press in turn")
+    rest = _untouched(ctx, ctx.span(phases[0])[0])
+    free = _pressures(ctx, rest - 2 * _BEFORE_S, rest)
+    worst: tuple[float, str, str, float, float] | None = None
+    for phase, after in zip(phases, [*phases[1:], None], strict=True):
+        finger = phase.params.get("finger", "")
+        begin, end = ctx.span(phase)
+        later = end if after is None else ctx.span(after)[1]
+        if not finger:  # they are all soft again
+            continue
+        for word, a, b in (("rises", begin, end), ("falls", end, later)):
+            found = _share(ctx, finger, free, a, b)
+            if found is not None and (worst is None or found < worst[0]):
+                worst = found, finger, word, a, b
+    if worst is None:
+        return ctx.absent("no finger's torque changed while it held the object")
+    share, finger, word, begin, end = worst
+    text = f"where the torque of the {finger} {word} on the object, its pressure shows {share:.0%}"
+    limit = ctx.tolerance("min_part" if word == "rises" else "min_fall_part")
+    if share >= limit:
+        return ctx.passed(f"{share:.0%}", f"{text} of that", part=share)
+    place = ctx.at(ctx.states.topic, begin, end)
+    return ctx.failed(f"{share:.0%}", f"{text} of that", place, part=share)
+
+
+def _share(
+    ctx: Context, finger: str, free: Floats | None, begin: float, end: float
+) -> float | None:
+    """The change of a finger's pressure from before ``begin`` to ``end``, in parts of what the
+    change of its torque makes of it; None where that hardly changes.
+    """
+    joints = [i for i, j in enumerate(ctx.joints) if j.closing and j.name.startswith(finger)]
+    before, then = (
+        ctx.states.between(begin - _BEFORE_S, begin),
+        ctx.states.between(end - _BEFORE_S, end),
+    )
+    was, now = _pressures(ctx, begin - _BEFORE_S, begin), _pressures(ctx, end - _BEFORE_S, end)
+    mine = _finger_packets(ctx, finger)
+    if free is None or was is None or now is None or not joints or max(mine) >= len(now):
+        return None
+    had, has = (np.abs(np.median(ctx.states.tau[r][:, joints], axis=0)) for r in (before, then))
+    if end - begin < _BEFORE_S or had.min() < ctx.tolerance("min_tau_nm"):
+        return None
+    part = float((has / had).max() if has.sum() > had.sum() else (has / had).min()) - 1.0
+    if abs(part) < ctx.tolerance("min_change_part"):
+        return None
+    felt, feels = np.nan_to_num(was - free)[mine], np.nan_to_num(now - free)[mine]
+    most = float(max(felt.max(initial=0.0), feels.max(initial=0.0)))
+    touched = np.maximum(felt, feels) >= ctx.tolerance("min_rise_part") * most
+    if most <= 0.0:
+        return 0.0
+    changed = (feels[touched] - felt[touched]) / np.maximum(felt[touched], 1e-3 * most)
+    return float((changed / part).max())
+
+
+@check("DEX3-SENS-11")
+def feels_nothing(ctx: Context) -> Outcome:
+    """The rise of pressures in a free hand that stands, while the other one squeezes an object."""
+    if ctx.object_at is not None:
+        return ctx.skipped("this hand has an object itself")
+    other = [s for s in ctx.recording.judged if s != ctx.side]
+    squeezes = [p for s in other for p in ctx.recording.phases("squeeze", s)]
+    touches = [p for s in other for p in ctx.recording.phases("touch", s)]
+    if not squeezes or not touches:
+        return ctx.skipped("no other hand squeezes an object")
+    (side,) = other
+    rest, end = ctx.span(touches[0])[0], ctx.span(squeezes[0])[1]
+    spans = ((rest - 2 * _BEFORE_S, rest), (end - 2 * _BEFORE_S, end))
+    mine = [_pressures(ctx, *span) for span in spans]
+    theirs = [_pressures(ctx, *span, side=side) for span in spans]
+    if mine[0] is None or mine[1] is None or theirs[0] is None or theirs[1] is None:
+        return ctx.absent("the states hold no sensor packets")
+    rise = np.nan_to_num(mine[1] - mine[0])
+    pressed = float(np.nan_to_num(theirs[1] - theirs[0]).max(initial=0.0))
+    if pressed <= 0.0:
+        return ctx.skipped(f"the {side} hand felt no object")
+    packet, slot = (int(k) for k in np.unravel_index(int(np.argmax(rise)), rise.shape))
+    part = float(rise[packet, slot]) / pressed
+    text = (
+        f"while the {side} hand squeezes an object, the pressure in slot {slot} of packet {packet} "
+        f"of this one rises by {max(part, 0.0):.0%} of the most there"
+    )
+    if part <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{max(part, 0.0):.0%}", text, part=part)
+    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *spans[1]), part=part)
