@@ -98,8 +98,11 @@ def at_rest(ctx: Context) -> Outcome:
         edges = np.arange(float(t[0]), float(t[-1]), cell)
         rows = np.searchsorted(t, edges)
         full = np.diff(rows) >= ctx.tolerance("min_states")
+        if not full.any():
+            continue
+        q, dq = q[: rows[-1]], dq[: rows[-1]]
         # an end may be one past the last row; where a cell is empty, the next row stands for it
-        first = np.minimum(rows[:-1], len(t) - 1)
+        first = np.minimum(rows[:-1], len(q) - 1)
         low, high = np.minimum.reduceat(q, first), np.maximum.reduceat(q, first)
         size = np.maximum(np.diff(rows), 1)
         mean = np.add.reduceat(dq, first) / size
@@ -109,15 +112,16 @@ def at_rest(ctx: Context) -> Outcome:
         moves = (high - low) / cell
         most = ctx.tolerance("max_wander")
         beyond = np.maximum(np.abs(mean) - most * moves, level - most * wanders)
-        views = (np.lib.stride_tricks.sliding_window_view(x, count) for x in (low, high, full))
-        lows, highs, fulls = views
+        lows, highs, fulls, dqs = (
+            np.lib.stride_tricks.sliding_window_view(x, count) for x in (low, high, full, beyond)
+        )
         rest = fulls.all(axis=1)
         rest &= highs.max(axis=1) - lows.min(axis=1) <= ctx.tolerance("max_ripple_stroke", joint)
         rests += int(rest.sum())
         if not rest.any():
             continue
-        # of the last cells: by then it has stood for a while
-        last = np.where(rest, beyond[count - 1 :], 0.0)
+        # in all cells but the first: a motion begins within the play of a gear
+        last = np.where(rest, dqs[:, 1:].min(axis=1), 0.0)
         i = int(np.argmax(last))
         found = (float(last[i]) / spec.stroke, float(last[i]), joint, float(edges[i + count - 1]))
         worst = found if worst is None or found > worst else worst

@@ -97,9 +97,9 @@ _SPLITS = ((1, 2, 3, 6), (1, 2, 4, 5), (0, 2, 4, 6))
 """Joints with another mode byte than the rest of the hand, in three commands: each joint is among
 them and not, and no two joints are treated alike three times. Where there are many, k counts these
 commands, and every joint without bit 0 of its index is among them, then those with bit 1 and 2."""
-_SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.6, 0.2
+_SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.4, 0.15
 """A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
-_RAMP, _RAMP_SECONDS = 15, 0.3
+_RAMP, _RAMP_SECONDS = 12, 0.24
 """Steps in which a soft hold becomes a firm one, and seconds for all of them."""
 _STATUSES = range(2, 8)
 """What fits into the three bits of the status and has no meaning in a command to a hand. A status
