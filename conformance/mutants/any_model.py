@@ -249,7 +249,7 @@ class FrozenAtFirst(Service):
         return self.first.setdefault(sides, newest) if frozen else newest
 
 
-@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), whole=True)
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), also=("DEX1-FIELD-20",), whole=True)
 class FreezesOnce(Service):
     """Publishes the same values for 0.3 s when it first begins to move."""
 

@@ -167,7 +167,7 @@ class JumpsOnce(_Timed):
             motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
 
 
-@wrong_hand("DEX3-FIELD-16")
+@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-18", "DEX3-FIELD-19"))
 class ShakenVelocity(_Timed):
     """For some seconds has an oscillation on dq that q does not make."""
 
@@ -370,7 +370,7 @@ class CrossedCables(Dex3Service):
         return super().pressures(hand)[[0, 1, 4, 5, 2, 3, 6, 7, 8]]
 
 
-@wrong_hand("DEX3-SENS-07", also=("DEX3-SENS-03",), sides=BOTH)
+@wrong_hand("DEX3-SENS-07", also=("DEX3-SENS-03", "DEX3-SENS-10"), sides=BOTH)
 class SaturatesToNothing(FingerService):
     """Publishes a pressure at the end of the converter's range as a slot without a sensor."""
 
@@ -379,7 +379,7 @@ class SaturatesToNothing(FingerService):
         return np.where(felt > 5000.0, 30000.0, felt)
 
 
-@wrong_hand("DEX3-SENS-08", also=("DEX3-SENS-09",), sides=BOTH, whole=True)
+@wrong_hand("DEX3-SENS-08", also=("DEX3-SENS-10",), sides=BOTH, whole=True)
 class SlowFoam(Dex3Service):
     """Its pressures fall with a time constant of 2 s."""
 
@@ -857,8 +857,8 @@ class GoesById(FingerService):
 # ------------------------------------------------------------------------------------- force
 
 
-@wrong_hand("DEX3-FORCE-01", sides=BOTH)
-@wrong_hand("DEX5-FORCE-01", also=("DEX5-FORCE-03",), sides=BOTH)
+@wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-07",), sides=BOTH)
+@wrong_hand("DEX5-FORCE-01", also=("DEX5-FORCE-03", "DEX5-FORCE-07"), sides=BOTH)
 class TurnedForce(FingerService):
     """Publishes tau_est with the wrong sign."""
 
@@ -876,7 +876,7 @@ class FingersInNewtonMetres(FingerService):
         motors["tau_est"] *= self.torque_units[: len(motors)]
 
 
-@wrong_hand("DEX3-FORCE-04")
+@wrong_hand("DEX3-FORCE-04", also=("DEX3-FORCE-07",))
 class UnsignedForce(Dex3Service):
     """Has unsigned sensors of the current: each torque is that of closing."""
 

@@ -177,7 +177,7 @@ class JumpsOnce(_Fields):
         return {**fields, "q": fields["q"] + off, "dq": 0.0, "ddq": 0.0}
 
 
-@wrong_hand("DEX1-FIELD-16")
+@wrong_hand("DEX1-FIELD-16", also=("DEX1-FIELD-20",))
 class ShakenVelocity(_Fields):
     """For some seconds has an oscillation on dq that q does not make."""
 
@@ -623,7 +623,7 @@ class ForceAtRest(_Fields):
         return {**fields, "tau_est": fields["tau_est"] - 0.4}
 
 
-@wrong_hand("DEX1-FORCE-03", also=("DEX1-FORCE-08",))
+@wrong_hand("DEX1-FORCE-03", also=("DEX1-FORCE-08", "DEX1-FORCE-16"))
 class UnsignedForce(_Fields):
     """Reports the magnitude of the force."""
 
@@ -648,33 +648,36 @@ class _Chatters(ReferenceHand):
 
     def step(self, dt: float) -> None:
         super().step(dt)
-        pressing = self.touch is not None and self.q < self.touch
+        pressing = self.touch is not None and self.q < self.touch + 0.1
         self.load = self.load + dt if pressing else 0.0
 
 
-@wrong_hand("DEX1-FORCE-10", also=("DEX1-FORCE-09",), sides=BOTH)
+@wrong_hand("DEX1-FORCE-10", sides=BOTH)
 class ChatteringLimit(ReferenceService):
     """After 1.5 s of a grip its thermal limit takes the force away for a third of the time."""
 
     hand = _Chatters
 
 
-class _Tires(ReferenceHand):
-    grips, presses = 0, False
+class _LimitsLater(ReferenceHand):
+    held, let_go = 0.0, False
 
     def motor_torque(self) -> float:
-        pressing = self.touch is not None and self.q < self.touch
-        self.grips += pressing and not self.presses
-        self.presses = pressing or (self.presses and self.q < (self.touch or 0.0) + 0.1)
         tau = super().motor_torque()
-        return max(tau, -0.4) if self.grips > 1 else tau
+        return max(tau, -0.4) if self.let_go else tau
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        pressing = self.touch is not None and self.q < self.touch and self.tau < -0.5
+        self.held += dt * pressing
+        self.let_go |= self.held > 1.0 and self.q > (self.touch or 0.0) + 0.1
 
 
-@wrong_hand("DEX1-FORCE-17", also=("DEX1-FORCE-09", "DEX1-FORCE-12"), sides=BOTH)
+@wrong_hand("DEX1-FORCE-17", also=("DEX1-FORCE-09",), sides=BOTH, whole=True)
 class SecondGripWeak(ReferenceService):
-    """Grips with 0.4 N m at most from its second grip on."""
+    """Pushes with 0.4 N m at most towards closing after the first long grip has ended."""
 
-    hand = _Tires
+    hand = _LimitsLater
 
 
 @wrong_hand("DEX1-FORCE-04", also=("DEX1-FORCE-02",))
@@ -731,7 +734,7 @@ class ForceBeforeCommands(_Fields):
         return fields if self.hands[side].goal else {**fields, "tau_est": -0.6}
 
 
-@wrong_hand("DEX1-FORCE-08")
+@wrong_hand("DEX1-FORCE-08", also=("DEX1-FORCE-16",))
 class AlwaysClosing(_Fields):
     """Has an unsigned sensor of the current: its torque is always that of closing."""
 
@@ -947,7 +950,7 @@ class _Tires(ReferenceHand):
         self.seconds = self.seconds + dt if self.contact() > 0.0 and not self.braking else 0.0
 
 
-@wrong_hand("DEX1-FORCE-10", also=("DEX1-FORCE-09",))
+@wrong_hand("DEX1-FORCE-10")
 class GripFades(ReferenceService):
     """Presses with half of the force after three seconds of contact."""
 
