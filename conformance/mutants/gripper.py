@@ -669,11 +669,16 @@ class _LimitsLater(ReferenceHand):
     def step(self, dt: float) -> None:
         super().step(dt)
         pressing = self.touch is not None and self.q < self.touch and self.tau < -0.5
-        self.held += dt * pressing
-        self.let_go |= self.held > 1.0 and self.q > (self.touch or 0.0) + 0.1
+        self.let_go |= self.held > 2.0 and not pressing
+        self.held = self.held + dt if pressing else 0.0
 
 
-@wrong_hand("DEX1-FORCE-17", also=("DEX1-FORCE-09",), sides=BOTH, whole=True)
+@wrong_hand(
+    "DEX1-FORCE-17",
+    also=("DEX1-FORCE-09", "DEX1-FORCE-12", "DEX1-ABUSE-01"),
+    sides=BOTH,
+    whole=True,
+)
 class SecondGripWeak(ReferenceService):
     """Pushes with 0.4 N m at most towards closing after the first long grip has ended."""
 
