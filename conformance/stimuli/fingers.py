@@ -643,7 +643,7 @@ class FingerScript(HandScript):
         fingers = dict.fromkeys(j.name.partition("_")[0] for j in self._joints[pressing[0]])
         before = soft
         for finger in (*fingers, ""):  # in the end all softly again
-            hands = {
+            hands: dict[Side, Motors] = {
                 s: [
                     firm[s][i] if finger and self._joints[s][i].name.startswith(finger) else m
                     for i, m in enumerate(soft[s])
