@@ -167,7 +167,7 @@ class JumpsOnce(_Timed):
             motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
 
 
-@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-18", "DEX3-FIELD-19"))
+@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-19",))
 class ShakenVelocity(_Timed):
     """For some seconds has an oscillation on dq that q does not make."""
 
