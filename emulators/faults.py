@@ -14,7 +14,7 @@ itself; ``id`` picks one servo of several, or one motor of a hand, and ``side`` 
 Chance is seeded, so a run can be repeated.
 
 Each family of devices has its kinds: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`,
-:data:`M4010_FAULTS`, :data:`RH56_FAULTS`.
+:data:`M4010_FAULTS`, :data:`RH56_FAULTS`, :data:`RH56_TCP_FAULTS`, :data:`REVO2_FAULTS`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ __all__ = [
     "FAULT_KINDS",
     "M4010_FAULTS",
     "MX64_FAULTS",
+    "REVO2_FAULTS",
     "RH56_FAULTS",
+    "RH56_TCP_FAULTS",
     "Fault",
     "FaultFamily",
     "FaultKind",
@@ -175,6 +177,14 @@ RH56_FAULTS = FaultFamily(
     max_id=0,
 )
 """Faults of an emulated Inspire RH56."""
+
+RH56_TCP_FAULTS = FaultFamily(
+    "rh56-tcp", tuple(kind for kind in RH56_FAULTS.kinds if kind is not _CORRUPT), max_id=0
+)
+"""Faults of one on TCP, which delivers no spoilt bytes."""
+
+REVO2_FAULTS = FaultFamily("revo2", (_DROP, _CORRUPT, _DELAY, _UNPLUG), max_id=0)
+"""Faults of an emulated BrainCo Revo2."""
 
 FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kinds}
 """The kinds of the MX-64 by name."""

@@ -1,11 +1,11 @@
-"""An emulated Inspire RH56DFX on a serial line: registers and joints.
+"""An emulated Inspire RH56 on its serial line, or by Modbus on TCP: registers and joints.
 
 :mod:`dexkit.emulators.servo_mechanics` moves the joints, :mod:`dexkit.wire.rh56` has the frames.
 The registers that are there are those of :class:`~dexkit.wire.rh56.Register`; others read as 0, and
 writes to them are answered and change nothing. No source says what the device does with them.
 
 Forces are those of the mechanics, in thousandths; currents and temperatures are assumed. Not
-modelled: Modbus, the tactile sensors of other models, how far a fast finger exceeds its limit of
+modelled: the tactile sensors of other models, how far a fast finger exceeds its limit of
 force, and storing of settings.
 """
 
@@ -13,19 +13,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from dexkit.clock import RealClock
-from dexkit.emulators.faults import RH56_FAULTS, Fault, parse_fault
+from dexkit.emulators.faults import RH56_FAULTS, RH56_TCP_FAULTS, Fault, parse_fault
 from dexkit.emulators.joint_mechanics import FixedSteps
-from dexkit.emulators.serial_line import BITS_PER_BYTE, LineCounters, SerialLine
+from dexkit.emulators.modbus_line import tcp_answers
+from dexkit.emulators.request_line import RequestLine, ServedDevice
 from dexkit.emulators.serial_port import Port
 from dexkit.emulators.servo_mechanics import STEP, ServoMechanics
+from dexkit.emulators.tcp_port import TcpPort
 from dexkit.errors import WireError
 from dexkit.hand import HandCommand, JointMode, Side
 from dexkit.models import INSPIRE_DFX
+from dexkit.wire.modbus import Function, TcpParser
 from dexkit.wire.rh56 import (
     BAUD_RATE,
     DONE,
@@ -41,11 +43,10 @@ from dexkit.wire.rh56 import (
     numbers,
 )
 
-__all__ = ["Rh56", "Rh56Bus", "Rh56Hand"]
+__all__ = ["Rh56", "Rh56Hand", "Rh56TcpHand", "rh56_bus"]
 
 _CELSIUS = 35  # assumed
 _NEAR = 0.01  # of the travel within which a joint that stands has arrived
-_BYTE_GAP = 5e-3  # s after which a frame begun is dropped; assumed
 _MODE = int(JointMode.FOC), int(JointMode.BRAKE)
 
 
@@ -94,6 +95,11 @@ class Rh56:
         """Whether no joint moves."""
         return not self.mechanics.state(self._now).dq.any()
 
+    def strike(self, kind: str) -> None:
+        """Have the fault ``locked``."""
+        if kind == "locked":
+            self.lock()
+
     def lock(self) -> None:
         """Every joint reports a locked rotor and has no power, until its error is cleared."""
         self.errors = [Error.LOCKED_ROTOR] * JOINTS
@@ -107,29 +113,44 @@ class Rh56:
         if frame.operation is Operation.READ:
             if len(frame.data) != 1:
                 return None
-            data = self._memory(frame.address, frame.data[0])
+            data = self.read(frame.address, frame.data[0])
         else:
-            self._write(frame.address, frame.data)
+            self.write(frame.address, frame.data)
         return Frame(self.number, frame.operation, frame.address, data, answer=True)
 
-    def _write(self, address: int, data: bytes) -> None:
+    def write(self, address: int, data: bytes) -> None:
+        """Write bytes to the registers from an address on."""
         if address == Register.CLEAR_ERROR and data[:1] == b"\x01":
             self.errors = [Error(0)] * JOINTS
             self._drive()
             return
         try:
-            values = numbers(data)[:JOINTS]
+            values = numbers(data)
         except WireError:
             return
-        if address == Register.ANGLE_SET:
-            self.goals[: len(values)] = [
-                before if value == UNCHANGED else min(max(value, 0), FULL)
-                for value, before in zip(values, self.goals, strict=False)
-            ]
-        elif address in self.words:
-            words = self.words[Register(address)]
-            words[: len(values)] = [min(max(value, 0), FULL) for value in values]
+        for at, value in enumerate(values):
+            self._write_word(address + 2 * at, value)
         self._drive()
+
+    def _write_word(self, address: int, value: int) -> None:
+        joint, odd = divmod(address - Register.ANGLE_SET, 2)
+        if not odd and 0 <= joint < JOINTS:
+            if value != UNCHANGED:
+                self.goals[joint] = min(max(value, 0), FULL)
+            return
+        for register, words in self.words.items():
+            joint, odd = divmod(address - register, 2)
+            if not odd and 0 <= joint < JOINTS:
+                words[joint] = min(max(value, 0), FULL)
+
+    def read_registers(self, function: Function, address: int, count: int) -> list[int]:
+        """Read by Modbus: a register is the two bytes from its address on."""
+        del function  # no source distinguishes them
+        return list(np.frombuffer(self.read(address, 2 * count), "<u2").tolist())
+
+    def write_registers(self, address: int, values: tuple[int, ...]) -> None:
+        """Write by Modbus."""
+        self.write(address, np.array(values, "<u2").tobytes())
 
     def _drive(self) -> None:
         """Put goals and speeds in force."""
@@ -139,7 +160,7 @@ class Rh56:
         command.mode[:] = [_MODE[not on] for on in driven]
         self.mechanics.apply(command)
 
-    def _memory(self, address: int, count: int) -> bytes:
+    def read(self, address: int, count: int) -> bytes:
         """So many bytes of the registers from an address on."""
         state = self.mechanics.state(self._now)
         angles = np.round(state.q * FULL).astype(int).tolist()
@@ -182,92 +203,43 @@ class Rh56:
         return Status.ARRIVED if arrived else Status.FORCE_REACHED
 
 
-@dataclass
-class Counters(LineCounters):
-    """Counters of the line."""
-
-    requests: int = 0
-    answers: int = 0
-    unknown_ids: int = 0
-    damaged: int = 0
-    skipped: int = 0
-
-
-class Rh56Bus(SerialLine):
-    """One device on its line.
+def rh56_bus(
+    device: Rh56,
+    *,
+    baudrate: int = BAUD_RATE,
+    answer_time: float = 0.0,
+    line_time: bool = True,
+    latency_timer: float = 0.0,
+    faults: Sequence[Fault] = (),
+    start: float = 0.0,
+    seed: int = 0,
+) -> RequestLine[Frame]:
+    """A device on its serial line.
 
     :param answer_time: seconds from a request to its answer; not known.
 
     Other parameters as :class:`~dexkit.emulators.serial_line.SerialLine`.
     """
 
-    def __init__(
-        self,
-        device: Rh56,
-        *,
-        baudrate: int = BAUD_RATE,
-        answer_time: float = 0.0,
-        line_time: bool = True,
-        latency_timer: float = 0.0,
-        faults: Sequence[Fault] = (),
-        start: float = 0.0,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(
-            line_time=line_time, latency_timer=latency_timer, faults=faults, start=start, seed=seed
-        )
-        self.device = device
-        self.baudrate = baudrate
-        self.counters: Counters = Counters()
-        self._answer_time = answer_time
-        self._parser = FrameParser(answers=False)
-        self._last_byte = start
+    def answer(frame: Frame) -> bytes | None:
+        found = device.handle(frame)
+        return None if found is None else found.pack()
 
-    def advance_to(self, now: float) -> None:
-        """Let faults strike and the device live up to ``now``."""
-        events = self.schedule.poll(now)
-        self.device.advance_to(now)
-        for fault, begins in events:
-            if fault.kind == "unplug":
-                self._apply_plug()
-                self._parser.reset()
-            elif fault.kind == "locked" and begins:
-                self.device.lock()
-
-    @property
-    def busy(self) -> bool:
-        """Whether a joint moves."""
-        return not self.device.resting
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Take bytes that the host's adapter began to send at ``now``."""
-        counters, rate = self.counters, self.baudrate
-        counters.bytes_in += len(data)
-        if self.host_baudrate not in (None, rate):
-            counters.garbled += len(data)
-            return
-        begin = max(now, self._line_free) if self.line_time else now
-        if self._parser.pending and begin - self._last_byte > _BYTE_GAP:
-            self._parser.reset()
-        arrival = begin + (len(data) * BITS_PER_BYTE / rate if self.line_time else 0.0)
-        self._line_free = self._last_byte = arrival
-        for frame in self._parser.feed(data):
-            counters.requests += 1
-            counters.unknown_ids += frame.device != self.device.number
-            self.device.advance_to(arrival)
-            try:
-                answer = self.device.handle(frame)
-                payload = b"" if answer is None else answer.pack()
-            except Exception as error:  # one frame must not end the others' service
-                self._record_failure(error, frame)
-                continue
-            if payload:
-                counters.answers += 1
-                self._send(max(arrival, self._line_free) + self._answer_time, payload, rate)
-        counters.damaged, counters.skipped = self._parser.damaged, self._parser.skipped
+    return RequestLine(
+        device,
+        FrameParser(answers=False),
+        answer,
+        baudrate=baudrate,
+        answer_time=answer_time,
+        line_time=line_time,
+        latency_timer=latency_timer,
+        faults=faults,
+        start=start,
+        seed=seed,
+    )
 
 
-class Rh56Hand:
+class Rh56Hand(ServedDevice):
     """The device on a pseudo-terminal, served in a thread.
 
     :param link: where the terminal's link is put; None for a name in a temporary directory.
@@ -294,7 +266,7 @@ class Rh56Hand:
     ) -> None:
         now = RealClock().now()
         self.device = Rh56(side, number=number, object_at=object_pct, start=start_pct, now=now)
-        self.bus = Rh56Bus(
+        bus = rh56_bus(
             self.device,
             baudrate=baudrate,
             answer_time=answer_time,
@@ -304,24 +276,47 @@ class Rh56Hand:
             start=now,
             seed=seed,
         )
-        self.port = Port(self.bus, link, check_baudrate=check_baudrate)
-        self.port.start()
-
-    @property
-    def path(self) -> str:
-        """Path for a client to open."""
-        return self.port.path
-
-    def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now)."""
-        self.port.inject(parse_fault(spec, RH56_FAULTS))
-
-    def close(self) -> None:
-        """Stop, and remove the path. May be called twice."""
-        self.port.close()
+        port = Port(bus, link, check_baudrate=check_baudrate)
+        super().__init__(port, RH56_FAULTS, f"{side} id={number} baudrate={baudrate}")
 
     def __enter__(self) -> Rh56Hand:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self.close()
+
+class Rh56TcpHand(ServedDevice):
+    """The device on a TCP port of this machine (Modbus), served in a thread.
+
+    :param port: 0 for a free one.
+    :param faults: specifications, see :mod:`dexkit.emulators.faults`.
+    :raises EmulatorError: the port cannot be had.
+    :raises UsageError: a fault or a figure that cannot be.
+    """
+
+    def __init__(
+        self,
+        side: Side = Side.RIGHT,
+        *,
+        port: int = 0,
+        object_pct: float | None = None,
+        start_pct: float | None = None,
+        answer_time: float = 0.0,
+        faults: Sequence[str] = (),
+        seed: int = 0,
+    ) -> None:
+        now = RealClock().now()
+        self.device = Rh56(side, object_at=object_pct, start=start_pct, now=now)
+        bus = RequestLine(
+            self.device,
+            TcpParser(),
+            tcp_answers(self.device),
+            baudrate=0,
+            answer_time=answer_time,
+            line_time=False,
+            faults=[parse_fault(spec, RH56_TCP_FAULTS) for spec in faults],
+            start=now,
+            seed=seed,
+        )
+        super().__init__(TcpPort(bus, port), RH56_TCP_FAULTS, f"{side} modbus-tcp")
+
+    def __enter__(self) -> Rh56TcpHand:
+        return self

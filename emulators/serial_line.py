@@ -106,6 +106,15 @@ class SerialLine(ABC):
         Call it in order of time, after :meth:`advance_to` of the same ``now``.
         """
 
+    @property
+    def broken(self) -> bool:
+        """Whether nothing that follows can be understood, so that a connection is to be closed."""
+        return False
+
+    def disconnected(self) -> None:
+        """The client has gone; what was on its way to it is lost."""
+        self._out.clear()
+
     # --- to the host
 
     @property

@@ -17,26 +17,17 @@ import time
 import tty
 from pathlib import Path
 
-from dexkit.clock import Clock, RealClock
-from dexkit.descriptors import wait_readable
-from dexkit.emulators.faults import Fault
+from dexkit.clock import Clock
+from dexkit.emulators.line_server import BUSY_TICK, CHUNK, LineServer
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
 from dexkit.temporary_folder import TemporaryFolder
-from dexkit.threads import Worker
 
 __all__ = ["Port", "client_baudrate"]
 
 _TCGETS2 = 0x802C542A  # asm-generic and x86: termios with numeric speeds
 _TERMIOS2_SIZE = 44
 _OSPEED_OFFSET = 40
-_CHUNK = 4096
-_SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
-_BUSY_TICK = 4e-3
-_IDLE_TICK = 20e-3
-_MAX_BACKLOG = 0.1
-"""Seconds of line time from which nothing more is read: a client that floods the line waits for
-it, as it waits for the buffers of an adapter, instead of filling this program's memory."""
 
 
 def client_baudrate(fd: int) -> int | None:
@@ -50,7 +41,7 @@ def client_baudrate(fd: int) -> int | None:
     return speed or None
 
 
-class Port:
+class Port(LineServer):
     """Runs a line on a pseudo-terminal.
 
     :param line: with its devices.
@@ -59,12 +50,9 @@ class Port:
     :param check_baudrate: a client at another baud rate than a device's is not understood.
     :raises EmulatorError: ``link`` is something else than a dangling symbolic link, or its
         directory is missing or not writable, or there are no pseudo-terminals.
-
-    ``run`` serves until ``stop``; ``start`` does so in a thread. Also a context manager.
-
-    :ivar path: what clients open.
-    :ivar overruns: bytes lost because no client read them.
     """
+
+    name = "serial line"
 
     def __init__(
         self,
@@ -74,30 +62,30 @@ class Port:
         clock: Clock | None = None,
         check_baudrate: bool = True,
     ) -> None:
-        self.line = line
-        self.overruns = 0
-        self.error: BaseException | None = None
-        self._clock: Clock = clock or RealClock()
+        super().__init__(line, clock)
         self._check_baudrate = check_baudrate
         self._directory: TemporaryFolder | None = None
         if link is None:
             self._directory = TemporaryFolder("tty")
-            self.path = str(self._directory.path / "tty")
+            self._path = str(self._directory.path / "tty")
         else:
-            self.path = os.path.abspath(os.fspath(link))
-        self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._stopping = False
-        self._closed = False
-        self._thread: threading.Thread | None = None
-        self._injected: list[Fault] = []
-        self._lock = threading.Lock()
+            self._path = os.path.abspath(os.fspath(link))
         self._master = self._slave = -1
         self._terminal = ""
         try:
-            self._apply_plug()
+            self._plug()
         except BaseException:
             self.close()
             raise
+
+    @property
+    def path(self) -> str:
+        """Path of the link, for clients to open."""
+        return self._path
+
+    @property
+    def _descriptor(self) -> int:
+        return self._master
 
     @property
     def terminal(self) -> str:
@@ -111,7 +99,7 @@ class Port:
 
     # --- plugging
 
-    def _apply_plug(self) -> None:
+    def _plug(self) -> None:
         try:
             self._master, self._slave = os.openpty()
         except OSError as error:
@@ -158,82 +146,17 @@ class Port:
                 os.close(fd)
         self._master = self._slave = -1
 
-    # --- running
-
-    def start(self) -> None:
-        """Serve in a background thread."""
-        self._thread = Worker("serial line", self.run, failed=self._record_error)
-        self._thread.start()
-
-    def _record_error(self, error: Exception) -> None:
-        self.error = error
-
-    def stop(self) -> None:
-        """Ask :meth:`run` to return; may be called from a signal handler or another thread."""
-        self._stopping = True
-        with contextlib.suppress(OSError):
-            os.write(self._wake_write, b"x")
-
-    def inject(self, fault: Fault) -> None:
-        """Have a fault, its time counted from now; from any thread."""
-        with self._lock:
-            self._injected.append(fault)
-        with contextlib.suppress(OSError):
-            os.write(self._wake_write, b"x")
-
-    def run(self) -> None:
-        """Serve until :meth:`stop`."""
-        line = self.line
-        clock = self._clock
-        while not self._stopping:
-            now = clock.now()
-            with self._lock:
-                injected, self._injected = self._injected, []
-            for fault in injected:
-                line.schedule.add(fault, now)
-            line.advance_to(now)
-            if line.unplugged != (self._master < 0):
-                if line.unplugged:
-                    self._unplug()
-                else:
-                    self._apply_plug()
-            out = line.due(now)
-            if out:
-                self._write(out)
-            self._wait(line.next_time)
-
-    def _wait(self, next_time: float | None) -> None:
-        """Sleep until something is to be done, and take what the client sent."""
-        deadline = self._clock.now() + (_BUSY_TICK if self.line.busy else _IDLE_TICK)
-        sharp = next_time is not None and next_time < deadline
-        if sharp and next_time is not None:
-            deadline = next_time
-        fds = [self._wake_read]
-        if self._master >= 0 and self.line.behind(self._clock.now()) < _MAX_BACKLOG:
-            fds.append(self._master)
-        while True:
-            left = deadline - self._clock.now()
-            if left <= 0:
-                return
-            pause = max(0.0, left - _SPIN) if sharp else left
-            ready = wait_readable(fds, pause)
-            if self._wake_read in ready:
-                with contextlib.suppress(BlockingIOError):
-                    os.read(self._wake_read, _CHUNK)
-                return
-            if ready:
-                self._read()
-                return
+    # --- reading and writing
 
     def _read(self) -> None:
         try:
-            data = os.read(self._master, _CHUNK)
+            data = os.read(self._master, CHUNK)
         except BlockingIOError:
             return
         except OSError as error:
             if error.errno == errno.EIO:
                 # cannot happen while the slave is held open; do not turn it into a busy loop
-                time.sleep(_BUSY_TICK)
+                time.sleep(BUSY_TICK)
                 return
             raise
         now = self._clock.now()
@@ -254,20 +177,10 @@ class Port:
 
     def close(self) -> None:
         """Stop, and remove link and terminal. May be called twice."""
-        if self._closed:
-            return
-        self.stop()
-        if self._thread is not None:
-            self._thread.join()
-        self._closed = True
-        self._unplug()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
+        super().close()
         if self._directory is not None:
             self._directory.close()
+            self._directory = None
 
     def __enter__(self) -> Port:
         return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()

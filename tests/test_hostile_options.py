@@ -16,6 +16,7 @@ from dexkit.emulators.faults import (
     DEX3_FAULTS,
     M4010_FAULTS,
     MX64_FAULTS,
+    REVO2_FAULTS,
     RH56_FAULTS,
     FaultSchedule,
     parse_fault,
@@ -35,6 +36,7 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("emulate", "dex1-motor"): ["--link", "<link>"],
     ("emulate", "dex3-usb"): ["--port", "0"],
     ("emulate", "mx64"): ["--link", "<link>"],
+    ("emulate", "revo2"): ["--link", "<link>"],
     ("emulate", "rh56"): ["--link", "<link>"],
     ("info",): [_SAMPLE],
     ("install-service",): ["sim-dex1", "--side", "left", "--dry-run"],
@@ -185,7 +187,7 @@ def fault_text(rng: random.Random) -> str:
 def test_fault_is_parsed_or_refused() -> None:
     rng = random.Random(11)
     understood = 0
-    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS, RH56_FAULTS)
+    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS, RH56_FAULTS, REVO2_FAULTS)
     for _ in range(3000):
         text = fault_text(rng)
         for family in families:

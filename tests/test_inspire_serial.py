@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.drivers import inspire_serial
-from dexkit.drivers.inspire_serial import InspireSerial, InspireSettings
+from dexkit.drivers.inspire_serial import InspireSerial, InspireSerialSettings
 from dexkit.emulators.faults import RH56_FAULTS, parse_fault
-from dexkit.emulators.rh56 import Rh56, Rh56Bus, Rh56Hand
+from dexkit.emulators.rh56 import Rh56, Rh56Hand, rh56_bus
 from dexkit.errors import (
     ChecksumError,
     EncodeError,
@@ -174,7 +174,7 @@ def test_frames_of_others_and_unknown_registers() -> None:
 
 
 def test_line_takes_its_time_and_needs_the_right_rate() -> None:
-    bus = Rh56Bus(Rh56())
+    bus = rh56_bus(Rh56())
     bus.host_baudrate = 9600
     bus.receive(READ_ANGLES, 0.0)
     assert bus.counters.garbled == len(READ_ANGLES)
@@ -198,7 +198,7 @@ def emulated() -> Iterator[Rh56Hand]:
 
 def driver(hand: Rh56Hand, **change: object) -> InspireSerial:
     values: dict[str, object] = {"device": hand.path, "timeout": PATIENT, **change}
-    return InspireSerial(Side.RIGHT, InspireSettings(**values))  # type: ignore[arg-type]
+    return InspireSerial(Side.RIGHT, InspireSerialSettings(**values))  # type: ignore[arg-type]
 
 
 def until(hand: InspireSerial, command: HandCommand, q: float) -> HandState:
@@ -303,7 +303,7 @@ def test_settings() -> None:
     options = BackendOptions(Side.LEFT, "/dev/x", {"id": "2", "speed": "500", "timeout": "0.1"})
     made = inspire_serial.backend.make(options)
     assert isinstance(made, InspireSerial)
-    assert made.configuration == InspireSettings("/dev/x", id=2, speed=500, timeout=0.1)
+    assert made.configuration == InspireSerialSettings("/dev/x", id=2, speed=500, timeout=0.1)
     for bad in (
         {"id": "0"},
         {"speed": "1001"},

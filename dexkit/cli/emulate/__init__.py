@@ -40,10 +40,15 @@ _DEVICES = {
         "emulate_lerobot_g1",
         "Serve LeRobot's ports (ZeroMQ) for an emulated G1.",
     ),
+    "revo2": (
+        "dexkit.cli.emulate.revo2",
+        "emulate_revo2",
+        "Emulate a BrainCo Revo2 hand on a pseudo-terminal.",
+    ),
     "rh56": (
         "dexkit.cli.emulate.rh56",
         "emulate_rh56",
-        "Emulate an Inspire RH56DFX hand on a pseudo-terminal.",
+        "Emulate an Inspire RH56 hand on a pseudo-terminal or a TCP port.",
     ),
     "mx64": (
         "dexkit.cli.emulate.mx64",

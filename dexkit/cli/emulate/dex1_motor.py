@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-
 import click
 
-from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
-from dexkit.cli.options import (
-    Number,
-    any_baudrate_option,
-    fault_options,
-    latency_timer_option,
-    line_time_option,
-    object_option,
-    seed_option,
-    side_option,
-    start_option,
-)
-from dexkit.errors import EmulatorError, UsageError
+from dexkit.cli.emulate.serving import line_options, serve
+from dexkit.cli.options import Number, object_option, side_option, start_option
+from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import m4010
@@ -47,25 +35,12 @@ __all__ = ["emulate_dex1_motor"]
     metavar="RAD",
     help="Report the position too large by this, until it is calibrated.",
 )
-@click.option(
-    "--baudrate",
-    type=click.IntRange(9600, 12_000_000),
-    default=m4010.BAUD_RATE,
-    metavar="B",
-    help="Bits a second that the motor understands.",
+@line_options(
+    "motor",
+    baudrate=m4010.BAUD_RATE,
+    most=12_000_000,
+    faults="unplug@5s:for=2s, stray:before=1, silent:id=1",
 )
-@line_time_option()
-@click.option(
-    "--answer-time",
-    type=Number(0, 1000),
-    default=0.0,
-    metavar="MS",
-    help="From a command to its answer; what the real motor needs is not known.",
-)
-@latency_timer_option(0.0)
-@fault_options("unplug@5s:for=2s, stray:before=1, silent:id=1")
-@seed_option("the faults")
-@any_baudrate_option()
 def emulate_dex1_motor(
     sides: tuple[Side, ...],
     links: tuple[str, ...],
@@ -104,17 +79,7 @@ def emulate_dex1_motor(
             check_baudrate=not any_baudrate,
         ) as motors,
     ):
-        if faults_from_stdin:
-            read_faults(motors.inject, request)
-        click.echo("\n".join(motors.ready_lines))
-        sys.stdout.flush()
-        while not request.wait(0.2):
-            if motors.error is not None:
-                raise EmulatorError(f"the emulator stopped: {motors.error}") from motors.error
-    for line in motors.summaries():
-        click.echo(f"stopped: {line}")
-    if motors.failure is not None:
-        raise EmulatorError(f"the emulator failed inside: {motors.failure!r}", hint=A_MISTAKE)
+        serve(motors, request, faults_from_stdin=faults_from_stdin)
 
 
 def _places(links: tuple[str, ...], sides: tuple[Side, ...]) -> dict[Side, str]:

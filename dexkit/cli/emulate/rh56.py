@@ -1,34 +1,31 @@
-"""``dexkit emulate rh56``: Inspire's RH56DFX on a pseudo-terminal."""
+"""``dexkit emulate rh56``: an Inspire RH56 on a pseudo-terminal, or on a TCP port."""
 
 from __future__ import annotations
 
-import sys
-
 import click
 
-from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
-from dexkit.cli.options import (
-    Number,
-    any_baudrate_option,
-    fault_options,
-    latency_timer_option,
-    line_time_option,
-    object_option,
-    seed_option,
-    side_option,
-    start_option,
-)
-from dexkit.errors import EmulatorError, UsageError
+from dexkit.cli.emulate.serving import line_options, serve
+from dexkit.cli.options import object_option, side_option, start_option
+from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import rh56
 
 __all__ = ["emulate_rh56"]
 
+_SERIAL_ONLY = ("number", "baudrate", "line_time", "latency_timer", "any_baudrate")
+
 
 @click.command("rh56", context_settings={"show_default": True})
 @side_option("Hand to emulate.", default="right")
-@click.option("--link", required=True, metavar="PATH", help="Link that clients open.")
+@click.option("--link", metavar="PATH", help="Link that clients open: the hand's serial line.")
+@click.option(
+    "--modbus-tcp",
+    "tcp",
+    type=click.IntRange(0, 65535),
+    metavar="PORT",
+    help="Instead of --link: Modbus on this TCP port of 127.0.0.1; 0 takes a free one.",
+)
 @object_option("Percent of closing at which the joints touch an object")
 @start_option("Percent of closing at first; by default a relaxed pose.")
 @click.option(
@@ -39,28 +36,16 @@ __all__ = ["emulate_rh56"]
     metavar="N",
     help="Its id on the line.",
 )
-@click.option(
-    "--baudrate",
-    type=click.IntRange(9600, 1_000_000),
-    default=rh56.BAUD_RATE,
-    metavar="B",
-    help="Bits a second that the hand understands.",
+@line_options(
+    "hand",
+    baudrate=rh56.BAUD_RATE,
+    most=1_000_000,
+    faults="unplug@5s:for=2s, drop:p=0.1, locked@3s",
 )
-@line_time_option()
-@click.option(
-    "--answer-time",
-    type=Number(0, 1000),
-    default=0.0,
-    metavar="MS",
-    help="From a request to its answer; what the real hand needs is not known.",
-)
-@latency_timer_option(0.0)
-@fault_options("unplug@5s:for=2s, drop:p=0.1, locked@3s")
-@seed_option("the faults")
-@any_baudrate_option()
 def emulate_rh56(
     sides: tuple[Side, ...],
-    link: str,
+    link: str | None,
+    tcp: int | None,
     object_pct: float | None,
     start: float | None,
     number: int,
@@ -73,39 +58,60 @@ def emulate_rh56(
     seed: int,
     any_baudrate: bool,
 ) -> None:
-    """Emulate an Inspire RH56DFX hand on its serial line.
+    """Emulate an Inspire RH56 hand on its serial line, or with --modbus-tcp on the network.
 
-    Prints "ready: PATH SIDE ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
-    link.
+    Prints "ready: PATH SIDE ..." (or HOST:PORT) when it answers there. Ctrl-C or SIGTERM ends it
+    and removes the link.
     """
-    from dexkit.emulators.rh56 import Rh56Hand
+    from dexkit.emulators.rh56 import Rh56Hand, Rh56TcpHand
 
     if len(sides) != 1:
         raise UsageError("a line has one hand", hint="run one emulator for each side")
-    with (
-        stop_on_signals() as request,
-        Rh56Hand(
-            sides[0],
-            link=link,
-            number=number,
-            object_pct=object_pct,
-            start_pct=start,
-            baudrate=baudrate,
-            answer_time=answer_time * 1e-3,
-            line_time=line_time,
-            latency_timer=latency_timer * 1e-3,
-            faults=faults,
-            seed=seed,
-            check_baudrate=not any_baudrate,
-        ) as hand,
-    ):
-        if faults_from_stdin:
-            read_faults(hand.inject, request)
-        click.echo(f"ready: {hand.path} {sides[0]} id={number} baudrate={baudrate}")
-        sys.stdout.flush()
-        while not request.wait(0.2):
-            if hand.port.error is not None:
-                raise EmulatorError(f"the emulator stopped: {hand.port.error}")
-    click.echo(f"stopped: {hand.path}: {hand.bus.counters.summary() or 'nothing was sent'}")
-    if hand.bus.failure is not None:
-        raise EmulatorError(f"the emulator failed inside: {hand.bus.failure!r}", hint=A_MISTAKE)
+    if (link is None) == (tcp is None):
+        raise UsageError(
+            "where is the hand to be?", hint="--link PATH for a serial line, or --modbus-tcp PORT"
+        )
+    with stop_on_signals() as request:
+        hand: Rh56Hand | Rh56TcpHand
+        if tcp is not None:
+            _refuse_serial_options()
+            hand = Rh56TcpHand(
+                sides[0],
+                port=tcp,
+                object_pct=object_pct,
+                start_pct=start,
+                answer_time=answer_time * 1e-3,
+                faults=faults,
+                seed=seed,
+            )
+        else:
+            hand = Rh56Hand(
+                sides[0],
+                link=link,
+                number=number,
+                object_pct=object_pct,
+                start_pct=start,
+                baudrate=baudrate,
+                answer_time=answer_time * 1e-3,
+                line_time=line_time,
+                latency_timer=latency_timer * 1e-3,
+                faults=faults,
+                seed=seed,
+                check_baudrate=not any_baudrate,
+            )
+        with hand:
+            serve(hand, request, faults_from_stdin=faults_from_stdin)
+
+
+def _refuse_serial_options() -> None:
+    """Refuse the options of a serial line beside ``--modbus-tcp``.
+
+    :raises UsageError: one was given.
+    """
+    context = click.get_current_context()
+    for name in _SERIAL_ONLY:
+        if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
+            option = next(p.opts[0] for p in context.command.params if p.name == name)
+            raise UsageError(
+                f"{option} is of a serial line, and --modbus-tcp has none", hint="leave it out"
+            )

@@ -44,6 +44,7 @@ from dexkit.emulators.faults import (
     DEX3_FAULTS,
     M4010_FAULTS,
     MX64_FAULTS,
+    REVO2_FAULTS,
     RH56_FAULTS,
     parse_fault,
 )
@@ -272,7 +273,7 @@ def _faults(rng: random.Random, scratch: Path) -> Target:
         words,
         rng,
     )
-    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS, RH56_FAULTS)
+    families = (MX64_FAULTS, DEX3_FAULTS, M4010_FAULTS, RH56_FAULTS, REVO2_FAULTS)
 
     def run(given: str) -> None:
         for family in families:

@@ -1,0 +1,73 @@
+"""``dexkit emulate revo2``: BrainCo's Revo2 on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import click
+
+from dexkit.cli.emulate.serving import line_options, serve
+from dexkit.cli.options import object_option, side_option, start_option
+from dexkit.errors import UsageError
+from dexkit.hand import Side
+from dexkit.stop_signals import stop_on_signals
+from dexkit.wire import revo2
+
+__all__ = ["emulate_revo2"]
+
+
+@click.command("revo2", context_settings={"show_default": True})
+@side_option("Hand to emulate.", default="right")
+@click.option("--link", required=True, metavar="PATH", help="Link that clients open.")
+@object_option("Percent of closing at which the joints touch an object")
+@start_option("Percent of closing at first; by default a relaxed pose.")
+@click.option(
+    "--id",
+    "number",
+    type=click.IntRange(revo2.IDS[0], revo2.IDS[-1]),
+    metavar="N",
+    help="Its Modbus unit; by default 126 of a left hand and 127 of a right one.",
+)
+@line_options(
+    "hand", baudrate=revo2.BAUD_RATE, most=5_000_000, faults="unplug@5s:for=2s, drop:p=0.1"
+)
+def emulate_revo2(
+    sides: tuple[Side, ...],
+    link: str,
+    object_pct: float | None,
+    start: float | None,
+    number: int | None,
+    baudrate: int,
+    line_time: bool,
+    answer_time: float,
+    latency_timer: float,
+    faults: tuple[str, ...],
+    faults_from_stdin: bool,
+    seed: int,
+    any_baudrate: bool,
+) -> None:
+    """Emulate a BrainCo Revo2 hand on its serial line (Modbus RTU).
+
+    Prints "ready: PATH SIDE ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
+    link.
+    """
+    from dexkit.emulators.revo2 import Revo2Hand
+
+    if len(sides) != 1:
+        raise UsageError("a line has one hand", hint="run one emulator for each side")
+    with (
+        stop_on_signals() as request,
+        Revo2Hand(
+            sides[0],
+            link=link,
+            number=number,
+            object_pct=object_pct,
+            start_pct=start,
+            baudrate=baudrate,
+            answer_time=answer_time * 1e-3,
+            line_time=line_time,
+            latency_timer=latency_timer * 1e-3,
+            faults=faults,
+            seed=seed,
+            check_baudrate=not any_baudrate,
+        ) as hand,
+    ):
+        serve(hand, request, faults_from_stdin=faults_from_stdin)

@@ -1,0 +1,108 @@
+"""What the emulators of devices on a line have in common: their options, and how they run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeVar
+
+import click
+
+from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
+from dexkit.cli.options import (
+    Number,
+    any_baudrate_option,
+    fault_options,
+    latency_timer_option,
+    line_time_option,
+    seed_option,
+)
+from dexkit.errors import EmulatorError
+from dexkit.stop_signals import StopRequest
+
+__all__ = ["Served", "line_options", "serve"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Served(Protocol):
+    """An emulated device that is being served."""
+
+    @property
+    def ready_lines(self) -> Sequence[str]:
+        """What says that it is there."""
+
+    @property
+    def error(self) -> BaseException | None:
+        """What ended its service, or None."""
+
+    @property
+    def failure(self) -> Exception | None:
+        """The first exception that its service has survived, or None."""
+
+    def inject(self, spec: str) -> None:
+        """Have a fault."""
+
+    def summaries(self) -> Sequence[str]:
+        """What was seen, a line each."""
+
+    def close(self) -> None:
+        """Stop. May be called twice."""
+
+
+def line_options(
+    device: str, *, baudrate: int, most: int, faults: str, latency_timer: float = 0.0
+) -> Callable[[F], F]:
+    """The options of a device on a serial line, from ``--baudrate`` to ``--any-baudrate``.
+
+    :param device: what the help calls it.
+    :param baudrate: its own; ``most`` that can be given.
+    :param faults: examples.
+    """
+    options = (
+        click.option(
+            "--baudrate",
+            type=click.IntRange(9600, most),
+            default=baudrate,
+            metavar="B",
+            help=f"Bits a second that the {device} understands.",
+        ),
+        line_time_option(),
+        click.option(
+            "--answer-time",
+            type=Number(0, 1000),
+            default=0.0,
+            metavar="MS",
+            help=f"From a request to its answer; what the real {device} needs is not known.",
+        ),
+        latency_timer_option(latency_timer),
+        fault_options(faults),
+        seed_option("the faults"),
+        any_baudrate_option(),
+    )
+
+    def add(function: F) -> F:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return add
+
+
+def serve(device: Served, request: StopRequest, *, faults_from_stdin: bool) -> None:
+    """Serve until a stop is requested; then close the device and say what was seen.
+
+    :raises EmulatorError: its service ended, or it failed inside.
+    """
+    if faults_from_stdin:
+        read_faults(device.inject, request)
+    click.echo("\n".join(device.ready_lines))
+    sys.stdout.flush()
+    while not request.wait(0.2):
+        if device.error is not None:
+            raise EmulatorError(f"the emulator stopped: {device.error}") from device.error
+    device.close()
+    for line in device.summaries():
+        click.echo(f"stopped: {line}")
+    if device.failure is not None:
+        raise EmulatorError(f"the emulator failed inside: {device.failure!r}", hint=A_MISTAKE)

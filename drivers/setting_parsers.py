@@ -1,0 +1,28 @@
+"""Read the settings of a backend, for the drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from dexkit.backends import BackendOptions
+from dexkit.errors import UsageError
+
+__all__ = ["Parsers", "parse_settings"]
+
+Parsers = Mapping[str, tuple[Callable[[str], object], str]]
+"""Of each setting, how it is read and what it means."""
+
+
+def parse_settings(options: BackendOptions, parsers: Parsers) -> dict[str, object]:
+    """The settings of a backend's options.
+
+    :raises UsageError: one cannot be read.
+    """
+    values: dict[str, object] = {}
+    for name, text in options.settings.items():
+        parse, meaning = parsers[name]
+        try:
+            values[name] = parse(text)
+        except ValueError as error:
+            raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
+    return values
