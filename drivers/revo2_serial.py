@@ -13,6 +13,7 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock, RealClock
@@ -260,10 +261,10 @@ class Revo2Serial:
 
     # --- the registers
 
-    def _read_motors(self) -> np.ndarray:
+    def _read_motors(self) -> npt.NDArray[np.int64]:
         """Positions, speeds, currents and status, shape (4, 6)."""
         found = self._read(Function.READ_INPUT, Input.POSITION, 4 * _N)
-        table = np.array(signed(found)).reshape(4, _N)
+        table = np.array(signed(found), np.int64).reshape(4, _N)
         table[0] = np.clip(table[0], 0, _FULL)
         return table
 

@@ -33,6 +33,7 @@ from dexkit.hand import Hand, HandCommand, MotorError, Side
 from dexkit.wire.modbus import TcpParser
 from dexkit.wire.rh56 import Register
 from tests.each import each
+from tests.patience import PATIENCE
 
 N = 6
 PATIENT = 1.0  # s; a busy machine answers late
@@ -208,32 +209,29 @@ def test_driver_speaks_to_pymodbus_server() -> None:
         SimData(1552, count=100, values=0, datatype=DataType.REGISTERS),
     ]
     place: list[str] = []
+    stops: list[asyncio.Event] = []
     ready, loop = threading.Event(), asyncio.new_event_loop()
 
     async def serve() -> None:
+        stops.append(asyncio.Event())
         device = SimDevice(id=1, simdata=memory)
         server = ModbusTcpServer(device, address=("127.0.0.1", 0), trace_pdu=trace)  # type: ignore[arg-type]
         await server.serve_forever(background=True)
         port = server.transport.sockets[0].getsockname()[1]  # type: ignore[union-attr]
         place.append(f"127.0.0.1:{port}")
         ready.set()
-        await stop.wait()
+        await stops[0].wait()
         await server.shutdown()
 
-    async def main() -> None:
-        global stop
-        stop = asyncio.Event()
-        await serve()
-
-    thread = threading.Thread(target=lambda: loop.run_until_complete(main()))
+    thread = threading.Thread(target=lambda: loop.run_until_complete(serve()))
     thread.start()
     try:
-        assert ready.wait(60)
-        with driver(place[0], timeout=1.0, force=300) as hand:
+        assert ready.wait(PATIENCE)
+        with driver(place[0], force=300) as hand:
             state = hand.exchange(HandCommand.position([0.25] * N))
             assert np.allclose(state.q, 0.7)
     finally:
-        loop.call_soon_threadsafe(stop.set)
+        loop.call_soon_threadsafe(lambda: stops[0].set())
         thread.join()
         loop.close()
     assert written == [
@@ -242,9 +240,6 @@ def test_driver_speaks_to_pymodbus_server() -> None:
         (1486, [250] * N),
         (1486, [700] * N),  # it holds when it is closed
     ]
-
-
-stop: asyncio.Event
 
 
 def test_settings() -> None:
