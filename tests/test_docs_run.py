@@ -42,8 +42,9 @@ ELSEWHERE = (
     (r"--peer|--interface (wlan0|192)", "other machines: tests/test_networks.py"),
     (r"^mutants", "minutes: tests/test_mutants.py"),
     (
-        r"ttyUSB1|(dex1|inspire)-serial .*--device /dev|(calibrate|selftest) dex1",
-        "other devices: tests/test_dex1_serial.py",
+        r"ttyUSB1|(dex1|inspire|revo2)-serial .*--device /dev|--device 192|"
+        r"(calibrate|selftest) dex1",
+        "other devices: tests/test_dex1_serial.py, tests/test_inspire_modbus.py",
     ),
     (r"^serve (dex1-serial|dex3-usb) --side (left|both)$", "looks for a device of this machine"),
     (r"^bringup (?!.*--dry-run)", "a person holds a key: tests/test_bringup_cli.py"),
