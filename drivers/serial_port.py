@@ -19,6 +19,7 @@ __all__ = [
     "Device",
     "exchange_period",
     "find_device",
+    "is_pseudo_terminal",
     "latency_timer",
     "latency_warning",
     "open_failed",
@@ -68,6 +69,11 @@ def find_device(name: str) -> Device:
             f"serial number {name} is that of more than one port: {found}", hint="give the path"
         )
     raise HandNotFound(f"no adapter has the serial number {name}", hint=_list_known_ports(ports))
+
+
+def is_pseudo_terminal(path: str) -> bool:
+    """Whether a port is a pseudo-terminal, which only emulated devices have."""
+    return str(Path(path).resolve()).startswith("/dev/pts/")
 
 
 def _list_known_ports(ports: list[list_ports.ListPortInfo]) -> str:  # type: ignore[name-defined]

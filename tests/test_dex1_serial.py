@@ -537,6 +537,11 @@ def test_the_backend_reads_its_settings() -> None:
     settings = {
         "ports": "/dev/a*, /dev/b",
         "id": "3",
+        "sign": "-",
+        "offset": "0.5",
+        "ratio": "32",
+        "adapter": "SN1",
+        "config": "/dev/c.json",
         "baudrate": "4000000",
         "protect": "off",
         "timeout": "0.05",
@@ -545,7 +550,18 @@ def test_the_backend_reads_its_settings() -> None:
     hand = backend.create(BackendOptions(Side.RIGHT, "/dev/x", settings))
     assert isinstance(hand, Dex1Serial)
     assert hand.configuration == Dex1Settings(
-        "/dev/x", ("/dev/a*", "/dev/b"), 3, 4_000_000, False, 0.05
+        device="/dev/x",
+        ports=("/dev/a*", "/dev/b"),
+        id=3,
+        sign=-1,
+        offset=0.5,
+        ratio=32.0,
+        adapter="SN1",
+        config=Path("/dev/c.json"),
+        given=frozenset(settings),
+        baudrate=4_000_000,
+        protect=False,
+        timeout=0.05,
     )
     assert hand.id == 3
     assert Dex1Serial(Side.RIGHT).id == 0

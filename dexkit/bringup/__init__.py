@@ -6,12 +6,13 @@ slowly until it arrives or stalls), :mod:`script` (what to move and to ask, in w
 exchanges frames with the hand; ``dexkit bringup`` has the loop and the terminal.
 """
 
-from dexkit.bringup.bench import Bench, Drive, JointChoice, Plan, Reading, Snapshot
+from dexkit.bringup.bench import Bench, Drive, JointChoice, Plan, Reading, Snapshot, Zero
 from dexkit.bringup.dead_man import DeadMan
 from dexkit.bringup.findings import Findings
 from dexkit.bringup.motion import Effort
 from dexkit.bringup.script import Question
 from dexkit.bringup.session import Session
+from dexkit.bringup.settings_file import SettingsFile
 
 __all__ = [
     "Bench",
@@ -24,5 +25,7 @@ __all__ = [
     "Question",
     "Reading",
     "Session",
+    "SettingsFile",
     "Snapshot",
+    "Zero",
 ]

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from dexkit.bringup.findings import Findings
 
-__all__ = ["Bench", "Drive", "JointChoice", "Plan", "Reading", "Snapshot"]
+__all__ = ["Bench", "Drive", "JointChoice", "Plan", "Reading", "Snapshot", "Zero"]
 
 
 @dataclass(frozen=True)
 class Reading:
     """State of one motor.
 
-    :param q: position, rad at a joint with the plan's reference ratio, in the motor's direction.
+    :param q: position, rad at a joint with the plan's reference ratio, in the motor's direction
+        (see :class:`JointChoice`).
     :param fault: :class:`~dexkit.hand.MotorError` bits.
     :param temperature: °C, the highest that the motor reports.
     """
@@ -41,22 +43,45 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Drive:
-    """Drive one motor towards ``q`` and lock all others; units as of :class:`Reading`."""
+    """Drive one motor towards ``q`` and lock all others; units as of :class:`Reading`.
+
+    :param torque: N·m that it may give at most, for motors that take a limit. Those that follow kp
+        need none: ``q`` is never further ahead of the motor than torque / kp.
+    """
 
     motor: str
     q: float
     kp: float
     kd: float
+    torque: float
+
+
+class Zero(str, Enum):
+    """What the travel between the stops says of a joint's zero."""
+
+    MIDDLE = "middle"
+    """The range of q lies in the middle of the travel; the limits keep off the stops."""
+    LOW_STOP = "low stop"
+    """q is the lower of :attr:`JointChoice.stops` at that stop: a closed gripper."""
 
 
 @dataclass(frozen=True)
 class JointChoice:
-    """A joint that a motor may move.
+    """A joint that a motor may move: what is not known of it, and how it is found.
+
+    A motor reports ``ratio / reference * (sign * q + offset)``.
 
     :param rising: what is seen while q rises; ``falling`` while it falls: one word each.
-    :param ratios: what its gear ratio may be.
+    :param ratios: what its gear ratio may be; the lowest and the highest if it is ``measured``.
     :param zero: what the joint looks like at q = 0; empty if that is not asked.
     :param first: sign of dq towards the stop that is looked for first: the open one.
+    :param stops: q at its stops; None where they are near the limits.
+    :param zero_from: how the travel gives the zero.
+    :param measured: the ratio is any that makes the travel that between ``stops``, and not one of
+        a few.
+    :param motors: how many motors may move it, each a part of it: two servos of one gripper.
+    :param wanted: it is of this hand. Others are only told apart from it, and their travel is not
+        measured.
     """
 
     name: str
@@ -67,22 +92,38 @@ class JointChoice:
     ratios: tuple[float, ...]
     zero: str = ""
     first: int = -1
+    stops: tuple[float, float] | None = None
+    zero_from: Zero = Zero.MIDDLE
+    measured: bool = False
+    motors: int = 1
+    wanted: bool = True
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What there is to find on a hand.
+    """What there is to find on a hand, and how gently.
 
     :param joints: in the order in which their travel is measured.
     :param reference: gear ratio in whose radians motors are read and driven.
     :param places: where a person can press the hand, one pressure sensor each.
     :param travel: whether to go to the stops.
+    :param part: what a joint is called in questions.
+    :param nudge: rad of the first motion, at a joint with the reference ratio; less with more
+        gears.
+    :param torque: N·m at a joint that is enough, as far as is known, and ``most_torque`` that is
+        allowed.
+    :param speed: rad/s of a joint.
     """
 
     joints: tuple[JointChoice, ...]
     reference: float
     places: tuple[str, ...] = ()
     travel: bool = True
+    part: str = "joint"
+    nudge: float = 0.14
+    torque: float = 0.25
+    most_torque: float = 0.5
+    speed: float = 0.2
 
     @property
     def widest(self) -> float:
@@ -116,8 +157,10 @@ class Bench(Protocol):
         ...
 
     @property
-    def local_server(self) -> bool:
-        """Whether the open hand is behind a USB/IP server of this machine, as emulated ones are."""
+    def emulated(self) -> bool:
+        """Whether the open hand is where only emulated ones are: behind a USB/IP server of this
+        machine, or on a pseudo-terminal.
+        """
         ...
 
     def open(self) -> None:

@@ -44,7 +44,7 @@ class Findings:
     """All that is known of one hand.
 
     :ivar motors: by address.
-    :ivar travel: by joint.
+    :ivar travel: by joint; of a joint that more than one motor moves, by motor.
     :ivar sensors: address of each place's sensor; None where the person has skipped it.
     :ivar answers: what was answered to each question, by its key.
     """
@@ -59,10 +59,13 @@ class Findings:
 
         :raises KeyError: it has not been found.
         """
-        for address, found in self.motors.items():
-            if found.joint == joint:
-                return address
+        for address in self.motors_of(joint):
+            return address
         raise KeyError(joint)
+
+    def motors_of(self, joint: str) -> list[str]:
+        """Addresses of all motors that move a joint."""
+        return [address for address, found in self.motors.items() if found.joint == joint]
 
     def to_document(self) -> dict[str, Any]:
         """Everything but the answers, for a JSON file."""

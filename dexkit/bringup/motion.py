@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from dexkit.bringup.bench import Drive, Reading, Snapshot
+from dexkit.bringup.bench import Drive, Plan, Reading, Snapshot
 from dexkit.errors import HandFault, UsageError
 from dexkit.hand import MotorError
 
@@ -24,16 +24,30 @@ class Effort:
 
     :param torque: N·m at the joint, at most. Motion starts with a quarter of it.
     :param speed: rad/s.
+    :param most_torque: what the plan of the hand allows.
     """
 
-    torque: float = 0.25
-    speed: float = 0.2
+    torque: float = Plan.torque
+    speed: float = Plan.speed
+    most_torque: float = Plan.most_torque
 
     def __post_init__(self) -> None:
-        if not 0.01 <= self.torque <= 0.5:
-            raise UsageError(f"torque is 0.01 to 0.5 N·m, not {self.torque:g}")
+        if not 0.01 <= self.torque <= self.most_torque:
+            raise UsageError(f"torque is 0.01 to {self.most_torque:g} N·m, not {self.torque:g}")
         if not 0.02 <= self.speed <= 2.0:
             raise UsageError(f"speed is 0.02 to 2 rad/s, not {self.speed:g}")
+
+    @classmethod
+    def of(cls, plan: Plan, torque: float | None = None, speed: float | None = None) -> Effort:
+        """What is asked for, or else what the plan has.
+
+        :raises UsageError: it is more than the plan allows.
+        """
+        return cls(
+            plan.torque if torque is None else torque,
+            plan.speed if speed is None else speed,
+            plan.most_torque,
+        )
 
 
 KP = 1.5
@@ -148,12 +162,12 @@ class Mover:
                 return End.ARRIVED if abs(way) < _NEAR else End.STALLED
             self._level += 1
             self._marked = now
-        return Drive(self.go.motor, self._advance(now, q), KP, KD)
+        torque = self._torque * _LEVELS[self._level]
+        return Drive(self.go.motor, self._advance(now, q, torque / KP), KP, KD, torque)
 
-    def _advance(self, now: float, q: float) -> float:
+    def _advance(self, now: float, q: float, lead: float) -> float:
         step = self._speed * min(now - self._time, _LONGEST_STEP)
         self._time = now
-        lead = self._torque * _LEVELS[self._level] / KP
         if self.go.target > q:
             self._carrot = min(self._carrot + step, q + lead, self.go.target)
         else:

@@ -33,7 +33,11 @@ _LOST_ANSWERS = 3
 @click.command("bringup")
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Hand to bring up.", required=True)
-@click.option("--device", metavar="SERIAL", help="Serial number or address of the device.")
+@click.option(
+    "--device",
+    metavar="PATH|SERIAL",
+    help="Serial number, address or port of the device.",
+)
 @set_option("Setting of the backend, e.g. config=FILE; 'dexkit backends' lists the settings.")
 @click.option(
     "--usb",
@@ -42,19 +46,16 @@ _LOST_ANSWERS = 3
 )
 @click.option(
     "--torque",
-    type=Number(0.01, 0.5),
-    default=Effort.torque,
-    show_default=True,
+    type=Number(0.01, 3.0),
     metavar="NM",
-    help="Torque at a joint, at most; motion begins with a quarter of it.",
+    help="Torque at a joint, at most; motion begins with a quarter of it.  [default: the "
+    "backend's, shown by --dry-run]",
 )
 @click.option(
     "--speed",
     type=Number(0.02, 2.0),
-    default=Effort.speed,
-    show_default=True,
     metavar="RAD/S",
-    help="Speed of every motion.",
+    help="Speed of every motion.  [default: the backend's]",
 )
 @click.option("--dry-run", is_flag=True, help="Only print the plan: nothing is opened, or moves.")
 @click.option("--restart", is_flag=True, help="Forget what an earlier bring-up has found.")
@@ -71,8 +72,8 @@ _LOST_ANSWERS = 3
 @click.option(
     "--unattended",
     is_flag=True,
-    help="Move without the dead-man key: only a hand on a USB/IP server of this machine, such as "
-    "an emulated one, and only with --answers.",
+    help="Move without the dead-man key: only a hand on a USB/IP server of this machine or a "
+    "pseudo-terminal, as emulated ones are, and only with --answers.",
 )
 def command(
     backend_name: str,
@@ -80,8 +81,8 @@ def command(
     device: str | None,
     settings: tuple[str, ...],
     usb: str | None,
-    torque: float,
-    speed: float,
+    torque: float | None,
+    speed: float | None,
     dry_run: bool,
     restart: bool,
     answers_path: Path | None,
@@ -103,13 +104,13 @@ def command(
     if kind.bringup is None:
         raise UsageError(
             f"{backend_name} has nothing that a bring-up finds",
-            hint="dex3-usb has; an EZGripper or Dex1-1 is calibrated: dexkit calibrate",
+            hint="dex3-usb, dex1-serial and ezgripper have",
         )
     texts = _settings(settings, usb)
     options = BackendOptions(sides[0], device, texts)
     options.refuse_unknown(kind.settings)
     bench: Bench = kind.bringup.load()(options)
-    effort = Effort(torque, speed)
+    effort = Effort.of(bench.plan, torque, speed)
     if dry_run:
         _print_plan(bench, effort, (), attended=not unattended)
         return
@@ -118,10 +119,10 @@ def command(
     with stop_on_signals() as stop:
         try:
             bench.open()
-            if unattended and not bench.local_server:
+            if unattended and not bench.emulated:
                 raise UsageError(
-                    "--unattended is not for this hand: it is not behind a USB/IP server of this "
-                    "machine",
+                    "--unattended is not for this hand: it is neither behind a USB/IP server of "
+                    "this machine nor on a pseudo-terminal",
                     hint="leave it out, and hold the space bar",
                 )
             findings = Findings() if restart else bench.load()

@@ -7,6 +7,7 @@ import sys
 import click
 
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
+from dexkit.drivers.dex1_serial.settings import default_path
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, Side
 
@@ -25,7 +26,7 @@ def calibrate_dex1(device: str | None, side: str | None, *, dry_run: bool, yes: 
         raise UsageError("no hand is given", hint="--side left or --side right")
     if not (yes or dry_run) and not sys.stdin.isatty():
         raise UsageError("cannot ask whether the jaws are closed: no terminal", hint="give --yes")
-    with Dex1Serial(Side(side), Dex1Settings(device=device)) as hand:
+    with Dex1Serial(Side(side), Dex1Settings(device=device, config=default_path())) as hand:
         q = float(hand.exchange(HandCommand.brake(1)).q[0])
         click.echo(f"motor {hand.id} on {hand.path} reports that the jaws are at {q:.3f} rad")
         if dry_run:

@@ -10,16 +10,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dexkit.backends import Backend, BackendOptions
+from dexkit.bringup.settings_file import SettingsFile
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex1_serial.discovery import find_motor
 from dexkit.drivers.dex1_serial.line import LATE, LineStatistics, MotorLine
-from dexkit.drivers.dex1_serial.settings import SETTINGS, Dex1Settings, from_options
-from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout
+from dexkit.drivers.dex1_serial.settings import (
+    SETTINGS,
+    Dex1Settings,
+    from_options,
+    with_stored,
+)
+from dexkit.drivers.serial_port import find_device
+from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
+from dexkit.lazy import Lazy
 from dexkit.models import DEX1_1
 from dexkit.wire.m4010 import (
     Calibration,
+    Feedback,
     MotorCmd,
     MotorData,
     Status,
@@ -76,8 +85,8 @@ class Dex1Serial:
     ) -> None:
         self.configuration = configuration if configuration is not None else Dex1Settings()
         self.statistics = Dex1Statistics()
-        number = self.configuration.id
-        self.id = DEX1_1.vendor_ids[side] if number is None else number
+        self._side = side
+        self._apply(self.configuration)
         self._clock: Clock = clock if clock is not None else RealClock()
         self._line: MotorLine | None = None
         self._tripped = False
@@ -91,6 +100,43 @@ class Dex1Serial:
         self._spec = replace(
             spec, joints=tuple(replace(joint, q_max=_FURTHEST) for joint in spec.joints)
         )
+
+    def _apply(self, settings: Dex1Settings) -> None:
+        self._settings = settings
+        self.id = DEX1_1.vendor_ids[self._side] if settings.id is None else settings.id
+        self._mounting = settings.mounting
+
+    def _load_stored(self) -> None:
+        """Take what a bring-up has found of this side's gripper.
+
+        :raises UsageError: the file cannot be read, or holds a setting that cannot be.
+        """
+        if self.configuration.config is None:
+            return
+        store = SettingsFile(self.configuration.config, "dex1-serial")
+        texts = store.section(str(self._side), "settings")
+        try:
+            self._apply(with_stored(self.configuration, texts))
+        except UsageError as error:
+            raise UsageError(
+                f"{store.path}: {self._side}: {error.message}",
+                hint=error.hint or "dexkit bringup dex1-serial",
+            ) from error
+        if texts:
+            log.info("settings of the %s gripper: %s", self._side, store.path)
+
+    def _check_adapter(self, path: str) -> None:
+        """Refuse a gripper on another adapter than that of the settings.
+
+        :raises HandRefused: it is on another one.
+        """
+        wanted, found = self._settings.adapter, find_device(path).serial_number
+        if wanted is not None and found != wanted:
+            raise HandRefused(
+                f"the settings of the {self._side} gripper are of the one on adapter {wanted}, and "
+                f"this is on {found or 'an adapter without serial number'}",
+                hint="bring this gripper up: dexkit bringup dex1-serial",
+            )
 
     @property
     def spec(self) -> HandSpec:
@@ -120,12 +166,19 @@ class Dex1Serial:
             return
         self._tripped = False
         self._error = 0
-        self._line, data = find_motor(self.configuration, self.id)
+        self._load_stored()
+        line, data = find_motor(self._settings, self.id)
+        try:
+            self._check_adapter(line.path)
+        except BaseException:
+            line.release()
+            raise
+        self._line = line
         log.info(
             "Dex1-1 on %s: motor %d, at %.2f rad, %d degC, %.1f V",
             self._line.path,
             self.id,
-            data.joint().q,
+            self._joint(data)[0],
             data.temp,
             data.voltage,
         )
@@ -184,7 +237,13 @@ class Dex1Serial:
         data = line.exchange(frame, self.id, self.configuration.timeout, deadline)
         stamp = self._clock.now()
         self._report_status(data)
-        return _decode_state(data, stamp)
+        return _decode_state(data, self._joint(data), stamp)
+
+    def _joint(self, data: MotorData) -> Feedback:
+        """What the motor measured, at the joint and in its direction."""
+        q, dq, tau = data.joint(self._mounting.ratios[0])
+        sign = self._mounting.signs[0]
+        return Feedback(self._mounting.joint(0, q), sign * dq, sign * tau)
 
     def _encode_command(self, command: HandCommand) -> bytes:
         if self._tripped:
@@ -193,14 +252,17 @@ class Dex1Serial:
         protect = self.configuration.protect
         if not command.mode[0]:
             return MotorCmd(self.id, Status.BRAKE, protect).pack()
+        mounting = self._mounting
+        sign = mounting.signs[0]
         return MotorCmd.setpoint(
             self.id,
-            q=float(command.q[0]),
-            dq=float(command.dq[0]),
-            tau=float(command.tau[0]),
+            q=mounting.motor(0, float(command.q[0])),
+            dq=sign * float(command.dq[0]),
+            tau=sign * float(command.tau[0]),
             kp=float(command.kp[0]),
             kd=float(command.kd[0]),
             timeout=protect,
+            ratio=mounting.ratios[0],
         ).pack()
 
     def _report_status(self, data: MotorData) -> None:
@@ -250,6 +312,8 @@ class Dex1Serial:
             raise HandRefused(f"motor {self.id} was not calibrated: {problem}")
         data = line.exchange(MotorCmd(self.id).pack(), self.id, self.configuration.timeout)
         q = data.joint().q
+        if self._mounting.offsets[0]:
+            self._forget_offset()
         if abs(q - position) > _CALIBRATION_TOLERANCE:
             raise HandRefused(
                 f"motor {self.id} says that it is calibrated, but is at {q:.2f} rad",
@@ -257,12 +321,20 @@ class Dex1Serial:
             )
         return q
 
+    def _forget_offset(self) -> None:
+        """Set the offset to 0, also in the settings file: the motor itself has the zero now."""
+        self._apply(replace(self._settings, offset=0.0))
+        if self.configuration.config is not None:
+            store = SettingsFile(self.configuration.config, "dex1-serial")
+            texts = store.section(str(self._side), "settings")
+            store.write(str(self._side), {"settings": texts | {"offset": "0"}})
+
 
 _FOC, _BRAKE = int(JointMode.FOC), int(JointMode.BRAKE)
 
 
-def _decode_state(data: MotorData, stamp: float) -> HandState:
-    q, dq, tau = data.joint()
+def _decode_state(data: MotorData, joint: Feedback, stamp: float) -> HandState:
+    q, dq, tau = joint
     fault = data.merror
     if data.timeout:
         fault |= MotorError.MOTOR_SAW_HOST_TIMEOUT
@@ -295,4 +367,5 @@ backend = Backend(
     make=_create_hand,
     needs="--device PATH or USB serial number, if the port is not to be looked for",
     settings=SETTINGS,
+    bringup=Lazy("dexkit.drivers.dex1_serial.bringup:bench"),
 )

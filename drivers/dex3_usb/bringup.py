@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import datetime
 import logging
 from collections.abc import Mapping
 from typing import Any
 
-from dexkit import __version__
 from dexkit.backends import BackendOptions
 from dexkit.bringup.bench import Drive, JointChoice, Plan, Reading, Snapshot
 from dexkit.bringup.findings import Findings
@@ -91,7 +89,7 @@ class Dex3Bench:
         return str(self._store.path)
 
     @property
-    def local_server(self) -> bool:
+    def emulated(self) -> bool:
         """Whether the open hand is behind a USB/IP server of this machine."""
         return self._server is not None and self._server.host in _LOOPBACK
 
@@ -242,28 +240,11 @@ class Dex3Bench:
 
     def load(self) -> Findings:
         """What the file has of this hand."""
-        record = self._store.record(self._key)
-        found = record.get("found", {})
-        document = found.get("details", {}) if isinstance(found, dict) else {}
-        return Findings.from_document(document, self._store.section(self._key, "answers"))
+        return self._store.load(self._key)
 
     def store(self, findings: Findings) -> None:
         """Write settings, findings and answers under the hand's serial number."""
-        self._store.write(
-            self._key,
-            {
-                "settings": self.settings(findings),
-                "found": {
-                    "at": datetime.datetime.now(datetime.timezone.utc).isoformat(
-                        timespec="seconds"
-                    ),
-                    "by": f"dexkit {__version__} bringup",
-                    "hand": dict(self._facts),
-                    "details": findings.to_document(),
-                },
-                "answers": dict(findings.answers),
-            },
-        )
+        self._store.store(self._key, self.settings(findings), self._facts, findings)
 
     @property
     def _key(self) -> str:

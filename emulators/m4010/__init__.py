@@ -10,5 +10,15 @@ from dexkit.emulators.m4010.bus import Bus
 from dexkit.emulators.m4010.gripper import Dex1Motors, Dex1Process, emulated_dex1
 from dexkit.emulators.m4010.motor import Motor
 from dexkit.emulators.m4010.settings import Firmware, Heat
+from dexkit.emulators.m4010.wiring import Wiring
 
-__all__ = ["Bus", "Dex1Motors", "Dex1Process", "Firmware", "Heat", "Motor", "emulated_dex1"]
+__all__ = [
+    "Bus",
+    "Dex1Motors",
+    "Dex1Process",
+    "Firmware",
+    "Heat",
+    "Motor",
+    "Wiring",
+    "emulated_dex1",
+]

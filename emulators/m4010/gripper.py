@@ -14,11 +14,11 @@ from dexkit.emulators.line_port import SCHEME, line_port
 from dexkit.emulators.m4010.bus import Bus
 from dexkit.emulators.m4010.motor import LOCKING, Motor
 from dexkit.emulators.m4010.settings import Firmware
+from dexkit.emulators.m4010.wiring import Wiring
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.emulators.serial_port import Port
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.models import DEX1_1
 from dexkit.temporary_folder import TemporaryFolder
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class Dex1Motors:
     :param object_pct: opening at which an object is touched, percent; None for none.
     :param start_pct: opening at first, percent.
     :param zero_error: rad by which the position is reported too large, until calibrated.
+    :param wiring: ids and mounting of the motors.
     :param faults: specifications, see :mod:`dexkit.emulators.faults`. Those of the line strike
         every line.
     :param check_baudrate: a client at another baud rate is not understood.
@@ -54,6 +55,7 @@ class Dex1Motors:
         object_pct: float | None = None,
         start_pct: float = 20.0,
         zero_error: float = 0.0,
+        wiring: Wiring | None = None,
         firmware: Firmware | None = None,
         line_time: bool = True,
         latency_timer: float = 0.0,
@@ -63,14 +65,16 @@ class Dex1Motors:
     ) -> None:
         plan = [parse_fault(spec, M4010_FAULTS) for spec in faults]
         now = RealClock().now()
+        wiring = wiring or Wiring.assumed()
         self.motors: dict[Side, Motor] = {}
         for side in sides:
             mechanics = Dex1Mechanics(object_pct=object_pct, start_pct=start_pct, locking=LOCKING)
             self.motors[side] = Motor(
-                DEX1_1.vendor_ids[side],
+                wiring.ids[side],
                 mechanics=mechanics,
                 firmware=firmware,
                 zero_error=zero_error,
+                mounting=wiring.mountings[side],
                 now=now,
             )
         lines: dict[str | None, list[Side]] = {}

@@ -17,12 +17,14 @@ from dexkit.errors import UsageError
 from dexkit.hand import JointMode, MotorError
 from dexkit.wire.m4010 import (
     BROADCAST_ID,
+    GEAR_RATIO,
     Calibration,
     CalibrationProblem,
     MotorCmd,
     MotorData,
     Status,
 )
+from dexkit.wire.mounting import Mounting
 
 __all__ = ["LOCKING", "Motor"]
 
@@ -40,6 +42,7 @@ class Motor:
     :param mechanics: the gripper; a new one by default.
     :param zero_error: rad by which the position that it reports is too large, until it is
         calibrated.
+    :param mounting: direction, zero and gearing of the motor in the gripper.
     :param now: time on the caller's clock.
     :raises UsageError: there is no such id.
 
@@ -56,6 +59,7 @@ class Motor:
         firmware: Firmware | None = None,
         heat: Heat | None = None,
         zero_error: float = 0.0,
+        mounting: Mounting | None = None,
         now: float = 0.0,
     ) -> None:
         if not 0 <= number < BROADCAST_ID:
@@ -65,6 +69,7 @@ class Motor:
         self.firmware = firmware or Firmware()
         self.heat = heat or Heat()
         self.zero_error = zero_error
+        self.mounting = mounting or Mounting((1,), (0.0,), (GEAR_RATIO,))
         self.tripped = False
         self.silent = False
         self.trips = self.ignored = 0
@@ -93,8 +98,8 @@ class Motor:
 
     @property
     def q(self) -> float:
-        """Position that it reports, rad at the joint."""
-        return self.mechanics.joint.q + self.zero_error
+        """Position that it reports, divided by its ratio, rad."""
+        return self.mounting.motor(0, self.mechanics.joint.q) + self.zero_error
 
     # --- time and faults
 
@@ -207,8 +212,11 @@ class Motor:
         if command.status != Status.FOC or self._own_errors | self._faults:
             self.mechanics.brake()
             return
-        q, dq, tau, kp, kd = command.joint()
-        self.mechanics.drive(q - self.zero_error, dq, tau, kp, kd)
+        mounting = self.mounting
+        sign = mounting.signs[0]
+        q, dq, tau, kp, kd = command.joint(mounting.ratios[0])
+        at = mounting.joint(0, q - self.zero_error)
+        self.mechanics.drive(at, sign * dq, sign * tau, kp, kd)
 
     def _calibrate(self, calibration: Calibration) -> MotorData:
         self.mechanics.brake()
@@ -227,23 +235,25 @@ class Motor:
             if wrong:
                 problem |= bit
         if not problem:
-            self.zero_error = calibration.position - self.mechanics.joint.q
+            self.zero_error += calibration.position - self.q
             self.calibrated = True
         return calibration.answer(problem)
 
     def data(self) -> MotorData:
         """The data frame of the present state."""
         status = Status.FOC if self.mechanics.mode is JointMode.FOC else Status.BRAKE
+        sign = self.mounting.signs[0]
         return MotorData.measured(
             self.number,
             status,
             q=self.q,
-            dq=self.mechanics.joint.dq,
+            dq=sign * self.mechanics.joint.dq,
             # braking, its windings are shorted: no current is controlled, none reported
-            tau=self.mechanics.torque if status is Status.FOC else 0.0,
+            tau=sign * self.mechanics.torque if status is Status.FOC else 0.0,
             temperature=self.case,
             winding=self.winding,
             voltage=self.supply,
             error=int(self.error),
             timeout=self.tripped,
+            ratio=self.mounting.ratios[0],
         )

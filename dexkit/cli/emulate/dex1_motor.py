@@ -35,6 +35,12 @@ __all__ = ["emulate_dex1_motor"]
     metavar="RAD",
     help="Report the position too large by this, until it is calibrated.",
 )
+@click.option(
+    "--wiring",
+    type=click.IntRange(0),
+    metavar="SEED",
+    help="Other ids, mirrored, offset and geared motors, at random, for a bring-up to find.",
+)
 @line_options(
     "motor",
     baudrate=m4010.BAUD_RATE,
@@ -47,6 +53,7 @@ def emulate_dex1_motor(
     object_pct: float | None,
     start: float,
     zero_error: float,
+    wiring: int | None,
     baudrate: int,
     line_time: bool,
     answer_time: float,
@@ -61,7 +68,7 @@ def emulate_dex1_motor(
     Prints "ready: PATH SIDE ..." for each line when it answers there. Ctrl-C or SIGTERM ends it
     and removes the link.
     """
-    from dexkit.emulators.m4010 import Dex1Motors, Firmware
+    from dexkit.emulators.m4010 import Dex1Motors, Firmware, Wiring
 
     with (
         stop_on_signals() as request,
@@ -71,6 +78,7 @@ def emulate_dex1_motor(
             object_pct=object_pct,
             start_pct=start,
             zero_error=zero_error,
+            wiring=None if wiring is None else Wiring.random(wiring),
             firmware=Firmware(baudrate=baudrate, answer_time=answer_time * 1e-3),
             line_time=line_time,
             latency_timer=latency_timer * 1e-3,

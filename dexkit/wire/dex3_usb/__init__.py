@@ -27,7 +27,6 @@ from dexkit.wire.dex3_usb.layout import (
     VENDOR_ID,
     CommandLayout,
 )
-from dexkit.wire.dex3_usb.mounting import Mounting
 from dexkit.wire.dex3_usb.packets import (
     FROM_HAND,
     TO_HAND,
@@ -46,6 +45,7 @@ from dexkit.wire.dex3_usb.packets import (
     scan_bus,
 )
 from dexkit.wire.dex3_usb.units import NO_VALUE, SCALES, Scale
+from dexkit.wire.mounting import Mounting
 from dexkit.wire.ris import BROADCAST_ID, RIS_MODE, ris_mode
 
 __all__ = [

@@ -42,7 +42,6 @@ from dexkit.wire.dex3_usb.layout import (
     STATE_BUS_SIZE,
     CommandLayout,
 )
-from dexkit.wire.dex3_usb.mounting import Mounting
 from dexkit.wire.dex3_usb.packets import (
     FROM_HAND,
     Bytes,
@@ -60,6 +59,7 @@ from dexkit.wire.dex3_usb.packets import (
     parse_command,
     scan_bus,
 )
+from dexkit.wire.mounting import Mounting
 from dexkit.wire.ris import BROADCAST_ID, NUDGE, Structure, ris_mode
 
 __all__ = ["DEFAULT_BUS_MAP", "BusMap", "DecodedCommand", "HandCodec"]
