@@ -41,6 +41,7 @@ from dexkit.emulators.sim_brainco import SimBrainCo
 from dexkit.emulators.sim_dex3 import SimDex3
 from dexkit.emulators.sim_dex5 import SimDex5
 from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.sim_inspire import SimInspireDfx
 from dexkit.emulators.simulated import SimulatedHand
 from dexkit.emulators.wear import parse_wear
 from dexkit.errors import HandLost, HandTimeout, UsageError
@@ -56,6 +57,7 @@ HANDS: dict[str, Callable[[ManualClock], SimulatedHand]] = {
     "dex3": lambda clock: SimDex3(Side.LEFT, clock=clock),
     "dex5": lambda clock: SimDex5(Side.LEFT, clock=clock),
     "brainco": lambda clock: SimBrainCo(Side.LEFT, clock=clock),
+    "inspire-dfx": lambda clock: SimInspireDfx(Side.LEFT, clock=clock),
 }
 
 

@@ -15,7 +15,7 @@ from dexkit.cli.options import Number
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
-from dexkit.drivers.ezgripper.config import GripperRecord, Store
+from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.control import ControlSettings
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.gripper import stored_device
@@ -53,6 +53,17 @@ class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
         )
 
 
+class _Ids(click.ParamType):  # type: ignore[type-arg]
+    name = "N,N"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> object:
+        if re.fullmatch("[0-9]{1,3},[0-9]{1,3}", str(value)):
+            return tuple(int(part) for part in str(value).split(","))
+        self.fail(f"{one_line(value, 40)!r} is not two servo ids, such as 1,2", param, ctx)
+
+
 @click.command()
 @click.argument("gripper", type=click.Choice(["ezgripper", "dex1-serial"]), default="ezgripper")
 @click.option("--device", metavar="PATH|SERIAL", help="Serial port, or its USB serial number.")
@@ -69,6 +80,13 @@ class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
     default=1,
     show_default=True,
     help="Servo id, or auto.",
+)
+@click.option(
+    "--ids",
+    type=_Ids(),
+    metavar="N,N",
+    help="Instead of --id: the two servos of a quad gripper. Each is calibrated alone, the other "
+    "one limp or held open.",
 )
 @click.option(
     "--baudrate",
@@ -131,6 +149,7 @@ def command(
     device: str | None,
     side: str | None,
     servo_id: int | str,
+    ids: tuple[int, ...] | None,
     baudrate: int | str,
     effort: float,
     speed: bool,
@@ -175,9 +194,16 @@ def command(
         device = stored_device(store, Side(side))
     if distances and (force or not speed):
         raise UsageError("--distances is for --speed", hint="give both: --speed --distances")
+    if ids is not None:
+        if ctx.get_parameter_source("servo_id") is not click.core.ParameterSource.DEFAULT:
+            raise UsageError("give --id of one servo, or --ids of two, not both")
+        for option, given in (("--force", force), ("--set-baudrate", set_baudrate)):
+            if given:
+                raise UsageError(f"{option} is for one servo at a time", hint="give --id")
     console = Console()
     configuration = GripperSettings(
         id=servo_id if isinstance(servo_id, int) else None,
+        ids=ids or (),
         baudrate=baudrate if isinstance(baudrate, int) else None,
         config=config,
     )
@@ -199,21 +225,32 @@ def command(
             if set_baudrate is not None:
                 _change_baudrate(servo, int(set_baudrate))
                 console.print(f"servo {servo.id} is at {set_baudrate} baud now")
-            console.print(f"servo {servo.id} on {servo.bus.path} is set up; key {hand.key}")
-            if force:
-                record = GripperRecord(force_table=_force(hand, servo, console, stop, up_to))
-            else:
-                record = _zero_and_speed(
-                    servo, console, stop, effort, runs if speed else 0, distances=distances
-                )
+            records = {}
+            for unit in hand.units:
+                servo = unit.servo
+                console.print(f"servo {servo.id} on {servo.bus.path} is set up; key {unit.key}")
+                if force:
+                    table = _force(hand, servo, console, stop, up_to)
+                    records[unit.key] = GripperRecord(force_table=table)
+                else:
+                    records[unit.key] = _zero_and_speed(
+                        servo,
+                        console,
+                        stop,
+                        effort,
+                        runs if speed else 0,
+                        stroke=unit.stroke,
+                        distances=distances,
+                    )
         except calibration.CalibrationFailed:
             if stop:
                 raise click.Abort from None
             raise
         finally:
             hand.close()
-        store.write(hand.key, record)
-    console.print(f"stored for {hand.key} in {store.path}")
+        for key, record in records.items():
+            store.write(key, record)
+    console.print(f"stored for {', '.join(records)} in {store.path}")
 
 
 def _refuse_foreign(ctx: click.Context, known: set[str], gripper: str) -> None:
@@ -235,6 +272,7 @@ def _zero_and_speed(
     effort: float,
     runs: int,
     *,
+    stroke: int,
     distances: bool,
 ) -> GripperRecord:
     def progress(text: str) -> None:
@@ -243,16 +281,20 @@ def _zero_and_speed(
     def cancelled() -> bool:
         return bool(stop)
 
-    zero = calibration.find_zero(servo, effort=effort, progress=progress, cancelled=cancelled)
+    zero = calibration.find_zero(
+        servo, stroke=stroke, effort=effort, progress=progress, cancelled=cancelled
+    )
     console.print(f"zero: {zero} ticks")
     if not runs:
         return GripperRecord(zero=zero)
     result = calibration.measure_speed(
-        servo, zero, runs=runs, progress=progress, cancelled=cancelled
+        servo, zero, stroke=stroke, runs=runs, progress=progress, cancelled=cancelled
     )
     console.print(f"speed: opens {result.opening:.0f} %/s, closes {result.closing:.0f} %/s")
     if distances:
-        ways = calibration.measure_distances(servo, zero, progress=progress, cancelled=cancelled)
+        ways = calibration.measure_distances(
+            servo, zero, stroke=stroke, progress=progress, cancelled=cancelled
+        )
         for verb, way in zip(("open", "close"), ways, strict=True):
             console.print(
                 f"overhead of a move: {1e3 * way.overhead:.0f} ms to {verb}, beside "
@@ -325,17 +367,17 @@ def _print_servo(hand: EZGripper, console: Console, store: Store) -> None:
         console.print(f"[yellow]{warning}[/yellow]")
     bus = ServoBus(device.path, configuration.baudrate or 1_000_000)
     try:
-        ping = discovery.find_servo(
-            bus, configuration.id, configuration.baudrate, _print_dim(console)
-        )
-        console.print(
-            f"servo {ping.id} at {bus.baudrate} baud: MX-64(2.0), firmware {ping.firmware}"
-        )
-        differing = settings.differences(bus, ping.id)
-        for item, found, wanted in differing:
-            console.print(f"  {item.name}({item.address}) is {found}, would be set to {wanted}")
-        if not differing:
-            console.print("  its EEPROM holds what the driver needs")
+        for number in configuration.servo_ids:
+            ping = discovery.find_servo(bus, number, configuration.baudrate, _print_dim(console))
+            console.print(
+                f"servo {ping.id} at {bus.baudrate} baud: MX-64(2.0), firmware {ping.firmware}"
+            )
+            mirrored = bool(store.read(record_key(device.key, ping.id)).mirrored)
+            differing = settings.differences(bus, ping.id, mirrored=mirrored)
+            for item, found, wanted in differing:
+                console.print(f"  {item.name}({item.address}) is {found}, would be set to {wanted}")
+            if not differing:
+                console.print("  its EEPROM holds what the driver needs")
     finally:
         bus.close()
     _print_store(store)

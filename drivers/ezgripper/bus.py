@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import termios
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import serial
@@ -26,7 +27,15 @@ from dexkit.errors import HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.wire import dynamixel, mx64
 from dexkit.wire.dynamixel import BROADCAST_ID, Instruction, Packet, PacketParser
 
-__all__ = ["BITS_PER_BYTE", "BusStatistics", "DevicePort", "Ping", "ServoBus", "ServoError"]
+__all__ = [
+    "BITS_PER_BYTE",
+    "BusStatistics",
+    "DevicePort",
+    "Ping",
+    "ServoBus",
+    "ServoError",
+    "ServoSilent",
+]
 
 BITS_PER_BYTE = 10
 """8N1: start bit, eight data bits, stop bit."""
@@ -74,6 +83,10 @@ class ServoError(HandRefused):
     def __init__(self, message: str, number: int, *, hint: str = "") -> None:
         super().__init__(message, hint=hint)
         self.number = number
+
+
+class ServoSilent(HandTimeout):
+    """A servo gives no intact answer to any attempt."""
 
 
 class DevicePort:
@@ -303,16 +316,29 @@ class ServoBus:
         with_next: bool = False,
         before: WriteDeadline | None = None,
     ) -> None:
-        """Write without a status packet, as a Sync Write to one servo.
+        """Write to one servo without a status packet. As :meth:`sync_write`."""
+        self.sync_write(address, {servo_id: data}, with_next=with_next, before=before)
 
+    def sync_write(
+        self,
+        address: int,
+        data: Mapping[int, bytes],
+        *,
+        with_next: bool = False,
+        before: WriteDeadline | None = None,
+    ) -> None:
+        """Write to several servos in one packet, without a status packet.
+
+        :param data: of each servo, by id; all of one length.
         :param with_next: send it together with the next transaction: one system call and, on a USB
             adapter, one transfer instead of two.
         :param before: checked right before the bytes are written. What it raises comes from here,
             or from the next transaction.
         :raises HandLost: the port has gone away or takes no more bytes.
         """
-        size = len(data)
-        params = bytes((address & 0xFF, address >> 8, size & 0xFF, size >> 8, servo_id)) + data
+        size = len(next(iter(data.values())))
+        params = bytes((address & 0xFF, address >> 8, size & 0xFF, size >> 8))
+        params += b"".join(bytes((servo_id,)) + part for servo_id, part in data.items())
         packet = dynamixel.encode(BROADCAST_ID, Instruction.SYNC_WRITE, params)
         self._before = before
         if with_next:
@@ -320,6 +346,61 @@ class ServoBus:
             return
         with port_errors(self.path):
             self._send(packet)
+
+    def sync_read(self, servo_ids: Sequence[int], address: int, length: int) -> dict[int, bytes]:
+        """Read ``length`` bytes from ``address`` of several servos with one instruction.
+
+        :raises ServoSilent: one of them gives no intact answer.
+        :raises HandLost: the port has gone away.
+        :raises ServoError: one refuses.
+        """
+        params = address.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(servo_ids)
+        request = dynamixel.encode(BROADCAST_ID, Instruction.SYNC_READ, params)
+        statistics = self.statistics
+        expected = len(servo_ids) * (_STATUS + length)
+        missing: list[int] = []
+        for attempt in range(1 + self.retries):
+            statistics.transactions += 1
+            statistics.retries += attempt > 0
+            with port_errors(self.path):
+                self._send(request)
+                found = self._receive_all(servo_ids, length, self._deadline(expected))
+            missing = [servo_id for servo_id in servo_ids if servo_id not in found]
+            if not missing:
+                return found
+            statistics.timeouts += 1
+        raise ServoSilent(
+            f"servo {' and '.join(map(str, missing))} on {self.path} does not answer "
+            f"({1 + self.retries} attempt(s) at {self.baudrate} baud)",
+            hint="check power, cable, id and baud rate",
+        )
+
+    def _receive_all(
+        self, servo_ids: Sequence[int], length: int, deadline: float
+    ) -> dict[int, bytes]:
+        """Data of the servos' intact answers, by id, until all are there or the deadline."""
+        parser = self._parser
+        parser.reset()
+        found: dict[int, bytes] = {}
+        late = False
+        while not late and len(found) < len(servo_ids):
+            late = time.monotonic() >= deadline
+            data = self._port.read(deadline)
+            if not data:
+                break
+            for packet in parser.feed(data):
+                if not packet.is_status or packet.id not in servo_ids:
+                    continue
+                number = packet.error_number if packet.crc_ok and packet.params else 0
+                if number and number != dynamixel.ErrorNumber.CRC:
+                    refusal = _describe_refusal(packet.id, Instruction.SYNC_READ, b"", number)
+                    raise ServoError(refusal, number)
+                if packet.crc_ok and packet.params and len(packet.data) == length:
+                    found[packet.id] = packet.data
+                else:
+                    self.statistics.corrupt += 1
+        parser.reset()
+        return found
 
     def reboot(self, servo_id: int) -> None:
         """Reboot the servo; it does not answer until it has booted.
@@ -369,7 +450,7 @@ class ServoBus:
             # for example a late answer to an earlier instruction
             statistics.corrupt += 1
             problem = "answers with packets of the wrong length"
-        raise HandTimeout(
+        raise ServoSilent(
             f"servo {servo_id} on {self.path} {problem} "
             f"({attempts} attempt(s) at {self.baudrate} baud)",
             hint="check power, cable, id and baud rate",

@@ -214,6 +214,7 @@ def _timeout(ticks: float, speed: float) -> float:
 def find_zero(
     drive: Drive,
     *,
+    stroke: int = STROKE,
     effort: float = EFFORT,
     speed: float = SPEED,
     progress: Progress = _ignore_progress,
@@ -223,10 +224,12 @@ def find_zero(
 
     The gripper must be empty. It is left open.
 
+    :param stroke: ticks from closed to open, here and below.
+
     :raises CalibrationFailed: there is no stop, or the gripper does not open by its stroke.
     """
     start = drive.sample().position
-    reach = STROKE + _SEARCH_MARGIN
+    reach = stroke + _SEARCH_MARGIN
     progress(f"closing at {effort:g} % effort")
     closing = move(
         drive,
@@ -243,20 +246,20 @@ def find_zero(
             hint="are the tendons attached?",
         )
     zero = closing.end.position
-    progress(f"stopped after {abs(zero - start) / TICKS_PER_PERCENT:.0f} % of the stroke; opening")
+    progress(f"stopped after {100 * abs(zero - start) / stroke:.0f} % of the stroke; opening")
     opening = move(
         drive,
-        zero - mx64.EZGRIPPER_CLOSING * STROKE,
+        zero - mx64.EZGRIPPER_CLOSING * stroke,
         effort=effort,
         speed=speed,
-        timeout=_timeout(STROKE, speed),
+        timeout=_timeout(stroke, speed),
         cancelled=cancelled,
     )
     travel = abs(opening.end.position - zero)
-    if travel < STROKE - _OPEN_TOLERANCE:
+    if travel < stroke - _OPEN_TOLERANCE:
         _stop_current(drive, opening.end)
         raise CalibrationFailed(
-            f"the gripper opens only {travel / TICKS_PER_PERCENT:.0f} % of its stroke from where "
+            f"the gripper opens only {100 * travel / stroke:.0f} % of its stroke from where "
             "it stopped closing",
             hint="take out what it holds, free the fingers, and try again",
         )
@@ -271,6 +274,7 @@ def measure_speed(
     drive: Drive,
     zero: int,
     *,
+    stroke: int = STROKE,
     effort: float = 100.0,
     runs: int = 3,
     progress: Progress = _ignore_progress,
@@ -284,8 +288,8 @@ def measure_speed(
     results: list[tuple[float, float]] = []
     _stroke(drive, zero, 0, effort=EFFORT, speed=SPEED, cancelled=cancelled)
     for run in range(runs):
-        opening = _measure_run(drive, zero, STROKE, effort, cancelled)
-        closing = _measure_run(drive, zero, 0, effort, cancelled)
+        opening = _measure_run(drive, zero, stroke, effort, cancelled, stroke)
+        closing = _measure_run(drive, zero, 0, effort, cancelled, stroke)
         results.append((opening, closing))
         progress(f"run {run + 1} of {runs}: opens {opening:.0f} %/s, closes {closing:.0f} %/s")
     return SpeedResult(
@@ -304,6 +308,7 @@ def measure_distances(
     zero: int,
     *,
     distances: Sequence[float] = DISTANCES,
+    stroke: int = STROKE,
     effort: float = 100.0,
     progress: Progress = _ignore_progress,
     cancelled: Cancelled = _never_cancelled,
@@ -322,7 +327,7 @@ def measure_distances(
     closing: list[tuple[float, float]] = []
     _stroke(drive, zero, 0, effort=EFFORT, speed=SPEED, cancelled=cancelled)
     for percent in distances:
-        goal = round(percent * TICKS_PER_PERCENT)
+        goal = round(percent * stroke / 100)
         for target, found in ((goal, opening), (0, closing)):
             track = _stroke(
                 drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled
@@ -380,7 +385,7 @@ def _stroke(
 
 
 def _measure_run(
-    drive: Drive, zero: int, target: int, effort: float, cancelled: Cancelled
+    drive: Drive, zero: int, target: int, effort: float, cancelled: Cancelled, stroke: int
 ) -> float:
     # faster than the motor, so the profile does not limit the speed
     track = _stroke(drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled)
@@ -390,12 +395,12 @@ def _measure_run(
         if s.received - s.time < _LATE_ANSWER
     ]
     if target == 0:
-        points = [(t, STROKE - p) for t, p in points]
-    low, high = 0.1 * STROKE, 0.9 * STROKE
+        points = [(t, stroke - p) for t, p in points]
+    low, high = 0.1 * stroke, 0.9 * stroke
     elapsed = _crossing_time(points, high) - _crossing_time(points, low)
     if elapsed <= 0:
         raise CalibrationFailed("too few samples to measure a speed", hint="see the latency timer")
-    return (high - low) / TICKS_PER_PERCENT / elapsed
+    return 100 * (high - low) / stroke / elapsed
 
 
 def _crossing_time(points: list[tuple[float, int]], level: float) -> float:

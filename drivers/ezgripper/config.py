@@ -8,14 +8,17 @@ unchanged, and what is written has the types that such a driver reads::
      "movement_speed":       {"DA1Z9T40": 127.5},
      "direction_speeds":     {"DA1Z9T40": {"opening": 131.0, "closing": 127.5}},
      "force_lookup":         {"DA1Z9T40": {"0": 0.0, "100": 0.5}},
-     "force_lookup_unit":    {"DA1Z9T40": "3.36 mA"}}
+     "force_lookup_unit":    {"DA1Z9T40": "3.36 mA"},
+     "left_ids": [1, 2], "mirrored": {"DA1Z9T40": true}, "stroke": {"DA1Z9T40": 2480}}
 
 Keys are the USB serial number of the adapter, or the device path where there is none (a
 pseudo-terminal); ``#2`` is appended for servo id 2. Zero in ticks within the turn, speed in
 percent of stroke a second, force over current units. ``movement_speed`` is the slower of the two
 ``direction_speeds``; if another program has changed it, that number holds for both directions.
 (Earlier files hold the two in ``movement_speed``; they are read.) ``left``, ``right``,
-``left_serial`` and ``right_serial`` name the adapter of a side. Unknown entries are kept.
+``left_serial`` and ``right_serial`` name the adapter of a side. ``left_ids``, ``right_ids``,
+``mirrored`` and ``stroke`` (ticks from closed to open) are of ``dexkit bringup``. Unknown entries
+are kept.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +35,7 @@ import platformdirs
 
 from dexkit import documents
 from dexkit.drivers.ezgripper.force import ForceTable
+from dexkit.drivers.ezgripper.scaling import STROKES
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.wire import mx64
@@ -44,6 +49,7 @@ ENVIRONMENT = "DEXKIT_EZGRIPPER_CONFIG"
 
 _ZERO, _SPEED, _FORCE = "calibration", "movement_speed", "force_lookup"
 _DIRECTIONS, _UNIT = "direction_speeds", "force_lookup_unit"
+_MIRRORED, _STROKE = "mirrored", "stroke"
 CURRENT_UNIT = "3.36 mA"
 """Unit of the currents of a force table: one count of Present Current(126)."""
 
@@ -71,6 +77,9 @@ class GripperRecord:
     :param closing: percent of stroke a second.
     :param force_unit_known: the file says that the table is in units of 3.36 mA. A table of SAKE's
         driver, which says nothing, may be of register 40 (docs/sources/mx64-ezgripper.md#d10-1).
+    :param mirrored: the fingers close while the encoder's position rises; ``zero`` is then counted
+        in the direction in which it falls.
+    :param stroke: ticks from closed to open.
     """
 
     zero: int | None = None
@@ -78,6 +87,8 @@ class GripperRecord:
     closing: float | None = None
     force_table: ForceTable | None = None
     force_unit_known: bool = True
+    mirrored: bool | None = None
+    stroke: int | None = None
 
 
 class Store:
@@ -131,6 +142,30 @@ class Store:
                 return value
         return None
 
+    def servo_ids(self, side: Side) -> tuple[int, ...]:
+        """Ids of the servos of a side's gripper; empty if the file names none.
+
+        :raises UsageError: the file cannot be read, or they are no ids.
+        """
+        value = self._load().get(f"{side}_ids", [])
+        if not isinstance(value, list) or not all(type(number) is int for number in value):
+            raise UsageError(f"{self.path}: {side}_ids must be a list of servo ids, not {value!r}")
+        return tuple(value)
+
+    def write_side(self, side: Side, device: str, servo_ids: Sequence[int]) -> None:
+        """Store which adapter and which servos a side has.
+
+        :raises UsageError: the file cannot be read or written.
+        """
+
+        def change(text: str | None) -> str:
+            content = {} if text is None else self._parse(text)
+            content[str(side) if "/" in device else f"{side}_serial"] = device
+            content[f"{side}_ids"] = list(servo_ids)
+            return json.dumps(content, indent=2, sort_keys=True) + "\n"
+
+        documents.update_file(self.path, change)
+
     def read(self, key: str) -> GripperRecord:
         """Read a gripper's calibration; an empty record if there is none.
 
@@ -159,12 +194,24 @@ class Store:
         table = self._get_section(content, _FORCE).get(key)
         if table is not None and not isinstance(table, dict):
             raise UsageError(f"{where}: the force table must be an object")
+        mirrored = self._get_section(content, _MIRRORED).get(key)
+        if mirrored is not None and not isinstance(mirrored, bool):
+            raise UsageError(f"{where}: mirrored is true or false, not {mirrored!r}")
+        stroke = self._get_section(content, _STROKE).get(key)
+        if stroke is not None and (
+            isinstance(stroke, bool)
+            or not isinstance(stroke, int)
+            or not STROKES[0] <= stroke <= STROKES[1]
+        ):
+            raise UsageError(f"{where}: a stroke is {STROKES[0]} to {STROKES[1]} ticks")
         return GripperRecord(
             zero=None if zero is None else zero % mx64.TICKS_PER_TURN,
             opening=opening,
             closing=closing,
             force_table=None if table is None else ForceTable.from_mapping(table),
             force_unit_known=table is None or unit is not None,
+            mirrored=mirrored,
+            stroke=stroke,
         )
 
     @staticmethod
@@ -212,6 +259,9 @@ class Store:
         if speeds:
             content[_SPEED] = self._get_section(content, _SPEED) | {key: min(speeds.values())}
             content[_DIRECTIONS] = self._get_section(content, _DIRECTIONS) | {key: speeds}
+        for name, value in ((_MIRRORED, record.mirrored), (_STROKE, record.stroke)):
+            if value is not None:
+                content[name] = self._get_section(content, name) | {key: value}
         if record.force_table is not None:
             content[_FORCE] = self._get_section(content, _FORCE) | {
                 key: record.force_table.to_mapping()

@@ -30,6 +30,7 @@ from enum import Enum
 from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import MIN_FREE_SPEED, Contact, ContactDetector
 from dexkit.drivers.ezgripper.scaling import (
+    STROKE,
     current_of_effort,
     profile_velocity,
     relative_position,
@@ -124,10 +125,18 @@ class Control:
     """Plans the goal of each exchange from the newest command and the newest sample.
 
     :param zero: calibrated zero, ticks, in any turn.
+    :param stroke: ticks from closed to open.
+
+    :ivar partner_reduced: the other servo of the gripper is hot or was overloaded, so that the
+        effort of this one is reduced, too.
     """
 
-    def __init__(self, zero: int, settings: ControlSettings | None = None) -> None:
+    def __init__(
+        self, zero: int, settings: ControlSettings | None = None, *, stroke: int = STROKE
+    ) -> None:
         self.zero = zero
+        self.stroke = stroke
+        self.partner_reduced = False
         self.settings = settings if settings is not None else ControlSettings()
         self.detector = ContactDetector()
         self.phase = Phase.LIMP
@@ -149,9 +158,14 @@ class Control:
         """The present contact, or None."""
         return self.detector.contact
 
+    @property
+    def reduced(self) -> bool:
+        """Whether the servo is hot or was overloaded, so that its effort is reduced."""
+        return self._warm or self._overloaded_at is not None
+
     def position(self, sample: Sample) -> int:
         """Return a sample's position, ticks from the zero."""
-        return relative_position(sample.position, self.zero)
+        return relative_position(sample.position, self.zero, self.stroke)
 
     def recovered(self, command: HandCommand | None, *, overload_at: float | None = None) -> None:
         """Start over after a servo reboot: no torque until a command differs from ``command``.
@@ -221,7 +235,7 @@ class Control:
     ) -> Goal:
         settings = self.settings
         self._braked_at = None
-        target = ticks_of_joint(float(command.q[0]))
+        target = ticks_of_joint(float(command.q[0]), self.stroke)
         held = self.detector.contact
         contact = self.detector.update(now, position, target, received=sample.received)
         self._end_startup(now, abs(target - position) <= _AT_GOAL)
@@ -235,7 +249,7 @@ class Control:
         else:
             self.phase = Phase.HOLDING
         effort = settings.effort
-        if self.phase is Phase.HOLDING or self._warm or self._overloaded_at is not None:
+        if self.phase is Phase.HOLDING or self.reduced or self.partner_reduced:
             effort = min(effort, settings.hold_effort)
         current = current_of_effort(effort)
         if held is not None and contact is None:
@@ -258,7 +272,7 @@ class Control:
     def _profile_velocity(self) -> int:
         settings = self.settings
         speed = min(settings.speed, settings.startup_speed) if self._starting else settings.speed
-        return profile_velocity(speed)
+        return profile_velocity(speed, self.stroke)
 
 
 def _clamp_to_stroke(ticks: int) -> int:

@@ -14,6 +14,7 @@ __all__ = [
     "Device",
     "find_device",
     "find_servo",
+    "find_servos",
     "latency_timer",
     "latency_warning",
 ]
@@ -86,6 +87,28 @@ def find_servo(
     raise HandNotFound(
         f"no servo answers on {bus.path}: tried {who} at {tried} baud",
         hint=hint + "; is the 12 V supply on?",
+    )
+
+
+def find_servos(bus: ServoBus, baudrate: int | None) -> list[Ping]:
+    """Find every servo on a line and leave the bus open at their baud rate.
+
+    :param baudrate: bits a second, or None for the first of :data:`SCAN_BAUD_RATES` at which any
+        answers.
+    :raises HandNotFound: no servo answers.
+    :raises HandRefused: one is no MX-64 with Protocol 2.0.
+    :raises HandLost: the port has gone away.
+    """
+    rates = SCAN_BAUD_RATES if baudrate is None else (baudrate,)
+    for rate in rates:
+        bus.set_baudrate(rate)
+        found = bus.ping_all()
+        if found:
+            return [_check_model(ping, bus) for ping in found]
+    tried = ", ".join(str(rate) for rate in rates)
+    raise HandNotFound(
+        f"no servo answers on {bus.path}: tried {tried} baud",
+        hint="is the 12 V supply on? baudrate=auto tries every baud rate (a new servo has 57600)",
     )
 
 

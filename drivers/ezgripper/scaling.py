@@ -16,6 +16,7 @@ __all__ = [
     "CURRENT_LIMIT",
     "JOINT_PER_TICK",
     "STROKE",
+    "STROKES",
     "TICKS_PER_PERCENT",
     "VELOCITY_LIMIT",
     "amperes",
@@ -29,6 +30,8 @@ __all__ = [
 ]
 
 STROKE = mx64.EZGRIPPER_STROKE
+STROKES = (1000, 3600)
+"""Strokes that a gripper may have, ticks: below one turn by as much as tells open from closed."""
 TICKS_PER_PERCENT = STROKE / 100
 
 _JOINT = DEX1_1.joints[Side.LEFT][0]
@@ -46,14 +49,17 @@ _TICKS_PER_SECOND = mx64.VELOCITY_UNIT_RPM / 60 * mx64.TICKS_PER_TURN
 """ticks/s of one velocity unit (0.229 rpm): 15.63."""
 
 
-def joint_of_ticks(ticks: float) -> float:
-    """Joint angle, rad, of a position relative to the zero."""
-    return _JOINT.q_min + ticks * JOINT_PER_TICK
+def joint_of_ticks(ticks: float, stroke: int = STROKE) -> float:
+    """Joint angle, rad, of a position relative to the zero.
+
+    :param stroke: ticks from closed to open, here and below.
+    """
+    return _JOINT.q_min + ticks * _JOINT.stroke / stroke
 
 
-def ticks_of_joint(q: float) -> int:
+def ticks_of_joint(q: float, stroke: int = STROKE) -> int:
     """Position relative to the zero, in whole ticks within the stroke, of a joint angle in rad."""
-    return min(max(round((q - _JOINT.q_min) / JOINT_PER_TICK), 0), STROKE)
+    return min(max(round((q - _JOINT.q_min) * stroke / _JOINT.stroke), 0), stroke)
 
 
 def ticks_per_second(velocity: float) -> float:
@@ -61,18 +67,18 @@ def ticks_per_second(velocity: float) -> float:
     return velocity * _TICKS_PER_SECOND
 
 
-def joint_speed(velocity: float) -> float:
+def joint_speed(velocity: float, stroke: int = STROKE) -> float:
     """rad/s of the joint of a velocity register's value; positive opens."""
-    return ticks_per_second(velocity) * JOINT_PER_TICK
+    return ticks_per_second(velocity) * _JOINT.stroke / stroke
 
 
-def profile_velocity(percent_per_second: float) -> int:
+def profile_velocity(percent_per_second: float, stroke: int = STROKE) -> int:
     """Profile Velocity register value for a speed.
 
     At least 1, because 0 means no limit, and at most Velocity Limit's 1023, because the servo
     may refuse more (docs/sources/mx64-ezgripper.md#b5).
     """
-    units = round(percent_per_second * TICKS_PER_PERCENT / _TICKS_PER_SECOND)
+    units = round(percent_per_second * stroke / 100 / _TICKS_PER_SECOND)
     return min(max(units, 1), VELOCITY_LIMIT)
 
 
@@ -88,7 +94,7 @@ def amperes(units: float) -> float:
     return units * mx64.CURRENT_UNIT
 
 
-def relative_position(present: int, zero: int) -> int:
+def relative_position(present: int, zero: int, stroke: int = STROKE) -> int:
     """Return ticks from the zero to ``present``, which may be counted in different turns.
 
     The encoder is absolute only within one turn: after power-on or a reboot the servo reports
@@ -98,5 +104,5 @@ def relative_position(present: int, zero: int) -> int:
     the middle of these: up to 798 ticks (32 %) beyond open read as open, up to 798 below the zero
     as negative.
     """
-    margin = (mx64.TICKS_PER_TURN - STROKE) // 2
+    margin = (mx64.TICKS_PER_TURN - stroke) // 2
     return (present - zero + margin) % mx64.TICKS_PER_TURN - margin

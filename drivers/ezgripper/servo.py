@@ -1,7 +1,8 @@
-"""Exchange goals and samples with one servo, with its bus watchdog enabled."""
+"""Exchange goals and samples with one servo or a group, with their bus watchdogs enabled."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dexkit.clock import Clock, RealClock
@@ -18,33 +19,44 @@ from dexkit.drivers.ezgripper.settings import (
 from dexkit.errors import HandTimeout
 from dexkit.wire import mx64
 
-__all__ = ["BOOT_TIME", "Servo", "ServoStatistics", "exchange_bytes", "line_time"]
+__all__ = [
+    "BOOT_TIME",
+    "Servo",
+    "ServoGroup",
+    "ServoStatistics",
+    "exchange_bytes",
+    "line_time",
+]
 
 BOOT_TIME = 5.0
 """Seconds after which a rebooted servo should answer again; the true boot time is not published
 (docs/sources/mx64-ezgripper.md#d6: its authors waited 0.5 to 1.5 s)."""
 
-_SYNC_WRITE_OVERHEAD = 15
-_READ_INSTRUCTION = 14
+_SYNC_WRITE_OVERHEAD = 14
+_READ_INSTRUCTION = 14  # also of a sync read, and an id for each servo
 _STATUS_OVERHEAD = 11
 _RETURN_DELAY = 4e-6  # as settings.py sets it
 
 
-def exchange_bytes() -> tuple[int, int]:
-    """Return the bytes on the line of one exchange: (to the servo, from the servo)."""
-    sent = _SYNC_WRITE_OVERHEAD + block.WRITE_SIZE + _READ_INSTRUCTION
-    return sent, _STATUS_OVERHEAD + block.READ_SIZE
+def exchange_bytes(servos: int = 1) -> tuple[int, int]:
+    """Return the bytes on the line of one exchange: (to the servos, from the servos)."""
+    sent = _SYNC_WRITE_OVERHEAD + servos * (1 + block.WRITE_SIZE) + _read_bytes(servos)
+    return sent, servos * (_STATUS_OVERHEAD + block.READ_SIZE)
 
 
-def line_time(baudrate: int, return_delay: float = _RETURN_DELAY) -> float:
+def _read_bytes(servos: int) -> int:
+    return _READ_INSTRUCTION + (servos if servos > 1 else 0)
+
+
+def line_time(baudrate: int, return_delay: float = _RETURN_DELAY, *, servos: int = 1) -> float:
     """Return the seconds that one exchange takes on the line, without the USB adapter.
 
     With the adapter: :func:`dexkit.drivers.serial_port.exchange_period`.
 
     :param baudrate: bits a second.
-    :param return_delay: seconds that the servo waits before it answers.
+    :param return_delay: seconds that a servo waits before it answers.
     """
-    return sum(exchange_bytes()) * BITS_PER_BYTE / baudrate + return_delay
+    return sum(exchange_bytes(servos)) * BITS_PER_BYTE / baudrate + servos * return_delay
 
 
 @dataclass
@@ -80,9 +92,9 @@ class Servo:
         self._to_measurement = bus.wire_time(sent)
         self._read_to_measurement = bus.wire_time(_READ_INSTRUCTION)
 
-    def configure(self) -> ServoLimits:
-        """Write and verify all registers. Raises as :func:`settings.apply_settings`."""
-        return apply_settings(self.bus, self.id)
+    def configure(self, *, mirrored: bool = False) -> ServoLimits:
+        """Write and verify all registers. As :func:`settings.apply_settings`."""
+        return apply_settings(self.bus, self.id, mirrored=mirrored)
 
     def exchange(self, goal: Goal, before: WriteDeadline | None = None) -> Sample:
         """Write a goal and read a sample.
@@ -96,7 +108,10 @@ class Servo:
         self.bus.write_unacknowledged(
             self.id, block.WRITE_ADDRESS, data, with_next=True, before=before
         )
-        sample = self._read(started + self._to_measurement)
+        return self.check_goal(goal, self._read(started + self._to_measurement))
+
+    def check_goal(self, goal: Goal, sample: Sample) -> Sample:
+        """Count an exchange, and whether its goal has arrived; return its sample."""
         self.statistics.exchanges += 1
         if sample.goal_current != goal.current or sample.goal_position != goal.position:
             self.statistics.lost_writes += 1
@@ -108,6 +123,13 @@ class Servo:
 
     def _read(self, measured_at: float) -> Sample:
         data, _ = self.bus.read(self.id, block.READ_ADDRESS, block.READ_SIZE)
+        return self.decode(data, measured_at)
+
+    def decode(self, data: bytes, measured_at: float) -> Sample:
+        """The sample in the bytes that have just been read.
+
+        :param measured_at: monotonic seconds, the earliest that it can be.
+        """
         received = self._clock.now()
         # the time must not be in the future
         sample = block.decode(data, min(measured_at, received), received)
@@ -150,3 +172,40 @@ class Servo:
         except HandTimeout:
             return False
         return True
+
+
+class ServoGroup:
+    """The servos of one gripper, on one line: one packet with the goals, one with the request.
+
+    :param servos: one, or several on one bus.
+    """
+
+    def __init__(self, servos: Sequence[Servo], clock: Clock | None = None) -> None:
+        self.servos = tuple(servos)
+        self._clock: Clock = clock if clock is not None else RealClock()
+        self._bus = servos[0].bus
+        sent, _ = exchange_bytes(len(servos))
+        self._to_measurement = self._bus.wire_time(sent)
+
+    def exchange(self, goals: Sequence[Goal], before: WriteDeadline | None = None) -> list[Sample]:
+        """Write every servo's goal and read every servo's sample. As :meth:`Servo.exchange`."""
+        if len(self.servos) == 1:
+            return [self.servos[0].exchange(goals[0], before)]
+        started = self._clock.now()
+        pairs = list(zip(self.servos, goals, strict=True))
+        data = {servo.id: block.encode(goal) for servo, goal in pairs}
+        self._bus.sync_write(block.WRITE_ADDRESS, data, with_next=True, before=before)
+        answers = self._bus.sync_read(list(data), block.READ_ADDRESS, block.READ_SIZE)
+        at = started + self._to_measurement
+        return [
+            servo.check_goal(goal, servo.decode(answers[servo.id], at)) for servo, goal in pairs
+        ]
+
+    def switch_off(self) -> None:
+        """Switch every motor off with one packet, whichever of them answer.
+
+        :raises HandLost: the port has gone away.
+        """
+        off = mx64.TORQUE_ENABLE.encode(0)
+        ids = [servo.id for servo in self.servos]
+        self._bus.sync_write(mx64.TORQUE_ENABLE.address, dict.fromkeys(ids, off))

@@ -71,9 +71,15 @@ class ServoLimits:
     voltage_max: float
 
 
-def differences(bus: ServoBus, servo_id: int) -> list[tuple[mx64.Item, int, int]]:
-    """List EEPROM items that differ: (item, value read, value needed). Raises as the bus."""
-    found = [(item, bus.read_item(servo_id, item), wanted) for item, wanted in EEPROM]
+def differences(
+    bus: ServoBus, servo_id: int, *, mirrored: bool = False
+) -> list[tuple[mx64.Item, int, int]]:
+    """List EEPROM items that differ: (item, value read, value needed). Raises as the bus.
+
+    :param mirrored: as :func:`apply_settings`.
+    """
+    needed = dict(EEPROM) | ({mx64.DRIVE_MODE: int(mx64.DriveMode.REVERSE)} if mirrored else {})
+    found = [(item, bus.read_item(servo_id, item), wanted) for item, wanted in needed.items()]
     return [entry for entry in found if entry[1] != entry[2]]
 
 
@@ -99,8 +105,11 @@ def hold_here(bus: ServoBus, servo_id: int, watchdog: int = 0) -> None:
         bus.write_item(servo_id, mx64.BUS_WATCHDOG, watchdog)
 
 
-def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
+def apply_settings(bus: ServoBus, servo_id: int, *, mirrored: bool = False) -> ServoLimits:
     """Write the registers of a servo to what the driver needs. No motion.
+
+    :param mirrored: the fingers close while the encoder's position rises: the servo counts the
+        other way (Drive Mode), so that closing is toward smaller ticks for everything else.
 
     Torque is switched off only if EEPROM or the mapping must change; otherwise a servo that holds
     an object goes on holding it at its present position.
@@ -115,7 +124,9 @@ def apply_settings(bus: ServoBus, servo_id: int) -> ServoLimits:
         mx64.STATUS_RETURN_LEVEL.address,
         mx64.STATUS_RETURN_LEVEL.encode(StatusReturnLevel.ALL),
     )
-    differing = [(item, wanted) for item, _, wanted in differences(bus, servo_id)]
+    differing = [
+        (item, wanted) for item, _, wanted in differences(bus, servo_id, mirrored=mirrored)
+    ]
     mapped = _mapping(bus, servo_id) == block.mapping()
     if bus.read_item(servo_id, mx64.TORQUE_ENABLE):
         # ROBOTIS' examples write indirect addresses only with torque off

@@ -10,6 +10,7 @@ from dexkit.emulators.mx64.bus import Bus
 from dexkit.emulators.mx64.gripper import EmulatedProcess, EmulatedThread, emulated_ezgripper
 from dexkit.emulators.mx64.servo import Servo
 from dexkit.emulators.mx64.settings import Firmware, GripperMechanics, Physics
+from dexkit.emulators.mx64.wiring import Wiring
 from dexkit.emulators.serial_port import Port
 
 __all__ = [
@@ -21,5 +22,6 @@ __all__ = [
     "Physics",
     "Port",
     "Servo",
+    "Wiring",
     "emulated_ezgripper",
 ]

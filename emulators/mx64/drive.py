@@ -153,16 +153,17 @@ class Drive:
     def __init__(self, physics: Physics) -> None:
         self.physics = physics
         mechanics = physics.gripper
-        stroke = mx64.EZGRIPPER_STROKE * _TICK
+        opens = -1 if mechanics.mirrored else 1
+        stroke = self._stroke = opens * mechanics.stroke * _TICK
         walls = []
         if not mechanics.bare:
             walls = [
-                Wall(0.0, +1, mechanics.closed_stiffness, 0.6),
-                Wall(stroke, -1, mechanics.open_stiffness, 1.0),
+                Wall(0.0, opens, mechanics.closed_stiffness, 0.6),
+                Wall(stroke, -opens, mechanics.open_stiffness, 1.0),
             ]
         if mechanics.object_pct is not None:
             walls.append(
-                Wall(stroke * mechanics.object_pct / 100, +1, mechanics.object_stiffness, 1.0)
+                Wall(stroke * mechanics.object_pct / 100, opens, mechanics.object_stiffness, 1.0)
             )
         self.joint = Joint(
             inertia=physics.inertia + mechanics.inertia,
@@ -219,7 +220,7 @@ class Drive:
     @property
     def opening(self) -> float:
         """Percent of the stroke: 0 closed, 100 open; a little beyond where the stops give."""
-        return 100.0 * self.joint.q / (mx64.EZGRIPPER_STROKE * _TICK)
+        return 100.0 * self.joint.q / self._stroke
 
     # --- control
 

@@ -94,6 +94,7 @@ def emulated_ezgripper(
     process: bool = False,
     baudrate: int = 1_000_000,
     servo_id: int = 1,
+    servo_ids: Sequence[int] = (),
     line_time: bool = True,
     latency_timer: float = 1e-3,
     faults: Sequence[str] = (),
@@ -113,6 +114,7 @@ def emulated_ezgripper(
         thread of this one. A client in the same process competes with the thread for the
         interpreter, so rates are measured against a process; a thread's servos can be looked
         into (``.servo``).
+    :param servo_ids: of several servos on the line, each with fingers of its own, instead of one.
     :param latency_timer: of the USB-serial adapter, seconds.
     :param faults: specifications, see :mod:`dexkit.emulators.faults`.
     :param start: opening at power-on, percent.
@@ -123,13 +125,14 @@ def emulated_ezgripper(
     :raises UsageError: an option that cannot be.
     """
     gripper: EmulatedThread | EmulatedProcess
+    ids = tuple(servo_ids) or (servo_id,)
     if process:
         if firmware is not None or physics is not None:
             raise UsageError("firmware and physics can be given to a thread only")
         gripper = EmulatedProcess(
             [
                 f"--baudrate={baudrate}",
-                f"--id={servo_id}",
+                *(f"--id={number}" for number in ids),
                 f"--latency-timer={latency_timer * 1e3:g}",
                 f"--start={start:g}",
                 f"--seed={seed}",
@@ -152,16 +155,19 @@ def emulated_ezgripper(
         if closed_at is not None:
             mechanics = dataclasses.replace(mechanics, closed_at=closed_at)
         now = RealClock().now()
-        servo = Servo(
-            servo_id,
-            baudrate=baudrate,
-            physics=dataclasses.replace(physics, gripper=mechanics),
-            firmware=firmware,
-            now=now,
-            seed=seed,
-        )
+        servos = [
+            Servo(
+                number,
+                baudrate=baudrate,
+                physics=dataclasses.replace(physics, gripper=mechanics),
+                firmware=firmware,
+                now=now,
+                seed=seed + index,
+            )
+            for index, number in enumerate(ids)
+        ]
         bus = Bus(
-            [servo],
+            servos,
             line_time=line_time,
             latency_timer=latency_timer,
             faults=[parse_fault(spec) for spec in faults],

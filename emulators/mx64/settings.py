@@ -97,6 +97,8 @@ class GripperMechanics:
     :param object_stiffness: N·m/rad at the shaft.
     :param coulomb: tendon friction, N·m.
     :param spring: the opening springs, N·m/rad at the shaft.
+    :param mirrored: it closes while the encoder's position rises.
+    :param stroke: ticks from closed to open.
     :param bare: no gripper at all: a shaft that turns freely, any number of turns. See
         :meth:`none`.
     """
@@ -111,6 +113,8 @@ class GripperMechanics:
     coulomb: float = 0.15
     viscous: float = 0.02
     spring: float = 0.008
+    mirrored: bool = False
+    stroke: int = mx64.EZGRIPPER_STROKE
     bare: bool = False
 
     @classmethod

@@ -64,6 +64,13 @@ __all__ = ["emulate_mx64"]
     metavar="TICK",
     help="Encoder tick at which the fingers are closed.",
 )
+@click.option(
+    "--wiring",
+    type=click.IntRange(0),
+    metavar="SEED",
+    help="One gripper or two, dual or quad, with ids, directions, closed positions and strokes at "
+    "random, for a bring-up to find; instead of --id and what describes a gripper.",
+)
 @line_time_option()
 @latency_timer_option(1.0)
 @fault_options("overload@3s, drop:p=0.05, unplug@5s:for=2s")
@@ -86,6 +93,7 @@ def emulate_mx64(
     object_pct: float | None,
     start: float,
     closed_at: int,
+    wiring: int | None,
     line_time: bool,
     latency_timer: float,
     faults: tuple[str, ...],
@@ -107,27 +115,43 @@ def emulate_mx64(
     """
     from dexkit.emulators.faults import parse_fault
     from dexkit.emulators.line_port import SCHEME, line_port
-    from dexkit.emulators.mx64 import Bus, Firmware, GripperMechanics, Physics, Servo
+    from dexkit.emulators.mx64 import (
+        Bus,
+        Firmware,
+        GripperMechanics,
+        Physics,
+        Servo,
+        Wiring,
+    )
     from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 
     plan = [parse_fault(spec) for spec in faults]
     if bare:
-        _refuse_gripper_options()
+        _refuse_gripper_options("--bare has none", "object_pct", "start", "closed_at")
         mechanics = GripperMechanics.none()
     else:
         mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
-    physics = dataclasses.replace(Physics(), gripper=mechanics)
+    grippers = dict.fromkeys(ids, mechanics)
+    if wiring is not None:
+        _refuse_gripper_options(
+            "--wiring says it", "bare", "ids", "object_pct", "start", "closed_at"
+        )
+        grippers = {
+            number: each
+            for servos_of in Wiring.random(wiring).servos.values()
+            for number, each in servos_of.items()
+        }
     firmware = Firmware(fast_reads=fast_reads, backup=backup)
     store = _EepromFile(eeprom) if eeprom is not None else None
     with stop_on_signals() as request:
         now = RealClock().now()
         servos = []
         if not protocol_1:
-            for index, servo_id in enumerate(ids):
+            for index, (servo_id, each) in enumerate(grippers.items()):
                 servo = Servo(
                     servo_id,
                     baudrate=int(baudrate),
-                    physics=physics,
+                    physics=dataclasses.replace(Physics(), gripper=each),
                     firmware=firmware,
                     now=now,
                     eeprom=store.load(index) if store else None,
@@ -170,16 +194,16 @@ def emulate_mx64(
             raise EmulatorError(f"the emulator failed inside: {bus.failure!r}", hint=A_MISTAKE)
 
 
-def _refuse_gripper_options() -> None:
-    """Refuse the options of a gripper beside ``--bare``.
+def _refuse_gripper_options(why: str, *names: str) -> None:
+    """Refuse options of a gripper that another option leaves without meaning.
 
     :raises UsageError: one was given.
     """
     context = click.get_current_context()
-    for name in ("object_pct", "start", "closed_at"):
+    for name in names:
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
             option = next(p.opts[0] for p in context.command.params if p.name == name)
-            raise click.UsageError(f"{option} is of a gripper, and --bare has none")
+            raise click.UsageError(f"{option} is of a gripper, and {why}")
 
 
 class _EepromFile:

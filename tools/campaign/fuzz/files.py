@@ -385,7 +385,7 @@ def _settings(rng: random.Random, scratch: Path) -> Target:
     ]
     from dexkit.drivers.ezgripper import gripper
 
-    backends = [*backends, (gripper._create_hand, list(gripper._SETTINGS))]
+    backends = [*backends, (gripper._create_hand, list(gripper.backend.settings))]
     text = TextMutator(
         ["1", "auto", "0.5", "yes", "0:1,1:2", "usbip://127.0.0.1:3240/1", "1234", "0x81"],
         [*_NUMBERS, "usbip://", "[::1", ":99999", "/dev/null", "/", ",", "default", "no"],
