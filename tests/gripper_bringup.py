@@ -35,7 +35,7 @@ class Watched:
         """A session that goes on from ``findings``."""
         self.session = Session(self.bench.plan, self.bench.motors, findings, self.effort)
         self.drive: Drive | None = None
-        self._seen = [self._opening()]
+        self.seen = [self._opening()]
         self.moved: set[str] = set()
 
     def cycle(self, held: bool = True) -> None:
@@ -43,7 +43,7 @@ class Watched:
         self.clock.advance(PERIOD)
         snapshot = self.bench.exchange(self.drive)
         self.drive = self.session.step(self.clock.now(), snapshot, held)
-        self._seen.append(self._opening())
+        self.seen.append(self._opening())
 
     def until_question(self) -> Question | None:
         """Hold the key until something is asked; None when all is found."""
@@ -53,7 +53,7 @@ class Watched:
 
     def look(self, question: Question) -> str:
         """What a person who has watched the fingers answers."""
-        seen = self._seen
+        seen = self.seen
         most = {m: max((s[m] - seen[0][m] for s in seen), key=abs) for m in seen[0]}
         motor = max(most, key=lambda m: abs(most[m]))
         others = [abs(value) for m, value in most.items() if m != motor]
@@ -61,7 +61,7 @@ class Watched:
         what = question.key.split()[-1]
         if what == self.bench.plan.part:
             return self._belongs[motor]
-        self._seen = [seen[-1]]
+        self.seen = [seen[-1]]
         if what == "way":
             return "opened" if most[motor] > 0 else "closed"
         if what == "zero":

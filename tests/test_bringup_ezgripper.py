@@ -14,7 +14,15 @@ from dexkit.drivers.ezgripper import GripperSettings
 from dexkit.drivers.ezgripper.bringup import EZGripperBench, plan_of
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus
 from dexkit.drivers.ezgripper.config import Store, record_key
-from dexkit.emulators.mx64 import Bus, EmulatedThread, Physics, Port, Servo, Wiring
+from dexkit.emulators.mx64 import (
+    Bus,
+    EmulatedThread,
+    GripperMechanics,
+    Physics,
+    Port,
+    Servo,
+    Wiring,
+)
 from dexkit.errors import HandFault, HandLost, UsageError
 from dexkit.hand import HandCommand, Side
 from dexkit.wire import mx64
@@ -157,6 +165,22 @@ def test_release_and_a_fault_stop_it(tmp_path: Path) -> None:
     bring.bench.close()
     with pytest.raises(HandLost):
         bring.bench.exchange(None)
+
+
+def test_a_gripper_without_an_open_stop_has_sakes_stroke(tmp_path: Path) -> None:
+    """The tendon is not wound up the other way in search of a stop."""
+    mechanics = GripperMechanics(open_stiffness=1e-6, start=40.0)
+    grippers, bring = watched(tmp_path, Wiring({Side.LEFT: {1: mechanics}}), Side.LEFT)
+    widest = 0.0
+    while (question := bring.until_question()) is not None:
+        widest = max(widest, *(seen["1"] for seen in bring.seen))
+        bring.session.answer(bring.look(question))
+    bring.bench.store(bring.session.findings)
+    record = Store(tmp_path / "ezgripper.json").read("SN1")
+    assert record.stroke == mx64.EZGRIPPER_STROKE
+    assert record.zero == pytest.approx(mechanics.closed_at, abs=30)
+    assert 1.1 < widest < 1.3
+    assert len(grippers.servos) == 1
 
 
 def test_its_torque_is_a_current_limit(tmp_path: Path) -> None:

@@ -74,12 +74,15 @@ class JointChoice:
     :param rising: what is seen while q rises; ``falling`` while it falls: one word each.
     :param ratios: what its gear ratio may be; the lowest and the highest if it is ``measured``.
     :param zero: what the joint looks like at q = 0; empty if that is not asked.
-    :param first: sign of dq towards the stop that is looked for first: the open one.
+    :param first: sign of dq towards the stop that is looked for first: the open one, unless there
+        may be none.
     :param stops: q at its stops; None where they are near the limits.
     :param zero_from: how the travel gives the zero.
     :param measured: the ratio is any that makes the travel that between ``stops``, and not one of
         a few.
     :param motors: how many motors may move it, each a part of it: two servos of one gripper.
+    :param most_travel: rad, at the reference ratio, that it goes from the first stop at most. If
+        there is no second stop up to there, the ratio is the reference. None: it has two stops.
     :param wanted: it is of this hand. Others are only told apart from it, and their travel is not
         measured.
     """
@@ -96,6 +99,7 @@ class JointChoice:
     zero_from: Zero = Zero.MIDDLE
     measured: bool = False
     motors: int = 1
+    most_travel: float | None = None
     wanted: bool = True
 
 

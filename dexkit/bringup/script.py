@@ -177,10 +177,14 @@ def _travel(plan: Plan, joint: JointChoice, motor: str, findings: Findings) -> _
         for direction in (joint.first, -joint.first):
             seen = joint.rising if direction > 0 else joint.falling
             start: float = yield Locate(motor)
-            target = start + direction * sign * reach
+            last = direction == -joint.first
+            far = reach if joint.most_travel is None or not last else joint.most_travel
+            target = start + direction * sign * far
             end, ends[direction] = yield Go(motor, target, f"{key}: {seen}, to its stop")
-            if end is not End.STALLED:
+            if end is not End.STALLED and (joint.most_travel is None or not last):
                 raise HandFault(f"{key} meets no stop", hint=f"is it the right {plan.part}?")
+            if end is not End.STALLED:
+                ends[direction] = ends[joint.first] + direction * sign * (stops[1] - stops[0])
         free = yield Question(
             f"{key} way free",
             f"Did {key} go from stop to stop, and touch nothing else?",

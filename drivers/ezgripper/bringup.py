@@ -40,6 +40,8 @@ _TORQUE_OF_AMPERE = 6.0 / 4.1
 """N·m of the servo's shaft per A: its stall at 12 V (docs/sources/mx64-ezgripper.md#b1)."""
 _JOINT_TORQUE = _TORQUE_OF_AMPERE * mx64.CURRENT_UNIT * mx64.TICK / JOINT_PER_TICK
 """N·m at the joint of one unit of current."""
+_WIDEST = 1.2
+"""Parts of SAKE's stroke that a gripper is opened at most."""
 
 
 def plan_of(side: Side) -> Plan:
@@ -64,9 +66,12 @@ def _choice(side: Side, *, wanted: bool) -> JointChoice:
         spec.q_max,
         "opened",
         "closed",
-        (STROKES[0] / STROKE, STROKES[1] / STROKE),
+        (STROKES[0] / STROKE, _WIDEST),
         "closed",
-        first=1,
+        # closed first: whether there is a stop at the open end is not documented, and a tendon must
+        # not be wound up the other way
+        first=-1,
+        most_travel=_WIDEST * spec.stroke,
         stops=(spec.q_min, spec.q_max),
         zero_from=Zero.LOW_STOP,
         measured=True,
