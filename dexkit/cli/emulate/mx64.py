@@ -131,23 +131,20 @@ def emulate_mx64(
         mechanics = GripperMechanics.none()
     else:
         mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
-    grippers = dict.fromkeys(ids, mechanics)
+    grippers = [(number, mechanics) for number in ids]
     if wiring is not None:
         _refuse_gripper_options(
             "--wiring says it", "bare", "ids", "object_pct", "start", "closed_at"
         )
-        grippers = {
-            number: each
-            for servos_of in Wiring.random(wiring).servos.values()
-            for number, each in servos_of.items()
-        }
+        sides = Wiring.random(wiring).servos.values()
+        grippers = [pair for servos_of in sides for pair in servos_of.items()]
     firmware = Firmware(fast_reads=fast_reads, backup=backup)
     store = _EepromFile(eeprom) if eeprom is not None else None
     with stop_on_signals() as request:
         now = RealClock().now()
         servos = []
         if not protocol_1:
-            for index, (servo_id, each) in enumerate(grippers.items()):
+            for index, (servo_id, each) in enumerate(grippers):
                 servo = Servo(
                     servo_id,
                     baudrate=int(baudrate),
