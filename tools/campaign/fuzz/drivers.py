@@ -127,8 +127,8 @@ def ezgripper(case: Inputs, count: int) -> None:
                 configuration=GripperSettings(
                     zero=1510, retries=rnd.choice((0, 2)), config=Path("/nowhere/x")
                 ),
+                clock=clock,
             )
-            hand._clock = clock
             device = SimpleNamespace(path="fuzz", key="fuzz", serial_number=None)
             with (
                 mock.patch.object(ezgripper_bus, "DevicePort", return_value=port),
