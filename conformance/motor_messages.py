@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.hand import JointMode, Side, Subject
-from dexkit.messages import MessageType, message_type
+from dexkit.hand import Floats, JointMode, Side, Subject
+from dexkit.messages import Columns, MessageType, message_type
 from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
 __all__ = ["Motor", "MotorCodec", "Motors", "mode_byte"]
@@ -31,7 +31,16 @@ _SEQUENCE = {
     "unitree_go::msg::dds_::LowState_": ("motor_state", "unitree_go::msg::dds_::MotorState_"),
     "unitree_hg::msg::dds_::LowCmd_": ("motor_cmd", "unitree_hg::msg::dds_::MotorCmd_"),
     "unitree_hg::msg::dds_::LowState_": ("motor_state", "unitree_hg::msg::dds_::MotorState_"),
+    "inspire::inspire_hand_ctrl": ("angle_set", "unitree_go::msg::dds_::MotorCmd_"),
+    "inspire::inspire_hand_state": ("angle_act", "unitree_go::msg::dds_::MotorState_"),
 }
+# Where each quantity has a list of its own: which, and how many there are one.
+_LISTS = {
+    "inspire::inspire_hand_ctrl": {"q": ("angle_set", 1000)},
+    "inspire::inspire_hand_state": {"q": ("angle_act", 1000), "tau_est": ("force_act", -1000)},
+}
+_ANGLES = 1
+"""The mode of a command whose angles count."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +173,10 @@ class MotorCodec:
         return [(topic, self._payload([])) for topic in topics]
 
     def _payload(self, motors: Motors) -> bytes:
+        if self.command.name in _LISTS:
+            message = self._lists(self.command, motors)
+            message.mode = _ANGLES
+            return self.command.encode(message)
         message = self.command.cls()
         setattr(
             message,
@@ -179,7 +192,7 @@ class MotorCodec:
 
         :raises WireError: the payload is not of the dialect's state type.
         """
-        motors = self._mine(getattr(self.state.decode(data), self.state_sequence), side)
+        motors = self._mine(self._motors(self.state, data), side)
         if motors is None:
             return None
         return tuple(m.q for m in motors), tuple(m.dq for m in motors)
@@ -189,12 +202,67 @@ class MotorCodec:
 
         :raises WireError: the payload is not of the dialect's command type.
         """
-        motors = self._mine(getattr(self.command.decode(data), self.command_sequence), side)
+        motors = self._mine(self.commanded(data), side)
         if motors is None:
             return None
         return tuple(
             Motor(q=m.q, dq=m.dq, tau=m.tau, kp=m.kp, kd=m.kd, mode=m.mode) for m in motors
         )
+
+    def commanded(self, data: bytes) -> Sequence[Any]:
+        """All motors of a command.
+
+        :raises WireError: the payload is not of the dialect's command type.
+        """
+        return self._motors(self.command, data)
+
+    def _motors(self, kind: MessageType, data: bytes) -> Sequence[Any]:
+        message = kind.decode(data)
+        sequence, motor = _SEQUENCE[kind.name]
+        motors: Sequence[Any] = getattr(message, sequence)
+        if kind.name not in _LISTS:
+            return motors
+        if getattr(message, "mode", _ANGLES) & _ANGLES == 0:
+            return []
+        make = message_type(motor).cls
+        lists = _LISTS[kind.name].items()
+        return [
+            make(**{member: getattr(message, name)[i] / scale for member, (name, scale) in lists})
+            for i in range(len(motors))
+        ]
+
+    def _lists(self, kind: MessageType, motors: Sequence[Any]) -> Any:
+        """A message with a list for each quantity, of objects with the members of motors."""
+        every = [f.name for f in kind.layout.fields if f.sequence]
+        message = kind.cls(**{name: [0] * len(motors) for name in every})
+        for member, (name, scale) in _LISTS[kind.name].items():
+            values = np.array([getattr(m, member) for m in motors], dtype=np.float64) * scale
+            # -1 leaves a joint alone
+            whole = np.clip(np.rint(np.where(np.isnan(values), -1, values)), -32768, 32767)
+            setattr(message, name, whole.astype(int).tolist())
+        return message
+
+    def state_lists(self, motors: Any) -> bytes:
+        """Encode a state that has a list for each quantity.
+
+        :param motors: array of structs with the members of motors.
+        """
+        return self.state.encode(self._lists(self.state, motors.view(np.recarray)))
+
+    def column(self, columns: Columns, side: Subject, kind: MessageType, name: str) -> Floats:
+        """A value of a subject's joints: shape (n, n_joints), NaN where the sequence is too short.
+
+        What the type does not have is 0.
+        """
+        first = self.dialect.index[side]
+        slots = range(first, first + self.joints)
+        if kind.name not in _LISTS:
+            # the values of one joint are contiguous: checks read one joint at a time
+            sequence, _ = _SEQUENCE[kind.name]
+            return columns.table([f"{sequence}[{i}].{name}" for i in slots])
+        where, scale = _LISTS[kind.name].get(name, _LISTS[kind.name]["q"])
+        table = columns.table([f"{where}[{i}]" for i in slots]) / scale
+        return table if name in _LISTS[kind.name] else table * 0.0
 
     def _mine(self, motors: Sequence[Any], side: Subject) -> Sequence[Any] | None:
         first = self.dialect.index[side]
@@ -214,6 +282,11 @@ class MotorCodec:
         :param rest: other members of the message.
         """
         count = self.dialect.length if length is None else length
+        if self.state.name in _LISTS:
+            kind = message_type(self._state_motor).cls
+            given = next(iter(hands.values()), ())
+            made = [kind(**dict(fields)) for fields in given] or [kind() for _ in range(count)]
+            return self.state.encode(self._lists(self.state, made[:count]))
         message, places = self._blank_state(count)
         for side, motors in hands.items():
             for index, fields in enumerate(motors, self.dialect.index[side]):

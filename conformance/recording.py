@@ -394,7 +394,7 @@ def _states(
         columns = codec.state.columns(samples.payloads)
 
     def column(name: str, unit: tuple[float, ...] = ()) -> Floats:
-        values = _joints(columns, codec, side, codec.state_sequence, name)
+        values = codec.column(columns, side, codec.state, name)
         return np.asarray(values * unit) if unit else values
 
     speeds, torques = codec.dialect.speed_units, codec.dialect.torque_units
@@ -438,13 +438,6 @@ def _is_blank(view: SideView) -> bool:
     )
 
 
-def _joints(columns: Columns, codec: MotorCodec, side: Side, sequence: str, name: str) -> Floats:
-    """A hand's part of a sequence: shape (n, n_joints), NaN where it is too short."""
-    first = codec.dialect.index[side]
-    # the values of one joint are contiguous: checks read one joint at a time
-    return columns.table([f"{sequence}[{first + i}].{name}" for i in range(codec.joints)])
-
-
 def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> Commands:
     topic = codec.dialect.topics(side)[0]
     if samples is None or samples.type_name != codec.dialect.cmd_type:
@@ -457,7 +450,7 @@ def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin
         columns = codec.command.columns(samples.payloads)
 
     def column(name: str) -> Floats:
-        return _joints(columns, codec, side, codec.command_sequence, name)
+        return codec.column(columns, side, codec.command, name)
 
     return Commands(
         topic=topic,

@@ -412,6 +412,7 @@ def cyclone_type(name: str) -> Any:
     cyclone = _cyclone()
     struct = layout.ALL[name]
     numbers = {
+        "int8": cyclone.types.int8,
         "uint8": cyclone.types.uint8,
         "int16": cyclone.types.int16,
         "uint16": cyclone.types.uint16,
@@ -430,7 +431,8 @@ def cyclone_type(name: str) -> Any:
             else cyclone_type(member.type.dds_name)
         )
         if member.sequence and not member.is_text:
-            kind = cyclone.types.sequence[kind]
+            bounded = kind if member.bound is None else (kind, member.bound)
+            kind = cyclone.types.sequence[bounded]
         elif member.array is not None:
             kind = cyclone.types.array[kind, member.array]
         fields[member.name] = kind

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -39,13 +39,6 @@ _HEALTH_EVERY = 20
 """Exchanges of which one reads errors and temperatures."""
 _HEALTH = int(Register.TEMPERATURE) + rh56.JOINTS - int(Register.ERROR)
 """Bytes from the errors to the end of the temperatures."""
-_FAULTS: Mapping[Error, MotorError] = {
-    Error.LOCKED_ROTOR: MotorError.LOCKED,
-    Error.OVER_TEMPERATURE: MotorError.CASE_TEMPERATURE,
-    Error.OVER_CURRENT: MotorError.OVERCURRENT,
-    Error.MOTOR: MotorError.ABNORMAL_RESET,
-    Error.COMMUNICATION: MotorError.COMMUNICATION_CHECK,
-}
 
 
 FoundT = TypeVar("FoundT")
@@ -281,7 +274,7 @@ class InspireHand(ABC):
     @staticmethod
     def _fault(error: Error) -> int:
         found = MotorError.NONE
-        for bit, meaning in _FAULTS.items():
+        for bit, meaning in rh56.FAULTS.items():
             if error & bit:
                 found |= meaning
         return int(found)

@@ -18,6 +18,7 @@ NAMES = list(STRUCTS)
 SERVICE_NAMES = ["unitree_api::msg::dds_::Request_", "unitree_api::msg::dds_::Response_"]
 
 _RANGES = {
+    "int8": (-128, 127),
     "uint8": (0, 255),
     "int16": (-(2**15), 2**15 - 1),
     "uint16": (0, 2**16 - 1),
@@ -78,7 +79,7 @@ def messages(name: str, max_elements: int = 9) -> st.SearchStrategy[Any]:
         if member.is_bytes:
             fields[member.name] = st.binary(max_size=max_elements)
         elif member.sequence:
-            fields[member.name] = st.lists(values, max_size=max_elements)
+            fields[member.name] = st.lists(values, max_size=min(max_elements, member.most))
         elif member.array is not None:
             fields[member.name] = st.tuples(*[values] * member.array)
         else:

@@ -66,6 +66,7 @@ class TestByName:
             "sim-dex3",
             "sim-brainco",
             "sim-inspire-dfx",
+            "sim-inspire-ftp",
             "sim-dex5",
             "dex3-usb",
         } <= names.keys()

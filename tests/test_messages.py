@@ -91,7 +91,7 @@ def test_names() -> None:
     assert mt.cls is hg.HandState_
     with pytest.raises(UsageError, match="unknown message type"):
         message_type("unitree_hg::msg::dds_::Nothing_")
-    assert len(message_types()) == 18
+    assert len(message_types()) == 21
 
 
 def test_hostile_sequence_length_allocates_nothing() -> None:

@@ -129,7 +129,7 @@ def test_our_omgidl_reads_back_as_the_same_layout() -> None:
     for mt in message_types():
         text = mt.omgidl.replace("::".join(mt.layout.scope) + "::", "")
         for old, new in classic.items():
-            text = text.replace(f"  {old} ", f"  {new} ")
+            text = text.replace(f"  {old} ", f"  {new} ").replace(f"<{old}, ", f"<{new}, ")
         (*_, struct) = parse(text).values()
         assert [(f.name, f.array, f.sequence) for f in struct.fields] == [
             (f.name, f.array, f.sequence) for f in mt.layout.fields

@@ -45,7 +45,16 @@ sim-twofinger = twofinger_hand.simulated:sim_twofinger
 
 NAMES = {m.name for m in BUILT_IN} | {m.short_name for m in BUILT_IN} | set(ROBOTS)
 NAMES |= {d.name for m in BUILT_IN for d in m.dialects} | {"unitree_go", "unitree_hg"}
-CONSTANTS = {"DEX1_1", "DEX3_1", "DEX5_1", "BRAINCO_REVO2", "INSPIRE_DFX", "H1", "G1"}
+CONSTANTS = {
+    "DEX1_1",
+    "DEX3_1",
+    "DEX5_1",
+    "BRAINCO_REVO2",
+    "INSPIRE_DFX",
+    "INSPIRE_FTP",
+    "H1",
+    "G1",
+}
 NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
 HOMES = ("dexkit/models/", "dexkit/robots.py")
 # wrong hands are declared for the models on which they are tried

@@ -34,6 +34,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         pytest.param("dex5", BOTH, marks=pytest.mark.soak),
         pytest.param("brainco", BOTH, marks=pytest.mark.soak),
         pytest.param("inspire_dfx", BOTH, marks=pytest.mark.soak),
+        pytest.param("inspire_ftp", BOTH, marks=pytest.mark.soak),
     ],
 )
 def test_reference_hand_passes(dialect: str, sides: tuple[Side, ...]) -> None:
@@ -100,6 +101,7 @@ def test_every_wrong_hand_has_a_summary() -> None:
         ("dds", "dex5-1"),
         ("dds", "brainco-revo2"),
         ("dds", "inspire-dfx"),
+        ("dds", "inspire-ftp"),
         ("robot", "h1"),
         ("robot", "g1"),
     ],

@@ -35,6 +35,7 @@ from types import ModuleType
 from typing import Any
 
 from dexkit.messages import message_type
+from tests.inspire_sdk import inspire_class
 from tests.json_child import JsonChild, answer_requests
 
 __all__ = ["SdkClient", "SdkSample", "load", "sdk_class"]
@@ -51,9 +52,11 @@ def load() -> Any:
 
 
 def sdk_class(type_name: str) -> Any:
-    """The SDK's class for a DDS type name; importing it starts no DDS."""
+    """The SDK's class for a DDS type name, or that of Inspire's package; it starts no DDS."""
     load()
     package, *_, name = type_name.split("::")
+    if package == "inspire":
+        return inspire_class(name)
     return getattr(importlib.import_module(f"unitree_sdk2py.idl.{package}.msg.dds_"), name)
 
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable
 
+from dexkit.messages.layout import ALL
+
 __all__ = ["SESSION", "USB", "dds_topic", "dds_type", "select_topics"]
 
 USB = "usb/"
@@ -17,6 +19,10 @@ USB = "usb/"
 
 SESSION = "rt/session/"
 """Beginning of the topics that hold what an imported session has and no DDS topic carries."""
+
+
+_OTHERS = {kind.ros_name: name for name, kind in ALL.items() if "dds_" not in kind.scope}
+"""DDS types outside the modules of ROS 2, by what recordings call them."""
 
 
 def dds_topic(name: str) -> str:
@@ -45,6 +51,8 @@ def dds_type(name: str) -> str:
         return "::".join(parts)
     if len(parts) == 2:
         parts.insert(1, "msg")
+    if "/".join(parts) in _OTHERS:
+        return _OTHERS["/".join(parts)]
     if len(parts) == 3 and parts[1] == "msg":
         return f"{parts[0]}::msg::dds_::{parts[2]}_"
     return "::".join(parts)

@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.registry import BOTH, obeys_gains, wrong_hand
+from dexkit.conformance.mutants.registry import BOTH, obeys_gains, takes_floats, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.hand import Side
@@ -219,7 +219,7 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("FTP-SAFE-10",), whole=True)
 class StaleLater(StaleState):
     """Measures five times a second from 12 s on."""
 
@@ -321,7 +321,7 @@ class Frozen(Service):
 # ----------------------------------------------------------------------------------- fields
 
 
-@wrong_hand(("DEX1-FIELD-01", "DEX3-FIELD-01"))
+@wrong_hand(("DEX1-FIELD-01", "DEX3-FIELD-01"), where=takes_floats)
 class OneTooMany(Service):
     """Publishes a sequence with one motor too many."""
 
@@ -360,6 +360,7 @@ class EmptyNowAndThen(Service):
     sides=BOTH,
 )
 @wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-SAFE-10"), sides=BOTH)
+@wrong_hand("FTP-SIDE-01", also=("FTP-SAFE-10", "FTP-SIDE-02", "FTP-WDOG-01"), sides=BOTH)
 class Swapped(Service):
     """Each side obeys the other side's commands."""
 
@@ -550,7 +551,12 @@ class OneBehind(Service):
         super().motors(side, before)
 
 
-@wrong_hand(("DEX1-SIDE-02", "DEX3-SIDE-02"), also=("DEX1-MOVE-09", "DEX3-MOVE-08"), sides=BOTH)
+@wrong_hand(
+    ("DEX1-SIDE-02", "DEX3-SIDE-02"),
+    also=("DEX1-MOVE-09", "DEX3-MOVE-08"),
+    sides=BOTH,
+    where=takes_floats,
+)
 class BadCommandsStopBoth(Service):
     """Drops the commands to both hands for half a second after a bad one."""
 
@@ -668,7 +674,7 @@ class EmptyIsZero(Service):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
-        if getattr(self.codec.command.decode(payload), self.codec.command_sequence):
+        if self.codec.commanded(payload):
             return
         for side in self.sides:
             if self.codec.command_topics[side] == topic:
@@ -684,7 +690,7 @@ class DiesOfEmpty(Service):
     dead_until = 0.0
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
-        sequence = getattr(self.codec.command.decode(payload), self.codec.command_sequence)
+        sequence = self.codec.commanded(payload)
         if not sequence and any(self.codec.command_topics[s] == topic for s in self.sides):
             self.dead_until = self.now + 0.4
         super().receive(topic, payload, client)
@@ -827,7 +833,7 @@ class IgnoresTwo(Service):
             super().receive(topic, payload, client)
 
 
-@wrong_hand(("DEX1-MOVE-09", "DEX3-MOVE-08"), whole=True)
+@wrong_hand(("DEX1-MOVE-09", "DEX3-MOVE-08"), whole=True, where=takes_floats)
 class DeafAfterFar(Service):
     """Ignores commands for 0.8 s after one that is far out of range."""
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import LIMP, Motor
-from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.mutants.registry import takes_floats, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual.client import ReferenceClient
 from dexkit.hand import Side
@@ -20,7 +20,7 @@ from dexkit.teleop import Dex1Client, Pose, TeleopClient
 # ------------------------------------------------------------------------------ form and values
 
 
-@wrong_hand("DEX1-CLIENT-01")
+@wrong_hand("DEX1-CLIENT-01", where=takes_floats)
 class OneMotorTooMany(ReferenceClient):
     """Sends one motor more than the hand has."""
 

@@ -1024,7 +1024,7 @@ class FillsUpWithZeros(FingerService):
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
-        sequence = getattr(self.codec.command.decode(payload), self.codec.command_sequence)
+        sequence = self.codec.commanded(payload)
         dq = self.hand.model.client_dq
         for side in self.sides:
             mine = self.codec.command_topics[side] == topic

@@ -17,9 +17,10 @@ from typing import Any, TypeVar
 from dexkit.conformance.layers import layer
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.hand import Side, Subject
+from dexkit.messages import message_type
 from dexkit.models import HandModel, model
 
-__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "obeys_gains", "wrong_hand"]
+__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "obeys_gains", "takes_floats", "wrong_hand"]
 
 LEFT = (Side.LEFT,)
 BOTH = (Side.LEFT, Side.RIGHT)
@@ -122,6 +123,13 @@ def wrong_hand(
 def obeys_gains(hand: HandModel) -> bool:
     """Whether a hand's commands have gains: a place for ``where``."""
     return hand.dialects[0].gains_are_used
+
+
+def takes_floats(hand: HandModel) -> bool:
+    """Whether a hand's messages hold NaN, far values and sequences of any length: a place for
+    ``where``.
+    """
+    return not message_type(hand.dialects[0].cmd_type).layout.fields[0].is_numbers
 
 
 def mix(fault: type[Any], reference: type[C]) -> type[C]:

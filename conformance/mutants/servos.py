@@ -9,12 +9,14 @@ import numpy as np
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.any_model import ChokesOnThousands
-from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.mutants.registry import BOTH, takes_floats, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
 from dexkit.hand import Floats, Side
 from dexkit.models import HandModel, model
+
+_FAR = 10.0  # full travels; a goal in 16 bits is 32.8 at most
 
 # ----------------------------------------------------------------------------- state
 
@@ -50,6 +52,11 @@ class Thousandths(ServoService):
     sides=BOTH,
 )
 @wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-MOVE-09", "DFX-SAFE-10"), sides=BOTH)
+@wrong_hand(
+    "FTP-SIDE-01",
+    also=("FTP-MOVE-09", "FTP-SAFE-10", "FTP-SIDE-02", "FTP-WDOG-01"),
+    sides=BOTH,
+)
 class StatesSwapped(ServoService):
     """Publishes each side's state as the other's."""
 
@@ -326,8 +333,36 @@ class _SlowAfterNan(ServoHand):
             self.reach = [0.33 * r for r in self.reach]
 
 
-@wrong_hand("BRAINCO-ABUSE-01", also=("DFX-MOVE-08",))
+@wrong_hand("BRAINCO-ABUSE-01", also=("DFX-MOVE-08",), where=takes_floats)
 class SlowAfterNan(ServoService):
     """Moves with a third of each speed since it has got a command that is not finite."""
 
     hand_fault = _SlowAfterNan
+
+
+class _SlowAfterFar(_SlowAfterNan):
+    def command(self, motors: tuple[Motor, ...]) -> None:
+        self.slow = self.slow or any(abs(m.q) > _FAR for m in motors)
+        super().command(motors)
+
+
+@wrong_hand("FTP-ABUSE-01")
+class SlowAfterFar(ServoService):
+    """Moves with a third of its speed since it has got a goal that is far out of range."""
+
+    hand_fault = _SlowAfterFar
+
+
+@wrong_hand("FTP-MOVE-08", whole=True)
+class DeafAfterOutOfRange(ServoService):
+    """Ignores commands for 0.8 s after one whose goal is far out of range."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.deaf_until: dict[Side, float] = {}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if any(abs(m.q) > _FAR for m in motors):
+            self.deaf_until[side] = self.now + 0.8
+        if self.now >= self.deaf_until.get(side, 0.0):
+            super().motors(side, motors)

@@ -98,7 +98,7 @@ class HandWire:
         :raises WireError: it is not of the dialect's state type.
         """
         message = self._state.decode(data)
-        every = getattr(message, self._state.motor_sequence)
+        every = self._state.motors(message)
         motors = every[self._first : self._first + len(self._joints)]
         if len(motors) < len(self._joints):
             return None

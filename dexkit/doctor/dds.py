@@ -98,7 +98,7 @@ class _Watch:
             return  # that they come is enough
         try:
             kind = message_type(self.endpoint.type_name)
-            motors = getattr(kind.decode(data), kind.motor_sequence)
+            motors = kind.motors(kind.decode(data))
         except DexkitError:
             self.undecodable += 1
             known = layout_of(self.endpoint.type_name, data)

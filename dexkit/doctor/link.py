@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from dexkit.doctor.observations import DomainView, Link, Stream
+from dexkit.topics import roles
 
 __all__ = ["RoundTrips", "link_to", "measure_round_trips", "percentile"]
 
@@ -185,11 +186,16 @@ def link_to(
         clock_offset=one_way - least,
         samples=sum(s.samples for s in streams),
         lost=sum(s.lost for s in streams),
-        state_age_95=_age(streams, lambda topic: topic.endswith("state"), least, one_way),
-        command_age_95=_age(streams, lambda topic: topic.endswith("cmd"), least, one_way),
+        state_age_95=_age(streams, _topics("state"), least, one_way),
+        command_age_95=_age(streams, _topics("cmd"), least, one_way),
         rmem_max=receive_buffer_limit() if rmem_max is None else rmem_max,
         dropped=dropped,
     )
+
+
+def _topics(kind: str) -> Callable[[str], bool]:
+    """Whether a topic is one of commands (``cmd``), or of states."""
+    return lambda topic: topic.endswith(kind) or any(r.kind == kind for r in roles(topic))
 
 
 def _age(

@@ -1,4 +1,4 @@
-"""Unitree's hand messages: typed dataclasses, a CDR codec without CycloneDDS, schema texts.
+"""Messages of Unitree's and Inspire's hands: dataclasses, CDR codec without CycloneDDS, schemas.
 
     >>> from dexkit.messages import message_type
     >>> from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_
@@ -8,7 +8,8 @@
     1.5
 
 The layouts are written down once, in ``idl/*.idl``; ``python -m tools.generate`` writes
-the modules :mod:`dexkit.messages.unitree_go` and :mod:`dexkit.messages.unitree_hg` from them.
+the modules :mod:`dexkit.messages.unitree_go`, :mod:`dexkit.messages.unitree_hg` and
+:mod:`dexkit.messages.inspire` from them.
 """
 
 from __future__ import annotations

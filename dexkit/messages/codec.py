@@ -25,8 +25,10 @@ __all__ = [
     "explain",
     "is_big",
     "pack_bytes",
+    "pack_numbers",
     "pack_text",
     "take_bytes",
+    "take_numbers",
     "take_text",
 ]
 
@@ -79,14 +81,14 @@ def truncated(name: str, need: int, have: int) -> TruncatedError:
     return TruncatedError(f"{name}: needs at least {need} bytes, there are {have}")
 
 
-def check_count(name: str, count: int, need: int, have: int) -> None:
+def check_count(name: str, count: int, need: int, have: int, most: int = MAX_ELEMENTS) -> None:
     """Refuse a sequence length that the data cannot hold, before anything is allocated.
 
-    :raises OversizeError: longer than :data:`~dexkit.messages.layout.MAX_ELEMENTS`.
+    :raises OversizeError: longer than ``most``.
     :raises TruncatedError: longer than the rest of the data.
     """
-    if count > MAX_ELEMENTS:
-        raise OversizeError(f"{name}: {count} elements, at most {MAX_ELEMENTS} are accepted")
+    if count > most:
+        raise OversizeError(f"{name}: {count} elements, at most {most} are accepted")
     if need > have:
         raise TruncatedError(f"{name}: {count} elements need {need} bytes, there are {have}")
 
@@ -110,6 +112,18 @@ def pack_bytes(value: Sequence[int]) -> bytes:
     if len(data) > MAX_BYTES:
         raise ValueError("too many bytes")
     return data
+
+
+def pack_numbers(code: str, values: Sequence[Any], most: int) -> bytes:
+    """A sequence of numbers and its length before them.
+
+    :param code: format character of :mod:`struct`.
+    :raises ArrayLengthError: longer than ``most``.
+    """
+    count = len(values)
+    if count > most:
+        raise ArrayLengthError
+    return struct.pack(f"<I{count}{code}", count, *values)
 
 
 def pack_text(value: str) -> bytes:
@@ -138,6 +152,23 @@ def take_bytes(name: str, data: Buffer, at: int, big: bool) -> tuple[bytes, int]
     if at + count > len(data):
         raise truncated(name, at + count, len(data))
     return bytes(data[at : at + count]), at + count
+
+
+def take_numbers(
+    name: str, code: str, most: int, data: Buffer, at: int, big: bool
+) -> tuple[list[Any], int]:
+    """The numbers whose count is at ``at`` or at the next multiple of 4, and their end.
+
+    :raises OversizeError: more than ``most``.
+    :raises TruncatedError: more than the rest of the data holds.
+    """
+    at += -at % 4 + 4
+    if at > len(data):
+        raise truncated(name, at, len(data))
+    count = int.from_bytes(data[at - 4 : at], "big" if big else "little")
+    end = at + count * struct.calcsize(code)
+    check_count(name, count, end, len(data), most)
+    return list(struct.unpack_from(f"{'>' if big else '<'}{count}{code}", data, at)), end
 
 
 def take_text(name: str, data: Buffer, at: int, big: bool) -> tuple[str, int]:
@@ -173,7 +204,7 @@ def _find(value: object, kind: Struct, path: str) -> str:
         elif member.array is None and not member.sequence:
             problem = _check_item(item, member.type, where)
         else:
-            problem = _check_items(item, member.type, member.array, where)
+            problem = _check_items(item, member.type, member.array, where, member.most)
         if problem:
             return problem
     return ""
@@ -190,15 +221,17 @@ def _check_bytes(item: Any, member: Field, where: str) -> str:
     return ""
 
 
-def _check_items(items: Any, kind: Primitive | Struct, length: int | None, where: str) -> str:
+def _check_items(
+    items: Any, kind: Primitive | Struct, length: int | None, where: str, most: int
+) -> str:
     try:
         values: Sequence[Any] = list(items)
     except TypeError:
         return f"{where} is a {type(items).__name__}, not a sequence"
     if length is not None and len(values) != length:
         return f"{where} has {len(values)} elements, not {length}"
-    if length is None and len(values) > MAX_ELEMENTS:
-        return f"{where} has {len(values)} elements, at most {MAX_ELEMENTS} are sent"
+    if length is None and len(values) > most:
+        return f"{where} has {len(values)} elements, at most {most} are sent"
     for i, value in enumerate(values):
         problem = _check_item(value, kind, f"{where}[{i}]")
         if problem:

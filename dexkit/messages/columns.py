@@ -532,13 +532,12 @@ def _counts(kind: Struct, data: bytes, big: bool) -> tuple[int, ...]:
     at = 0
     for member in kind.fields:
         if member.sequence:
-            assert isinstance(member.type, Struct)
             at += -at % 4
             if len(data) < at + 8:
                 raise truncated(kind.name, at + 8, len(data))
             count = _UINT32[big].unpack_from(data, at + 4)[0]
-            at += 4 + count * member.type.end(0)
-            check_count(f"{kind.name}.{member.name}", count, at + 4, len(data))
+            at += 4 + count * member.element_size
+            check_count(f"{kind.name}.{member.name}", count, at + 4, len(data), member.most)
             counts.append(count)
         else:
             at = _end(member, at)
@@ -555,10 +554,9 @@ def _count_words(kind: Struct, counts: tuple[int, ...]) -> list[int]:
     at = 0
     for member in kind.fields:
         if member.sequence:
-            assert isinstance(member.type, Struct)
             at += -at % 4
             out.append(at // 4 + 1)
-            at += 4 + remaining.pop(0) * member.type.end(0)
+            at += 4 + remaining.pop(0) * member.element_size
         else:
             at = _end(member, at)
     return out
@@ -585,12 +583,16 @@ def _dtype(kind: Struct, counts: tuple[int, ...], order: str, size: int) -> np.d
             continue
         names.append(member.name)
         if member.sequence:
-            assert isinstance(member.type, Struct)
             at += -at % 4 + 4
             count = remaining.pop(0)
-            formats.append(np.dtype((_element(member.type, 0, order), (count,))))
+            element = (
+                _element(member.type, 0, order)
+                if isinstance(member.type, Struct)
+                else np.dtype(order + member.type.dtype)
+            )
+            formats.append(np.dtype((element, (count,))))
             offsets.append(at + 4)
-            at += count * member.type.end(0)
+            at += count * member.element_size
             continue
         if isinstance(member.type, Struct):
             formats.append(_element(member.type, at, order))

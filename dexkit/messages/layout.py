@@ -5,8 +5,8 @@ are all made from :data:`STRUCTS`, so a layout is written down once, in ``idl/*.
 
 The subset of IDL that is read: nested modules, ``@final`` structs of numeric members,
 one-dimensional arrays of them, members that are structs, unbounded sequences of structs, and (in
-structs that no other contains) one-dimensional arrays of structs, strings and sequences of bytes.
-Anything else is refused when it is read, not when it is used.
+structs that no other contains) one-dimensional arrays of structs, strings, sequences of bytes, and
+bounded sequences of numbers. Anything else is refused when it is read, not when it is used.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ class Primitive:
 PRIMITIVES: dict[str, Primitive] = {
     p.idl: p
     for p in (
+        Primitive("int8", "b", 1, "int8", "int8", "i1", "int"),
         Primitive("uint8", "B", 1, "uint8", "octet", "u1", "int"),
         Primitive("int16", "h", 2, "int16", "short", "i2", "int"),
         Primitive("uint16", "H", 2, "uint16", "unsigned short", "u2", "int"),
@@ -90,7 +91,8 @@ class Field:
 
     :param type: a number type or a struct.
     :param array: length of a fixed array, or None.
-    :param sequence: whether it is an unbounded sequence.
+    :param sequence: whether it is a sequence.
+    :param bound: most elements of a sequence of numbers; None for other members.
     """
 
     name: str
@@ -98,6 +100,7 @@ class Field:
     array: int | None = None
     sequence: bool = False
     doc: str = ""
+    bound: int | None = None
 
     @property
     def is_structs(self) -> bool:
@@ -111,8 +114,23 @@ class Field:
 
     @property
     def is_bytes(self) -> bool:
-        """Whether it is a string or a sequence of bytes."""
-        return self.sequence and isinstance(self.type, Primitive)
+        """Whether it is a string or an unbounded sequence of bytes."""
+        return self.sequence and isinstance(self.type, Primitive) and self.bound is None
+
+    @property
+    def is_numbers(self) -> bool:
+        """Whether it is a bounded sequence of numbers."""
+        return self.bound is not None
+
+    @property
+    def element_size(self) -> int:
+        """Bytes from one element of a sequence to the next."""
+        return self.type.size if isinstance(self.type, Primitive) else self.type.end(0)
+
+    @property
+    def most(self) -> int:
+        """The longest sequence of structs or numbers that is encoded or decoded."""
+        return MAX_ELEMENTS if self.bound is None else self.bound
 
     def places(self) -> list[str]:
         """The names of its values in a path: ``q``, or ``motor_cmd[0]`` to ``motor_cmd[19]``."""
@@ -140,8 +158,12 @@ class Struct:
 
     @property
     def ros_name(self) -> str:
-        """Name of the ROS 2 type whose DDS type this is: ``unitree_go/msg/MotorCmd``."""
-        return f"{self.scope[0]}/{self.scope[1]}/{self.name.removesuffix('_')}"
+        """Name of the ROS 2 type whose DDS type this is: ``unitree_go/msg/MotorCmd``.
+
+        A type outside the modules of ROS 2 is no DDS type of a ROS 2 type; recordings name it in
+        the same form: ``inspire/msg/inspire_hand_ctrl``.
+        """
+        return f"{self.scope[0]}/msg/{self.name.removesuffix('_')}"
 
     @property
     def is_fixed(self) -> bool:
@@ -197,8 +219,7 @@ def max_size(struct: Struct) -> int:
         if member.is_bytes:
             size += -size % 4 + 4 + MAX_BYTES
         elif member.sequence:
-            assert isinstance(member.type, Struct)
-            size += 4 + MAX_ELEMENTS * member.type.end(0)
+            size += -size % 4 + 4 + member.most * member.element_size
         else:
             size = Struct((), "", (member,)).end(size)
     return size + (-size % 4)
@@ -261,8 +282,8 @@ class _Parser:
                 self._struct(scope)
 
     def _struct(self, scope: tuple[str, ...]) -> None:
-        if len(scope) < 2:
-            raise IdlError(f"IDL line {self._line()}: a struct outside PACKAGE::msg")
+        if not scope:
+            raise IdlError(f"IDL line {self._line()}: a struct outside a module")
         doc = self._docs.get(self._line() - 1, "")
         # an unannotated struct would be appendable to some DDS versions and final to others
         self._next("@")
@@ -288,23 +309,37 @@ class _Parser:
             self._next()
             self._next("<")
         kind = self._type(scope)
+        bound = None
         if sequence:
+            if self._peek() == ",":
+                self._next()
+                bound = self._length(self._next())
             self._next(">")
         text = kind is _CHARACTER
         name = self._next()
         array = None
         if self._peek() == "[":
             self._next()
-            length = self._next()
-            if not length.isdecimal() or len(length) > 9:
-                raise IdlError(f"IDL line {line}: {length!r} is no length of an array")
-            array = int(length)
+            array = self._length(self._next())
             self._next("]")
         self._next(";")
+        numbers = kind in PRIMITIVES.values() and kind is not PRIMITIVES["boolean"]
         plain = isinstance(kind, Struct) or kind is PRIMITIVES["uint8"]
-        if (sequence and not plain) or ((sequence or text) and array is not None):
-            raise IdlError(f"IDL line {line}: only sequences of structs or bytes are supported")
-        return Field(name, kind, array, sequence or text, self._docs.get(line, ""))
+        if (
+            (sequence and not (numbers if bound else plain))
+            or ((sequence or text) and array is not None)
+            or (bound is not None and not 0 < bound <= MAX_ELEMENTS)
+        ):
+            raise IdlError(
+                f"IDL line {line}: only sequences of structs or bytes, and sequences of at most "
+                f"{MAX_ELEMENTS} numbers, are supported"
+            )
+        return Field(name, kind, array, sequence or text, self._docs.get(line, ""), bound)
+
+    def _length(self, text: str) -> int:
+        if not text.isdecimal() or len(text) > 9:
+            raise IdlError(f"IDL line {self._line()}: {text!r} is no length")
+        return int(text)
 
     def _type(self, scope: tuple[str, ...]) -> Primitive | Struct:
         token = self._next()
@@ -319,8 +354,14 @@ class _Parser:
 
     def _check(self, struct: Struct) -> None:
         at, varied = 0, False
+        numbers = any(member.is_numbers for member in struct.fields)
         for member in struct.fields:
             where = f"{struct.name}.{member.name}"
+            if numbers:
+                # each begins where the one before it happens to end
+                if isinstance(member.type, Struct) or member.is_bytes or member.type.size > 4:
+                    raise IdlError(f"{where}: only numbers of 4 bytes beside a sequence of numbers")
+                continue
             inner = member.type
             if varied and not member.is_bytes:
                 raise IdlError(f"{where}: a member after a string or bytes")

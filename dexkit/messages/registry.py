@@ -9,10 +9,14 @@ from functools import cache, cached_property
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dexkit.errors import EncodeError, UsageError
 from dexkit.messages import layout, schemas
 from dexkit.messages.codec import ArrayLengthError, Buffer, explain, is_big
 from dexkit.messages.columns import Columns
+from dexkit.messages.joint_lists import JOINT_LISTS, JointLists
 
 __all__ = ["MessageType", "decode", "encode", "message_type", "message_types"]
 
@@ -62,18 +66,71 @@ class MessageType:
     def motor_sequence(self) -> str:
         """Name of the member that holds the motors of a command or state: ``motor_cmd``.
 
+        Where each quantity has a list, that of the positions.
+
         :raises UsageError: the type has no sequence of motors.
         """
-        return self._motor_member.name
+        return self._lists.sequence if self._lists else self._motor_member.name
 
     @cached_property
     def motor_type(self) -> MessageType:
-        """Type of one element of :attr:`motor_sequence`.
+        """Type of one of :meth:`motors`.
 
         :raises UsageError: the type has no sequence of motors.
         """
+        if self._lists:
+            return message_type(self._lists.motor)
         assert isinstance(self._motor_member.type, layout.Struct)
         return message_type(self._motor_member.type.dds_name)
+
+    def motors(self, message: Any) -> list[Any]:
+        """The motors of a command or state, each of :attr:`motor_type`.
+
+        :raises UsageError: the type has no sequence of motors.
+        """
+        if self._lists:
+            return self._lists.motors(message, self.motor_type.cls)
+        found: list[Any] = getattr(message, self.motor_sequence)
+        return found
+
+    def of_motors(self, motors: Sequence[Any]) -> Any:
+        """A message with these motors; every other member has its default.
+
+        :raises UsageError: the type has no sequence of motors.
+        """
+        if self._lists:
+            return self._lists.message(motors, self.cls)
+        return self.cls(**{self.motor_sequence: list(motors)})
+
+    def motor_place(self, member: str, slot: int) -> tuple[str, int] | None:
+        """Path of a motor's value in a message and how many there are one; None if it has none.
+
+        :raises UsageError: the type has no sequence of motors.
+        """
+        if not self._lists:
+            return f"{self.motor_sequence}[{slot}].{member}", 1
+        if member not in self._lists.lists:
+            return None
+        name, scale = self._lists.lists[member]
+        return f"{name}[{slot}]", scale
+
+    def motor_table(
+        self, columns: Columns, member: str, slots: Sequence[int]
+    ) -> NDArray[np.float64]:
+        """A value of some motors in each sample, shape (n, len(slots)); 0 where the type lacks it.
+
+        :raises UsageError: the type has no such member, or no sequence of motors.
+        """
+        places = [self.motor_place(member, slot) for slot in slots]
+        here = [place for place in places if place is not None]
+        if len(here) < len(places) or not here:
+            return np.zeros((len(columns), len(places)))
+        table = columns.table([path for path, _ in here])
+        return table if not self._lists else table / here[0][1]
+
+    @cached_property
+    def _lists(self) -> JointLists | None:
+        return JOINT_LISTS.get(self.name)
 
     @cached_property
     def _motor_member(self) -> layout.Field:

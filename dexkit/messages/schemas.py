@@ -16,7 +16,7 @@ def _ros_member(member: Field) -> str:
         package, _, name = member.type.ros_name.split("/")
         kind = f"{package}/{name}"
     if member.sequence and not member.is_text:
-        kind += "[]"
+        kind += "[]" if member.bound is None else f"[<={member.bound}]"
     elif member.array is not None:
         kind += f"[{member.array}]"
     comment = f"  # {member.doc}" if member.doc else ""
@@ -40,7 +40,8 @@ def ros2msg(struct: Struct) -> str:
 def _idl_member(member: Field) -> str:
     kind = member.type.classic if isinstance(member.type, Primitive) else member.type.dds_name
     if member.sequence and not member.is_text:
-        return f"  sequence<{kind}> {member.name};"
+        bound = "" if member.bound is None else f", {member.bound}"
+        return f"  sequence<{kind}{bound}> {member.name};"
     array = f"[{member.array}]" if member.array is not None else ""
     return f"  {kind} {member.name}{array};"
 

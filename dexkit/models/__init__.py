@@ -23,7 +23,7 @@ from dexkit.models.brainco import BRAINCO_REVO2
 from dexkit.models.dex1 import DEX1_1
 from dexkit.models.dex3 import DEX3_1
 from dexkit.models.dex5 import DEX5_1
-from dexkit.models.inspire import INSPIRE_DFX
+from dexkit.models.inspire import INSPIRE_DFX, INSPIRE_FTP
 from dexkit.models.profile import (
     Dialect,
     Finger,
@@ -44,6 +44,7 @@ __all__ = [
     "DIALECTS",
     "GROUP",
     "INSPIRE_DFX",
+    "INSPIRE_FTP",
     "MODELS",
     "Dialect",
     "Finger",
@@ -59,7 +60,7 @@ __all__ = [
 ]
 
 GROUP = "dexkit.models"
-BUILT_IN = (DEX1_1, DEX3_1, DEX5_1, BRAINCO_REVO2, INSPIRE_DFX)
+BUILT_IN = (DEX1_1, DEX3_1, DEX5_1, BRAINCO_REVO2, INSPIRE_DFX, INSPIRE_FTP)
 """The models of dexkit itself."""
 
 _HAND_TYPES = (

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
 from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles
 
-__all__ = ["INSPIRE_DFX"]
+__all__ = ["INSPIRE_DFX", "INSPIRE_FTP"]
 
 _FULL_TRAVEL_S = 0.8  # docs/sources/unitree-dex.md#j2
 _NAMES = ("pinky", "ring", "middle", "index", "thumb_bend", "thumb_rotation")
@@ -75,4 +76,33 @@ INSPIRE_DFX = HandModel(
             Finger("Thumb", range(4, 6), (-167.0, 26.0), (-9.0, -66.0), tip=1.0, root=0.1),
         ),
     ),
+)
+
+INSPIRE_FTP = replace(
+    INSPIRE_DFX,
+    name="inspire-ftp",
+    title="Inspire FTP hand",
+    other_short_name="inspire-ftp",
+    dialects=(
+        Dialect(
+            name="inspire_ftp",
+            model="inspire-ftp",
+            cmd_topic="rt/inspire_hand/ctrl/{s}",
+            state_topic="rt/inspire_hand/state/{s}",
+            cmd_type="inspire::inspire_hand_ctrl",
+            state_type="inspire::inspire_hand_state",
+            index=dict.fromkeys(Side, 0),
+            length=6,
+            q_open=math.nan,
+            summary="RH56DFTP: lists of 6 integers; angles 0 closed to 1000 open, with mode bit 1",
+            codec=Lazy("dexkit.service.ftp_map:FtpMap"),
+            position_servo=True,
+            zero_is_no_state=True,
+        ),
+    ),
+    client=Lazy("dexkit.teleop.client:EitherHandClient"),
+    requirements=("inspire_ftp.toml", "inspire_ftp_client.toml"),
+    reference=Lazy("dexkit.conformance.virtual.inspire:FtpService"),
+    simulator="sim-inspire-ftp",
+    client_option="inspire_ftp",
 )

@@ -51,7 +51,8 @@ class Dialect:
     """A hand model on DDS: topics, types, motors and scale of q.
 
     :param model: name of the hand model.
-    :param cmd_topic: command topic; ``{side}`` is replaced by ``left`` or ``right``.
+    :param cmd_topic: command topic; ``{side}`` is replaced by ``left`` or ``right``, ``{s}`` by
+        ``l`` or ``r``.
     :param cmd_type: DDS type name of the command.
     :param index: position of a subject's first motor in the sequence (0 unless both sides share
         a topic).
@@ -100,7 +101,11 @@ class Dialect:
 
     def topics(self, side: Subject) -> tuple[str, str]:
         """(command topic, state topic) of a side or a robot."""
-        return self.cmd_topic.format(side=side), self.state_topic.format(side=side)
+        return self._of(self.cmd_topic, side), self._of(self.state_topic, side)
+
+    @staticmethod
+    def _of(topic: str, side: Subject) -> str:
+        return topic.format(side=side, s=str(side)[0])
 
     @property
     def is_gripper(self) -> bool:
@@ -229,6 +234,8 @@ _FINGER_PROFILES: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = Lazy(
 class HandModel:
     """One hand model.
 
+    :param other_short_name: what it is called in ``--hands``, if another model has the same name
+        without its revision.
     :param unit: of q, of its limits and of all that is derived from them.
     :param torque_unit: of tau_est and tau_max: A, where a hand reports currents.
 
@@ -297,6 +304,7 @@ class HandModel:
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
     low_rate: float = 0.0
+    other_short_name: str = ""
     unit: str = "rad"
     torque_unit: str = "N m"
     client_dq: float = 0.0
@@ -318,8 +326,8 @@ class HandModel:
 
     @property
     def short_name(self) -> str:
-        """The name without the vendor's revision: ``dex3`` of ``dex3-1``."""
-        return self.name.partition("-")[0]
+        """The name without the vendor's revision, unless it has another: ``dex3`` of ``dex3-1``."""
+        return self.other_short_name or self.name.partition("-")[0]
 
     @property
     def gains(self) -> tuple[tuple[float, float], ...]:

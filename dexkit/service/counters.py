@@ -13,7 +13,8 @@ class TopicCounters:
 
     :ivar received: command samples taken.
     :ivar undecodable: of those, samples that are not the message they claim to be.
-    :ivar short: samples with too few motors for a hand that is served here; ignored.
+    :ivar short: samples with too few motors for a hand that is served here, or that leave its
+        joints without a goal; ignored.
     :ivar overlong: samples with more motors than the dialect has; the surplus is ignored.
     :ivar pauses: times that the service was paused for more than a quarter of a second (stopped,
         suspended, starved); the hands brake then until a command comes that was sent later.
@@ -46,7 +47,8 @@ class HandCounters:
     :ivar rejected: commands with NaN or infinity.
     :ivar clamped: accepted commands that had to be brought within the limits.
     :ivar wrong_ids: accepted commands with a mode byte whose id is not the motor's index.
-    :ivar unknown_status: accepted commands with a mode byte whose status is neither lock nor FOC.
+    :ivar unknown_status: accepted commands with a mode byte whose status is neither lock nor FOC,
+        or that has bits which are not used.
     :ivar zero_gains: accepted commands of a client that has changed q for a second or more without
         gains, so that the hand stays limp (:mod:`dexkit.service.limp`).
     :ivar brakes: times that driving stopped because no fresh command was there.

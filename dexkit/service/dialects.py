@@ -145,7 +145,7 @@ class DialectMap(ABC):
         self.fill = fill
         self._specs = dict(specs)
         self._state_type = message_type(dialect.state_type)
-        self._sequence = message_type(dialect.cmd_type).motor_sequence
+        self._command_type = message_type(dialect.cmd_type)
         self._first = {side: dialect.index[side] for side in specs}
         self._length = max(
             max(self._first[s] + spec.n_joints for s, spec in specs.items()), dialect.length
@@ -192,8 +192,7 @@ class DialectMap(ABC):
 
     def _motor_commands(self, message: Any) -> list[Any]:
         """The motors of a command message."""
-        motors: list[Any] = getattr(message, self._sequence)
-        return motors
+        return self._command_type.motors(message)
 
     def _q_in(self, q: float, joint: JointSpec) -> float:
         # 5.4 as float32 is 1e-7 above 5.4: not a command beyond the limit

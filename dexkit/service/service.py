@@ -399,7 +399,10 @@ class HandService:
         if short:
             count.short += 1
             self._log_once(
-                "short", f"ignored, {motors} motor(s) where {self._map.length} are needed"
+                "short",
+                f"ignored, {motors} motor(s) where {self._map.length} are needed"
+                if motors < self._map.length
+                else "ignored, it leaves joints without a goal",
             )
 
     def _submit(self, unit: _ServedHand, command: HandCommand, message: Any, sent: float) -> None:

@@ -37,6 +37,7 @@ __all__ = [
     "PINCH_MIN",
     "POLL_PAUSE",
     "Dex1Client",
+    "EitherHandClient",
     "FingerClient",
     "Inputs",
     "JointCommand",
@@ -434,6 +435,19 @@ class RightHandClient(FingerClient):
     @property
     def _awaited(self) -> Sequence[Side]:
         return (Side.RIGHT,)
+
+
+class EitherHandClient(FingerClient):
+    """A client that begins when some joint of either hand is not at 0
+    (docs/sources/unitree-dex.md#j3).
+
+    The genuine one begins after 5 s in any case.
+    """
+
+    @property
+    def _awaited(self) -> Sequence[Side]:
+        latest = self.receiver.seen
+        return () if any(any(q) for q in latest.values()) else self.sides
 
 
 def client_for(

@@ -46,16 +46,15 @@ class ClientWire:
         return [(self._dialect.cmd_topic, self._payload(places))] if commands else []
 
     def _payload(self, motors: Sequence[JointCommand]) -> bytes:
-        message = self._command.cls()
-        setattr(message, self._command.motor_sequence, [self._motor(**m._asdict()) for m in motors])
-        return self._command.encode(message)
+        made = [self._motor(**m._asdict()) for m in motors]
+        return self._command.encode(self._command.of_motors(made))
 
     def positions(self, topic: str, data: bytes) -> dict[Side, Pose]:
         """The positions of the sides in a state message, without those that it is too short for.
 
         :raises WireError: it is not of the dialect's state type.
         """
-        motors = getattr(self._state.decode(data), self._state.motor_sequence)
+        motors = self._state.motors(self._state.decode(data))
         found: dict[Side, Pose] = {}
         for side, its_topic in self.state_topics.items():
             first = self._dialect.index[side]

@@ -164,10 +164,14 @@ def _motor_fields(
     :param unit: of q, and that of tau.
     :param speeds: that of dq, in units of q a second; empty for 1.
     """
+    mt = message_type(type_name)
     motors = next(
-        f.name
-        for f in message_type(type_name).layout.fields
-        if isinstance(f.type, Struct) and any(m.name == "q" for m in f.type.fields)
+        (
+            f.name
+            for f in mt.layout.fields
+            if isinstance(f.type, Struct) and any(m.name == "q" for m in f.type.fields)
+        ),
+        "",
     )
     if kind == "cmd":
         members = _COMMAND
@@ -175,17 +179,25 @@ def _motor_fields(
         members = _HG_STATE if type_name.startswith("unitree_hg") else _GO_STATE
     for number, (slot, joint) in enumerate(joints):
         for quantity, member in members.items():
+            place: tuple[str, int] | None = (f"{motors}[{slot}].{member}", 1)
+            if not motors:
+                place = mt.motor_place(member, slot)
+            if place is None:
+                continue
             yield Field(
-                f"{motors}[{slot}].{member}",
+                place[0],
                 f"{joint.name} {quantity}",
                 quantity,
                 number,
                 _unit(quantity, unit, torque_unit),
-                units[number]
-                if quantity == "tau"
-                else speeds[number]
-                if speeds and quantity in ("dq", "ddq")
-                else 1.0,
+                (
+                    units[number]
+                    if quantity == "tau"
+                    else speeds[number]
+                    if speeds and quantity in ("dq", "ddq")
+                    else 1.0
+                )
+                / place[1],
             )
 
 

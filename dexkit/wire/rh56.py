@@ -12,15 +12,17 @@ order of the joints: pinky, ring, middle, index, thumb bend, thumb rotation.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
+from dexkit.hand import MotorError
 
 __all__ = [
     "BAUD_RATE",
     "DONE",
+    "FAULTS",
     "FULL",
     "IDS",
     "JOINTS",
@@ -80,6 +82,16 @@ class Error(IntFlag):
     OVER_CURRENT = 4
     MOTOR = 8
     COMMUNICATION = 16
+
+
+FAULTS: Mapping[Error, MotorError] = {
+    Error.LOCKED_ROTOR: MotorError.LOCKED,
+    Error.OVER_TEMPERATURE: MotorError.CASE_TEMPERATURE,
+    Error.OVER_CURRENT: MotorError.OVERCURRENT,
+    Error.MOTOR: MotorError.ABNORMAL_RESET,
+    Error.COMMUNICATION: MotorError.COMMUNICATION_CHECK,
+}
+"""What each of them is in a :class:`~dexkit.hand.HandState`."""
 
 
 class Status(IntEnum):

@@ -186,7 +186,7 @@ class PeerCase(Case):
         def q() -> float:
             if client.newest is None:
                 return 0.0
-            motors = getattr(client.newest.message, state.motor_sequence)
+            motors = state.motors(client.newest.message)
             return float(sum(abs(m.q) for m in motors))
 
         client.wait_states()

@@ -15,7 +15,8 @@ __all__ = ["files", "render"]
 # what generated codecs may take from dexkit.messages.codec, in the order of an import
 _CODEC_NAMES = (
     *("HEADER", "ArrayLengthError", "Buffer", "check_count", "check_end"),
-    *("pack_bytes", "pack_text", "take_bytes", "take_text", "truncated"),
+    *("pack_bytes", "pack_numbers", "pack_text"),
+    *("take_bytes", "take_numbers", "take_text", "truncated"),
 )
 _ELEMENTS_LINES = {
     False: [],
@@ -196,9 +197,65 @@ def _text_codec(struct: Struct) -> list[str]:
     ]
 
 
+def _numbers_codec(struct: Struct) -> list[str]:
+    """Codec of a struct of numbers and of sequences of them: each begins where its alignment is."""
+    stem = f"_{struct.name.rstrip('_')}"
+    constants, encode, decode = [], [], []
+    for index, member in enumerate(struct.fields):
+        assert isinstance(member.type, Primitive)
+        name = f"x_{member.name}"
+        if member.is_numbers:
+            encode += [
+                "    out += bytes(-len(out) % 4)",
+                f'    out += pack_numbers("{member.type.code}", m.{member.name}, {member.bound})',
+            ]
+            decode.append(
+                f'    {name}, at = take_numbers("{struct.name}.{member.name}", '
+                f'"{member.type.code}", {member.bound}, data, at, big)'
+            )
+            continue
+        leaves = _member_leaves(member)
+        code, size = _padded(leaves, 0)
+        part = f"{stem}_{index}"
+        constants.append(f'{part} = (Struct("<{code}"), Struct(">{code}"))')
+        if member.type.size > 1:
+            encode.append(f"    out += bytes(-len(out) % {member.type.size})")
+            decode.append(f"    at += -at % {member.type.size}")
+        encode += [
+            *_array_checks(leaves, "m", "    "),
+            f"    out += {part}[0].pack({_values(leaves, 'm')})",
+        ]
+        decode += [
+            f"    if len(data) < at + {size}:",
+            f'        raise truncated("{struct.name}", at + {size}, len(data))',
+            f"    {name} = {part}[big].unpack_from(data, at){'' if member.array else '[0]'}",
+            f"    at += {size}",
+        ]
+    arguments = ", ".join(f"x_{member.name}" for member in struct.fields)
+    return [
+        *([*constants, "", ""] if constants else []),
+        f"def encode_{struct.name}(m: {struct.name}) -> bytes:",
+        f'    """Encapsulation header and little-endian data of a {struct.name}."""',
+        "    out = bytearray(HEADER)",
+        *encode,
+        "    return bytes(out)",
+        "",
+        "",
+        f"def decode_{struct.name}(data: Buffer, big: bool) -> {struct.name}:",
+        f'    """The {struct.name} after the encapsulation header of ``data``."""',
+        "    at = 4",
+        *decode,
+        "    if at != len(data):",
+        f'        check_end("{struct.name}", data, at)',
+        f"    return {struct.name}({arguments})",
+    ]
+
+
 def _codec(struct: Struct) -> list[str]:
     if any(member.is_bytes for member in struct.fields):
         return _text_codec(struct)
+    if any(member.is_numbers for member in struct.fields):
+        return _numbers_codec(struct)
     constants: list[str] = []
     encode: list[str] = []
     decode: list[str] = []
@@ -339,7 +396,7 @@ def render(package: str, structs: Iterable[Struct]) -> str:
         "bounds and turns every failure into a :class:`dexkit.errors.WireError`.",
         '"""',
         "",
-        "# ruff: noqa: E501, N802",
+        f"# ruff: noqa: E501{', N802' if any(s.name[0].isupper() for s in mine) else ''}",
         "# fmt: off",
         "",
         "from __future__ import annotations",

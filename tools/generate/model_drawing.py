@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, Side
-from dexkit.models import Finger, HandLayout, HandModel
+from dexkit.models import Dialect, Finger, HandLayout, HandModel
 from dexkit.robot_layout import RobotLayout
 from dexkit.robots import RobotModel
 from tools.generate.svg_sheet import Point, Sheet
@@ -93,10 +93,16 @@ def _draw_fingers(model: HandModel, layout: HandLayout) -> Sheet:
         for packet, at in zip(palm, layout.palm_sensors, strict=True):
             _taxels(sheet, place(at), len(model.sensors[packet].slots), packet)
         sheet.text((x, bottom + 28), f"{side} hand", bold=True, size=14, anchor="middle")
-        both = topics.cmd_topic.format(side=side).rpartition("/")[0]
-        sheet.text((x, bottom + 46), f"{both}/cmd, …/state", "muted", size=12, anchor="middle")
+        sheet.text((x, bottom + 46), _topics(topics, side), "muted", size=12, anchor="middle")
     _legend(sheet, model)
     return sheet
+
+
+def _topics(dialect: Dialect, side: Side) -> str:
+    """``rt/dex3/left/cmd, …/state``: both topics, what they have in common once."""
+    command, state = (topic.split("/") for topic in dialect.topics(side))
+    same = next(i for i, (a, b) in enumerate(zip(command, state, strict=True)) if a != b)
+    return f"{'/'.join(command)}, …/{'/'.join(state[same:])}"
 
 
 def _flesh(sheet: Sheet, limbs: Sequence[Sequence[Point]], width: float) -> None:
@@ -196,9 +202,8 @@ def _draw_gripper(model: HandModel) -> Sheet:
     for side, x in zip(Side, (230.0, 650.0), strict=True):
         _jaws(sheet, (x, 210.0), model.joints[side][0])
         sheet.text((x, 286), f"{side} gripper", bold=True, size=14, anchor="middle")
-        both = topics.cmd_topic.format(side=side).rpartition("/")[0]
         motor = f", motor id {model.vendor_ids[side]}" if side in model.vendor_ids else ""
-        text = f"{both}/cmd, …/state{motor}"
+        text = f"{_topics(topics, side)}{motor}"
         sheet.text((x, 304), text, "muted", size=12, anchor="middle")
     return sheet
 

@@ -62,7 +62,7 @@ class StateWire:
         :raises WireError: it is not of the dialect's state type.
         """
         message = self._type.decode(data)
-        motors = getattr(message, self._type.motor_sequence)
+        motors = self._type.motors(message)
         found = {}
         for side, its_topic in self.topics.items():
             first = self._dialect.index[side]

@@ -330,7 +330,7 @@ def _motor_encoder(
                 given["kp"], given["kd"] = gains[j]
                 given["mode"] = _mode(dialect, j)
             motors.append(motor(**given))
-        return mt.encode(mt.cls(**{mt.motor_sequence: motors}))
+        return mt.encode(mt.of_motors(motors))
 
     return encode
 

@@ -178,13 +178,13 @@ def _columns(samples: SampleArray) -> Columns:
 def _values(
     columns: Columns, type_name: str, kind: str, slots: Sequence[int], units: Sequence[float]
 ) -> dict[str, Floats]:
-    sequence = message_type(type_name).motor_sequence
-    array = next(f for f in message_type(type_name).layout.fields if f.name == sequence).array
+    mt = message_type(type_name)
+    array = next(f for f in mt.layout.fields if f.name == mt.motor_sequence).array
     values = {}
     with np.errstate(invalid="ignore"):
         for name, member in _MEMBERS[kind].items():
-            paths = [f"{sequence}[{i}].{member}" for i in slots if array is None or i < array]
-            values[name] = columns.table(paths)
+            here = [i for i in slots if array is None or i < array]
+            values[name] = mt.motor_table(columns, member, here)
     if units:
         values["tau"] = values["tau"] * np.asarray(units)
     return values
