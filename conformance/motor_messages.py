@@ -122,6 +122,11 @@ class MotorCodec:
     def _motor(self) -> type[Any]:
         return message_type(self._command_motor).cls
 
+    @property
+    def holds_nan(self) -> bool:
+        """Whether a command can hold a value that is not finite; one of integers cannot."""
+        return self.command.name not in _LISTS
+
     def encode(self, hands: Mapping[Side, Motors]) -> list[tuple[str, bytes]]:
         """Encode commands to these sides as (topic, payload); one message if they share a topic.
 

@@ -545,6 +545,7 @@ _KNOWN = {
     "emulators/lerobot/ports.py": {"bind"},  # loopback only
     "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address
     "emulators/dex3_mcu/server.py": {"bind", "listen"},
+    "emulators/tcp_port.py": {"bind", "listen"},  # loopback only
 }
 
 

@@ -101,6 +101,7 @@ def test_every_verdict() -> None:
     assert "does not say what was between the fingers" in reasons.pop("DEX1-FORCE-07")
     # no client starts from rest here
     assert "no step from rest" in reasons.pop("DEX1-FORCE-08")
+    assert "in any step from rest" in reasons.pop("DEX1-FORCE-16")
     assert "does not say what was between the fingers" in reasons.pop("DEX1-FORCE-13")
     for name, reason in reasons.items():
         assert "only a live run" in reason or "does not apply to the dialect" in reason, name

@@ -290,10 +290,10 @@ def feels_nothing(ctx: Context) -> Outcome:
     other = [s for s in ctx.recording.judged if s != ctx.side]
     squeezes = [p for s in other for p in ctx.recording.phases("squeeze", s)]
     touches = [p for s in other for p in ctx.recording.phases("touch", s)]
-    if not squeezes or not touches:
+    if not squeezes:
         return ctx.skipped("no other hand squeezes an object")
     (side,) = other
-    rest, end = ctx.span(touches[0])[0], ctx.span(squeezes[0])[1]
+    rest, end = ctx.span((touches or squeezes)[0])[0], ctx.span(squeezes[0])[1]
     spans = ((rest - 2 * _BEFORE_S, rest), (end - 2 * _BEFORE_S, end))
     mine = [_pressures(ctx, *span) for span in spans]
     theirs = [_pressures(ctx, *span, side=side) for span in spans]

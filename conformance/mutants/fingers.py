@@ -430,7 +430,7 @@ class KeepsTheMost(Dex3Service):
         return self.felt[hand.side]
 
 
-@wrong_hand("DEX3-SENS-11", sides=BOTH)
+@wrong_hand("DEX3-SENS-11", sides=BOTH, whole=True)
 class OneSensorBuffer(Dex3Service):
     """Publishes the right hand's pressures as those of both."""
 

@@ -192,7 +192,7 @@ class _Overshoots(ServoHand):
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08", "DFX-WDOG-01"))
+@wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08", "DFX-WDOG-01", "FTP-WDOG-01"))
 class Overshoots(ServoService):
     """Goes 8 % of the travel too far in a large step, and comes back after 0.4 s."""
 

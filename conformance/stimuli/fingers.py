@@ -400,7 +400,7 @@ class FingerScript(HandScript):
         """No command to one side but rejected ones, while it moves and the other is commanded."""
         self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
         yield from self._drive("drive", (side,), {})
-        yield from self._silence_alone("silence", side, {side: rejected})
+        yield from self._silence_alone("silence", side, {side: rejected} if rejected else {})
         yield from self._everyone("resume", {s: self._home(s) for s in self.plan.sides}, most=1.5)
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
@@ -731,7 +731,8 @@ class FingerScript(HandScript):
         if len(sides) > 1 and "silence" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 home = self._motors(side, self._home(side))
-                yield from self._silent_alone(side, [replace(m, q=bad) for m in home])
+                rejected = [replace(m, q=bad) for m in home]
+                yield from self._silent_alone(side, rejected if self._codec.holds_nan else [])
         yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})
 
 

@@ -50,6 +50,7 @@ HANDS: Mapping[str, Counts] = {
     "dex5-1": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
     "brainco-revo2": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
     "inspire-dfx": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
+    "inspire-ftp": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
 }
 """By model, so many hands are generated and tried. A run of a kind that is not there has no
 score. ``--hands`` tries fewer; the file says how many each entry has."""
