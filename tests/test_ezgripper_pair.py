@@ -240,6 +240,7 @@ def test_exchanged_ids_are_refused(tmp_path: Path) -> None:
         assert off(gripper)
 
 
+@pytest.mark.soak  # a pause of the machine ends it, as it must: the servo's bus watchdog
 def test_both_are_calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dexkit.cli.calibrate.GripperSettings", partial(GripperSettings, timeout=0.2)
@@ -253,6 +254,11 @@ def test_both_are_calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         keys = [record_key(gripper.path, number) for number in ZEROS]
         assert [zeros[key] for key in keys] == pytest.approx(list(ZEROS.values()), abs=40)
         assert off(gripper)
+
+
+def test_a_pair_that_is_not_calibrated_is_refused(tmp_path: Path) -> None:
+    arguments = ["--ids", "2,1", "--config", str(tmp_path / "config.json"), "--yes"]
+    with pair() as gripper:
         for extra in (["--id", "3"], ["--force"], ["--set-baudrate", "57600"]):
             refused = CliRunner().invoke(
                 calibrate_command, ["--device", gripper.path, *arguments, *extra]

@@ -69,7 +69,7 @@ def test_a_parquet_table_has_the_values_of_the_messages(tmp_path: Path, part: Pa
                 assert table[f"{mt.motor_sequence}[{j}].q"][i].as_py() == motor.q
 
 
-@settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(
     st.sampled_from(NAMES).flatmap(
         lambda n: st.tuples(st.just(n), st.lists(messages(n, 2), max_size=2))

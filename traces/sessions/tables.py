@@ -344,9 +344,12 @@ def _encode(
         if not rows.any():
             continue
         elements = {
-            f.name: [message_type(f.type.dds_name).cls() for _ in range(sizes[f.name])]
+            f.name: [
+                message_type(f.type.dds_name).cls() if isinstance(f.type, Struct) else 0
+                for _ in range(sizes[f.name])
+            ]
             for f in mt.layout.fields
-            if f.sequence and isinstance(f.type, Struct)
+            if f.sequence
         }
         example = mt.encode(mt.cls(**elements))
         data = encode_columns(
