@@ -534,7 +534,12 @@ def _counts(kind: Struct, data: bytes, big: bool) -> tuple[int, ...]:
         if member.sequence:
             at += -at % 4
             if len(data) < at + 8:
-                raise truncated(kind.name, at + 8, len(data))
+                name = (
+                    f"{kind.name}.{member.name}"
+                    if isinstance(member.type, Primitive)
+                    else kind.name
+                )
+                raise truncated(name, at + 8, len(data))
             count = _UINT32[big].unpack_from(data, at + 4)[0]
             at += 4 + count * member.element_size
             check_count(f"{kind.name}.{member.name}", count, at + 4, len(data), member.most)
