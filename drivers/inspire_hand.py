@@ -2,7 +2,7 @@
 
 Each exchange writes the goals where they have changed and reads the angles; some exchanges read
 errors and temperatures as well. :mod:`dexkit.drivers.inspire_serial` and
-:mod:`dexkit.drivers.inspire_modbus` are the ways to the registers.
+:mod:`dexkit.drivers.inspire_modbus` access the registers.
 
 The device has no time-out: it goes to its last goal and stays there. A joint that is to hold gets
 the angle at which it was measured last as its goal.
@@ -120,11 +120,11 @@ class InspireHand(ABC):
         """Side, joints, rates and time-outs of this hand."""
         return self._spec
 
-    # --- the way to the registers
+    # --- access to the registers
 
     @abstractmethod
     def _connect(self) -> Channel:
-        """Open the way to the device.
+        """Open the connection to the device.
 
         :raises HandError: it cannot be.
         """
@@ -202,7 +202,7 @@ class InspireHand(ABC):
                     raise
 
     def close(self) -> None:
-        """Hold every joint and let go of the way. Failures are logged, not raised."""
+        """Hold every joint and close the connection. Failures are logged, not raised."""
         channel = self._channel
         if channel is None:
             return

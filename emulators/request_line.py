@@ -23,17 +23,17 @@ FoundFrameT = TypeVar("FoundFrameT", covariant=True)
 
 
 class AskedDevice(Protocol):
-    """A device without its line."""
+    """A device that answers requests, without its serial line."""
 
     @property
     def resting(self) -> bool:
         """Whether nothing of it moves."""
 
     def advance_to(self, now: float) -> None:
-        """Let it live up to ``now``."""
+        """Advance the device to ``now``."""
 
     def strike(self, kind: str) -> None:
-        """Suffer a fault of its own."""
+        """Apply a fault that only this device has."""
 
 
 class Parser(Protocol[FoundFrameT]):
@@ -97,7 +97,7 @@ class RequestLine(SerialLine, Generic[FrameT]):
         self._last_byte = start
 
     def advance_to(self, now: float) -> None:
-        """Let faults strike and the device live up to ``now``."""
+        """Apply due faults and advance the device to ``now``."""
         events = self.schedule.poll(now)
         self.device.advance_to(now)
         for fault, begins in events:

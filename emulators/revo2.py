@@ -85,7 +85,7 @@ class Revo2:
         self._now = now
 
     def advance_to(self, now: float) -> None:
-        """Let the joints live up to ``now``."""
+        """Advance the joints to ``now``."""
         self.mechanics.step(self._steps.due(now))
         self._now = now
 

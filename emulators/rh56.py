@@ -86,7 +86,7 @@ class Rh56:
         self._drive()
 
     def advance_to(self, now: float) -> None:
-        """Let the joints live up to ``now``."""
+        """Advance the joints to ``now``."""
         self.mechanics.step(self._steps.due(now))
         self._now = now
 

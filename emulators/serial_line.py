@@ -48,7 +48,7 @@ class LineCounters:
 
 
 class SerialLine(ABC):
-    """Time, faults and the way to the host; whoever derives from it adds the devices.
+    """Timing, faults and host connection of a serial line; a subclass adds the devices.
 
     :param line_time: bytes and latency take their time; otherwise everything is there at once.
     :param latency_timer: seconds; 0 for an adapter without one.
@@ -92,7 +92,7 @@ class SerialLine(ABC):
 
     @abstractmethod
     def advance_to(self, now: float) -> None:
-        """Let faults strike and devices live up to ``now``."""
+        """Apply due faults and advance the devices to ``now``."""
 
     @property
     @abstractmethod

@@ -166,7 +166,7 @@ class _Player:
         return Observation(self._now_ns(), status, data)
 
     def end_turn(self) -> None:
-        """Let the other hand have its turn."""
+        """Let the run of the other hand continue."""
         if self._has_turn:
             self._has_turn = False
             self._turn.release()
