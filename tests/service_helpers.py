@@ -157,3 +157,10 @@ def wait_until(condition: Callable[[], Any], timeout: float = PATIENCE, what: st
     while not condition():
         assert time.monotonic() < deadline, f"waited {timeout} s for {what or condition}"
         time.sleep(0.002)
+
+
+def deliver_until(
+    node: FakeNode, topic: str, payload: bytes, condition: Callable[[], object]
+) -> None:
+    """Send a command again until it shows: one that falls into a pause of this program is lost."""
+    wait_until(lambda: node.deliver(topic, payload) or condition())  # type: ignore[func-returns-value]

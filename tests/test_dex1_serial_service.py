@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from dexkit.hand import HandCommand, JointMode, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go
 from dexkit.models import dialect
 from dexkit.service import HandService
-from tests.service_helpers import FakeNode, wait_until
+from tests.service_helpers import FakeNode, deliver_until, wait_until
 
 LOST = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
 GO = dialect("unitree_go")
@@ -33,13 +32,6 @@ def newest(node: FakeNode, side: Side) -> unitree_go.MotorState_:
     topic = GO.topics(side)[1]
     payload = next(data for name, data in reversed(node.sent) if name == topic)
     return STATES.decode(payload).states[0]  # type: ignore[no-any-return]
-
-
-def deliver_until(
-    node: FakeNode, topic: str, payload: bytes, condition: Callable[[], object]
-) -> None:
-    """Send a command again until it shows: one that falls into a pause of this program is lost."""
-    wait_until(lambda: node.deliver(topic, payload) or condition())  # type: ignore[func-returns-value]
 
 
 def test_unplugged_hand_is_reported_and_ignores_stale_commands_on_return() -> None:

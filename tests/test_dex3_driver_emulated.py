@@ -23,7 +23,7 @@ from dexkit.messages import encode, message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import HandService
 from tests.patience import PATIENCE
-from tests.service_helpers import FakeNode, wait_until
+from tests.service_helpers import FakeNode, deliver_until, wait_until
 
 GOAL = {
     Side.LEFT: np.array([0.3, 0.5, 0.8, -0.6, -0.7, -0.5, -0.9]),
@@ -280,8 +280,7 @@ class TestService:
             hand = hand_at(emulated.url)
             with HandService(hand, node=node, dialect="dex3", state_rate=200.0) as service:  # type: ignore[arg-type]
                 core = service.cores[Side.LEFT]
-                node.deliver(CMD, message(GOAL[Side.LEFT]))
-                wait_until(lambda: core.driving)
+                deliver_until(node, CMD, message(GOAL[Side.LEFT]), lambda: core.driving)
                 emulated.inject("unplug:for=1500ms")
                 wait_until(lambda: not device.plugged)
                 wait_until(lambda: not core.connected, what="the loss")
@@ -307,8 +306,7 @@ class TestService:
                 view = core.view()
                 assert view is not None
                 assert not any(view.fault)
-                node.deliver(CMD, message(GOAL[Side.LEFT]))
-                wait_until(lambda: core.driving)
+                deliver_until(node, CMD, message(GOAL[Side.LEFT]), lambda: core.driving)
                 assert core.counters.reconnects == 1
 
     def test_attempts_to_reopen_continue(self, monkeypatch: pytest.MonkeyPatch) -> None:

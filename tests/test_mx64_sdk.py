@@ -53,7 +53,13 @@ def port(pair: EmulatedProcess) -> Iterator[sdk.PortHandler]:
     assert handler.setBaudRate(1_000_000)  # closes and opens again
     yield handler
     for servo_id in (1, 2):
-        PACKETS.write1ByteTxRx(handler, servo_id, 64, 0)
+        PACKETS.write1ByteTxRx(handler, servo_id, mx64.TORQUE_ENABLE.address, 0)
+    for servo_id in (1, 2):  # the next test finds both at rest
+        eventually(
+            lambda i=servo_id: (  # type: ignore[misc]
+                PACKETS.read4ByteTxRx(handler, i, mx64.PRESENT_VELOCITY.address) == (0, *OK)
+            )
+        )
     handler.closePort()
 
 

@@ -25,7 +25,14 @@ from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go, unitree_hg
 from dexkit.models import dialect
 from dexkit.service import HandService, diagnose, limp
-from tests.service_helpers import FakeEndpoint, FakeNode, FakeWriter, ScriptedHand, wait_until
+from tests.service_helpers import (
+    FakeEndpoint,
+    FakeNode,
+    FakeWriter,
+    ScriptedHand,
+    deliver_until,
+    wait_until,
+)
 
 CMD, STATE = dialect("unitree_go").topics(Side.LEFT)
 STATES = message_type(dialect("unitree_go").state_type)
@@ -65,8 +72,7 @@ def test_state_flows_before_any_command_and_is_measured() -> None:
 def test_a_command_moves_the_hand_and_the_state_follows() -> None:
     hand, node = ScriptedHand(), FakeNode()
     with serve(hand, node) as service:
-        node.deliver(CMD, cmd(2.5))
-        wait_until(lambda: node.sent and newest(node).q == 2.5)
+        deliver_until(node, CMD, cmd(2.5), lambda: node.sent and newest(node).q == 2.5)
         assert newest(node).mode == 1
         assert service.cores[Side.LEFT].driving
 
@@ -141,8 +147,12 @@ def test_a_hand_may_adapt_the_commands_of_its_clients() -> None:
     hand, node = ScriptedHand(), FakeNode()
     hand.adapt_command = lambda c: HandCommand.position(c.q)  # type: ignore[attr-defined]
     with serve(hand, node) as service:
-        node.deliver(CMD, encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=2.0)])))
-        wait_until(lambda: newest(node).q == pytest.approx(2.0))
+        deliver_until(
+            node,
+            CMD,
+            encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=2.0)])),
+            lambda: newest(node).q == pytest.approx(2.0),
+        )
         assert service.snapshot()["hands"]["left"]["zero_gains"] == 0
 
 
@@ -169,8 +179,7 @@ class TestLink:
     def test_unplugged_hand_is_reopened(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
         with serve(hand, node) as service:
-            node.deliver(CMD, cmd(2.0))
-            wait_until(lambda: node.sent and newest(node).q == 2.0)
+            deliver_until(node, CMD, cmd(2.0), lambda: node.sent and newest(node).q == 2.0)
             hand.plugged = False
             wait_until(lambda: newest(node).lost >= 2)
             lost = newest(node)
@@ -185,8 +194,7 @@ class TestLink:
             seen = [hand.commands.get(timeout=60) for _ in range(20)]
             assert all(command.is_brake for command in seen)
             assert hand.q == 2.0
-            node.deliver(CMD, cmd(4.0))
-            wait_until(lambda: newest(node).q == 4.0)
+            deliver_until(node, CMD, cmd(4.0), lambda: newest(node).q == 4.0)
             counters = service.cores[Side.LEFT].counters
             assert (counters.losses, counters.reconnects) == (1, 1)
         assert hand.closes == 2
@@ -298,8 +306,7 @@ def test_hands_brake_when_a_thread_dies(thread: str, monkeypatch: pytest.MonkeyP
     hand, node = ScriptedHand(), FakeNode()
     with serve(hand, node) as service:
         core = service.cores[Side.LEFT]
-        node.deliver(CMD, cmd(2.0))
-        wait_until(lambda: core.driving)
+        deliver_until(node, CMD, cmd(2.0), lambda: core.driving)
 
         def fail(*arguments: object, **options: object) -> None:
             raise RuntimeError("a bug")
@@ -319,8 +326,7 @@ class TestStop:
         hand, node = ScriptedHand(), FakeNode()
         service = serve(hand, node)
         service.start()
-        node.deliver(CMD, cmd(2.0))
-        wait_until(lambda: node.sent and newest(node).q == 2.0)
+        deliver_until(node, CMD, cmd(2.0), lambda: node.sent and newest(node).q == 2.0)
         service.stop()
         service.stop()
         assert hand.last is not None
@@ -334,8 +340,7 @@ class TestStop:
         hand, node = ScriptedHand(), FakeNode()
         service = serve(hand, node, state_rate=5.0)
         service.start()
-        node.deliver(CMD, cmd(2.0))
-        wait_until(lambda: newest(node).mode == 1)
+        deliver_until(node, CMD, cmd(2.0), lambda: newest(node).mode == 1)
         service.stop()
         assert newest(node).mode == 0
 
@@ -382,8 +387,12 @@ class TestTwoHands:
         d = dialect("unitree_actuator")
         motors = [unitree_go.MotorCmd_(q=q, kp=5.0) for q in (1.0, 2.0)]
         with HandService([left, right], node=node, dialect=d):
-            node.deliver(d.cmd_topic, encode(unitree_go.MotorCmds_(motors)))
-            wait_until(lambda: (right.q, left.q) == (1.0, 2.0))
+            deliver_until(
+                node,
+                d.cmd_topic,
+                encode(unitree_go.MotorCmds_(motors)),
+                lambda: (right.q, left.q) == (1.0, 2.0),
+            )
             wait_until(lambda: [m.q for m in states(node, d.state_topic)] == [1.0, 2.0])
         assert {topic for topic, _ in node.sent} == {d.state_topic}
 
@@ -394,8 +403,12 @@ class TestTwoHands:
         with HandService([left, right], node=node, dialect=d):
             right.plugged = False
             wait_until(lambda: states(node, d.state_topic)[0].lost > 0)
-            node.deliver(d.cmd_topic, encode(unitree_go.MotorCmds_(motors)))
-            wait_until(lambda: states(node, d.state_topic)[1].q == 2.0)
+            deliver_until(
+                node,
+                d.cmd_topic,
+                encode(unitree_go.MotorCmds_(motors)),
+                lambda: states(node, d.state_topic)[1].q == 2.0,
+            )
             assert states(node, d.state_topic)[1].lost == 0
 
     def test_hands_of_different_topics_need_two_services(self) -> None:
@@ -561,8 +574,12 @@ def test_hg_messages_on_an_hg_service() -> None:
     hand, node = ScriptedHand(), FakeNode()
     d = dialect("unitree_hg")
     with serve(hand, node, dialect="unitree_hg"):
-        node.deliver(CMD, encode(unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=math.pi)])))
-        wait_until(lambda: hand.q == pytest.approx(2.7))
+        deliver_until(
+            node,
+            CMD,
+            encode(unitree_hg.HandCmd_([unitree_hg.MotorCmd_(q=math.pi)])),
+            lambda: hand.q == pytest.approx(2.7),
+        )
         mt = message_type(d.state_type)
         wait_until(
             lambda: (

@@ -35,7 +35,7 @@ from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.finger_state import FingerStateEncoder
 from tests.each import each
-from tests.service_helpers import FakeNode, wait_until
+from tests.service_helpers import FakeNode, deliver_until, wait_until
 
 DEX3 = dialect("dex3")
 STATES, COMMANDS = message_type(DEX3.state_type), message_type(DEX3.cmd_type)
@@ -554,8 +554,12 @@ class TestService:
             wait_until(lambda: "stay braked" in caplog.text)
             assert "send it once with bit 7 = 0" in caplog.text
             wait_until(lambda: newest(node).motor_state[0].mode == 0x80)
-            node.deliver(CMD, COMMANDS.encode(message()))
-            wait_until(lambda: newest(node).motor_state[0].mode == 0x10)
+            deliver_until(
+                node,
+                CMD,
+                COMMANDS.encode(message()),
+                lambda: newest(node).motor_state[0].mode == 0x10,
+            )
 
     def test_one_thread_publishes_for_both_hands(self) -> None:
         publisher = Publisher(1000.0)
