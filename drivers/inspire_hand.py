@@ -3,28 +3,23 @@
 Each exchange writes the goals where they have changed and reads the angles; some exchanges read
 errors and temperatures as well. :mod:`dexkit.drivers.inspire_serial` and
 :mod:`dexkit.drivers.inspire_modbus` access the registers.
-
-The device has no time-out: it goes to its last goal and stays there. A joint that is to hold gets
-the angle at which it was measured last as its goal.
 """
 
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
-from collections.abc import Callable
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
-from dexkit.clock import Clock, RealClock
+from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel
-from dexkit.drivers.request_line import LATE, RequestLine, RequestStatistics
+from dexkit.drivers.goal_hand import GoalHand
 from dexkit.drivers.setting_parsers import Parsers
-from dexkit.errors import HandError, HandLost, HandNotFound, HandTimeout, UsageError
-from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
+from dexkit.errors import UsageError
+from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import INSPIRE_DFX
 from dexkit.wire import rh56
 from dexkit.wire.rh56 import Error, Register
@@ -33,15 +28,10 @@ __all__ = ["COMMON_SETTINGS", "InspireHand", "InspireSettings"]
 
 log = logging.getLogger(__name__)
 
-_IO_RATE = INSPIRE_DFX.state_rate
-_ATTEMPTS = 3  # to prepare a hand that is opened
 _HEALTH_EVERY = 20
 """Exchanges of which one reads errors and temperatures."""
 _HEALTH = int(Register.TEMPERATURE) + rh56.JOINTS - int(Register.ERROR)
 """Bytes from the errors to the end of the temperatures."""
-
-
-FoundT = TypeVar("FoundT")
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,7 @@ class InspireSettings:
         return rh56.IDS
 
 
-class InspireHand(ABC):
+class InspireHand(GoalHand):
     """An Inspire RH56, however it is reached.
 
     :param side: which hand.
@@ -86,9 +76,6 @@ class InspireHand(ABC):
     ``close`` has every joint hold where it is.
     """
 
-    reconnect_interval = 0.5
-    """Longest time between the service's attempts to open a lost hand again, seconds."""
-
     def __init__(
         self,
         side: Side,
@@ -96,38 +83,13 @@ class InspireHand(ABC):
         *,
         clock: Clock | None = None,
     ) -> None:
+        super().__init__("RH56", INSPIRE_DFX, side, configuration.timeout, clock)
         self.configuration = configuration
-        self.statistics = RequestStatistics()
-        self._line = RequestLine(self.statistics, configuration.timeout)
-        self._clock: Clock = clock or RealClock()
-        self._channel: Channel | None = None
         self._turn = 0
-        self._written: list[int] | None = None
-        """The goals that the device has acknowledged."""
-        self._angles = [0] * rh56.JOINTS
-        self._held: list[int | None] = [None] * rh56.JOINTS
-        """Where joints hold, while they do."""
         self._errors = [Error(0)] * rh56.JOINTS
         self._celsius = [float("nan")] * rh56.JOINTS
-        self._spec = INSPIRE_DFX.spec(
-            side,
-            io_rate=_IO_RATE,
-            exchange_timeout=2 * (configuration.timeout + LATE),
-        )
-
-    @property
-    def spec(self) -> HandSpec:
-        """Side, joints, rates and time-outs of this hand."""
-        return self._spec
 
     # --- access to the registers
-
-    @abstractmethod
-    def _connect(self) -> Channel:
-        """Open the connection to the device.
-
-        :raises HandError: it cannot be.
-        """
 
     @abstractmethod
     def _write(
@@ -145,130 +107,53 @@ class InspireHand(ABC):
         :raises HandError: there are none.
         """
 
-    @abstractmethod
-    def _absent(self, place: str) -> HandNotFound:
-        """What to say of a place where no hand answers."""
-
-    # --- opening and closing
-
-    def open(self) -> None:
-        """Open the way, clear errors, set speed and limit of force, read the angles. No motion.
-
-        :raises HandNotFound: no place was named or there is none, or the hand does not answer.
-        :raises HandRefused: another program uses the port.
-        :raises HandLost: the way goes away.
-        """
-        if self._channel is not None:
-            return
-        self._channel = self._connect()
-        self._line.restart()
-        self._turn, self._written = 0, None
-        self._held = [None] * rh56.JOINTS
-        place = self._channel.place
-        try:
-            self._prepare()
-        except HandTimeout as error:
-            self._close_channel()
-            raise self._absent(place) from error
-        except BaseException:
-            self._close_channel()
-            raise
-        log.info("RH56 on %s: id %d, at %s", place, self.configuration.id, self._angles)
+    # --- one hand
 
     def _prepare(self) -> None:
-        """Set speed and limit of force, read the angles, clear errors; an answer may be lost.
+        self._turn = 0
+        for register, value in (
+            (Register.SPEED_SET, self.configuration.speed),
+            (Register.FORCE_SET, self.configuration.force),
+        ):
+            if value is not None:
+                self._put(register, [value] * rh56.JOINTS)
+        self._read_angles()
+        self._read_health()
+        if any(self._errors):
+            # a joint that has its power again must not go on to a goal of before
+            self._put_goals(self._positions)
+            self._ask(lambda to: self._write(to, Register.CLEAR_ERROR, b"\x01\x00", None))
+            self._read_health()
 
-        :raises HandTimeout: several were.
-        """
-        settings = self.configuration
-        for left in reversed(range(_ATTEMPTS)):
-            try:
-                for register, value in (
-                    (Register.SPEED_SET, settings.speed),
-                    (Register.FORCE_SET, settings.force),
-                ):
-                    if value is not None:
-                        self._put(register, [value] * rh56.JOINTS)
-                self._read_angles()
-                self._read_health()
-                if any(self._errors):
-                    # a joint that has its power again must not go on to a goal of before
-                    self._put(Register.ANGLE_SET, self._angles)
-                    self._ask(lambda to: self._write(to, Register.CLEAR_ERROR, b"\x01\x00", None))
-                    self._read_health()
-                return
-            except HandTimeout:
-                if not left:
-                    raise
-
-    def close(self) -> None:
-        """Hold every joint and close the connection. Failures are logged, not raised."""
-        channel = self._channel
-        if channel is None:
-            return
-        try:
-            self._read_angles()
-            self._put(Register.ANGLE_SET, self._angles)
-        except HandError as error:
-            log.warning("could not hold: %s; the hand goes to its last goal", error)
-        finally:
-            self._close_channel()
-            log.info("RH56 on %s closed: %s", channel.place, self.statistics)
-
-    def _close_channel(self) -> None:
-        channel, self._channel = self._channel, None
-        if channel is not None:
-            channel.close()
-
-    def __enter__(self) -> InspireHand:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
-
-    # --- exchanging
-
-    def exchange(self, command: HandCommand) -> HandState:
-        """Write the goals if they have changed, and read the angles.
-
-        :raises HandLost: the device has gone away, or is not open.
-        :raises HandTimeout: no intact answer in time, or this program was paused before the goals
-            were written.
-        """
-        deadline = WriteDeadline(self._clock)
-        if self._channel is None:
-            raise HandLost("the hand is not open", hint="call open() first")
-        goals = self._goals(command)
-        if goals != self._written:
-            self._written = None
-            self._put(Register.ANGLE_SET, goals, deadline)
-            self._written = goals
+    def _measure(self, command: HandCommand) -> HandState:
         self._turn += 1
         if self._turn % _HEALTH_EVERY == 1:
             self._read_health()
         self._read_angles()
         driven = command.mode == JointMode.FOC
         return HandState.from_values(
-            np.array(self._angles) / rh56.FULL,
+            np.array(self._positions) / rh56.FULL,
             stamp=self._clock.now(),
             temperature=self._celsius,
             mode=driven.astype(int).tolist(),
             fault=[self._fault(error) for error in self._errors],
         )
 
+    def _holding_goals(self) -> list[int]:
+        self._read_angles()
+        return self._positions
+
+    def _put_goals(self, goals: list[int], before: WriteDeadline | None = None) -> None:
+        self._put(Register.ANGLE_SET, goals, before)
+
     def _goals(self, command: HandCommand) -> list[int]:
-        """The goal of each joint, of one that holds where it was when that began."""
         found = []
         for i, (mode, q) in enumerate(zip(command.mode.tolist(), command.q.tolist(), strict=True)):
             if mode == JointMode.FOC:
                 self._held[i] = None
                 found.append(round(min(max(q, 0.0), 1.0) * rh56.FULL))
-                continue
-            held = self._held[i]
-            if held is None:
-                held = self._held[i] = self._angles[i]
-            found.append(held)
+            else:
+                found.append(self._hold(i))
         return found
 
     @staticmethod
@@ -281,7 +166,7 @@ class InspireHand(ABC):
 
     def _read_angles(self) -> None:
         data = self._ask(lambda to: self._read(to, Register.ANGLE_ACT, 2 * rh56.JOINTS))
-        self._angles = [min(max(angle, 0), rh56.FULL) for angle in rh56.numbers(data)]
+        self._positions = [min(max(angle, 0), rh56.FULL) for angle in rh56.numbers(data)]
 
     def _read_health(self) -> None:
         data = self._ask(lambda to: self._read(to, Register.ERROR, _HEALTH))
@@ -304,19 +189,6 @@ class InspireHand(ABC):
     ) -> None:
         data = np.array(values, "<i2").tobytes()
         self._ask(lambda to: self._write(to, register, data, before))
-
-    def _ask(self, request: Callable[[Channel], FoundT]) -> FoundT:
-        """Do one request; a device that has gone is closed."""
-        channel = self._channel
-        if channel is None:
-            raise HandLost("the hand is not open", hint="call open() first")
-        try:
-            return request(channel)
-        except HandTimeout:
-            raise
-        except HandError:
-            self._close_channel()
-            raise
 
 
 COMMON_SETTINGS: Parsers = {

@@ -3,8 +3,7 @@
 Each exchange writes goals and speeds where they have changed, and reads position, speed, current
 and status of every motor in one request. The registers are in :mod:`dexkit.wire.revo2`.
 
-The device has no time-out that any source tells of: it goes to its last goal and stays there. A
-joint that is to hold gets the position at which it was measured last as its goal.
+No source tells of a time-out of the device.
 """
 
 from __future__ import annotations
@@ -16,21 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from dexkit.backends import Backend, BackendOptions
-from dexkit.clock import Clock, RealClock
+from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, SerialChannel
+from dexkit.drivers.goal_hand import GoalHand
 from dexkit.drivers.modbus_answers import accept
-from dexkit.drivers.request_line import LATE, RequestLine, RequestStatistics
 from dexkit.drivers.setting_parsers import Parsers, parse_settings
-from dexkit.errors import (
-    HandError,
-    HandLost,
-    HandNotFound,
-    HandRefused,
-    HandTimeout,
-    UsageError,
-)
-from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, Side
+from dexkit.errors import HandNotFound, HandRefused, UsageError
+from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import BRAINCO_REVO2
 from dexkit.wire import revo2
 from dexkit.wire.modbus import Adu, Function, Request, RtuParser, signed
@@ -40,7 +32,6 @@ __all__ = ["SETTINGS", "Revo2Serial", "Revo2Settings", "backend"]
 
 log = logging.getLogger(__name__)
 
-_ATTEMPTS = 3  # to prepare a hand that is opened
 _FULL = revo2.FULL
 _N = revo2.JOINTS
 
@@ -73,7 +64,7 @@ class Revo2Settings:
             raise UsageError(f"baudrate must be 9600 to 5000000, not {self.baudrate}")
 
 
-class Revo2Serial:
+class Revo2Serial(GoalHand):
     """A Revo2.
 
     :param side: which hand.
@@ -83,9 +74,6 @@ class Revo2Serial:
     ``close`` has every joint hold where it is.
     """
 
-    reconnect_interval = 0.5
-    """Longest time between the service's attempts to open a lost hand again, seconds."""
-
     def __init__(
         self,
         side: Side,
@@ -94,139 +82,49 @@ class Revo2Serial:
         clock: Clock | None = None,
     ) -> None:
         self.configuration = configuration or Revo2Settings()
-        self.statistics = RequestStatistics()
+        super().__init__("Revo2", BRAINCO_REVO2, side, self.configuration.timeout, clock)
         self._side = side
         own = self.configuration.id
         self._unit = revo2.UNITS[side] if own is None else own
-        self._line = RequestLine(self.statistics, self.configuration.timeout)
         self._parser = RtuParser(answers=True)
-        self._clock: Clock = clock or RealClock()
-        self._channel: Channel | None = None
-        self._written: list[int] | None = None
-        """Goals and speeds that the device has acknowledged."""
-        self._position = [0] * _N
-        self._held: list[int | None] = [None] * _N
-        """Where joints hold, while they do."""
-        joints = BRAINCO_REVO2.joints[side]
+        joints = self.spec.joints
         self._full_speed = np.array([joint.dq_max for joint in joints])
         self._full_current = np.array([joint.tau_max for joint in joints])
-        self._spec = BRAINCO_REVO2.spec(
-            side,
-            io_rate=BRAINCO_REVO2.state_rate,
-            exchange_timeout=2 * (self.configuration.timeout + LATE),
-        )
 
-    @property
-    def spec(self) -> HandSpec:
-        """Side, joints, rates and time-outs of this hand."""
-        return self._spec
-
-    # --- opening and closing
-
-    def open(self) -> None:
-        """Open the port, check the side, set the registers' unit, read the positions. No motion.
-
-        :raises HandNotFound: no port was named or there is none, or the hand does not answer.
-        :raises HandRefused: another program uses the port, or it is the other hand.
-        :raises HandLost: the port goes away.
-        """
-        if self._channel is not None:
-            return
-        settings = self.configuration
-        if settings.device is None:
+    def _connect(self) -> Channel:
+        if self.configuration.device is None:
             raise HandNotFound(
                 "which serial port is the hand on?", hint="--device PATH or USB serial number"
             )
-        self._channel = SerialChannel(settings.device, settings.baudrate)
-        self._line.restart()
-        self._written, self._held = None, [None] * _N
-        place = self._channel.place
-        try:
-            self._prepare()
-        except HandTimeout as error:
-            self._close_channel()
-            raise HandNotFound(
-                f"no hand with id {self._unit} answers on {place} at {settings.baudrate} baud",
-                hint="is its supply on, and its switch at Modbus? Left hands are 126, right ones "
-                "127 by default",
-            ) from error
-        except BaseException:
-            self._close_channel()
-            raise
-        log.info("Revo2 on %s: id %d, at %s", place, self._unit, self._position)
+        return SerialChannel(self.configuration.device, self.configuration.baudrate)
+
+    def _absent(self, place: str) -> HandNotFound:
+        return HandNotFound(
+            f"no hand with id {self._unit} answers on {place} at "
+            f"{self.configuration.baudrate} baud",
+            hint="is its supply on, and its switch at Modbus? Left hands are 126, right ones "
+            "127 by default",
+        )
 
     def _prepare(self) -> None:
-        """Check the side, set the registers' unit, read the positions; an answer may be lost.
+        """Check the side, set the registers' unit, read the positions.
 
         :raises HandRefused: it is the other hand.
-        :raises HandTimeout: several answers were lost.
         """
-        for left in reversed(range(_ATTEMPTS)):
-            try:
-                (number,) = self._read(Function.READ_HOLDING, Holding.SIDE, 1)
-                if revo2.SIDES.get(number, self._side) is not self._side:
-                    raise HandRefused(
-                        f"the hand on this port is a {revo2.SIDES[number]} one, not the "
-                        f"{self._side} one",
-                        hint="swap the ports of --device, or --side",
-                    )
-                (mode,) = self._read(Function.READ_HOLDING, Holding.UNIT_MODE, 1)
-                if mode != UnitMode.NORMALISED:
-                    log.warning("the hand was set to degrees; it is set to parts of the travel")
-                    self._ask(
-                        Request(Function.WRITE_ONE, Holding.UNIT_MODE, 1, (UnitMode.NORMALISED,))
-                    )
-                self._position = self._read_motors()[0].tolist()
-                return
-            except HandTimeout:
-                if not left:
-                    raise
+        (number,) = self._read(Function.READ_HOLDING, Holding.SIDE, 1)
+        if revo2.SIDES.get(number, self._side) is not self._side:
+            raise HandRefused(
+                f"the hand on this port is a {revo2.SIDES[number]} one, not the {self._side} one",
+                hint="swap the ports of --device, or --side",
+            )
+        (mode,) = self._read(Function.READ_HOLDING, Holding.UNIT_MODE, 1)
+        if mode != UnitMode.NORMALISED:
+            log.warning("the hand was set to degrees; it is set to parts of the travel")
+            self._request(Request(Function.WRITE_ONE, Holding.UNIT_MODE, 1, (UnitMode.NORMALISED,)))
+        self._read_motors()
 
-    def close(self) -> None:
-        """Hold every joint and release the port. Failures are logged, not raised."""
-        channel = self._channel
-        if channel is None:
-            return
-        try:
-            self._position = self._read_motors()[0].tolist()
-            self._write(revo2.position_and_speed(self._position, [_FULL] * _N))
-        except HandError as error:
-            log.warning("could not hold: %s; the hand goes to its last goal", error)
-        finally:
-            self._close_channel()
-            log.info("Revo2 on %s closed: %s", channel.place, self.statistics)
-
-    def _close_channel(self) -> None:
-        channel, self._channel = self._channel, None
-        if channel is not None:
-            channel.close()
-
-    def __enter__(self) -> Revo2Serial:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
-
-    # --- exchanging
-
-    def exchange(self, command: HandCommand) -> HandState:
-        """Write goals and speeds if they have changed, and read what is measured.
-
-        :raises HandLost: the port has gone away, or the hand is not open.
-        :raises HandTimeout: no intact answer in time, or this program was paused before the goals
-            were written.
-        """
-        deadline = WriteDeadline(self._clock)
-        if self._channel is None:
-            raise HandLost("the hand is not open", hint="call open() first")
-        goals = self._goals(command)
-        if goals != self._written:
-            self._written = None
-            self._write(goals, deadline)
-            self._written = goals
+    def _measure(self, command: HandCommand) -> HandState:
         position, speed, current, _ = self._read_motors()
-        self._position = position.tolist()
         driven = command.mode == JointMode.FOC
         return HandState.from_values(
             position / _FULL,
@@ -237,7 +135,6 @@ class Revo2Serial:
         )
 
     def _goals(self, command: HandCommand) -> list[int]:
-        """The goal and speed of each joint, of one that holds where it was when that began."""
         positions, speeds = [], []
         rows = zip(
             command.mode.tolist(),
@@ -251,13 +148,17 @@ class Revo2Serial:
                 self._held[i] = None
                 positions.append(round(min(max(q, 0.0), 1.0) * _FULL))
                 speeds.append(max(1, round(min(part, self.configuration.speed) * _FULL)))
-                continue
-            held = self._held[i]
-            if held is None:
-                held = self._held[i] = self._position[i]
-            positions.append(held)
-            speeds.append(_FULL)
+            else:
+                positions.append(self._hold(i))
+                speeds.append(_FULL)
         return revo2.position_and_speed(positions, speeds)
+
+    def _holding_goals(self) -> list[int]:
+        self._read_motors()
+        return revo2.position_and_speed(self._positions, [_FULL] * _N)
+
+    def _put_goals(self, goals: list[int], before: WriteDeadline | None = None) -> None:
+        self._request(Request.write(Holding.POSITION_AND_SPEED, goals), before)
 
     # --- the registers
 
@@ -266,31 +167,19 @@ class Revo2Serial:
         found = self._read(Function.READ_INPUT, Input.POSITION, 4 * _N)
         table = np.array(signed(found), np.int64).reshape(4, _N)
         table[0] = np.clip(table[0], 0, _FULL)
+        self._positions = table[0].tolist()
         return table
 
     def _read(self, function: Function, address: int, count: int) -> tuple[int, ...]:
-        return self._ask(Request(function, address, count))
+        return self._request(Request(function, address, count))
 
-    def _write(self, values: list[int], before: WriteDeadline | None = None) -> None:
-        self._ask(Request.write(Holding.POSITION_AND_SPEED, values), before)
-
-    def _ask(self, request: Request, before: WriteDeadline | None = None) -> tuple[int, ...]:
-        """Do one request; a device that has gone is closed."""
-        channel = self._channel
-        if channel is None:
-            raise HandLost("the hand is not open", hint="call open() first")
+    def _request(self, request: Request, before: WriteDeadline | None = None) -> tuple[int, ...]:
+        data = Adu(self._unit, request.pack()).pack_rtu()
 
         def match(answer: Adu) -> tuple[int, ...] | None:
             return accept(answer, request) if answer.unit == self._unit else None
 
-        data = Adu(self._unit, request.pack()).pack_rtu()
-        try:
-            return self._line.ask(channel, data, self._parser, match, before)
-        except HandTimeout:
-            raise
-        except HandError:
-            self._close_channel()
-            raise
+        return self._ask(lambda to: self._line.ask(to, data, self._parser, match, before))
 
 
 _PARSERS: Parsers = {
