@@ -182,7 +182,7 @@ def test_goal_from_before_a_pause_is_not_written_to_the_mx64() -> None:
     with emulated_ezgripper(start=20.0, closed_at=1510) as gripper:
         assert isinstance(gripper, EmulatedThread)
         servo = gripper.servo
-        settings = GripperSettings(zero=1510)
+        settings = GripperSettings(zero=1510, timeout=1.0)
         with EZGripper(gripper.path, LEFT, settings, clock=clock) as hand:
             hand.exchange(HandCommand.position(1.1))
             goal = servo.get(mx64.GOAL_POSITION)
@@ -196,7 +196,7 @@ def test_brake_after_a_pause_holds_the_present_position() -> None:
     with emulated_ezgripper(start=10.0, closed_at=1510) as gripper:
         assert isinstance(gripper, EmulatedThread)
         servo = gripper.servo
-        with EZGripper(gripper.path, LEFT, GripperSettings(zero=1510)) as hand:
+        with EZGripper(gripper.path, LEFT, GripperSettings(zero=1510, timeout=1.0)) as hand:
             wait_until(lambda: hand.exchange(HandCommand.position(5.0)).dq[0] > 1.0)
             time.sleep(1.2 * PAUSE)  # the servo goes on; its own watchdog acts later
             here = servo.get(mx64.PRESENT_POSITION)
@@ -208,7 +208,9 @@ def test_goal_from_before_a_pause_does_not_enable_the_mx64() -> None:
     clock = Slow()
     with emulated_ezgripper(start=20.0, closed_at=1510) as gripper:
         assert isinstance(gripper, EmulatedThread)
-        with EZGripper(gripper.path, LEFT, GripperSettings(zero=1510), clock=clock) as hand:
+        with EZGripper(
+            gripper.path, LEFT, GripperSettings(zero=1510, timeout=1.0), clock=clock
+        ) as hand:
             _refuses(hand, clock, HandCommand.position(5.0))
             assert not gripper.servo.torque
 
@@ -216,7 +218,7 @@ def test_goal_from_before_a_pause_does_not_enable_the_mx64() -> None:
 def test_command_from_before_a_pause_is_not_written_to_the_m4010() -> None:
     clock = Slow()
     with Dex1Motors((LEFT,)) as motors:
-        settings = Dex1Settings(device=motors.path, timeout=0.3)
+        settings = Dex1Settings(device=motors.path, timeout=1.0)
         with Dex1Serial(LEFT, settings, clock=clock) as hand:
             hand.exchange(HandCommand.brake(1))
             _refuses(hand, clock, HandCommand.position(5.0))
