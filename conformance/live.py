@@ -131,7 +131,11 @@ def record_run(
         topics = {
             t
             for s in Side
-            for t in (*dialect.topics(s), dialect.low_rate_topic.format(side=s))
+            for t in (
+                *dialect.topics(s),
+                dialect.low_rate_topic.format(side=s),
+                dialect.touch_topic_of(s),
+            )
             if t
         }
         # the recorder starts before the backend, so that it records the hand's first samples

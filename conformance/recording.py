@@ -20,6 +20,7 @@ from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
+from dexkit.conformance.touch import Touch
 from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
@@ -166,6 +167,7 @@ class Recording:
     :param usb: what was transferred on USB, where the kit did that.
     :param run: the run record; empty in a recording that no live run made.
     :param low_rate: the states on the low-rate topics, where there are any.
+    :param touch: what tactile areas felt, likewise.
     """
 
     dialect: Dialect
@@ -180,6 +182,7 @@ class Recording:
     usb: UsbRecording | None = None
     run: Mapping[str, str] = field(default_factory=dict)
     low_rate: Mapping[Subject, States] = field(default_factory=dict)
+    touch: Mapping[Subject, Touch] = field(default_factory=dict)
 
     layer = "dds"
     """Which layer's requirements it is judged by."""
@@ -218,7 +221,9 @@ class Recording:
         topics = {t for s in Side for t in chosen.topics(s)} & present
         slow = {s: chosen.low_rate_topic.format(side=s) for s in Side}
         slow = {s: topic for s, topic in slow.items() if topic in present}
-        wanted = sorted({*topics, *slow.values()})
+        felt = {s: chosen.touch_topic_of(s) for s in Side}
+        felt = {s: topic for s, topic in felt.items() if topic in present}
+        wanted = sorted({*topics, *slow.values(), *felt.values()})
         samples = trace.load(wanted, decode=True) if topics else {}
         times = [s.log_time_ns for topic, s in samples.items() if topic in topics and len(s)]
         marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
@@ -275,6 +280,13 @@ class Recording:
             run=trace.metadata.get(RUN, {}),
             low_rate={
                 s: _states(codec, s, samples.get(topic), origin, topic) for s, topic in slow.items()
+            },
+            touch={
+                s: _touch(chosen, samples[topic], origin)
+                for s, topic in felt.items()
+                if topic in samples
+                and samples[topic].type_name == chosen.touch_type
+                and not samples[topic].problem
             },
         )
 
@@ -411,6 +423,13 @@ def _states(
         errors={i: str(e) for i, e in columns.errors.items()},
         columns=columns,
     )
+
+
+def _touch(dialect: Dialect, samples: SampleArray, origin: int) -> Touch:
+    hand = model(dialect.model)
+    assert isinstance(hand, HandModel)  # a robot has no dialect with a touch topic
+    columns = samples.decoded if samples.decoded is not None else samples.columns()
+    return Touch(samples.topic, _seconds(samples.log_time_ns, origin), columns, hand.areas)
 
 
 def _publisher_times(t: Floats, sent: Floats) -> Floats:

@@ -162,7 +162,7 @@ class HandSpec:
     :param io_rate: exchanges a second that can be expected of the backend when nothing is wrong:
         the service asks for no more, and counts what it gets.
     :param exchange_timeout: seconds after which ``exchange`` has returned or raised.
-    :param n_sensors: pressure sensor packets in a state.
+    :param n_sensors: pressure sensor packets in a state, or tactile areas of a touch topic.
     :param simulated: no real device moves when this hand is commanded.
     """
 
@@ -310,7 +310,8 @@ class HandState:
     :param winding_temperature: likewise of its winding, or None where it is not measured apart.
     :param fault: :class:`MotorError` bits per joint.
     :param pressure: Pa, shape (n_sensors, 12), NaN where there is no sensor element; or None
-        without sensors.
+        without sensors. Of tactile areas: the device's own counts, shape (n_sensors, elements of
+        the largest area), row after row.
     :param sensor_temperature: °C, shape (n_sensors, 12), or None.
     :param sensor_lost: packets that each sensor has missed, shape (n_sensors,), or None.
     :param error: the hand's own error word, apart from its motors'.

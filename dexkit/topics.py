@@ -15,7 +15,8 @@ __all__ = ["HAND_TOPICS", "Role", "roles", "topics_of"]
 class Role:
     """The role of a topic in a dialect: state or command, and its sides.
 
-    :param kind: ``"cmd"``, ``"state"`` or ``"low"`` (the low-rate copy of the state).
+    :param kind: ``"cmd"``, ``"state"``, ``"low"`` (the low-rate copy of the state) or ``"touch"``
+        (tactile areas).
     :param sides: whose; both where they share it.
     """
 
@@ -35,6 +36,8 @@ def topics_of(dialect: Dialect) -> Iterator[tuple[str, Role]]:
         if dialect.low_rate_topic:
             low = dialect.low_rate_topic.format(side=side)
             sides.setdefault((low, "low", dialect.state_type), []).append(side)
+        if touch := dialect.touch_topic_of(side):
+            sides.setdefault((touch, "touch", dialect.touch_type), []).append(side)
     for (topic, kind, type_name), whose in sides.items():
         yield topic, Role(dialect, kind, tuple(whose), type_name)
 

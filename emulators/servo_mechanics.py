@@ -48,6 +48,8 @@ class _Servo:
     ddq: float = 0.0
     current: float = 0.0
     still: bool = False
+    contact: float = 0.0
+    """With what part of the current limit it presses on the object."""
     friction: float = 1.0
     """Factor of the current that it takes to move."""
     dead: bool = False
@@ -84,12 +86,14 @@ class _Servo:
         self.ddq = (self.dq - before) / dt
         self.q = q
         limit = self.spec.tau_max
+        presses = blocked == self.spec.closing != 0 and q == self.wall
         if blocked and abs(want) > 0:
             aim = blocked * limit
         else:
             idle = _IDLE if self.goal > self.q else 0.0
             aim = limit * (_MOVING * self.friction * self.dq / full + idle)
         self.current += (aim - self.current) * min(1.0, dt / _STALL)
+        self.contact = max(0.0, self.current * blocked / limit) if presses else 0.0
         self.still = want == 0.0 == self.dq and abs(aim - self.current) < 1e-4
 
 
@@ -138,6 +142,11 @@ class ServoMechanics:
     def q(self) -> Floats:
         """Positions, shape (n_joints,), as they are and not as they are reported."""
         return np.array([servo.q for servo in self._servos])
+
+    @property
+    def contacts(self) -> list[float]:
+        """With what part of its current limit each joint presses on the object."""
+        return [servo.contact for servo in self._servos]
 
     def apply(self, command: HandCommand) -> None:
         """Apply ``command`` until the next one; a joint that is not driven holds where it is."""

@@ -3,8 +3,10 @@ servos, without device or bus.
 
 :mod:`dexkit.emulators.servo_mechanics` has the mechanics. The full speed is the one of the device's
 highest setting, and the steps of q its thousandths (docs/sources/unitree-dex.md#j2); how a motor
-accelerates is assumed. Of a DFX only q is measured, as on Unitree's topics; of an FTP the forces,
-too, but not the pressures of its 17 tactile areas.
+accelerates is assumed. Of a DFX only q is measured, as on Unitree's topics; of an FTP the forces
+and what its 17 tactile areas feel, too. A finger that presses on the object is felt by the two
+large areas of its last joints, most in the middle of each, in proportion to its force; how much a
+real area counts is not known. The small areas and the palm feel nothing.
 
 Not modelled: the fingers' coupled links, that fingers and thumb meet each other, force limits and
 how far a fast finger exceeds them, the errors that stop a joint until they are cleared, and the
@@ -13,14 +15,18 @@ latency of the serial line.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from dexkit.backends import Backend, BackendOptions
-from dexkit.emulators.servo_mechanics import SETTINGS
+from dexkit.emulators.servo_mechanics import SETTINGS, ServoMechanics
 from dexkit.emulators.simulated_servos import SimulatedServos, make_servos
 from dexkit.emulators.wear import WEAR_SETTING
-from dexkit.hand import HandCommand, HandState
+from dexkit.hand import Floats, HandCommand, HandState, Side
 from dexkit.models import INSPIRE_DFX, INSPIRE_FTP
 
-__all__ = ["SimInspireDfx", "SimInspireFtp", "sim_inspire_dfx", "sim_inspire_ftp"]
+__all__ = ["FtpMechanics", "SimInspireDfx", "SimInspireFtp", "sim_inspire_dfx", "sim_inspire_ftp"]
 
 
 class SimInspireDfx(SimulatedServos):
@@ -50,11 +56,62 @@ sim_inspire_dfx = Backend(
 )
 
 
+_COUNTS = 1000.0  # of the middle of an area at the full force; assumed
+_WIDTH = 0.35  # of an area: how far from its middle it is pressed; assumed
+
+
+def _bump(elements: int) -> Floats:
+    """How much of the most each of so many elements in a row feels, the middle most."""
+    away = (np.arange(elements) + 0.5) / elements - 0.5
+    return np.exp(-0.5 * (away / _WIDTH) ** 2)
+
+
+def _touch_shares() -> Floats:
+    """Shape (n_areas, elements of the largest): counts at the full force; NaN for no element."""
+    areas = INSPIRE_FTP.areas
+    shares = np.full((len(areas), max(area.elements for area in areas)), np.nan)
+    for row, area in zip(shares, areas, strict=True):
+        pressed = area.place.partition(" ")[2] in ("top", "palm")
+        pattern = np.outer(_bump(area.rows), _bump(area.columns)).ravel()
+        row[: area.elements] = _COUNTS * pattern / pattern.max() if pressed else 0.0
+    return shares
+
+
+class FtpMechanics(ServoMechanics):
+    """Position servos whose fingers feel what they press on."""
+
+    _shares = _touch_shares()
+    # the joints that press each area: those of its finger; the palm's area has none
+    _joints = tuple(
+        [
+            i
+            for i, joint in enumerate(INSPIRE_FTP.joints[Side.LEFT])
+            if joint.name.partition("_")[0] == area.place.partition(" ")[0]
+        ]
+        for area in INSPIRE_FTP.areas
+    )
+    _felt: tuple[list[float], Floats] | None = None
+
+    @property
+    def pressure(self) -> Floats:
+        """Counts, shape (n_areas, elements of the largest); NaN where there is no element."""
+        contacts = self.contacts
+        if self._felt is None or self._felt[0] != contacts:
+            pressed = [max((contacts[i] for i in mine), default=0.0) for mine in self._joints]
+            self._felt = contacts, self._shares * np.array(pressed)[:, None]
+        return self._felt[1]
+
+    def state(self, stamp: float) -> HandState:
+        """The state of the hand at ``stamp``."""
+        return replace(super().state(stamp), pressure=self.pressure)
+
+
 class SimInspireFtp(SimulatedServos):
     """A simulated RH56DFTP."""
 
     model = INSPIRE_FTP
     resolution = 1e-3
+    mechanics_type = FtpMechanics
 
 
 def _make_ftp(options: BackendOptions) -> SimInspireFtp:
@@ -62,7 +119,7 @@ def _make_ftp(options: BackendOptions) -> SimInspireFtp:
 
 
 sim_inspire_ftp = Backend(
-    summary="Simulated Inspire RH56DFTP hand: 6 position servos, no tactile areas, no device",
+    summary="Simulated Inspire RH56DFTP hand: 6 position servos, 17 tactile areas, no device",
     model=INSPIRE_FTP.name,
     make=_make_ftp,
     settings={**SETTINGS, **WEAR_SETTING},

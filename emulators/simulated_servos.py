@@ -28,6 +28,7 @@ class SimulatedServos(SimulatedHand):
     model: ClassVar[HandModel]
     resolution: ClassVar[float]
     """Steps of q, in parts of the travel."""
+    mechanics_type: ClassVar[type[ServoMechanics]] = ServoMechanics
 
     def __init__(
         self,
@@ -37,7 +38,7 @@ class SimulatedServos(SimulatedHand):
         start: float | None = None,
         clock: Clock | None = None,
     ) -> None:
-        self.mechanics = ServoMechanics(
+        self.mechanics = self.mechanics_type(
             self.model, side, object_at=object_at, start=start, resolution=self.resolution
         )
         spec = self.model.spec(side, io_rate=self.model.state_rate, simulated=True)

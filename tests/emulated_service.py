@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from dexkit.clock import ManualClock
-from dexkit.conformance.virtual import Service
+from dexkit.conformance.virtual import Sample, Service
 from dexkit.conformance.virtual.service import TopicDevice
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import model
 from dexkit.service.core import HandCore
 from dexkit.service.dialects import dialect_map
+from dexkit.traces import TraceEndpoint
 
 __all__ = ["EmulatedService"]
 
@@ -24,6 +25,7 @@ class EmulatedService(Service):
 
     simulated: type[Any]
     tick = period = 0.002
+    ticks = 0
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -53,6 +55,16 @@ class EmulatedService(Service):
         self.clock, self.hands = before.clock, before.hands
         self._serve()
 
+    def endpoints(self) -> list[TraceEndpoint]:
+        """Its endpoints, as discovery reports them."""
+        kind = self.dialect.touch_type
+        touch = [
+            TraceEndpoint(topic, "writer", "reliable", "Volatile", "", kind)
+            for topic in map(self.dialect.touch_topic_of, self.sides)
+            if topic
+        ]
+        return super().endpoints() + touch
+
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         """Take a command message."""
         message = message_type(self.dialect.cmd_type).decode(payload)
@@ -72,6 +84,20 @@ class EmulatedService(Service):
     def positions(self, side: Side) -> tuple[float, ...]:
         """The pose of a hand."""
         return tuple(self.hands[side].mechanics.q.tolist())
+
+    def publish(self) -> list[Sample]:
+        """One state of every hand, and what it feels."""
+        samples = super().publish()
+        self.ticks += 1
+        if not self.dialect.touch_topic or self.ticks % 10:
+            return samples
+        for sides, mapping in self.maps.items():
+            view = self.cores[sides[0]].view()
+            felt = mapping.encode_touch({sides[0]: view}) if view is not None else None
+            if felt is not None:
+                topic = self.dialect.touch_topic_of(sides[0])
+                samples.append(Sample(topic, self.dialect.touch_type, felt, self.now))
+        return samples
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of these hands on the wire."""

@@ -6,8 +6,9 @@ models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.velocity`,
 :mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.safety`,
 :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers`,
-:mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints, :mod:`~.servos` for those of
-position servos, and :mod:`~.client` for the client that drives them.
+:mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints, :mod:`~.touch` for a topic of
+tactile areas, :mod:`~.servos` for position servos, and :mod:`~.client` for the client that drives
+them.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ __all__ = [
 _HAND = (
     *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "velocity"),
     *("drive", "safety", "lifecycle", "tracking", "fingers", "each_joint", "pressure"),
-    *("operator", "uncommanded", "servos"),
+    *("operator", "uncommanded", "servos", "touch"),
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),

@@ -1,4 +1,6 @@
-"""Checks of a Dex3-1's pressure sensors while its fingers press on an object."""
+"""Checks of what the fingers feel while they press on an object: pressure sensors in a state, or
+tactile areas on a topic of their own.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,13 @@ def _pressures(
     ctx: Context, begin: float, end: float, side: Subject | None = None
 ) -> Floats | None:
     """The median pressure in each slot, shape (n_packets, 12); NaN for no value; None if there are
-    no packets.
+    no packets. Of tactile areas likewise, in their order.
 
     :param side: None for the side to be judged.
     """
+    if ctx.recording.dialect.touch_topic:
+        touch = ctx.recording.touch.get(ctx.side if side is None else side)
+        return None if touch is None else touch.median(begin, end)
     states = ctx.states if side is None else ctx.recording.sides[side].states
     columns = states.columns
     rows = states.between(begin, end)
@@ -47,18 +52,21 @@ _NO_VALUE = 30000.0
 
 
 def _finger_packets(ctx: Context, finger: str) -> list[int]:
-    """The packets of a finger's sensors."""
+    """The packets of a finger's sensors, or its areas."""
+    return [i for i, place in enumerate(_places(ctx)) if place.partition(" ")[0] == finger]
+
+
+def _places(ctx: Context) -> list[str]:
+    """Where the packets or areas are."""
     hand = ctx.recording.model
     assert isinstance(hand, HandModel)  # a robot has no fingers
-    return [i for i, s in enumerate(hand.sensors) if s.place.partition(" ")[0] == finger]
+    return [one.place for one in hand.sensors or hand.areas]
 
 
 def _fingers(ctx: Context) -> tuple[str, ...]:
     """The fingers with sensors; the palm is none."""
-    hand = ctx.recording.model
-    assert isinstance(hand, HandModel)  # a robot has no fingers
     names = {j.name.partition("_")[0] for j in ctx.joints}
-    places = (s.place.partition(" ")[0] for s in hand.sensors)
+    places = (place.partition(" ")[0] for place in _places(ctx))
     return tuple(dict.fromkeys(p for p in places if p in names))
 
 

@@ -17,6 +17,7 @@ from dexkit.conformance.mutants import (
     operator,
     robot,
     servos,
+    touch,
     usb,
 )
 from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
@@ -25,7 +26,7 @@ from dexkit.models import model_plugins
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
-MODULES = (any_model, gripper, fingers, servos, operator, clients, robot, usb)
+MODULES = (any_model, gripper, fingers, servos, touch, operator, clients, robot, usb)
 """Where wrong hands are declared."""
 
 

@@ -380,7 +380,7 @@ class SaturatesToNothing(FingerService):
 
 
 @wrong_hand("DEX3-SENS-08", also=("DEX3-SENS-10",), sides=BOTH, whole=True)
-class SlowFoam(Dex3Service):
+class SlowFoam(FingerService):
     """Its pressures fall with a time constant of 2 s."""
 
     def __init__(self, *args: Any) -> None:
@@ -431,7 +431,7 @@ class KeepsTheMost(Dex3Service):
 
 
 @wrong_hand("DEX3-SENS-11", sides=BOTH, whole=True)
-class OneSensorBuffer(Dex3Service):
+class OneSensorBuffer(FingerService):
     """Publishes the right hand's pressures as those of both."""
 
     def pressures(self, hand: FingerHand) -> Floats:
@@ -441,7 +441,7 @@ class OneSensorBuffer(Dex3Service):
 
 
 @wrong_hand("DEX3-SENS-09", sides=BOTH)
-class TaresInAGrip(Dex3Service):
+class TaresInAGrip(FingerService):
     """Takes what each pressure has been for the last second as its zero, as drift."""
 
     def __init__(self, *args: Any) -> None:

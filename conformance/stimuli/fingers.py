@@ -101,6 +101,8 @@ _SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.4, 0.15
 """A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
 _RAMP, _RAMP_SECONDS = 12, 0.24
 """Steps in which a soft hold becomes a firm one, and seconds for all of them."""
+_TOUCH_SECONDS = 0.36
+"""Seconds in which a finger presses on the object alone; a slow one gets more."""
 _STATUSES = range(2, 8)
 """What fits into the three bits of the status and has no meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
@@ -622,8 +624,18 @@ class FingerScript(HandScript):
                 pose = [targets[s].get(i, q) for i, q in enumerate(self._home(s))]
                 hands[s] = self._motors(s, tuple(pose))
             phase = self._begin("touch", pressing, targets=targets, finger=finger)
-            yield from self._hold(0.36, hands)
+            yield from self._hold(_TOUCH_SECONDS + self._travel(targets), hands)
             self._end(phase)
+
+    def _travel(self, targets: Mapping[Side, Mapping[int, float]]) -> float:
+        """Seconds that position servos need from home; others are there at once."""
+        if not self.plan.dialect.position_servo:
+            return 0.0
+        return max(
+            abs(q - self._home(s)[i]) / self._joints[s][i].dq_max
+            for s, mine in targets.items()
+            for i, q in mine.items()
+        )
 
     def _firmer(self) -> Steps:
         """All fingers hold the object softly; each presses firmly in turn, and softly again."""

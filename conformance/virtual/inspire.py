@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from dexkit.conformance.virtual.fingers import GO_MOTOR, FingerHand
+from dexkit.conformance.virtual.service import Sample
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
-from dexkit.hand import Side
+from dexkit.hand import Floats, Side
+from dexkit.messages import message_type
+from dexkit.messages.integer_lists import IntegerLists
 from dexkit.models import INSPIRE_DFX, INSPIRE_FTP
+from dexkit.traces import TraceEndpoint
 
 __all__ = ["FtpService", "InspireService"]
 
@@ -32,16 +37,86 @@ class InspireService(ServoService):
         motors["q"] = hand.q[: len(motors)]
 
 
+_AREAS = INSPIRE_FTP.areas
+_MOST = max(area.elements for area in _AREAS)
+_JOINTS = tuple(joint.name.partition("_")[0] for joint in INSPIRE_FTP.joints[Side.LEFT])
+_COUNTS = 800.0  # at the full force, in each element of a finger's top area
+_LENGTHS = {area.member: area.elements for area in _AREAS}
+
+
 class FtpHand(InspireHand):
-    """The same joints, whose forces are measured, too."""
+    """The same joints, whose forces are measured, too, and fingers that feel."""
 
     model = INSPIRE_FTP
+
+    def pressures(self) -> Floats:
+        """Shape (n_areas, elements of the largest): counts of the tactile areas."""
+        felt = np.zeros((len(_AREAS), _MOST))
+        if not self.touches:
+            return felt
+        # the object is on the way to closed, which is toward 0
+        pressed = np.maximum(self.contact, 0.0) / self.most
+        for row, area in zip(felt, _AREAS, strict=True):
+            finger, _, part = area.place.partition(" ")
+            if part == "top":
+                mine = [p for p, name in zip(pressed, _JOINTS, strict=True) if name == finger]
+                row[: area.elements] = _COUNTS * max(mine)
+        return felt
 
 
 class FtpService(ServoService):
     """Each hand on topics of its own, in lists of integers."""
 
     hand = FtpHand
+    touch_period = 0.04
+    """Seconds from one touch message to the next."""
+    touch_lengths: Mapping[str, int] = _LENGTHS
+    touch_due = 0.0
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._touched: dict[Side, tuple[int, bytes]] = {}
+        self._lists = IntegerLists(message_type(self.dialect.touch_type), self.touch_lengths)
+        self._there = np.concatenate(
+            [
+                i * _MOST + np.arange(self.touch_lengths[area.member])
+                for i, area in enumerate(_AREAS)
+            ]
+        )
+
+    def endpoints(self) -> list[TraceEndpoint]:
+        """Its endpoints, as discovery reports them."""
+        kind = self.dialect.touch_type
+        touch = [
+            TraceEndpoint(self.touch_topic(s), "writer", "reliable", "Volatile", "", kind)
+            for s in self.sides
+        ]
+        return super().endpoints() + touch
+
+    def touch_topic(self, side: Side) -> str:
+        """Where a side's tactile areas are published."""
+        return self.dialect.touch_topic_of(side)
+
+    def publish(self) -> list[Sample]:
+        """One state of every hand, and now and then what its areas feel."""
+        samples = super().publish()
+        if self.now + 1e-9 < self.touch_due:
+            return samples
+        self.touch_due = self.now + self.touch_period
+        return samples + self.touch()
+
+    def touch(self) -> list[Sample]:
+        """What the areas of every hand feel."""
+        kind = self.dialect.touch_type
+        return [Sample(self.touch_topic(s), kind, self.touched(s), self.now) for s in self.sides]
+
+    def touched(self, side: Side) -> bytes:
+        """What the areas of a hand feel, on the wire."""
+        hand = self.hands[side]
+        if self._touched.get(side, (-1, b""))[0] != hand.version:
+            felt = self.pressures(hand)
+            self._touched[side] = hand.version, self._lists.encode(felt.ravel()[self._there])
+        return self._touched[side][1]
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of a hand on the wire."""

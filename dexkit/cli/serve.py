@@ -199,9 +199,10 @@ def command(
                 running.enter_context(service)
             for service, group in zip(services, groups, strict=True):
                 names = " and ".join(str(hand.spec.side) for hand in group)
+                touch = f", touch on {service.touch_topic}" if service.touch_topic else ""
                 click.echo(
                     f"ready: {backend_name} {names} on {service.cmd_topic} and "
-                    f"{service.state_topic} ({language.name}), {service.state_rate:g} Hz, "
+                    f"{service.state_topic}{touch} ({language.name}), {service.state_rate:g} Hz, "
                     f"domain {chosen}, {interface}"
                 )
             sys.stdout.flush()

@@ -21,8 +21,8 @@ _OTHERS = re.compile(r"(rt)?/?(lf/)?(dex\d+|inspire\w*|brainco\w*)/")
 
 
 def is_hand_topic(topic: str, type_name: str) -> bool:
-    """Whether a topic is a hand's and its samples can be read, with the right type or another."""
-    return bool(roles(topic, type_name))
+    """Whether a topic is a hand's and its samples hold motors, with the right type or another."""
+    return any(role.kind != "touch" for role in roles(topic, type_name))
 
 
 def is_driven(motor: Any, dialect: Dialect) -> bool:

@@ -32,6 +32,7 @@ from dexkit.models.profile import (
     JointRoles,
     ModeByte,
     PressureSensor,
+    TouchArea,
 )
 from dexkit.plugins import entry_points, import_object, origin
 
@@ -54,6 +55,7 @@ __all__ = [
     "ModeByte",
     "ModelPlugin",
     "PressureSensor",
+    "TouchArea",
     "dialect",
     "model",
     "model_plugins",

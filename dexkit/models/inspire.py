@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles
+from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles, TouchArea
 
 __all__ = ["INSPIRE_DFX", "INSPIRE_FTP"]
 
@@ -78,6 +78,19 @@ INSPIRE_DFX = HandModel(
     ),
 )
 
+# docs/sources/unitree-dex.md#j3: the vendor counts the fingers from the pinky
+_FINGER_AREAS = (("tip", 3, 3), ("top", 12, 8), ("palm", 10, 8))
+_THUMB_AREAS = (("tip", 3, 3), ("top", 12, 8), ("middle", 3, 3), ("palm", 12, 8))
+_COUNTED = {"pinky": "one", "ring": "two", "middle": "three", "index": "four", "thumb": "five"}
+_AREAS = (
+    *(
+        TouchArea(f"{finger} {part}", f"finger{number}_{part}_touch", rows, columns)
+        for finger, number in _COUNTED.items()
+        for part, rows, columns in (_THUMB_AREAS if finger == "thumb" else _FINGER_AREAS)
+    ),
+    TouchArea("palm", "palm_touch", 14, 8),
+)
+
 INSPIRE_FTP = replace(
     INSPIRE_DFX,
     name="inspire-ftp",
@@ -98,8 +111,12 @@ INSPIRE_FTP = replace(
             codec=Lazy("dexkit.service.ftp_map:FtpMap"),
             position_servo=True,
             zero_is_no_state=True,
+            touch_topic="rt/inspire_hand/touch/{s}",
+            touch_type="inspire::inspire_hand_touch",
         ),
     ),
+    areas=_AREAS,
+    touch_rate=50.0,  # more than the 30 Hz that clients record
     client=Lazy("dexkit.teleop.client:EitherHandClient"),
     requirements=("inspire_ftp.toml", "inspire_ftp_client.toml"),
     reference=Lazy("dexkit.conformance.virtual.inspire:FtpService"),

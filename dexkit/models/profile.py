@@ -35,6 +35,7 @@ __all__ = [
     "JointRoles",
     "ModeByte",
     "PressureSensor",
+    "TouchArea",
 ]
 
 
@@ -70,6 +71,9 @@ class Dialect:
     :param zero_is_no_state: clients take a state of which every q is exactly 0 for no state
         (docs/sources/unitree-dex.md#b1).
     :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
+    :param touch_topic: topic of what the hand's tactile areas feel, or empty; with ``{side}`` or
+        ``{s}``.
+    :param touch_type: its DDS type name.
     :param torque_units: N·m in one unit of a motor's tau and tau_est; empty where all are in N·m.
     :param position_servo: each motor goes to q by itself: kp, kd, tau and mode of a command are not
         used, and dq is no feed-forward.
@@ -95,6 +99,8 @@ class Dialect:
     has_client: bool = True
     zero_is_no_state: bool = False
     low_rate_topic: str = ""
+    touch_topic: str = ""
+    touch_type: str = ""
     torque_units: tuple[float, ...] = ()
     position_servo: bool = False
     speed_units: tuple[float, ...] = ()
@@ -102,6 +108,10 @@ class Dialect:
     def topics(self, side: Subject) -> tuple[str, str]:
         """(command topic, state topic) of a side or a robot."""
         return self._of(self.cmd_topic, side), self._of(self.state_topic, side)
+
+    def touch_topic_of(self, side: Subject) -> str:
+        """The topic of a side's tactile areas; empty where the dialect has none."""
+        return self._of(self.touch_topic, side)
 
     @staticmethod
     def _of(topic: str, side: Subject) -> str:
@@ -157,6 +167,27 @@ class PressureSensor:
 
     place: str
     slots: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class TouchArea:
+    """One tactile area of a hand with a touch topic.
+
+    :param place: where it is; the finger's name comes first.
+    :param member: of the touch message: the list of its elements, row after row.
+    :param rows: of elements.
+    :param columns: elements of a row.
+    """
+
+    place: str
+    member: str
+    rows: int
+    columns: int
+
+    @property
+    def elements(self) -> int:
+        """How many elements it has."""
+        return self.rows * self.columns
 
 
 @dataclass(frozen=True)
@@ -253,6 +284,8 @@ class HandModel:
     :param rest_q: where a simulated hand rests at first, per side; never all zero, because
         clients wait for a position that is not.
     :param sensors: pressure sensor packets of a state, in order.
+    :param areas: tactile areas, in the order of the touch message.
+    :param touch_rate: Hz at which dexkit publishes what they feel, where the dialect has a topic.
     :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
     :param shared_motors: joints that one motor moves, by index; the others have one each.
     :param simulator: name of the backend that simulates it, with the setting ``object``; or empty.
@@ -303,6 +336,8 @@ class HandModel:
     quick_seconds: float
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
+    areas: tuple[TouchArea, ...] = ()
+    touch_rate: float = 0.0
     low_rate: float = 0.0
     other_short_name: str = ""
     unit: str = "rad"
@@ -357,6 +392,6 @@ class HandModel:
             joints=self.joints[side],
             io_rate=io_rate,
             exchange_timeout=exchange_timeout,
-            n_sensors=len(self.sensors),
+            n_sensors=len(self.sensors) or len(self.areas),
             simulated=simulated,
         )

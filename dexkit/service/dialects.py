@@ -190,6 +190,10 @@ class DialectMap(ABC):
         """
         return self._state_type.encode(self.state(views))
 
+    def encode_touch(self, views: Mapping[Side, StateView]) -> bytes | None:
+        """The touch message as a DDS sample; None where the dialect or the hand has none."""
+        return None
+
     def _motor_commands(self, message: Any) -> list[Any]:
         """The motors of a command message."""
         return self._command_type.motors(message)

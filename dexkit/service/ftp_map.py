@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 
 from dexkit.hand import Floats, HandCommand, HandSpec, Side
+from dexkit.messages import message_type
 from dexkit.messages.inspire import inspire_hand_state
-from dexkit.models import Dialect
+from dexkit.messages.integer_lists import IntegerLists
+from dexkit.models import Dialect, model
 from dexkit.service.dialects import DialectMap, Fill, Remark, StateView
 from dexkit.wire.rh56 import FAULTS, FULL, UNCHANGED, Status
 
@@ -42,6 +44,14 @@ class FtpMap(DialectMap):
         self._full: Floats = np.array([joint.dq_max for joint in self._spec.joints])
         self._goals: Floats = np.full(n, math.nan)
         self._speeds: Floats = np.ones(n)
+        areas = model(dialect.model).areas
+        self._touch = IntegerLists(
+            message_type(dialect.touch_type), {area.member: area.elements for area in areas}
+        )
+        # which of the elements of a state's pressures there are
+        there = [range(area.elements) for area in areas]
+        self._areas = np.repeat(np.arange(len(areas)), [len(r) for r in there])
+        self._elements = np.concatenate([np.array(r) for r in there])
 
     def command(self, message: Any, side: Side) -> HandCommand | None:
         """The command for the hand; None where a list is too short or a joint has no goal yet."""
@@ -89,6 +99,13 @@ class FtpMap(DialectMap):
             ],
             temperature=[round(min(max(t, 0), 255)) for t in np.nan_to_num(s.temperature)],
         )
+
+    def encode_touch(self, views: Mapping[Side, StateView]) -> bytes | None:
+        """What the tactile areas feel, in the device's counts; None where it is not measured."""
+        (view,) = views.values()
+        if view.state.pressure is None:
+            return None
+        return self._touch.encode(view.state.pressure[self._areas, self._elements])
 
 
 def _list(message: Any, bit: int) -> list[int]:

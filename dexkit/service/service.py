@@ -165,6 +165,8 @@ class HandService:
             )
         ((self.cmd_topic, self.state_topic),) = topics
         self.low_rate_topic = self.dialect.low_rate_topic.format(side=sides[0])
+        feels = all(hand.spec.n_sensors for hand in group)
+        self.touch_topic = self.dialect.touch_topic_of(sides[0]) if feels else ""
         self.state_rate = state_rate if state_rate is not None else self.model.state_rate
         self.counters = TopicCounters()
         self.domain, self.interface = domain, interface
@@ -202,13 +204,15 @@ class HandService:
         self._pause_lock = threading.Lock()
         self._resumed = -math.inf  # when the last pause ended
         self._receiving: threading.Thread | None = None
-        self._low_rate_every = 0
+        self._low_rate_every = self._touch_every = 0
         self._ticks = 0
         self._reader: _Reader | None = None
         self._writer: _Writer | None = None
         self._low_rate_writer: _Writer | None = None
+        self._touch_writer: _Writer | None = None
         self._logged: set[str] = set()  # remarks logged, each kind only once
         self._encoded: tuple[tuple[StateView | None, ...], bytes | None] = ((), None)
+        self._touch: tuple[tuple[StateView | None, ...], bytes | None] = ((), None)
         self._started = False
         self._failure: Exception | None = None
 
@@ -245,7 +249,7 @@ class HandService:
 
             node = self._node = DdsNode(domain=self.domain, interface=self.interface)
         # no hand is touched before it is certain that no other service has these topics
-        topics = {self.state_topic, self.low_rate_topic} - {""}
+        topics = {self.state_topic, self.low_rate_topic, self.touch_topic} - {""}
         sole = self._sole = SolePublisher(
             [NodeTopics(node, topics)], hint=_CONFLICT_HINT, force=self._force
         )
@@ -256,11 +260,17 @@ class HandService:
             self._low_rate_writer = node.writer(
                 self.low_rate_topic, self.dialect.state_type, user_data=claim
             )
+        if self.touch_topic:
+            self._touch_writer = node.writer(
+                self.touch_topic, self.dialect.touch_type, user_data=claim
+            )
         sole.settle(self._wake.set)
         for unit in self._units:
             self._open_first(unit)
         if self.low_rate_topic:
             self._low_rate_every = max(1, round(self.state_rate / self.model.low_rate))
+        if self.touch_topic:
+            self._touch_every = max(1, round(self.state_rate / self.model.touch_rate))
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
         self._receive_watch.restart()  # from here on commands may wait to be received
         for unit in self._units:
@@ -296,10 +306,10 @@ class HandService:
             self._receiving.join()
         gave_way = isinstance(self.failure, TopicConflict)
         if self._writer is not None and self._receiving is not None and not gave_way:
-            self._publish_now(low_rate=True)
+            self._publish_now(low_rate=True, touch=True)
             if self.clients:
                 time.sleep(_LAST_STATE_DELAY)
-        for entity in (self._reader, self._writer, self._low_rate_writer):
+        for entity in (self._reader, self._writer, self._low_rate_writer, self._touch_writer):
             if entity is not None:
                 entity.close()
         if self._own_node and self._node is not None:
@@ -326,8 +336,8 @@ class HandService:
 
     @property
     def clients(self) -> int:
-        """Readers of the state topic and of its low-rate copy."""
-        writers = (self._writer, self._low_rate_writer)
+        """Readers of the state topic, of its low-rate copy and of the touch topic."""
+        writers = (self._writer, self._low_rate_writer, self._touch_writer)
         return sum(writer.matched for writer in writers if writer is not None)
 
     @property
@@ -625,12 +635,19 @@ class HandService:
         self._check_pause(self._publish_watch, self._units, self._publish_allowed)
         self.counters.publish_misses += missed
         self._ticks += 1
-        every = self._low_rate_every
-        self._publish_now(low_rate=every > 0 and self._ticks % every == 0)
+        low, touch = (
+            every > 0 and self._ticks % every == 0
+            for every in (self._low_rate_every, self._touch_every)
+        )
+        self._publish_now(low_rate=low, touch=touch)
 
-    def _publish_now(self, *, low_rate: bool) -> None:
+    def _publish_now(self, *, low_rate: bool, touch: bool) -> None:
         try:
             self._publish(self._compose(), low_rate=low_rate)
+            if touch and self._touch_writer is not None:
+                payload = self._compose_touch()
+                if payload is not None:
+                    self._write(self._touch_writer, payload)
         except Exception as error:  # a failure must be reported
             log.exception("%s: publishing failed", self.state_topic)
             self._record_failure(error)
@@ -655,6 +672,19 @@ class HandService:
             self._count_publish_error(error)
             payload = None
         self._encoded = (views, payload)
+        return payload
+
+    def _compose_touch(self) -> bytes | None:
+        """What the hands' tactile areas feel now; None without a state, or where they do not."""
+        views = tuple(unit.core.view() for unit in self._units)
+        encoded_views, payload = self._touch
+        if len(views) == len(encoded_views) and all(
+            a is b for a, b in zip(views, encoded_views, strict=True)
+        ):
+            return payload
+        known = {u.side: v for u, v in zip(self._units, views, strict=True) if v is not None}
+        payload = self._map.encode_touch(known) if known else None
+        self._touch = (views, payload)
         return payload
 
     def _publish(self, payload: bytes | None, *, low_rate: bool) -> None:

@@ -70,7 +70,7 @@ class Field:
 class Part:
     """What a topic says of one hand, or of a robot.
 
-    :param kind: ``"cmd"``, ``"state"`` or ``"low"``.
+    :param kind: ``"cmd"``, ``"state"``, ``"low"`` or ``"touch"``, of which no numbers are shown.
     :param joints: in the units of the topic's dialect.
     :param expected: samples a second that the vendor's publisher sends.
     :param mode_byte: what the mode byte of a motor holds.
@@ -111,17 +111,12 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
         joints = tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
     units = dialect.torque_units or (1.0,) * len(joints)
     first = dialect.index[side]
-    fields = list(
-        _motor_fields(
-            type_name,
-            kind,
-            [(first + i, j) for i, j in enumerate(joints)],
-            units,
-            hand.unit,
-            hand.torque_unit,
-            dialect.speed_units,
+    fields = []
+    if kind != "touch":
+        slots = [(first + i, j) for i, j in enumerate(joints)]
+        fields += _motor_fields(
+            type_name, kind, slots, units, hand.unit, hand.torque_unit, dialect.speed_units
         )
-    )
     if type_name.startswith("unitree_hg") and kind != "cmd":
         fields += [
             Field(
@@ -134,7 +129,12 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
             for n, slot in enumerate(sensor.slots)
         ]
         fields += [Field(name, name, name, -1, unit) for name, unit in _SUPPLY.items()]
-    rate = {"cmd": hand.command_rate, "state": hand.state_rate, "low": hand.low_rate}[kind]
+    rate = {
+        "cmd": hand.command_rate,
+        "state": hand.state_rate,
+        "low": hand.low_rate,
+        "touch": hand.touch_rate,
+    }[kind]
     return Part(
         side,
         kind,

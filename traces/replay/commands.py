@@ -184,7 +184,7 @@ def read_trace(trace: Trace, name: str) -> RecordedCommands:
 
 def _wanted(topic: str, type_name: str) -> bool:
     group = topic.startswith(SESSION) and topic.endswith(("/cmd", "/state"))
-    return group or any(r.kind != "low" for r in roles(topic, type_name))
+    return group or any(r.kind in ("cmd", "state") for r in roles(topic, type_name))
 
 
 def _role(stream: Stream) -> Role | None:

@@ -124,8 +124,8 @@ def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
     if samples.problem:
         return
     for role in roles(topic, samples.type_name)[:1]:
-        if role.kind == "low":
-            continue  # a copy
+        if role.kind in ("low", "touch"):
+            continue  # a copy, or no joints
         kind = COMMAND if role.kind == "cmd" else STATE
         hand = model(role.dialect.model)
         columns = _columns(samples)

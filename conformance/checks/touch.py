@@ -1,0 +1,122 @@
+"""Checks of a hand's topic for its tactile areas; what they feel is in
+:mod:`~dexkit.conformance.checks.pressure`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.touch import Touch
+from dexkit.hand import Floats
+
+__all__: list[str] = []
+
+_WINDOW_S = 1.0
+_NOTHING = "nothing was received on the touch topic"
+
+
+def _touch(ctx: Context) -> Touch | None:
+    found = ctx.recording.touch.get(ctx.side)
+    return found if found is not None and len(found) else None
+
+
+@check("FTP-TOUCH-01")
+def touch_topic(ctx: Context) -> Outcome:
+    """Whether the tactile areas are published on their topic, with their type."""
+    dialect = ctx.recording.dialect
+    topic, kind = dialect.touch_topic_of(ctx.side), dialect.touch_type
+    if (touch := _touch(ctx)) is not None:
+        return ctx.passed(kind.rpartition("::")[2], f"{len(touch)} samples on {topic}")
+    others = {
+        *(e.type_name for e in ctx.recording.endpoints if e.topic == topic and e.kind == "writer"),
+        *(c.type_name for c in ctx.recording.channels if c.topic == topic),
+    }
+    if kind in others:
+        return ctx.failed("no samples", f"{topic} is announced, and nothing comes on it")
+    if others:
+        return ctx.failed("other type", f"{topic} has {', '.join(sorted(others))}, not {kind}")
+    return ctx.failed("no topic", f"no process publishes {topic}")
+
+
+@check("FTP-TOUCH-02")
+def touch_sizes(ctx: Context) -> Outcome:
+    """Whether each area always has as many elements as its matrix."""
+    touch = _touch(ctx)
+    if touch is None:
+        return ctx.absent(_NOTHING)
+    want = np.array([area.elements for area in touch.areas])
+    wrong = touch.lengths != want
+    if not wrong.any():
+        return ctx.passed(
+            f"{len(want)} areas", f"{int(want.sum())} elements in each of {len(touch)}"
+        )
+    row = int(np.argmax(wrong.any(axis=1)))
+    at = float(touch.t[row])
+    if row in touch.columns.errors:
+        text = f"a sample does not decode: {touch.columns.errors[row]}"
+        return ctx.failed("undecodable", text, ctx.at(touch.topic, at))
+    area = touch.areas[int(np.argmax(wrong[row]))]
+    length = int(touch.lengths[row][int(np.argmax(wrong[row]))])
+    count = int(wrong.any(axis=1).sum())
+    return ctx.failed(
+        f"{area.member} {length}",
+        f"{area.member} has {length} elements, not {area.elements} ({area.rows} x {area.columns}), "
+        f"in {count} of {len(touch)} samples",
+        ctx.at(touch.topic, at),
+    )
+
+
+@check("FTP-TOUCH-03")
+def touch_goes_on(ctx: Context) -> Outcome:
+    """The longest time without touch while there were states."""
+    touch = _touch(ctx)
+    if touch is None or not len(ctx.states):
+        return ctx.absent(_NOTHING)
+    limit = ctx.tolerance("max_gap_s")
+    gap, at = _longest_gap(touch.t, ctx.states.t)
+    text = f"nothing on {touch.topic} for {gap:.2f} s, while there were states"
+    if gap <= limit:
+        return ctx.passed(f"{gap:.2f} s", text, gap_s=gap).timed(gap, limit)
+    outcome = ctx.failed(f"{gap:.2f} s", text, ctx.at(touch.topic, at, at + gap), gap_s=gap)
+    return outcome.timed(gap, limit).if_late(gap - limit)
+
+
+def _longest_gap(touch: Floats, states: Floats) -> tuple[float, float]:
+    """The longest time without ``touch``, and when it began; less what the states paused."""
+    times = np.concatenate((touch, states[-1:]))
+    worst = (0.0, float(times[0]))
+    for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+        if end - begin <= worst[0]:
+            continue
+        # a service that is restarted, or a machine that stood still, is silent on both
+        own = states[(states > begin) & (states < end)]
+        quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
+        worst = max(worst, (end - begin - quiet, begin))
+    return worst
+
+
+@check("FTP-TOUCH-04")
+def touch_rate(ctx: Context) -> Outcome:
+    """The rate of the touch topic in most seconds in which there were states."""
+    touch = _touch(ctx)
+    if touch is None or len(ctx.states) < 2:
+        return ctx.absent(_NOTHING)
+    begins = np.arange(touch.t[0], ctx.states.t[-1] - _WINDOW_S, _WINDOW_S)
+    if len(begins) < 2:
+        return ctx.skipped("the recording is too short to tell a rate")
+    counts = [
+        np.searchsorted(touch.t, b + _WINDOW_S) - np.searchsorted(touch.t, b)
+        for b in begins.tolist()
+    ]
+    rate = float(np.median(counts)) / _WINDOW_S
+    limit = ctx.tolerance("min_rate_hz")
+    text = f"{rate:.0f} Hz on {touch.topic} in most seconds"
+    seconds = len(begins) * _WINDOW_S
+    if rate >= limit:
+        return ctx.passed(f"{rate:.0f} Hz", text, rate_hz=rate).rated(rate, limit, seconds)
+    outcome = ctx.failed(
+        f"{rate:.0f} Hz", text, ctx.at(touch.topic, float(begins[0])), rate_hz=rate
+    )
+    late = 1.0 / max(rate, 0.5) - 1.0 / limit
+    return outcome.rated(rate, limit, seconds).if_late(late, how="mean", best=late)
