@@ -209,6 +209,16 @@ def _legacy() -> DomainView:
     )
 
 
+def _other_hand() -> DomainView:
+    """A Dex3-1 beside a client of the Dex1-1."""
+    hand, client = _without(_pair(model="dex3"), "client"), _without(GOOD, "hand")
+    return dataclasses.replace(
+        client,
+        endpoints=(*client.endpoints, *hand.endpoints),
+        streams=(*client.streams, *hand.streams),
+    )
+
+
 def _waiting(
     topic: str = "rt/lowstate",
     kind: str = "LowState_",
@@ -238,6 +248,7 @@ CASES: dict[str, Observations] = {
     "DDS-UNPUBLISHED": _seen(_waiting()),
     "DDS-OTHER-DOMAIN": _seen(_without(GOOD, "hand"), _without(_pair(number=7), "client")),
     "DDS-OTHER-STACK": _seen(_legacy()),
+    "DDS-OTHER-HAND": _seen(_other_hand()),
     "DDS-NAME": _seen(_renamed(GOOD, "hand", topic="x{0}")),
     "DDS-TYPE": _seen(_renamed(GOOD, "hand", type_name=HAND_STATE)),
     "DDS-LAYOUT": _seen(_pair(state_hash=("aa", "bb"))),

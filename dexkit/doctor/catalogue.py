@@ -211,6 +211,16 @@ _ALL = (
         "client",
     ),
     Diagnosis(
+        "DDS-OTHER-HAND",
+        _E,
+        "the client is for another model of hand than the one that is there",
+        _WAITS + ", or goes on after some seconds and drives nothing",
+        "each model has topics of its own, also Inspire's DFX and FTP hands; topics with different "
+        "names never match, and no error is reported",
+        "select the hand that is there in the client (xr_teleoperate: --ee), or serve the other "
+        "one",
+    ),
+    Diagnosis(
         "DDS-NAME",
         _E,
         "a topic's name differs slightly from that of a hand",

@@ -665,6 +665,8 @@ def _waiting(seen: Observations, view: DomainView) -> Iterator[Finding]:
                 topic=topic,
             )
         elif not writers:
+            if any(_instead(view, role.dialect) for role in roles(topic)):
+                continue  # that another hand is there is reported
             yield _finding(
                 "DDS-UNPUBLISHED",
                 f"{who} waits for {topic} ({kinds}) on domain {view.number}: no process publishes "
@@ -802,6 +804,9 @@ def _absent(
                     domain=view.number,
                     topic=other.endpoint.topic,
                 )
+            elif (instead := _instead(view, dialect)) is not None:
+                explained = True
+                yield _other_hand(view, dialect, instead)
         for dialect in wanted:
             parts = [p for p in _hands(view, scope) if p.role.dialect is dialect]
             sides = {side for p in parts for side in p.role.sides}
@@ -831,6 +836,30 @@ def _absent(
             if scope.devices_only or (other_clients and not wanted)
             else None,
         )
+
+
+def _instead(view: DomainView, dialect: Dialect) -> _Part | None:
+    """A hand of another model than a dialect's, for which no client of its own is there."""
+    served = _hands(view, Scope())
+    if any(p.role.dialect.model == dialect.model for p in served):
+        return None
+    asked = {p.role.dialect.model for p in _clients(view, Scope())}
+    return next((p for p in served if p.role.dialect.model not in asked), None)
+
+
+def _other_hand(view: DomainView, dialect: Dialect, instead: _Part) -> Finding:
+    wanted, there = MODELS[dialect.model], MODELS[instead.role.dialect.model]
+    readers = _parts(view, "reader", "state", Scope(dialects=(dialect,)))
+    return _finding(
+        "DDS-OTHER-HAND",
+        f"{instead.who} publishes {instead.endpoint.topic} ({there.title}) on domain "
+        f"{view.number}; {readers[0].who if readers else 'the client'} waits for "
+        f"{dialect.topics(Side.LEFT)[1]} ({wanted.title})",
+        fix="select the hand that is there in the client (xr_teleoperate: "
+        f"--ee={there.client_option or there.short_name}), or serve the other one",
+        domain=view.number,
+        topic=instead.endpoint.topic,
+    )
 
 
 def _other_domain(parts: list[_Part], instead: str, severity: Severity | None = None) -> Finding:

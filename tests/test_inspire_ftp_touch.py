@@ -1,0 +1,293 @@
+"""Test the tactile areas of Inspire's FTP hands, and what the doctor says of these hands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dexkit.clock import ManualClock
+from dexkit.conformance.checks.touch import _longest_gap
+from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.mutants.touch import CountsFromTheThumb, NoPalm, NoTouch
+from dexkit.conformance.recording import Recording
+from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.virtual.inspire import FtpService
+from dexkit.conformance.virtual.topics import run_virtual
+from dexkit.doctor.observations import DomainView, Endpoint, Observations, Participant, Stream
+from dexkit.doctor.rules import diagnose
+from dexkit.doctor.topics import is_hand_topic
+from dexkit.emulators.sim_inspire import SimInspireFtp
+from dexkit.errors import UsageError
+from dexkit.hand import HandCommand, HandState, Side
+from dexkit.messages import message_type
+from dexkit.messages.inspire import inspire_hand_touch
+from dexkit.messages.integer_lists import IntegerLists
+from dexkit.models import INSPIRE_FTP, Dialect, dialect
+from dexkit.service import HandService
+from dexkit.service.dialects import StateView, dialect_map
+from dexkit.topics import roles
+from dexkit.traces.sessions.streams import _streams
+from dexkit.watch.fields import parts_of
+from tests.each import each
+from tests.service_helpers import FakeNode, wait_until
+
+FTP = dialect("inspire_ftp")
+TOUCH, STATE = message_type(FTP.touch_type), message_type(FTP.state_type)
+LENGTHS = {area.member: area.elements for area in INSPIRE_FTP.areas}
+LEFT, RIGHT = Side.LEFT, Side.RIGHT
+N = 6
+
+# ------------------------------------------------------------------------------------ on the wire
+
+
+def test_areas_are_those_of_the_message() -> None:
+    assert {f.name: f.most for f in TOUCH.layout.fields} == LENGTHS
+    assert sum(LENGTHS.values()) == 1062
+    assert INSPIRE_FTP.areas[-2].place == "thumb palm"
+    (role,) = roles("rt/inspire_hand/touch/r")
+    assert (role.kind, role.sides, role.type_name) == ("touch", (RIGHT,), TOUCH.name)
+
+
+@given(st.lists(st.integers(-32768, 32767), min_size=1062, max_size=1062))
+@settings(max_examples=3, deadline=None)
+def test_bulk_encoding_is_that_of_the_codec(values: list[int]) -> None:
+    lists = IntegerLists(TOUCH, LENGTHS)
+    rest = iter(values)
+    message = inspire_hand_touch(**{m: [next(rest) for _ in range(n)] for m, n in LENGTHS.items()})
+    assert lists.encode(np.array(values)) == TOUCH.encode(message)
+
+
+def test_bulk_encoding_keeps_to_the_range_and_the_type() -> None:
+    values = np.zeros(1062)
+    values[:4] = [1e9, -1e9, np.nan, 1.6]
+    assert TOUCH.decode(IntegerLists(TOUCH, LENGTHS).encode(values)).fingerone_tip_touch[:4] == [
+        *(32767, -32768, 0, 2)
+    ]
+    with pytest.raises(UsageError, match="lists of int16"):
+        IntegerLists(STATE, {"pos_act": 6})
+    with pytest.raises(UsageError, match="lists of int16"):
+        IntegerLists(TOUCH, {"palm_touch": 112})
+
+
+# ---------------------------------------------------------------------------------- the simulated
+
+
+def felt(hand: SimInspireFtp, state: HandState) -> dict[str, int]:
+    """The most that each area that feels something counts."""
+    mapping = dialect_map(FTP, {hand.spec.side: hand.spec})
+    data = mapping.encode_touch({hand.spec.side: StateView(state, (0,) * N)})
+    assert data is not None
+    message = TOUCH.decode(data)
+    most = {area.place: max(getattr(message, area.member)) for area in INSPIRE_FTP.areas}
+    return {place: count for place, count in most.items() if count}
+
+
+def test_finger_that_presses_feels_it_and_no_other() -> None:
+    clock = ManualClock()
+    hand = SimInspireFtp(RIGHT, clock=clock, object_at=60.0)
+    hand.open()
+
+    def hold(q: list[float], steps: int) -> dict[str, int]:
+        for _ in range(steps):
+            clock.advance(0.01)
+            state = hand.exchange(HandCommand.position(q, dq=[1.25] * N))
+        return felt(hand, state)
+
+    opened = [0.85] * N
+    assert hold(opened, 20) == {}
+    for joint, finger in ((0, "pinky"), (3, "index"), (4, "thumb"), (5, "thumb")):
+        pose = [0.1 if i == joint else q for i, q in enumerate(opened)]
+        assert hold(pose, 100) == {f"{finger} top": 1000, f"{finger} palm": 1000}
+        assert hold(opened, 100) == {}
+
+
+def test_free_hand_feels_nothing_at_its_ends() -> None:
+    clock = ManualClock()
+    hand = SimInspireFtp(LEFT, clock=clock)
+    hand.open()
+    for q in (0.0, 1.0):
+        for _ in range(120):
+            clock.advance(0.01)
+            state = hand.exchange(HandCommand.position([q] * N, dq=[1.25] * N))
+        assert felt(hand, state) == {}
+
+
+def test_hand_that_does_not_feel_sends_no_touch() -> None:
+    mapping = dialect_map(FTP, {LEFT: INSPIRE_FTP.spec(LEFT, io_rate=100.0)})
+    view = StateView(HandState.from_values([0.5] * N, stamp=0.0), (0,) * N)
+    assert mapping.encode_touch({LEFT: view}) is None
+
+
+# -------------------------------------------------------------------------------------- the service
+
+
+def test_service_publishes_touch_with_every_second_state() -> None:
+    node = FakeNode()
+    with HandService(SimInspireFtp(RIGHT), node=node) as service:
+        assert service.touch_topic == "rt/inspire_hand/touch/r"
+        assert node.types[service.touch_topic] == TOUCH.name
+        wait_until(lambda: service.counters.published >= 12)
+        topics = [topic for topic, _ in node.sent]
+    touched = [i for i, topic in enumerate(topics) if topic == service.touch_topic]
+    between = [topics[a:b].count(service.state_topic) for a, b in pairwise(touched)]
+    assert set(between) == {2}
+    assert len(TOUCH.decode(node.sent[touched[0]][1]).palm_touch) == 112
+
+
+def test_service_of_a_hand_without_areas_has_no_touch_topic() -> None:
+    hand = SimInspireFtp(RIGHT)
+    hand._spec = replace(hand.spec, n_sensors=0)
+    assert HandService(hand, node=FakeNode()).touch_topic == ""
+
+
+# ---------------------------------------------------------------------------------- the conformance
+
+PHASES = frozenset(["listen", "touch"])
+
+
+def verdicts(service: type[FtpService], phases: frozenset[str] = PHASES) -> dict[str, str]:
+    plan = replace(plan_for("inspire_ftp", sides=(RIGHT,)), phases=phases)
+    wanted = tuple(
+        r for r in catalogue("inspire-ftp") if r.id.startswith(("FTP-TOUCH", "FTP-SENS"))
+    )
+    return {r.requirement.id: str(r.verdict) for r in run_mutant(service, plan, wanted).results}
+
+
+def test_touch_is_judged_by_its_topic() -> None:
+    good = verdicts(FtpService)
+    assert {i for i, v in good.items() if v == "pass"} == {
+        *(f"FTP-TOUCH-0{i}" for i in range(1, 5)),
+        "FTP-SENS-04",
+    }
+    other_order = verdicts(CountsFromTheThumb)
+    assert [i for i, v in other_order.items() if v == "fail"] == ["FTP-SENS-04"]
+    short = verdicts(NoPalm, frozenset(["listen"]))
+    assert short["FTP-TOUCH-02"] == "fail"
+    assert short["FTP-SENS-04"] in ("blocked", "not applicable")
+    absent = verdicts(NoTouch, frozenset(["listen"]))
+    assert [i for i, v in absent.items() if v == "warn"] == ["FTP-TOUCH-01"]
+    assert Verdict.PASS not in absent.values()
+
+
+@each(
+    ("touch", "states", "gap"),
+    [
+        ([0.0, 0.1, 0.2], [0.0, 0.05, 0.1, 0.15, 0.2], 0.05),
+        ([0.0, 0.1, 0.9], [0.01 * i for i in range(91)], 0.79),
+        ([0.0, 0.1, 0.9], [0.0, 0.1, 0.9], 0.0),  # both were silent
+        ([0.0], [0.01 * i for i in range(101)], 0.99),
+    ],
+)
+def test_gap_of_touch_is_one_while_there_are_states(
+    touch: list[float], states: list[float], gap: float
+) -> None:
+    assert _longest_gap(np.array(touch), np.array(states))[0] == pytest.approx(gap)
+
+
+def test_touch_in_a_recording_is_no_stream_of_joints() -> None:
+    trace = run_virtual(
+        replace(plan_for("inspire_ftp", sides=(RIGHT,)), phases=frozenset(["listen"])), FtpService
+    )
+    recording = Recording.decode(trace)
+    assert recording.touch[RIGHT].values.shape[1:] == (17, 112)
+    assert np.isnan(recording.touch[RIGHT].values[0, 0, 9:]).all()
+    assert not parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields
+    for topic, count in ((FTP.touch_topic_of(RIGHT), 0), (FTP.topics(RIGHT)[1], 1)):
+        assert len(list(_streams(topic, trace.load([topic])[topic]))) == count
+
+
+# ----------------------------------------------------------------------------------------- doctor
+
+
+def ends(spoken: Dialect, who: str, *, hand: bool) -> list[Endpoint]:
+    """The endpoints of a hand, or of its client."""
+    found = {}
+    for side in Side:
+        cmd, state = spoken.topics(side)
+        for topic, kind, writes in (
+            (cmd, spoken.cmd_type, not hand),
+            (state, spoken.state_type, hand),
+        ):
+            key = f"{who} {topic}"
+            found[key] = Endpoint(topic, kind, "writer" if writes else "reader", key, who)
+    return list(found.values())
+
+
+def found_in(*endpoints: Endpoint, streams: tuple[Stream, ...] = ()) -> dict[str, str]:
+    people = tuple(
+        Participant(key, version="0.10.5", process=f"{key}.py") for key in ("hand", "client")
+    )
+    flowing = streams or tuple(
+        Stream(e.topic, e.key, 2.0, 200, 100.0, nonzero=True)
+        for e in endpoints
+        if e.kind == "writer"
+    )
+    view = DomainView(1, people, endpoints, flowing)
+    return {f.id: f"{f.seen} | {f.fix}" for f in diagnose(Observations((view,)))}
+
+
+@each(
+    ("served", "asked", "option"),
+    [
+        ("inspire_ftp", "inspire_dfx", "inspire_ftp"),
+        ("inspire_dfx", "inspire_ftp", "inspire_dfx"),
+        ("brainco", "inspire_ftp", "brainco"),
+        ("inspire_ftp", "dex3", "inspire_ftp"),
+    ],
+)
+def test_doctor_says_that_another_hand_is_there(served: str, asked: str, option: str) -> None:
+    found = found_in(
+        *ends(dialect(served), "hand", hand=True), *ends(dialect(asked), "client", hand=False)
+    )
+    assert f"--ee={option})" in found["DDS-OTHER-HAND"]
+    assert dialect(served).topics(LEFT)[1] in found["DDS-OTHER-HAND"]
+    assert not {"DDS-UNPUBLISHED", "DDS-NOBODY", "DDS-OTHER-STACK"} & set(found)
+
+
+def test_doctor_has_nothing_to_say_of_the_right_client() -> None:
+    spoken = ends(FTP, "hand", hand=True), ends(FTP, "client", hand=False)
+    assert not found_in(*spoken[0], *spoken[1])
+    # a client of each: the hand that is missing is not taken for the one that is there
+    both = found_in(*spoken[0], *spoken[1], *ends(dialect("inspire_dfx"), "client", hand=False))
+    assert "DDS-OTHER-HAND" not in both
+    assert "rt/inspire/state" in both["DDS-UNPUBLISHED"]
+
+
+@each(
+    ("state", "expected"),
+    [
+        # each from right to left, as both are commanded from 0.9 to 0.1 and from 0.3 to 0.7
+        ((0.9, 0.3, 0.1, 0.7), set()),
+        ((0.1, 0.7, 0.9, 0.3), {"DDS-REVERSED"}),
+        ((0.3, 0.9, 0.7, 0.1), {"DDS-SIDES-SWAPPED"}),
+    ],
+)
+def test_doctor_sees_swapped_sides_and_a_reversed_scale(
+    state: tuple[float, float, float, float], expected: set[str]
+) -> None:
+    every = [*ends(FTP, "hand", hand=True), *ends(FTP, "client", hand=False)]
+    values = {"state": state, "ctrl": (0.9, 0.3, 0.1, 0.7)}
+    streams = []
+    for end in every:
+        if end.kind != "writer":
+            continue
+        right, left, now_right, now_left = values[end.topic.split("/")[2]]
+        began, q = (right, now_right) if end.topic.endswith("/r") else (left, now_left)
+        streams.append(
+            Stream(
+                end.topic, end.key, 2.0, 200, 100.0, q=(q,) * N, began=(began,) * N, nonzero=True
+            )
+        )
+    found = found_in(*every, streams=tuple(streams))
+    assert set(found) & {"DDS-REVERSED", "DDS-SIDES-SWAPPED"} == expected
+
+
+def test_doctor_does_not_look_for_motors_in_touch() -> None:
+    assert not is_hand_topic(FTP.touch_topic_of(LEFT), FTP.touch_type)
+    assert is_hand_topic(FTP.topics(LEFT)[1], FTP.state_type)
