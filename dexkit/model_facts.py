@@ -6,14 +6,16 @@ A hand::
 
     {"name", "title", "kind": "hand", "unit": "rad",
      "sides": {"left" | "right": {"vendor_id", "joints": [JOINT], "rest_q_rad": [...]}},
-     "dialects": [{"name", "summary", "command_type", "state_type", "length", "q_open_rad",
-                   "torque_units_nm": [...],
+     "dialects": [{"name", "summary", "command_type", "state_type", "touch_type", "length",
+                   "q_open_rad", "torque_units_nm": [...],
                    "sides": {"left" | "right": {"command_topic", "state_topic",
-                                                "low_rate_topic", "first_index"}}}],
-     "rates_hz": {"state", "state_at_least", "low_rate_state", "command"},
+                                                "low_rate_topic", "touch_topic",
+                                                "first_index"}}}],
+     "rates_hz": {"state", "state_at_least", "low_rate_state", "touch", "command"},
      "command_timeout_s", "client_gains": [{"kp_nm_per_rad", "kd_nms_per_rad"}],
      "shared_motors": [[index, ...]],
      "pressure_sensors": [{"packet", "place", "slots": [...]}],
+     "tactile_areas": [{"place", "member", "rows", "columns"}],
      "backends": [{"name", "summary", "needs"}]}
 
 A robot::
@@ -104,6 +106,7 @@ def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
             "state": model.state_rate,
             "state_at_least": model.min_state_rate,
             "low_rate_state": model.low_rate or None,
+            "touch": model.touch_rate or None,
             "command": model.command_rate,
         },
         "command_timeout_s": model.command_timeout,
@@ -112,6 +115,10 @@ def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
         "pressure_sensors": [
             {"packet": i, "place": sensor.place, "slots": list(sensor.slots)}
             for i, sensor in enumerate(model.sensors)
+        ],
+        "tactile_areas": [
+            {"place": a.place, "member": a.member, "rows": a.rows, "columns": a.columns}
+            for a in model.areas
         ],
         "backends": _backends(model.name, plugins),
     }
@@ -191,6 +198,7 @@ def _dialect(dialect: Dialect, unit: str) -> dict[str, Any]:
         "summary": dialect.summary,
         "command_type": dialect.cmd_type,
         "state_type": dialect.state_type,
+        "touch_type": dialect.touch_type or None,
         "length": dialect.length,
         f"q_open_{_short(unit)}": dialect.q_open if math.isfinite(dialect.q_open) else None,
         "torque_units_nm": list(dialect.torque_units),
@@ -199,6 +207,7 @@ def _dialect(dialect: Dialect, unit: str) -> dict[str, Any]:
                 "command_topic": dialect.topics(side)[0],
                 "state_topic": dialect.topics(side)[1],
                 "low_rate_topic": dialect.low_rate_topic.format(side=side) or None,
+                "touch_topic": dialect.touch_topic_of(side) or None,
                 "first_index": dialect.index[side],
             }
             for side in Side

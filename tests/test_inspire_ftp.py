@@ -127,7 +127,8 @@ def test_topics_have_the_side_as_a_letter() -> None:
 
 def test_nothing_is_told_in_radians() -> None:
     text = CliRunner().invoke(cli, ["models", "inspire-ftp"]).output
-    assert "rt/inspire_hand/ctrl/l" in text
+    assert "rt/inspire_hand/ctrl/{l,r}" in text
+    assert "rt/inspire_hand/touch/{l,r}" in text
     assert not RADIANS.search(text)
     (part,) = parts_of("rt/inspire_hand/state/l", FTP.state_type)
     (q, *_) = [f for f in part.fields if f.quantity == "q"]

@@ -124,6 +124,7 @@ def _hand(console: Console, data: dict[str, Any]) -> None:
                 ("command", _both(dialect, "command_topic"), dialect["command_type"]),
                 ("state", _both(dialect, "state_topic"), dialect["state_type"]),
                 ("slow state", _both(dialect, "low_rate_topic"), dialect["state_type"]),
+                ("touch", _both(dialect, "touch_topic"), dialect["touch_type"]),
             ],
         )
         motors = f"{dialect['length']} motor{'s' if dialect['length'] > 1 else ''} in a message"
@@ -167,6 +168,10 @@ def _hand(console: Console, data: dict[str, Any]) -> None:
         ]
         console.print("\n[bold]pressure[/bold]")
         console.print(_table(("packet", "place", "slots with an element"), rows, ["packet"]))
+    if data["tactile_areas"]:
+        rows = [(a["place"], f"{a['rows']} x {a['columns']}") for a in data["tactile_areas"]]
+        console.print(f"\n[bold]touch[/bold], {rates['touch']:g} Hz")
+        console.print(_table(("area", "elements"), rows, []))
 
 
 def _robot(console: Console, data: dict[str, Any]) -> None:
@@ -227,7 +232,10 @@ def _joint(joint: dict[str, Any]) -> tuple[object, ...]:
 def _both(dialect: dict[str, Any], key: str) -> str:
     """One text for both sides' topics; empty where there are none."""
     left, right = (dialect["sides"][side][key] or "" for side in _SIDES)
-    return left if left == right else left.replace("/left", "/{left,right}")
+    if left == right:
+        return left
+    short = left.removesuffix("/l")
+    return f"{short}/{{l,r}}" if short != left else left.replace("/left", "/{left,right}")
 
 
 def _topics(console: Console, rows: Sequence[tuple[str, str, str]]) -> None:

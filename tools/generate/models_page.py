@@ -101,7 +101,8 @@ def _sides(dialect: dict[str, Any], key: str) -> str | None:
     left, right = (dialect["sides"][side][key] for side in ("left", "right"))
     if left is None or left == right:
         return left  # type: ignore[no-any-return]
-    return str(left).replace("/left", "/{left,right}")
+    short = str(left).removesuffix("/l")
+    return f"{short}/{{l,r}}" if short != left else short.replace("/left", "/{left,right}")
 
 
 def _head(data: dict[str, Any]) -> list[str]:
@@ -171,15 +172,26 @@ def _hand(data: dict[str, Any]) -> list[str]:
             for s in data["pressure_sensors"]
         ]
         lines += _table(("packet", "place", "slots with an element"), rows)
+    if data["tactile_areas"]:
+        lines += [f"Touch, {rates['touch']:g} Hz:", ""]
+        lines += _table(
+            ("area", "elements", "list of the message"),
+            [
+                (a["place"], f"{a['rows']} x {a['columns']}", f"`{a['member']}`")
+                for a in data["tactile_areas"]
+            ],
+        )
     return lines
 
 
 def _dialect_row(dialect: dict[str, Any]) -> tuple[str, ...]:
-    topics = [_sides(dialect, key) for key in ("command_topic", "state_topic", "low_rate_topic")]
+    keys = "command_topic", "state_topic", "low_rate_topic", "touch_topic"
+    topics = [_sides(dialect, key) for key in keys]
+    types = [dialect[key] for key in ("command_type", "state_type", "touch_type")]
     return (
         f"`{dialect['name']}`",
         "<br>".join(f"`{topic}`" for topic in topics if topic),
-        f"`{short_type(dialect['command_type'])}`<br>`{short_type(dialect['state_type'])}`",
+        "<br>".join(f"`{short_type(name)}`" for name in types if name),
         str(dialect["length"]),
         dialect["summary"],
     )
