@@ -92,7 +92,7 @@ def test_clients_of_the_samples_meet_every_requirement(name: str) -> None:
     result = judge(recording_of(open_trace(sample_path(name)), None, ()))
     assert {r.verdict for r in result.client} <= GOOD, bad(result.client)
     passed = {r.requirement.id[-9:] for r in result.client if r.verdict is Verdict.PASS}
-    assert len(passed) >= 10
+    assert len(passed) >= min(10, len({r.requirement.id for r in result.client}))
 
 
 @each("name", [n for n, d in DIALECTS.items() if d.is_gripper])

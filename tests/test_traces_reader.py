@@ -56,6 +56,7 @@ def as_rows(path: Path) -> list[Row]:
 # -- the shipped recordings ----------------------------------------------------------------------
 
 SYNTHETIC = ("dex5_synthetic",)  # never on DDS
+RECORDED_BY_DEXKIT = (*SYNTHETIC, "inspire_ftp_grip")
 
 
 def readme_tables() -> dict[str, dict[str, list[float]]]:
@@ -84,7 +85,7 @@ def test_a_sample_holds_what_its_readme_says(name: str) -> None:
     for channel in trace.channels:
         count, hz, p50, p99, worst, first = table[channel.topic]
         assert channel.supported
-        assert channel.schema_encoding == ("ros2msg" if name in SYNTHETIC else "omgidl")
+        assert channel.schema_encoding == ("ros2msg" if name in RECORDED_BY_DEXKIT else "omgidl")
         assert channel.message_count == count
         times = loaded[channel.topic].log_time_ns
         gaps = np.diff(times) / 1e6

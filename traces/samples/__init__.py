@@ -21,6 +21,7 @@ SAMPLES: tuple[str, ...] = (
     "dex1_hand_dropout",
     "dex1_legacy_v1_1",
     "dex3_pinch",
+    "inspire_ftp_grip",
     "dex5_synthetic",
 )
 
