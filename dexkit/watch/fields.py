@@ -111,7 +111,7 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
         joints = tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
     units = dialect.torque_units or (1.0,) * len(joints)
     first = dialect.index[side]
-    fields = []
+    fields: list[Field] = []
     if kind != "touch":
         slots = [(first + i, j) for i, j in enumerate(joints)]
         fields += _motor_fields(
