@@ -93,7 +93,7 @@ def serial_rule(side: Side, device: Path, sys: Path = Path("/sys")) -> str:
     """The udev rule that gives the serial adapter of a hand a stable name.
 
     By its serial number, or by its place on the USB where it has none. An FTDI adapter's latency
-    timer is set to 1 ms.
+    timer is set to 1 ms. ModemManager is told to leave the adapter alone.
 
     :param device: where it is now, e.g. ``/dev/ttyUSB0``.
     :raises UsageError: it is not a serial adapter on USB.
@@ -123,6 +123,8 @@ def serial_rule(side: Side, device: Path, sys: Path = Path("/sys")) -> str:
     return f"""\
 # The {side} hand's serial adapter, {note}.
 SUBSYSTEM=="tty", {match}, SYMLINK+="{Path(device_link(side)).name}", GROUP="dialout", MODE="0660"
+# ModemManager must not send it a modem's commands.
+SUBSYSTEM=="tty", {match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", ENV{{ID_MM_PORT_IGNORE}}="1"
 ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="1"
 """
 

@@ -137,6 +137,8 @@ def test_an_adapter_gets_a_stable_name(tmp_path: Path) -> None:
     assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT9ABC"' in rule
     assert 'SYMLINK+="dexkit-left"' in rule
     assert 'ATTR{latency_timer}="1"' in rule
+    ignored = next(line for line in rule.splitlines() if "ID_MM_PORT_IGNORE" in line)
+    assert 'ATTRS{serial}=="FT9ABC"' in ignored
     for serial in ("", 'x", RUN+="/bin/sh'):  # none, or one that would be a rule of its own
         folder = tmp_path / f"b{len(serial)}"
         rule = serial_rule(Side.RIGHT, _adapter(folder, serial), folder)

@@ -78,7 +78,15 @@ def test_a_record_counts_only_set_points_that_change_and_drive() -> None:
     record.setpoint(0, 1.0)
     record.look()
     place[0] = 0.5
-    assert record.since(start) == {"low": [0.0], "high": [0.5], "q": [0.5], "setpoints": 1}
+    record.heard(b"AT\r")
+    assert record.since(start) == {
+        "low": [0.0],
+        "high": [0.5],
+        "q": [0.5],
+        "setpoints": 1,
+        "heard": 3,
+        "first": "AT\\r",
+    }
     again = record.now()["t"]
     record.rests(0)
     assert record.since(again)["setpoints"] == 0

@@ -8,6 +8,7 @@ and where the joints really were.
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ __all__ = ["ADAPTERS", "Devices", "Record"]
 ADAPTERS = ("DKLAB001", "DKLAB002")
 """Serial numbers of the USB-serial adapters: the MX-64's, the Dex1-1 motor's."""
 _PERIOD = 0.01  # seconds between two looks at the joints
+_HEARD, _SHOWN = 1000, 60  # messages on a serial line that are remembered; bytes that are shown
 _FOC = 1
 
 
@@ -42,6 +44,7 @@ class Record:
         self._positions = positions
         self._places: list[tuple[float, list[float]]] = []
         self._setpoints: list[float] = []
+        self._heard: deque[tuple[float, bytes]] = deque(maxlen=_HEARD)
         self._last: dict[int, tuple[object, ...]] = {}
         self._clock = RealClock()
         self._lock = threading.Lock()
@@ -51,6 +54,11 @@ class Record:
         place = [float(q) for q in self._positions()]
         with self._lock:
             self._places.append((self._clock.now(), place))
+
+    def heard(self, data: bytes) -> None:
+        """Note what came to the device's serial line."""
+        with self._lock:
+            self._heard.append((self._clock.now(), bytes(data)))
 
     def setpoint(self, joint: int, *values: object) -> None:
         """Note a command that can move ``joint``; nothing is noted while it stays the same."""
@@ -68,17 +76,22 @@ class Record:
         return {"t": self._clock.now(), "q": [float(q) for q in self._positions()]}
 
     def since(self, start: float) -> dict[str, Any]:
-        """What happened since ``start``: extremes of the joints, and how many set-points came."""
+        """What happened since ``start``: extremes of the joints, how many set-points came,
+        and what the serial line heard of late.
+        """
         self.look()
         with self._lock:
             places = [place for t, place in self._places if t >= start]
             count = sum(t >= start for t in self._setpoints)
+            heard = b"".join(data for t, data in self._heard if t >= start)
         columns = list(zip(*places, strict=True))
         return {
             "low": [min(column) for column in columns],
             "high": [max(column) for column in columns],
             "q": places[-1],
             "setpoints": count,
+            "heard": len(heard),
+            "first": repr(heard[:_SHOWN])[2:-1],
         }
 
 
@@ -108,6 +121,7 @@ class Devices:
             "mx64": _record_servo(servo),
             "dex1": _record_motor(motor),
         }
+        _record_line(self.adapters.adapters[0].line, self.records["mx64"])
         self._stopping = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="record", daemon=True)
         self._watcher.start()
@@ -163,6 +177,16 @@ def _record_servo(servo: Any) -> Record:
 
     servo.write_block = write_block
     return record
+
+
+def _record_line(line: Any, record: Record) -> None:
+    receive = line.receive
+
+    def received(data: bytes, now: float) -> None:
+        record.heard(data)
+        receive(data, now)
+
+    line.receive = received
 
 
 def _record_motor(motor: Any) -> Record:

@@ -24,8 +24,9 @@ _NEEDED = {
     "dpkg-deb": "dpkg",
 }
 _KERNEL = "linux-image-amd64"
-_GUEST = ("busybox-static", "kmod", "udev", "usbip")
-"""Programs of the guest. Their libraries are those of this machine, whose files the guest has."""
+_GUEST = ("busybox-static", "kmod", "udev", "usbip", "modemmanager", "dbus-daemon")
+"""Programs of the guest. It has this machine's files; libraries that this machine lacks are
+unpacked with them."""
 _MERGED = ("bin", "sbin", "lib", "lib64")
 """Folders that are links into ``usr`` on this machine; a plain folder in the packages' tree would
 hide what is behind the link."""
@@ -71,9 +72,9 @@ def fetch(folder: Path, say: Callable[[str], object]) -> Kernel:
         release = _concrete_kernel()
         names = _unpack([release], kernel, folder)
         _write_ready(kernel, names)
-    if not (programs / _READY).exists():
+    if not _has(programs, _GUEST):
         say(f"downloading {', '.join(_GUEST)}")
-        names = _unpack(_GUEST, programs, folder)
+        names = _unpack([*_GUEST, *_lacking(_GUEST)], programs, folder)
         for name in _MERGED:
             _merge_into_usr(programs, name)
         _write_ready(programs, names)
@@ -88,6 +89,21 @@ def fetch(folder: Path, say: Callable[[str], object]) -> Kernel:
         programs,
         tuple(name for names in packages for name in names if name),
     )
+
+
+def _has(place: Path, packages: tuple[str, ...]) -> bool:
+    """Whether all of them were unpacked there."""
+    if not (place / _READY).exists():
+        return False
+    there = {line.partition(" ")[0] for line in (place / _READY).read_text().splitlines()}
+    return there.issuperset(packages)
+
+
+def _lacking(packages: tuple[str, ...]) -> list[str]:
+    """What ``packages`` depend on and this machine lacks; another version of it will do."""
+    text = _run(["apt-get", "-s", "install", "--no-install-recommends", *packages])
+    new = re.findall(r"^Inst (\S+) \(", text, re.MULTILINE)
+    return [name for name in new if name not in packages]
 
 
 def _write_ready(place: Path, names: list[str]) -> None:

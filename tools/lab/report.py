@@ -15,12 +15,14 @@ __all__ = ["REAL", "Case", "junit", "markdown", "write_reports"]
 
 REAL = """\
 What is real: Debian's kernel and its drivers (usbcore, vhci_hcd, usbfs, usbserial, ftdi_sio), its
-device nodes and sysfs, libusb, udev, pyserial, DDS, and dexkit from its checkout.
+device nodes, sysfs and power management, libusb, udev, ModemManager, pyserial, DDS, and dexkit from
+its checkout.
 
 What is not: the devices (dexkit's emulators, on the host, by USB/IP), the cable (TCP through QEMU's
 user network: no packets on a bus, no bandwidth, no electrical faults), and time in the guest: its
 processor is emulated, several times slower than the host's and shared with it. Rates are
-therefore lower limits for this machine, not figures of a robot's computer.
+therefore lower limits for this machine, not figures of a robot's computer. dexkit's programs are
+forks of one process that has imported their modules before, so their start takes no imports.
 """
 
 

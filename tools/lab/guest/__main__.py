@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
+import statistics
 from collections.abc import Callable
 from pathlib import Path
 
-from tools.lab.guest.bench import Bench, udevd
+from tools.lab.guest import programs
+from tools.lab.guest.bench import Bench, attach_times, udevd
 
 _PREFIX = "lab."
 
@@ -21,6 +23,7 @@ def main() -> None:
     )
     # an ordinary user's programs are in this folder, too; the change stays in the guest
     os.chmod("/root", 0o755)
+    programs.prepare()
     bench = Bench(words)
     uptime = Path("/proc/uptime").read_text().split()[0]
     bench.fact(guest=platform.release(), **{"guest ready after": f"{uptime} s"})
@@ -28,6 +31,9 @@ def main() -> None:
         for name, do in _groups().items():
             if not words.get("only") or name in words["only"].split(","):
                 _whole(bench, name, do)
+    if attach_times:
+        middle = statistics.median(attach_times)
+        bench.fact(**{"usbip attach": f"{len(attach_times)} times, median {middle:.2f} s"})
     bench.ask(do="finished")
 
 

@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -16,16 +15,18 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.errors import DexkitError
+from tools.lab.guest.programs import Program
 
 __all__ = [
-    "DEXKIT",
     "HOST",
     "Bench",
     "Failed",
     "Serve",
     "Unprivileged",
     "attach",
+    "attach_times",
     "detach",
+    "dexkit",
     "kernel_log",
     "pin_of",
     "rule",
@@ -37,7 +38,6 @@ __all__ = [
 
 HOST = "10.0.2.2"
 """The host's loopback address, as QEMU's user network shows it."""
-DEXKIT = str(Path(sys.prefix) / "bin/dexkit")
 _VHCI = Path("/sys/devices/platform/vhci_hcd.0")
 _FREE = 4  # VDEV_ST_NULL of the kernel's usbip_common.h
 _PATIENCE = 30.0
@@ -139,6 +139,8 @@ def pin_of(busid: str) -> Path | None:
 
 
 _attached: dict[int, str] = {}
+attach_times: list[float] = []
+"""Seconds that each ``usbip attach`` took."""
 
 
 def _status() -> list[list[str]]:
@@ -152,7 +154,7 @@ def _used() -> set[int]:
 
 def attach(port: int | str, busid: str) -> int:
     """Have the kernel attach a device of the host's server ``port``; the port of vhci_hcd."""
-    before = _used()
+    before, started = _used(), time.monotonic()
     # usbip looks at all of the kernel's USB devices, and fails where one goes meanwhile
     for left in reversed(range(_TRIES)):
         try:
@@ -164,6 +166,7 @@ def attach(port: int | str, busid: str) -> int:
             time.sleep(0.1)
     (place,) = _used() - before
     _attached[place] = busid
+    attach_times.append(time.monotonic() - started)
     return place
 
 
@@ -183,7 +186,7 @@ def kernel_log(pattern: str) -> list[str]:
 # --- processes
 
 
-class Serve:
+class Serve(Program):
     """``dexkit serve`` in a process of its own.
 
     :param arguments: of the command.
@@ -194,30 +197,18 @@ class Serve:
     """
 
     def __init__(self, *arguments: str) -> None:
-        self.log = Path(f"/tmp/serve-{time.monotonic_ns()}.log")
-        self._out = self.log.open("wb")
-        self.process = subprocess.Popen(
-            [DEXKIT, "serve", *arguments, "--no-real-time", "--state-rate", "20"],
-            stdout=self._out,
-            stderr=subprocess.STDOUT,
-        )
         started = time.monotonic()
+        super().__init__("serve", *arguments, "--no-real-time", "--state-rate", "20")
         try:
             wait_for(
-                lambda: "ready:" in self.text() or self.process.poll() is not None,
-                "dexkit serve",
-                _START,
+                lambda: "ready:" in self.text() or self.code is not None, "dexkit serve", _START
             )
         except Failed as error:
-            self.close()
+            self.end()
             raise Failed(f"{error}: {self.text()[-600:]}") from error
-        if self.process.poll() is not None:
+        if self.code is not None:
             raise Failed(f"dexkit serve ended: {self.text()[-600:]}")
         self.start_time = time.monotonic() - started
-
-    def text(self, begin: int = 0) -> str:
-        """What it has printed."""
-        return self.log.read_bytes()[begin:].decode(errors="replace")
 
     def said(self, begin: int, pattern: str) -> str:
         """The first line from ``begin`` on that matches; empty without one."""
@@ -228,33 +219,29 @@ class Serve:
 
     def mark(self) -> int:
         """Where its output ends now."""
-        return self.log.stat().st_size
+        return self.out.stat().st_size
 
     def counters(self) -> list[dict[str, Any]]:
         """Its counters now, one dictionary for each topic pair."""
         begin = self.mark()
-        self.process.send_signal(signal.SIGUSR1)
+        self.signal(signal.SIGUSR1)
         ready = self.text().count("ready:")
         wait_for(lambda: self.text(begin).count("counters {") >= ready, "counters")
         return [json.loads(t) for t in re.findall(r"counters (\{.*\})", self.text(begin))]
 
-    def close(self) -> None:
+    def end(self) -> None:
         """End it as Ctrl-C does."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)
-            try:
-                self.process.wait(_PATIENCE)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
-        self._out.close()
+        self.close(_PATIENCE)
         print(self.text(), flush=True)
 
-    def __enter__(self) -> Serve:
-        return self
 
-    def __exit__(self, *exc: object) -> None:
-        self.close()
+def dexkit(*words: str) -> tuple[int, str]:
+    """Run a command of dexkit; its exit code, and what it printed."""
+    program = Program(*words)
+    try:
+        return program.wait(_START), program.text()
+    finally:
+        program.close(_PATIENCE)
 
 
 def use(*words: str, user: int | None = None, groups: Sequence[int] = ()) -> str:
@@ -262,17 +249,12 @@ def use(*words: str, user: int | None = None, groups: Sequence[int] = ()) -> str
 
     :param words: of :mod:`tools.lab.guest.probe`.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.lab.guest.probe", *words],
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        timeout=_START,
-        user=user,
-        group=user,
-        extra_groups=None if user is None else list(groups),
-    )
-    return done.stdout.strip()
+    program = Program("probe", *words, user=user, groups=groups)
+    try:
+        program.wait(_START)
+        return program.text().strip()
+    finally:
+        program.close(_PATIENCE)
 
 
 @contextlib.contextmanager

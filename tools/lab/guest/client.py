@@ -17,7 +17,7 @@ from tools.lab.guest.bench import Failed, wait_for
 __all__ = ["DOMAIN", "Client"]
 
 DOMAIN = 1
-_RATE = 100.0
+_RATE = 50.0
 _LINK_DOWN = 1 << 31
 
 

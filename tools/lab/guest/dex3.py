@@ -28,13 +28,14 @@ from tools.lab.guest.bench import (
 )
 from tools.lab.guest.client import DOMAIN, Client
 from tools.lab.guest.faults import Subject, table
+from tools.lab.guest.power import autosuspend, freeze_processes, runtime_status, suspend_refused
 
 __all__ = ["run_dex3"]
 
 _BUSID = {Side.LEFT: "1-1", Side.RIGHT: "1-2"}
 _EXCHANGES = 100
 _CYCLES = 20
-_BUDGET = 100.0  # seconds for all of them: a busy machine does fewer, and the report says so
+_FROZEN = 3  # seconds
 _STILL = 0.02  # rad
 _USBDEVFS_RESET = 0x5514
 _RULE = 'SUBSYSTEM=="usb", ATTR{idVendor}=="34b7", MODE="0660", GROUP="plugdev"\n'
@@ -51,6 +52,7 @@ def run_dex3(bench: Bench) -> None:
         ("a C program on libusb (tools/lab/exchange.c)", lab.c_program),
         ("an ordinary user without the udev rule", lab.denied),
         ("an ordinary user with the udev rule", lab.permitted),
+        ("USB autosuspend", lab.autosuspend),
     ):
         if do == lab.c_program and not bench.words.get("program"):
             bench.skip("dex3", name, "it was not compiled: see what make lab printed")
@@ -63,6 +65,8 @@ def run_dex3(bench: Bench) -> None:
             ("a second process on the hand", lab.second_process),
             ("USB reset while moving", lab.reset),
             ("driver unbound while moving", lab.unbound),
+            ("suspending the computer while moving", lab.suspend),
+            ("all processes frozen while moving, as for suspending", lab.frozen),
             (f"unplugged while moving, {_CYCLES} times, same and other port", lab.unplugged),
         ):
             bench.case("dex3 faults", name, do)
@@ -196,7 +200,7 @@ class _Dex3:
         before, started = self.service.counters(), time.monotonic()
         for side, client in self.clients.items():
             client.go(_target(side, 0.3))
-        rate = self.clients[Side.LEFT].rate(8.0)
+        rate = self.clients[Side.LEFT].rate(5.0)
         after, took = self.service.counters(), time.monotonic() - started
         for side, client in self.clients.items():
             wait_for(
@@ -210,7 +214,7 @@ class _Dex3:
         errors = sum(_sum(b, "exchange_errors") for b in after)
         return (
             f"exchanges {', '.join(exchanged)}, {errors} errors; left state {rate:.0f} Hz at the "
-            f"client; ready after {self.service.start_time:.0f} s"
+            f"client; ready after {self.service.start_time:.1f} s"
         )
 
     def second_process(self) -> str:
@@ -267,14 +271,47 @@ class _Dex3:
         outcome = self._subject().strike(strike, mend)
         return f"{table([outcome])}; " + self._obeys(0.1)
 
+    def autosuspend(self) -> str:
+        folder = pin_of(_BUSID[Side.LEFT])
+        assert folder is not None
+        with autosuspend(folder) as asleep_after:
+            started = time.monotonic()
+            with Dex3Usb(Side.LEFT, Dex3Settings(local=False)) as hand:
+                hand.exchange(HandCommand.brake(7))
+                took = time.monotonic() - started
+                time.sleep(0.5)  # nothing is exchanged
+                while_open = runtime_status(folder)
+                hand.exchange(HandCommand.brake(7))
+            if while_open != "active":
+                raise Failed(f"while it is open it is {while_open}")
+            again = wait_for(lambda: runtime_status(folder) == "suspended", "not suspended again")
+        return (
+            f"suspended {asleep_after:.2f} s after it is allowed; the driver wakes it, first "
+            f"answer after {took:.2f} s; while it is open it stays active; suspended again "
+            f"{again:.2f} s after it is closed"
+        )
+
+    def suspend(self) -> str:
+        said: list[str] = []
+
+        def strike() -> None:
+            said.extend(suspend_refused(state) for state in ("freeze", "mem"))
+
+        outcome = self._subject().strike(strike, survived=True)
+        return f"{'; '.join(said)}; {table([outcome])}; " + self._obeys(0.1)
+
+    def frozen(self) -> str:
+        took: list[float] = []
+        outcome = self._subject().strike(
+            lambda: took.append(freeze_processes(_FROZEN)), survived=True
+        )
+        return f"frozen for {took[0]:.1f} s; {table([outcome])}; " + self._obeys(0.1)
+
     def unplugged(self) -> str:
         subject, outcomes = self._subject(), []
         stand_in: int | None = None
         used: set[int] = set()
-        started = time.monotonic()
         for cycle in range(_CYCLES):
-            if cycle and time.monotonic() - started > _BUDGET:
-                break
 
             def mend(cycle: int = cycle) -> None:
                 nonlocal stand_in
@@ -300,7 +337,7 @@ class _Dex3:
         if self.node is not None:
             self.node.close()
         if self.service is not None:
-            self.service.close()
+            self.service.end()
         for place in self.places.values():
             detach(place)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from tools.lab.guest.bench import Bench, Failed, Serve, wait_for
 from tools.lab.guest.client import Client
@@ -25,13 +25,13 @@ _PAUSE = 0.5  # seconds in which nothing may move
 class Outcome:
     """One fault.
 
-    :ivar lost: seconds until the client saw that the device is gone.
+    :ivar lost: seconds until the client saw that the device is gone; None if it stayed.
     :ivar back: seconds from the repair to measured states.
     :ivar strayed: the largest motion that nobody commanded, in the record's unit.
     :ivar said: what the service said first.
     """
 
-    lost: float
+    lost: float | None
     back: float
     strayed: float
     said: str
@@ -42,8 +42,8 @@ class Subject:
     """A served hand, as the faults need it.
 
     :param device: name of its record on the host.
-    :param near: where it begins, rad.
-    :param far: where it is commanded when the fault strikes, rad.
+    :param near: one of the poses it is commanded to, rad.
+    :param far: the other; it moves to the one that is farther away.
     :param per_rad: of the record's unit in one rad, if all joints have the same zero.
     :param still: the largest change that is no motion, in the record's unit.
     :param within: how near to a target is there, rad.
@@ -58,9 +58,11 @@ class Subject:
     per_rad: float = 1.0
     still: float = 0.02
     within: float = 0.15
+    _rests: bool = field(default=False, init=False)  # seen at the end of the last fault
 
     def move(self, target: Sequence[float]) -> float:
         """Command ``target`` until the hand is there; seconds."""
+        self._rests = False
         self.client.go(target)
         return wait_for(
             lambda: self.client.arrived(target, self.within), f"{self.device} does not obey"
@@ -83,23 +85,40 @@ class Subject:
         now: list[float] = self.bench.ask(do="now", device=self.device)["q"]
         return max(abs(q - there) for q, there in zip(now, place, strict=True))
 
-    def strike(self, fault: Callable[[], object], mend: Callable[[], object]) -> Outcome:
+    def begin(self) -> list[float]:
+        """Have the hand move, from rest; where it is commanded to, in the record's unit."""
+        wait_for(lambda: self.client.linked, "the device is not there before the fault")
+        if not self._rests:
+            self._settle()
+        poses = {
+            self._distance([q * self.per_rad for q in pose]): pose for pose in (self.near, self.far)
+        }
+        target = poses[max(poses)]
+        start = self.bench.ask(do="now", device=self.device)["q"]
+        self._rests = False
+        self.client.go(target)
+        wait_for(lambda: self._distance(start) > 3 * self.still, f"{self.device} does not move")
+        return [q * self.per_rad for q in target]
+
+    def strike(
+        self,
+        fault: Callable[[], object],
+        mend: Callable[[], object] = lambda: None,
+        *,
+        survived: bool = False,
+    ) -> Outcome:
         """Have ``fault`` while it moves, then ``mend``.
 
+        :param survived: the device stays; without it, the client must see that it is gone.
         :raises Failed: it moved uncommanded, or did not come back.
         """
         ask, client = self.bench.ask, self.client
-        wait_for(lambda: client.linked, "the device is not there before the fault")
-        self.move(self.near)
-        self._settle()
+        goal = self.begin()
         begin = self.service.mark()
-        start = ask(do="now", device=self.device)["q"]
-        client.go(self.far)
-        wait_for(lambda: self._distance(start) > 3 * self.still, f"{self.device} does not move")
         at = ask(do="now", device=self.device)
         fault()
         client.silent()
-        lost = wait_for(lambda: not client.linked, "the loss is not seen")
+        lost = None if survived else wait_for(lambda: not client.linked, "the loss is not seen")
         mended = time.monotonic()
         mend()
         try:
@@ -107,7 +126,8 @@ class Subject:
         except Failed as error:
             raise Failed(f"{error}; {self.service.text(begin)[-600:]}") from error
         back = time.monotonic() - mended
-        goal = [q * self.per_rad for q in self.far]
+        if survived:
+            self._settle()  # the service still ends the motion that was commanded
         seen = ask(do="since", device=self.device, t=at["t"])
         astray = max(
             max(min(q, to) - low, high - max(q, to))
@@ -123,20 +143,25 @@ class Subject:
                 f"uncommanded motion: {moved:.3f} and {after['setpoints']} set-points after the "
                 f"return, {astray:.3f} astray before; {said}"
             )
+        self._rests = moved < self.still / 2
         return Outcome(lost, back, max(moved, astray, 0.0), said)
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """The outcomes in a line."""
+    losses = [o.lost for o in outcomes if o.lost is not None]
+    parts = [f"loss seen by the client after {_spread(losses)} s"] if losses else []
+    if losses:
+        back = _spread([o.back for o in outcomes])
+        parts.append(f"measured states {back} s after the repair")
     return (
-        f"loss seen by the client after {_spread([o.lost for o in outcomes])} s, measured states "
-        f"{_spread([o.back for o in outcomes])} s after the repair, uncommanded motion "
-        f"{max(o.strayed for o in outcomes):.4f} at most, no set-point before a new command; "
-        f"it says: {outcomes[0].said}"
+        "; ".join(parts)
+        + f"{'; ' * bool(parts)}uncommanded motion {max(o.strayed for o in outcomes):.4f} at most, "
+        f"no set-point before a new command; it says: {outcomes[0].said or 'nothing'}"
     )
 
 
 def _spread(values: Sequence[float]) -> str:
     if len(values) == 1:
         return f"{values[0]:.2f}"
-    return f"{statistics.median(values):.2f} (at most {max(values):.2f})"
+    return f"{statistics.median(values):.2f} (median; at most {max(values):.2f})"

@@ -1,14 +1,10 @@
-"""``python -m tools.lab.guest.probe dex3`` or ``mx64 PATH``: use a device once, in its own process,
-as its own user, and print what happened.
-"""
+"""Use a device once (``dex3``, or ``mx64 PATH``), in a process and as a user of its own."""
 
 from __future__ import annotations
 
-import sys
-
 from dexkit.errors import DexkitError
 
-__all__ = ["ping", "probe"]
+__all__ = ["main", "ping", "probe"]
 
 
 def probe(device: str, path: str = "") -> str:
@@ -35,8 +31,9 @@ def ping(path: str) -> str:
         bus.close()
 
 
-if __name__ == "__main__":
+def main(*words: str) -> None:
+    """Use a device, and print what happened."""
     try:
-        print(probe(*sys.argv[1:]))
+        print(probe(*words))
     except DexkitError as error:
         print(f"{type(error).__name__}: {error.message}; {error.hint}")

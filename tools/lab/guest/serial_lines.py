@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,31 +16,30 @@ from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.serial_port import exchange_period, latency_timer, latency_warning
 from dexkit.hand import HandCommand, Side
 from dexkit.wire import mx64
+from tools.lab.guest.adapters import Adapters
 from tools.lab.guest.bench import (
-    DEXKIT,
     Bench,
     Failed,
     Serve,
     Unprivileged,
-    attach,
-    detach,
+    dexkit,
     kernel_log,
     rule,
-    run,
     use,
     wait_for,
 )
 from tools.lab.guest.client import DOMAIN, Client
 from tools.lab.guest.faults import Subject, table
+from tools.lab.guest.modem_manager import PROCESS, manager, run_modem_manager
+from tools.lab.guest.power import freeze_processes
 from tools.lab.guest.probe import ping
 
 __all__ = ["run_serial"]
 
-_BUSID = {"mx64": "1-1", "dex1": "1-2"}
-_SERIAL = {"mx64": "DKLAB001", "dex1": "DKLAB002"}  # of tools.lab.devices
 _DIALOUT = 20  # Debian's
 _USBDEVFS_RESET = 0x5514
 _CYCLES = 5
+_FROZEN = 3  # seconds
 _SERVED = 4
 """Milliseconds of the timer under a service: at 1 ms the adapter sends a thousand packets a second,
 with or without data, which alone keep an emulated processor busy."""
@@ -62,13 +60,14 @@ def run_serial(bench: Bench) -> None:
         ("ezgripper", "exchanges with the timer at 4 ms", lambda: lab.servo_rate(4)),
         ("ezgripper", "exchanges with the timer at 1 ms", lambda: lab.servo_rate(1)),
         ("adapter", "the udev rule that dexkit's warning names", lab.rule),
-        ("adapter", "probe bytes at plug-in, as ModemManager sends them", lab.probes),
+        ("adapter", "probe bytes of modem software at plug-in", lab.probes),
         ("ezgripper", "dexkit calibrate ezgripper", lab.calibrate),
         ("dex1", "6 Mbaud through the emulated FT232H, timer 16 ms", lambda: lab.motor_rate(16)),
         ("dex1", "6 Mbaud through the emulated FT232H, timer 4 ms", lambda: lab.motor_rate(4)),
         ("dex1", "6 Mbaud through the emulated FT232H, timer 1 ms", lambda: lab.motor_rate(1)),
     ):
         bench.case(group, name, do)
+    run_modem_manager(bench, lab.adapters)
     for kind in ("ezgripper", "dex1-serial"):
         if not bench.case(kind, f"dexkit serve {kind}", lambda k=kind: lab.serve(k)):  # type: ignore[misc]
             continue
@@ -76,9 +75,12 @@ def run_serial(bench: Bench) -> None:
             ("a second process on the port", lab.second_process),
             ("USB reset", lab.reset),
             ("driver unbound while moving", lab.unbound),
+            ("all processes frozen while moving, as for suspending", lab.frozen),
             (f"unplugged while moving, {_CYCLES} times", lab.unplugged),
+            ("plugged in again while ModemManager probes", lab.probed),
         ):
-            bench.case(f"{kind} faults", name, do)
+            if do != lab.probed or kind == "ezgripper":
+                bench.case(f"{kind} faults", name, do)
         lab.end()
     lab.close()
 
@@ -86,40 +88,15 @@ def run_serial(bench: Bench) -> None:
 class _Lines:
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
-        self.places: dict[str, int] = {}
+        self.adapters = Adapters(bench)
         self.service: Serve | None = None
         self.node: DdsNode | None = None
         self.subject: Subject | None = None
         self.device = "mx64"
 
-    # --- the adapter
-
-    def plug(self, device: str) -> str:
-        """Attach a device's adapter; its port's path, once it is there."""
-        self.places[device] = attach(self.bench.words["adapters"], _BUSID[device])
-        wait_for(lambda: self._path(device), f"no port for the {device}'s adapter")
-        return self._path(device)
-
-    def _path(self, device: str) -> str:
-        for port in Path("/sys/bus/usb-serial/devices").glob("ttyUSB*"):
-            number = (port.resolve().parents[1] / "serial").read_text().strip()
-            node = Path("/dev") / port.name
-            if number == _SERIAL[device] and node.exists():
-                return str(node)
-        return ""
-
-    def _interface(self, device: str) -> Path:
-        return (
-            (Path("/sys/bus/usb-serial/devices") / Path(self._path(device)).name).resolve().parent
-        )
-
-    def _set_timer(self, device: str, milliseconds: int) -> None:
-        name = Path(self._path(device)).name
-        Path(f"/sys/bus/usb-serial/devices/{name}/latency_timer").write_text(str(milliseconds))
-
     def plug_in(self) -> str:
         started = time.monotonic()
-        path = self.plug("mx64")
+        path = self.adapters.plug("mx64")
         took = time.monotonic() - started
         if path != "/dev/ttyUSB0":
             raise Failed(path)
@@ -129,7 +106,7 @@ class _Lines:
         )
 
     def denied(self) -> str:
-        path = self._path("mx64")
+        path = self.adapters.path("mx64")
         wait_for(lambda: os.stat(path).st_gid == _DIALOUT, "udev does not set the group")
         said = use("mx64", path, user=Unprivileged)
         if "no permission" not in said or "dialout" not in said:
@@ -140,7 +117,7 @@ class _Lines:
         return f"{said}. In the group: {granted}"
 
     def doctor(self) -> str:
-        done = _doctor(self._path("mx64"))
+        done = _doctor(self.adapters.path("mx64"))
         line = next((text for text in done.splitlines() if "latency timer of" in text), "")
         cure = "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
         if "16 ms" not in line or cure not in done:
@@ -148,22 +125,20 @@ class _Lines:
         return f"{line.strip()}; cure: {cure}"
 
     def rule(self) -> str:
-        if "ATTR{latency_timer}" not in latency_warning(self._path("mx64")):
-            self._set_timer("mx64", 16)
-        named = latency_warning(self._path("mx64"))
+        if "ATTR{latency_timer}" not in latency_warning(self.adapters.path("mx64")):
+            self.adapters.set_timer("mx64", 16)
+        named = latency_warning(self.adapters.path("mx64"))
         if _RULE not in named:
             raise Failed(f"the warning names another rule: {named}")
         with rule(_RULE + "\n"):
-            detach(self.places["mx64"])
-            path = self.plug("mx64")
+            path = self.adapters.replug("mx64")
             wait_for(lambda: latency_timer(path) == 1, "udev does not set the timer")
         return f"after plugging in: timer 1 ms, by {_RULE}"
 
     def probes(self) -> str:
         ask = self.bench.ask
         before = ask(do="now", device="mx64")
-        detach(self.places["mx64"])
-        path = self.plug("mx64")
+        path = self.adapters.replug("mx64")
         for rate in (9600, 115200, 1_000_000):
             with serial.Serial(path, rate, timeout=0.02) as port:
                 for probe in _PROBES:
@@ -180,8 +155,8 @@ class _Lines:
     # --- rates
 
     def servo_rate(self, timer: int) -> str:
-        path = self._path("mx64")
-        self._set_timer("mx64", timer)
+        path = self.adapters.path("mx64")
+        self.adapters.set_timer("mx64", timer)
         bus = ServoBus(path, 1_000_000, timeout=0.2, retries=0)
         bus.open()
         try:
@@ -196,8 +171,8 @@ class _Lines:
         return f"{rate:.1f}/s at 1 Mbaud; the timer and the line allow {most:.1f}"
 
     def motor_rate(self, timer: int) -> str:
-        path = self._path("dex1") or self.plug("dex1")
-        self._set_timer("dex1", timer)
+        path = self.adapters.path("dex1") or self.adapters.plug("dex1")
+        self.adapters.set_timer("dex1", timer)
         with Dex1Serial(Side.LEFT, Dex1Settings(device=path, timeout=0.2)) as hand:
             rate = _rate(lambda: hand.exchange(HandCommand.brake(1)), 3.0)
             said = f"{hand.line_statistics}"
@@ -209,19 +184,27 @@ class _Lines:
     # --- the services
 
     def calibrate(self) -> str:
-        done = run(
-            DEXKIT, "calibrate", "ezgripper", "--device", self._path("mx64"), "--yes", timeout=180
-        )
-        return " / ".join(done.strip().splitlines()[-3:])
+        path = self.adapters.path("mx64")
+        code, said = dexkit("calibrate", "ezgripper", "--device", path, "--yes")
+        if code:
+            raise Failed(f"code {code}: {said[-600:]}")
+        return " / ".join(said.strip().splitlines()[-3:])
 
     def serve(self, kind: str) -> str:
         self.device = "mx64" if kind == "ezgripper" else "dex1"
-        if not self._path(self.device):
-            self.plug(self.device)
-        self._set_timer(self.device, _SERVED)
+        if not self.adapters.path(self.device):
+            self.adapters.plug(self.device)
+        self.adapters.set_timer(self.device, _SERVED)
         # by the adapter's serial number: an adapter that comes back while its old port is still
         # open becomes another ttyUSB
-        words = ("--side", "left", "--device", _SERIAL[self.device], "--domain", str(DOMAIN))
+        words = (
+            "--side",
+            "left",
+            "--device",
+            self.adapters.serial(self.device),
+            "--domain",
+            str(DOMAIN),
+        )
         # the default, 20 or 30 ms, is less than the hiccups of an emulated processor
         self.service = Serve(kind, *words, "--set", "timeout=0.2")
         self.node = DdsNode(domain=DOMAIN, interface="lo")
@@ -243,7 +226,7 @@ class _Lines:
             f"timer {_SERVED} ms: {done['exchanges'] / seconds:.0f} exchanges/s, "
             f"{done['exchange_errors']} errors; state {states:.0f} Hz at the "
             f"client; strokes of 3.5 rad in {', '.join(f'{t:.1f}' for t in took)} s; "
-            f"ready after {self.service.start_time:.0f} s"
+            f"ready after {self.service.start_time:.1f} s"
         )
 
     def _the_subject(self) -> Subject:
@@ -255,7 +238,7 @@ class _Lines:
         return f"obeys afterwards ({self._the_subject().move([3.0]):.1f} s)"
 
     def second_process(self) -> str:
-        path = self._path(self.device)
+        path = self.adapters.path(self.device)
         said = use("mx64", path)
         if "another program is using" not in said:
             raise Failed(said)
@@ -263,10 +246,9 @@ class _Lines:
 
     def reset(self) -> str:
         subject = self._the_subject()
-        folder = self._interface(self.device).parent
+        folder = self.adapters.interface(self.device).parent
         numbers = [int((folder / name).read_text()) for name in ("busnum", "devnum")]
         node = f"/dev/bus/usb/{numbers[0]:03}/{numbers[1]:03}"
-        begin = subject.service.mark()
 
         def strike() -> None:
             fd = os.open(node, os.O_WRONLY)
@@ -276,12 +258,11 @@ class _Lines:
                 os.close(fd)
 
         # ftdi_sio has no reset handlers: the kernel unbinds and binds it again
-        outcome = subject.strike(strike, lambda: None)
-        del begin
+        outcome = subject.strike(strike)
         return f"{table([outcome])}; " + self._obeys()
 
     def unbound(self) -> str:
-        interface = self._interface(self.device).name
+        interface = self.adapters.interface(self.device).name
         driver = Path("/sys/bus/usb/drivers/ftdi_sio")
         outcome = self._the_subject().strike(
             lambda: (driver / "unbind").write_text(interface),
@@ -292,10 +273,31 @@ class _Lines:
     def unplugged(self) -> str:
         subject = self._the_subject()
         outcomes = [
-            subject.strike(lambda: detach(self.places[self.device]), lambda: self.plug(self.device))
+            subject.strike(
+                lambda: self.adapters.unplug(self.device), lambda: self.adapters.plug(self.device)
+            )
             for _ in range(_CYCLES)
         ]
         return f"{table(outcomes)}; " + self._obeys()
+
+    def frozen(self) -> str:
+        took: list[float] = []
+        outcome = self._the_subject().strike(
+            lambda: took.append(freeze_processes(_FROZEN)), survived=True
+        )
+        return f"frozen for {took[0]:.1f} s; {table([outcome])}; " + self._obeys()
+
+    def probed(self) -> str:
+        def mend() -> None:
+            self.adapters.plug(self.device)
+            wait_for(lambda: seen.lines("ttyUSB.*prob"), "ModemManager does not probe")
+
+        with manager() as seen, rule(PROCESS):
+            outcome = self._the_subject().strike(lambda: self.adapters.unplug(self.device), mend)
+            said = table([outcome]) + "; " + self._obeys()
+            self.adapters.unplug(self.device)  # it gives up
+        self.adapters.plug(self.device)
+        return said
 
     def end(self) -> None:
         if self.subject is not None:
@@ -305,20 +307,18 @@ class _Lines:
             self.node.close()
             self.node = None
         if self.service is not None:
-            self.service.close()
+            self.service.end()
             self.service = None
 
     def close(self) -> None:
         self.end()
-        for place in self.places.values():
-            detach(place)
+        self.adapters.close()
 
 
 def _doctor(path: str) -> str:
-    words = ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.5", "--device", path)
     # its exit code says that it has found something
-    done = subprocess.run([DEXKIT, *words], capture_output=True, text=True, timeout=120)
-    return done.stdout + done.stderr
+    words = ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.5", "--device", path)
+    return dexkit(*words)[1]
 
 
 def _rate(exchange: Callable[[], object], seconds: float) -> float:
