@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import statistics
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,7 @@ def main() -> None:
     bench = Bench(words)
     uptime = Path("/proc/uptime").read_text().split()[0]
     bench.fact(guest=platform.release(), **{"guest ready after": f"{uptime} s"})
+    clocks = _clocks(bench)
     with udevd():
         for name, do in _groups().items():
             if not words.get("only") or name in words["only"].split(","):
@@ -34,7 +36,14 @@ def main() -> None:
     if attach_times:
         middle = statistics.median(attach_times)
         bench.fact(**{"usbip attach": f"{len(attach_times)} times, median {middle:.2f} s"})
+    host, guest = (later - before for before, later in zip(clocks, _clocks(bench), strict=True))
+    bench.fact(**{"guest's seconds in one of the host": f"{guest / host:.4f}"})
     bench.ask(do="finished")
+
+
+def _clocks(bench: Bench) -> tuple[float, float]:
+    """The host's time and the guest's."""
+    return bench.ask(do="now", device="left")["t"], time.monotonic()
 
 
 def _whole(bench: Bench, name: str, do: Callable[[Bench], None]) -> None:

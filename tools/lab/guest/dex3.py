@@ -90,6 +90,7 @@ class _Dex3:
         self.service: Serve | None = None
         self.node: DdsNode | None = None
         self.clients: dict[Side, Client] = {}
+        self._left: Subject | None = None
 
     def node_path(self, side: Side) -> str:
         folder = pin_of(_BUSID[side])
@@ -229,10 +230,12 @@ class _Dex3:
         return f"obeys afterwards ({self._subject().move(_target(Side.LEFT, part)):.1f} s)"
 
     def _subject(self) -> Subject:
-        service, client = self.service, self.clients[Side.LEFT]
-        assert service is not None
-        near, far = _target(Side.LEFT, -0.3), _target(Side.LEFT, 0.5)
-        return Subject(self.bench, service, client, "left", near, far)
+        if self._left is None:
+            service, client = self.service, self.clients[Side.LEFT]
+            assert service is not None
+            near, far = _target(Side.LEFT, -0.3), _target(Side.LEFT, 0.5)
+            self._left = Subject(self.bench, service, client, "left", near, far)
+        return self._left
 
     def reset(self) -> str:
         node = self.node_path(Side.LEFT)

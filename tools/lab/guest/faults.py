@@ -1,9 +1,10 @@
 """A fault on a hand that moves: what is seen, how long it takes, and whether anything strays.
 
 The client commands the hand far away, the fault strikes on the way, and the client falls silent at
-the same moment. From then on the joints may be between where they were and the last command, and
-nowhere else; and after the device is back, no set-point may reach a motor before the client
-commands again. The host's record of the emulated motors says so (:mod:`tools.lab.devices`).
+the same moment. From then on the joints may be between where they were and the far end of the same
+motion without a fault, which was seen before, and nowhere else; and after the device is back, no
+set-point may reach a motor before the client commands again. The host's record of the emulated
+motors says so (:mod:`tools.lab.devices`).
 """
 
 from __future__ import annotations
@@ -37,6 +38,18 @@ class Outcome:
     said: str
 
 
+@dataclass(frozen=True)
+class _Pose:
+    """A pose that is commanded (rad), and what the host sees of it, in the record's unit.
+
+    :ivar furthest: the far end of the motion there from the other pose, overshoot included.
+    """
+
+    target: Sequence[float]
+    rest: Sequence[float]
+    furthest: Sequence[float]
+
+
 @dataclass
 class Subject:
     """A served hand, as the faults need it.
@@ -44,7 +57,6 @@ class Subject:
     :param device: name of its record on the host.
     :param near: one of the poses it is commanded to, rad.
     :param far: the other; it moves to the one that is farther away.
-    :param per_rad: of the record's unit in one rad, if all joints have the same zero.
     :param still: the largest change that is no motion, in the record's unit.
     :param within: how near to a target is there, rad.
     """
@@ -55,9 +67,9 @@ class Subject:
     device: str
     near: Sequence[float]
     far: Sequence[float]
-    per_rad: float = 1.0
     still: float = 0.02
     within: float = 0.15
+    poses: list[_Pose] = field(default_factory=list, init=False)
     _rests: bool = field(default=False, init=False)  # seen at the end of the last fault
 
     def move(self, target: Sequence[float]) -> float:
@@ -85,20 +97,39 @@ class Subject:
         now: list[float] = self.bench.ask(do="now", device=self.device)["q"]
         return max(abs(q - there) for q, there in zip(now, place, strict=True))
 
-    def begin(self) -> list[float]:
-        """Have the hand move, from rest; where it is commanded to, in the record's unit."""
+    def learn(self) -> list[_Pose]:
+        """See on the host where the hand goes and rests when its poses are commanded."""
+        ask, places = self.bench.ask, []
+        for target in (self.near, self.far, self.near):
+            start = ask(do="now", device=self.device)["t"]
+            self.move(target)
+            self._settle()
+            places.append(ask(do="since", device=self.device, t=start))
+        poses = []
+        for before, after, target in zip(places, places[1:], (self.far, self.near), strict=False):
+            # the motion's extreme beyond the place of rest is its overshoot
+            furthest = [
+                high if to > was else low
+                for was, to, low, high in zip(
+                    before["q"], after["q"], after["low"], after["high"], strict=True
+                )
+            ]
+            poses.append(_Pose(target, after["q"], furthest))
+        return poses
+
+    def begin(self) -> _Pose:
+        """Have the hand move, from rest; where it is commanded to."""
         wait_for(lambda: self.client.linked, "the device is not there before the fault")
+        if not self.poses:
+            self.poses = self.learn()
         if not self._rests:
             self._settle()
-        poses = {
-            self._distance([q * self.per_rad for q in pose]): pose for pose in (self.near, self.far)
-        }
-        target = poses[max(poses)]
+        pose = max(self.poses, key=lambda one: self._distance(one.rest))
         start = self.bench.ask(do="now", device=self.device)["q"]
         self._rests = False
-        self.client.go(target)
+        self.client.go(pose.target)
         wait_for(lambda: self._distance(start) > 3 * self.still, f"{self.device} does not move")
-        return [q * self.per_rad for q in target]
+        return pose
 
     def strike(
         self,
@@ -113,7 +144,7 @@ class Subject:
         :raises Failed: it moved uncommanded, or did not come back.
         """
         ask, client = self.bench.ask, self.client
-        goal = self.begin()
+        pose = self.begin()
         begin = self.service.mark()
         at = ask(do="now", device=self.device)
         fault()
@@ -131,7 +162,9 @@ class Subject:
         seen = ask(do="since", device=self.device, t=at["t"])
         astray = max(
             max(min(q, to) - low, high - max(q, to))
-            for q, to, low, high in zip(at["q"], goal, seen["low"], seen["high"], strict=True)
+            for q, to, low, high in zip(
+                at["q"], pose.furthest, seen["low"], seen["high"], strict=True
+            )
         )
         again = ask(do="now", device=self.device)
         time.sleep(_PAUSE)
