@@ -171,7 +171,8 @@ def _kept_away(bench: Bench, adapters: Adapters, seen: _Manager) -> str:
         link = os.path.realpath(device_link(Side.LEFT))
         if link != path:
             raise Failed(f"{device_link(Side.LEFT)} is {link}, not {path}")
+    skipped = (seen.lines("ttyUSB.*skipping") or ["it does not say why"])[0]
     return (
-        f"no byte on the bus in {_WATCHED:.0f} s although it is told to probe; without that rule: "
-        f"{seen.lines(_DECISION)[-1]}; {device_link(Side.LEFT)}: {ping(path)}"
+        f"no byte on the bus in {_WATCHED:.0f} s although it is told to probe: {skipped}; "
+        f"not told: {seen.lines(_DECISION)[-1]}; {device_link(Side.LEFT)}: {ping(path)}"
     )
