@@ -113,7 +113,9 @@ def test_recorded_payloads_survive_decoding_and_encoding() -> None:
     for path in SAMPLES:
         for message in islice(open_trace(path).messages(), 0, None, 50):
             mt = message_type(message.type_name)
-            assert mt.encode(mt.decode(message.data)) == message.data
+            encoded = mt.encode(mt.decode(message.data))
+            # CycloneDDS fills up to a multiple of four
+            assert encoded + bytes(-len(encoded) % 4) == message.data
             checked += 1
     assert checked > 500
 

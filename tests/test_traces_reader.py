@@ -105,7 +105,9 @@ def test_every_payload_of_a_sample_decodes(name: str) -> None:
         assert columns.errors == {}
         kind = trace.message_type(topic)
         middle = samples.payloads[len(samples) // 2]
-        assert kind.encode(kind.decode(middle)) == middle
+        # CycloneDDS fills up to a multiple of four
+        encoded = kind.encode(kind.decode(middle))
+        assert encoded + bytes(-len(encoded) % 4) == middle
 
 
 @each("name", SAMPLES)

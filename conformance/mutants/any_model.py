@@ -80,7 +80,7 @@ class SilentUntilCommanded(Service):
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
-@wrong_hand("BRAINCO-RATE-02")
+@wrong_hand("BRAINCO-RATE-02", also=("FTP-RATE-04",))
 class SlowPublisher(Service):
     """Publishes at 125 Hz, or at 1.6 times the least rate where that is less."""
 
@@ -360,7 +360,11 @@ class EmptyNowAndThen(Service):
     sides=BOTH,
 )
 @wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-SAFE-10"), sides=BOTH)
-@wrong_hand("FTP-SIDE-01", also=("FTP-SAFE-10", "FTP-SIDE-02", "FTP-WDOG-01"), sides=BOTH)
+@wrong_hand(
+    "FTP-SIDE-01",
+    also=("FTP-SAFE-10", "FTP-SENS-04", "FTP-SIDE-02", "FTP-WDOG-01"),
+    sides=BOTH,
+)
 class Swapped(Service):
     """Each side obeys the other side's commands."""
 

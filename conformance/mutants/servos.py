@@ -231,7 +231,12 @@ class _LetsGo(ServoHand):
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-GRIP-01", also=("BRAINCO-PATH-01", "BRAINCO-STILL-01"), sides=BOTH, whole=True)
+@wrong_hand(
+    "BRAINCO-GRIP-01",
+    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09"),
+    sides=BOTH,
+    whole=True,
+)
 class LetsGo(ServoService):
     """Opens after a second of full current, as a protection does that gives up."""
 
