@@ -32,8 +32,10 @@ from dexkit.models import INSPIRE_FTP, Dialect, dialect
 from dexkit.service import HandService
 from dexkit.service.dialects import StateView, dialect_map
 from dexkit.topics import roles
+from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.streams import _streams
 from dexkit.watch.fields import parts_of
+from dexkit.watch.recorded import feed
 from tests.each import each
 from tests.service_helpers import FakeNode, wait_until
 
@@ -200,6 +202,16 @@ def test_touch_in_a_recording_is_no_stream_of_joints() -> None:
     assert not parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields
     for topic, count in ((FTP.touch_topic_of(RIGHT), 0), (FTP.topics(RIGHT)[1], 1)):
         assert len(list(_streams(topic, trace.load([topic])[topic]))) == count
+
+
+def test_viewers_show_a_session_with_goals_alone_and_touch() -> None:
+    picture = feed(open_trace(sample_path("inspire_ftp_grip"))).picture(12.0)
+    assert {t.name: (t.role, t.undecodable) for t in picture.topics if "/touch/" in t.name} == {
+        FTP.touch_topic_of(side): ("touch", 0) for side in Side
+    }
+    for view in picture.subjects:
+        assert np.isfinite(view.target).all()
+        assert np.isfinite(view.q).all()
 
 
 # ----------------------------------------------------------------------------------------- doctor

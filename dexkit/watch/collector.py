@@ -490,6 +490,8 @@ def _target(row: Floats, command: tuple[_Topic, Part]) -> Floats:
     """Commanded q of the joints that the command drives."""
     q, kp, mode = (_values(row, command, name) for name in ("q", "kp", "mode"))
     part = command[1]
+    if not len(kp):  # a command of goals alone
+        return q
     if part.mode_byte is ModeByte.UNUSED:
         driven = (kp > 0) | (not part.gains_are_used)
     else:
