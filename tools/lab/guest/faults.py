@@ -28,13 +28,14 @@ class Outcome:
 
     :ivar lost: seconds until the client saw that the device is gone; None if it stayed.
     :ivar back: seconds from the repair to measured states.
-    :ivar strayed: the largest motion that nobody commanded, in the record's unit.
+    :ivar strayed: the largest motion that nobody commanded, in the record's ``unit``.
     :ivar said: what the service said first.
     """
 
     lost: float | None
     back: float
     strayed: float
+    unit: str
     said: str
 
 
@@ -59,6 +60,7 @@ class Subject:
     :param far: the other; it moves to the one that is farther away.
     :param still: the largest change that is no motion, in the record's unit.
     :param within: how near to a target is there, rad.
+    :param unit: the record's, for the report.
     """
 
     bench: Bench
@@ -69,6 +71,7 @@ class Subject:
     far: Sequence[float]
     still: float = 0.02
     within: float = 0.15
+    unit: str = "rad"
     poses: list[_Pose] = field(default_factory=list, init=False)
     _rests: bool = field(default=False, init=False)  # seen at the end of the last fault
 
@@ -173,11 +176,11 @@ class Subject:
         said = self.service.said(begin, r"^(WARNING|ERROR)")
         if after["setpoints"] or max(moved, astray) > self.still:
             raise Failed(
-                f"uncommanded motion: {moved:.3f} and {after['setpoints']} set-points after the "
+                f"uncommanded motion ({self.unit}): {moved:.3f} and {after['setpoints']} set-points after the "
                 f"return, {astray:.3f} astray before; {said}"
             )
         self._rests = moved < self.still / 2
-        return Outcome(lost, back, max(moved, astray, 0.0), said)
+        return Outcome(lost, back, max(moved, astray, 0.0), self.unit, said)
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
@@ -189,8 +192,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
         parts.append(f"measured states {back} s after the repair")
     return (
         "; ".join(parts)
-        + f"{'; ' * bool(parts)}uncommanded motion {max(o.strayed for o in outcomes):.4f} at most, "
-        f"no set-point before a new command; it says: {outcomes[0].said or 'nothing'}"
+        + f"{'; ' * bool(parts)}uncommanded motion {max(o.strayed for o in outcomes):.4f} "
+        f"{outcomes[0].unit} at most, no set-point before a new command; it says: {outcomes[0].said or 'nothing'}"
     )
 
 

@@ -209,9 +209,9 @@ class _Lines:
         self.service = Serve(kind, *words, "--set", "timeout=0.2")
         self.node = DdsNode(domain=DOMAIN, interface="lo")
         client = Client(self.node, "unitree_go", Side.LEFT, 5.0, 0.05)
-        still = 1.5 if kind == "ezgripper" else 0.05
+        still, unit = (1.5, "% of the opening") if kind == "ezgripper" else (0.05, "rad")
         self.subject = Subject(
-            self.bench, self.service, client, self.device, [4.5], [1.0], still, 0.3
+            self.bench, self.service, client, self.device, [4.5], [1.0], still, 0.3, unit
         )
         before, started = self.service.counters()[0], time.monotonic()
         took = [self.subject.move([q]) for q in (4.5, 1.0, 4.5)]
