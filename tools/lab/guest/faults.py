@@ -176,8 +176,8 @@ class Subject:
         said = self.service.said(begin, r"^(WARNING|ERROR)")
         if after["setpoints"] or max(moved, astray) > self.still:
             raise Failed(
-                f"uncommanded motion ({self.unit}): {moved:.3f} and {after['setpoints']} set-points after the "
-                f"return, {astray:.3f} astray before; {said}"
+                f"uncommanded motion ({self.unit}): {moved:.3f} and {after['setpoints']} "
+                f"set-points after the return, {astray:.3f} astray before; {said}"
             )
         self._rests = moved < self.still / 2
         return Outcome(lost, back, max(moved, astray, 0.0), self.unit, said)
@@ -193,7 +193,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return (
         "; ".join(parts)
         + f"{'; ' * bool(parts)}uncommanded motion {max(o.strayed for o in outcomes):.4f} "
-        f"{outcomes[0].unit} at most, no set-point before a new command; it says: {outcomes[0].said or 'nothing'}"
+        f"{outcomes[0].unit} at most, no set-point before a new command; "
+        f"it says: {outcomes[0].said or 'nothing'}"
     )
 
 
