@@ -84,6 +84,7 @@ def test_a_record_counts_only_set_points_that_change_and_drive() -> None:
         "high": [0.5],
         "q": [0.5],
         "setpoints": 1,
+        "last": "[(1.0,)]",
         "heard": 3,
         "first": "AT\\r",
     }

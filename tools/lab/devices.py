@@ -44,7 +44,7 @@ class Record:
     def __init__(self, positions: Callable[[], Sequence[float]]) -> None:
         self._positions = positions
         self._places: list[tuple[float, list[float]]] = []
-        self._setpoints: list[float] = []
+        self._setpoints: list[tuple[float, tuple[object, ...]]] = []
         self._heard: deque[tuple[float, bytes]] = deque(maxlen=_HEARD)
         self._last: dict[int, tuple[object, ...]] = {}
         self._clock = RealClock()
@@ -66,7 +66,7 @@ class Record:
         if self._last.get(joint) != values:
             self._last[joint] = values
             with self._lock:
-                self._setpoints.append(self._clock.now())
+                self._setpoints.append((self._clock.now(), values))
 
     def rests(self, joint: int) -> None:
         """Note that ``joint`` was told to brake, or has no torque."""
@@ -83,14 +83,15 @@ class Record:
         self.look()
         with self._lock:
             places = [place for t, place in self._places if t >= start]
-            count = sum(t >= start for t in self._setpoints)
+            setpoints = [values for t, values in self._setpoints if t >= start]
             heard = b"".join(data for t, data in self._heard if t >= start)
         columns = list(zip(*places, strict=True))
         return {
             "low": [min(column) for column in columns],
             "high": [max(column) for column in columns],
             "q": places[-1],
-            "setpoints": count,
+            "setpoints": len(setpoints),
+            "last": repr(setpoints[-1:]),
             "heard": len(heard),
             "first": repr(heard[:_SHOWN])[2:-1],
         }
@@ -169,7 +170,8 @@ def _record_servo(servo: Any) -> Record:
 
     def write_block(*arguments: Any, **options: Any) -> Any:
         done = write(*arguments, **options)
-        if servo.torque:
+        # without current the motor is off, whatever its goal: the driver's brake after opening
+        if servo.torque and servo.get(mx64.GOAL_CURRENT):
             goals = (mx64.GOAL_POSITION, mx64.GOAL_CURRENT, mx64.GOAL_VELOCITY)
             record.setpoint(0, *(servo.get(item) for item in goals))
         else:

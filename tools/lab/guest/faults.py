@@ -177,7 +177,7 @@ class Subject:
         if after["setpoints"] or max(moved, astray) > self.still:
             raise Failed(
                 f"uncommanded motion ({self.unit}): {moved:.3f} and {after['setpoints']} "
-                f"set-points after the return, {astray:.3f} astray before; {said}"
+                f"set-points {after['last']} after the return, {astray:.3f} astray before; {said}"
             )
         self._rests = moved < self.still / 2
         return Outcome(lost, back, max(moved, astray, 0.0), self.unit, said)
