@@ -12,7 +12,6 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.checks.motion import Step, half_way, steps, steps_of
-from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 
 __all__: list[str] = []
@@ -309,81 +308,7 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
     return outcome.timed(took, least, at_least=True)
 
 
-# --------------------------------------------------------------------- held, pushed, and softly
-
-
-@dataclass(frozen=True)
-class _Nudge:
-    """A push by a torque at a gripper that is held by kp.
-
-    :param way: rad, by which the torque displaces it; ``asked`` is that torque through kp.
-    """
-
-    begin: float
-    end: float
-    way: float
-    asked: float
-
-
-def _nudges(ctx: Context) -> list[_Nudge]:
-    found = []
-    for phase in ctx.phases():
-        begin, end = ctx.span(phase)
-        before = ctx.states.q[ctx.states.between(begin - 0.15, begin), 0]
-        after = ctx.states.q[ctx.states.between(end - 0.1, end), 0]
-        given = (ctx.commands.t >= begin) & (ctx.commands.t < end)
-        if not len(before) or not len(after) or not given.any():
-            continue
-        kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
-        if kp > 0 and tau != 0:  # a damaged recording may hold another command here
-            way = (median(after) - median(before)) * (1 if tau > 0 else -1)
-            found.append(_Nudge(begin, end, way, abs(tau) / kp))
-    return found
-
-
-@check("DEX1-HOLD-01")
-def held(ctx: Context) -> Outcome:
-    """The displacement by a push after a long hold, compared with that by the same push before."""
-    found = _nudges(ctx)
-    if len(found) < 2:
-        return ctx.skipped("no state during two pushes")
-    least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
-    shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
-    if not shown:
-        return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
-    pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
-    for first, last in pairs:
-        text = (
-            f"a torque displaced it by {first.way:.3f} {ctx.unit}, and after "
-            f"{last.begin - first.end:.1f} "
-            f"s of equal commands by {last.way:.3f} {ctx.unit}"
-        )
-        if not least * first.way <= last.way <= most * first.way:
-            place = ctx.at(ctx.states.topic, last.begin, last.end)
-            return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
-    if not pairs:
-        return ctx.absent("the first push displaced it too little to compare the last with it")
-    return ctx.passed(f"{last.way:.3f} {ctx.unit}", text, motion_rad=last.way)
-
-
-@check("DEX1-GAIN-05")
-def stiffness(ctx: Context) -> Outcome:
-    """The largest displacement by a torque, as a part of that torque through kp."""
-    found = _nudges(ctx)
-    if not found:
-        return ctx.skipped("no state while it was pushed")
-    worst = max(found, key=lambda n: n.way / n.asked)
-    part = worst.way / worst.asked
-    text = (
-        f"a torque displaced it by {worst.way:.3f} {ctx.unit}, through kp by {worst.asked:.3f} "
-        f"{ctx.unit}"
-    )
-    limit = ctx.tolerance("max_part")
-    if part <= limit:
-        return ctx.passed(f"{part:.0%}", text, part=part).placed(worst.way, limit * worst.asked)
-    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
-    outcome = ctx.failed(f"{part:.0%}", text, place, part=part)
-    return outcome.placed(worst.way, limit * worst.asked)
+# ---------------------------------------------------------------------------------------- softly
 
 
 @check("DEX1-GAIN-04")

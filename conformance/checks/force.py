@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
+from dexkit.conformance.checks.motion import obeyed_before
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
 from dexkit.models import HandModel
@@ -143,11 +144,18 @@ def again(ctx: Context) -> Outcome:
         tau = tau[np.isfinite(tau)]
         return median(tau) if len(tau) else None
 
-    grips = [ctx.span(p) for p in ctx.phases("grip")]
-    first = force(*grips[0]) if grips else None
+    grips = ctx.phases("grip")
+    first = force(*ctx.span(grips[0])) if grips else None
     if first is None or first < ctx.tolerance("min_tau_nm"):
         return ctx.skipped("it did not grip before")
-    later = [(tau, *s) for s in map(ctx.span, ctx.phases()) if (tau := force(*s)) is not None]
+    # a driver may lower its effort at first (DEX1-FORCE-10): the least of the first grip's end
+    begin, end = ctx.span(grips[0])
+    pieces = _felt(ctx, max(begin, end - 0.5), end, 0.1)
+    first = max(min((tau for _, tau, _ in pieces), default=first), ctx.tolerance("min_tau_nm"))
+    judged = [
+        p for p in (*grips[1:], *ctx.phases(), *ctx.phases("regrip")) if obeyed_before(ctx, p)
+    ]
+    later = [(tau, *s) for s in map(ctx.span, judged) if (tau := force(*s)) is not None]
     if not later:
         return ctx.skipped("no state during a later grip")
     tau, begin, end = min(later)

@@ -66,7 +66,11 @@ def late_joiner(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
 def restarted_client(ctx: Context) -> Outcome:
-    """The step of a restarted client."""
+    """The steps of a restarted client."""
+    for phase in ctx.phases():
+        wrong = away_first(ctx, phase, "commanded by a restarted client")
+        if wrong is not None:
+            return wrong
     return arrival(ctx, "commanded by a restarted client")
 
 

@@ -533,6 +533,33 @@ def independent(ctx: Context) -> Outcome:
     return outcome.about(joint).placed(most, limit)
 
 
+@check("DEX1-SIDE-03")
+def by_its_own(ctx: Context) -> Outcome:
+    """Steps of this hand while the other one gets other values in the same members."""
+    worst: tuple[float, Step] | None = None
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        for step in steps_of(ctx, phase):
+            before = ctx.states.between(step.begin - 0.1, step.begin)
+            if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
+                continue  # it was still under way, from where it was limp
+            if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
+                part = (step.final - step.start) / step.size
+                if worst is None or part < worst[0]:
+                    worst = part, step
+                if step.error > ctx.tolerance("max_error_stroke", step.joint):
+                    return disobeyed(ctx, "while the other hand was commanded otherwise", step)
+    if worst is None:
+        return ctx.skipped("only one side was commanded, or the hand had stopped obeying before")
+    part, step = worst
+    text = f"while the other hand had zero gains: {step}"
+    limit = ctx.tolerance("min_progress")
+    if part >= limit:
+        return ctx.passed(f"{part:.0%}", text, progress=part)
+    place = ctx.at(ctx.states.topic, step.begin, step.end)
+    outcome = ctx.failed(f"{part:.0%}", text, place, progress=part).about(step.joint)
+    return outcome.if_late(STROKE_S * abs(step.size) / step.stroke)
+
+
 @check("DEX1-GAIN-01", "DEX3-GAIN-01")
 def zero_gains(ctx: Context) -> Outcome:
     """Motion towards q while all gains are zero."""
@@ -617,64 +644,6 @@ def every_command(ctx: Context) -> Outcome:
     )
     # on a network a single sample may be lost: another run tells
     return replace(outcome.about(joint).if_late(end - begin), retry=True)
-
-
-@check("DEX1-ABUSE-01", "DEX3-ABUSE-01")
-def unchanged(ctx: Context) -> Outcome:
-    """Duration of good steps after each abuse, compared with those before any, and the errors of
-    the steps between the phases.
-    """
-    between = [*ctx.phases("center"), *ctx.phases()]
-    for phase in (p for p in between if obeyed_before(ctx, p)):
-        for step in steps_of(ctx, phase):
-            if step.error > ctx.tolerance("max_error_stroke", step.joint):
-                return disobeyed(ctx, "between two phases", step)
-    first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
-    worst: tuple[float, Step, float, float, float] | None = None
-    for phase in (p for name in _AFTER_ABUSE for p in ctx.phases(name)):
-        for step in steps_of(ctx, phase):
-            like = [s for s in first if s.joint == step.joint and 0.7 < step.size / s.size < 1.4]
-            seconds = _duration(step)
-            known = [d for d in map(_duration, like) if d is not None]
-            if seconds is None or not known:
-                continue  # whether it arrives at all is judged by other requirements
-            slack = ctx.tolerance("slack_s" if phase.name == "recover" else "soft_start_s")
-            ratio = seconds / (max(known) + slack)
-            if worst is None or ratio > worst[0]:
-                worst = ratio, step, seconds, max(known), slack
-    if worst is None:
-        return ctx.skipped("no two steps that can be compared")
-    ratio, step, seconds, before, slack = worst
-    text = (
-        f"{step.name}{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {before:.2f} s in the "
-        "same step before any bad command"
-    )
-    longest = ctx.tolerance("max_ratio") * (before + slack)
-    if ratio <= ctx.tolerance("max_ratio"):
-        met = ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
-        return met.timed(seconds, longest, span=(step.begin, step.end))
-    return (
-        ctx.failed(
-            f"x {ratio:.1f}",
-            text,
-            ctx.at(ctx.states.topic, step.begin, step.end),
-            ratio=ratio,
-        )
-        .about(step.joint)
-        .timed(seconds, longest)
-        .if_late(seconds - longest)
-    )
-
-
-_AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
-
-
-def _duration(step: Step) -> float | None:
-    """Seconds from 10 to 90 % of a step; None if it does not get there."""
-    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
-    if not (part >= 0.9).any():
-        return None
-    return float(step.t[np.argmax(part >= 0.9)] - step.t[np.argmax(part >= 0.1)])
 
 
 def _driven(ctx: Context) -> list[tuple[int, int]]:

@@ -500,9 +500,12 @@ def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
     return None
 
 
-def arrival(ctx: Context, when: str) -> Outcome:
-    """Whether the phase's steps reach their targets."""
-    judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
+def arrival(ctx: Context, when: str, phases: Sequence[Phase] | None = None) -> Outcome:
+    """Whether the steps of these phases reach their targets.
+
+    :param phases: None for those that the requirement needs.
+    """
+    judged = [p for p in (ctx.phases() if phases is None else phases) if obeyed_before(ctx, p)]
     if not judged:
         return ctx.skipped("the hand had stopped obeying before this stimulus")
     found = [s for p in judged for s in steps_of(ctx, p)]
@@ -644,12 +647,6 @@ def two_writers(ctx: Context) -> Outcome:
     return ctx.passed(
         "between", "stayed between the two positions, and obeyed the remaining client"
     ).resting_on(*outcome.measures)
-
-
-@check("DEX1-SAFE-09", "DEX3-SAFE-10")
-def company(ctx: Context) -> Outcome:
-    """The steps of this hand while a second client sends the same commands."""
-    return arrival(ctx, "while a second client commanded the same")
 
 
 @check("DEX1-ORDER-02", "DEX3-ORDER-02")

@@ -517,7 +517,7 @@ def _medians(rows: Floats) -> Floats:
     return np.asarray(np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e)))
 
 
-@check("DEX1-FRESH-01", "DEX3-FRESH-01")
+@check("DEX1-FRESH-01", "DEX3-FRESH-01", "DEX1-FRESH-04")
 def fresh(ctx: Context) -> Outcome:
     """How long a position stays the same while the hand moves."""
     worst: Outcome | None = None

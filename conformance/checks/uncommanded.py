@@ -33,6 +33,8 @@ OWN_RULE = (
     *("guard-drive", "guard", "guard-latch", "guard-clear"),
 )
 """Stimuli during which other requirements say what may move."""
+_STOPPED = ("silence", "rejected")
+"""Those at whose end a hand has stopped: its next motion starts from there."""
 _GRID = 0.01  # s, of the cells in which extremes of q and of goals are compared
 _AT_REST_S = 0.3  # s without motion after which a joint is at rest
 _UNDRIVEN_S = 0.1  # the same before a command: nothing has been asked to move
@@ -54,8 +56,11 @@ class _Goals:
     high: Floats
 
 
-def _goals(ctx: Context, joint: int) -> _Goals:
-    """The goals of one joint; a command that is not finite is none."""
+def _goals(ctx: Context, joint: int, *, timeout: float = np.inf) -> _Goals:
+    """The goals of one joint; a command that is not finite is none.
+
+    :param timeout: s after which a command is no goal any more.
+    """
     commands, spec = ctx.commands, ctx.joints[joint]
     used = ctx.recording.dialect.gains_are_used
     fields = (commands.q, commands.dq, commands.tau, commands.kp, commands.kd)
@@ -67,8 +72,10 @@ def _goals(ctx: Context, joint: int) -> _Goals:
         low[driven], high[driven] = -np.inf, np.inf
         limp = (commands.kp[finite, joint] <= 0) & ~driven
         low[limp], high[limp] = np.inf, -np.inf
-    # a service that was started again has no goal
-    starts = np.asarray([ctx.span(p)[1] for p in ctx.phases("shutdown")], dtype=np.float64)
+    # a service that was started again has no goal, nor has one that brakes without commands
+    lost = t[:-1][np.diff(t) > timeout] + timeout
+    started = [ctx.span(p)[1] for p in ctx.phases("shutdown")]
+    starts = np.sort(np.concatenate((np.asarray(started, dtype=np.float64), lost)))
     rows = np.searchsorted(t, starts)
     t = np.insert(t, rows, starts)
     low, high = np.insert(low, rows, np.inf), np.insert(high, rows, -np.inf)
@@ -220,7 +227,7 @@ def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
     """How far q is outside of the hull of its earlier position and its goals, rad, and when."""
     good = np.isfinite(ctx.states.q[:, joint])
     t, q = ctx.states.t[good], ctx.states.q[good, joint]
-    goals = _goals(ctx, joint)
+    goals = _goals(ctx, joint, timeout=ctx.recording.model.command_timeout)
     before = round(ctx.tolerance("before_s") / _GRID)
     late = before + round(ctx.tolerance("max_delay_s") / _GRID)
     if len(t) < 2 or not len(goals.t):
@@ -242,10 +249,12 @@ def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
     now, then = here[late:], here[late - before : cells - before]
     away = np.maximum(np.minimum(low, then) - now, now - np.maximum(high, then))
     away[~seen[late:]] = np.nan
-    for begin, end in _excluded(ctx):
-        # what it was moved by there, it may still come back from
-        i, j = (round((x - origin) / _GRID) - late for x in (begin, end))
-        away[max(i, 0) : max(j + before, 0)] = np.nan
+    for name in OWN_RULE:
+        # what it was moved by there, it may still come back from; a hand that brakes has stopped
+        more = 0 if name in _STOPPED else before
+        for begin, end in (ctx.span(p) for p in ctx.recording.phases(name, ctx.side)):
+            i, j = (round((x - origin) / _GRID) - late for x in (begin, end))
+            away[max(i, 0) : max(j + more, 0)] = np.nan
     if not np.isfinite(away).any():
         return None
     i = int(np.nanargmax(away))

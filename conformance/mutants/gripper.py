@@ -188,6 +188,22 @@ class ShakenVelocity(_Fields):
         return {**fields, "dq": fields["dq"] + shaken}
 
 
+@wrong_hand("DEX1-FRESH-04")
+class RepeatsItsStates(_Fields):
+    """Measures 67 times a second, and publishes each measurement five times."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.turns = dict.fromkeys(self.sides, 0)
+        self.measured: dict[Side, dict[str, Any]] = {}
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        if self.turns[side] % 5 == 0:
+            self.measured[side] = fields
+        self.turns[side] += 1
+        return dict(self.measured[side])
+
+
 @wrong_hand("DEX1-FIELD-19")
 class VelocityByTurns(_Fields):
     """Measures every second state, and takes dq over one period: twice the speed and 0 by turns."""
@@ -768,6 +784,21 @@ class StiffnessSaturates(ReferenceService):
     hand = _Saturates
 
 
+class _Boosts(ReferenceHand):
+    def motor_torque(self) -> float:
+        tau = super().motor_torque()
+        if self.contact() > 0.0 and not self.braking:
+            return min(max(2.0 * tau, -self.tau_max), self.tau_max)
+        return tau
+
+
+@wrong_hand("DEX1-FORCE-18")
+class BoostsWhereItIsBlocked(ReferenceService):
+    """Presses with twice the torque that it was commanded."""
+
+    hand = _Boosts
+
+
 class _WeakAgain(ReferenceHand):
     contacts = 0
     touching = False
@@ -826,6 +857,17 @@ class NoWatchdog(ReferenceService):
     """Follows the last command for ever."""
 
     hand = _NoWatchdog
+
+
+class _Hasty(ReferenceHand):
+    timeout = 0.6 * ReferenceHand.timeout
+
+
+@wrong_hand("DEX1-WDOG-06")
+class BrakesEarly(ReferenceService):
+    """Brakes 0.6 s after the last command."""
+
+    hand = _Hasty
 
 
 class _FedByAnything(ReferenceHand):
@@ -1147,6 +1189,52 @@ class OldGoalFirst(ReferenceService):
     """Carries out the command from before a silence for 0.3 s when the next ones come."""
 
     hand = _OldGoalFirst
+
+
+class _BeginsAtZero(ReferenceHand):
+    until = -math.inf
+
+    def command(self, motor: Motor) -> None:
+        if math.isfinite(motor.q) and self.goal is not None and self.braking:
+            self.until = self.now + 0.2
+        if self.now < self.until:
+            motor = replace(motor, q=0.0 * motor.q)
+        super().command(motor)
+
+
+@wrong_hand("DEX1-PATH-01", also=("DEX1-WDOG-03",))
+class BeginsAtZero(ReferenceService):
+    """Goes towards 0 for 0.2 s when the commands come again after a silence."""
+
+    hand = _BeginsAtZero
+
+
+class _LosesTheFirst(ReferenceHand):
+    until = -math.inf
+
+    def command(self, motor: Motor) -> None:
+        if self.goal is not None and self.braking and self.now > self.until + 0.5:
+            self.until = self.now + 0.2
+        if self.now >= self.until:
+            super().command(motor)
+
+
+@wrong_hand("DEX1-WDOG-05")
+class LosesTheFirstAfterSilence(ReferenceService):
+    """Drops commands for 0.2 s after a time-out, while the motor is switched on."""
+
+    hand = _LosesTheFirst
+
+
+@wrong_hand("DEX1-SIDE-03", also=("DEX1-GAIN-01",), dialect="unitree_actuator")
+class GainsOfTheOtherSide(ReferenceService):
+    """Drives the left hand by the gains of the right one."""
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        super().receive(topic, payload, client)
+        left, right = (self.hands.get(side) for side in Side)
+        if left is not None and right is not None and left.goal and right.goal:
+            left.goal = replace(left.goal, kp=right.goal.kp, kd=right.goal.kd)
 
 
 @wrong_hand("DEX1-STILL-01", also=("DEX1-GAIN-05",))

@@ -7,6 +7,9 @@ listen         no commands; state must flow
 approach       slowly to mid stroke
 step           large steps of one side, the others hold
 ends           fully open, and fully closed where there is no object
+grip           (first) close on the object before anything has disturbed the hand
+stiffness      a torque pushes a hand that is held by kp: in the free, before anything has
+               disturbed it, after the bad commands and at the end
 dead-zone      where a dialect has them (``unitree_hg``): the inner limits of the zones that mean
                fully open and fully closed
 fingerprint    steps to compare the ``recover`` steps with
@@ -17,8 +20,10 @@ negative,
 foreign
 beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
-limp           zero gains, with a q far towards closed
-pull, push     a torque alone, without a position gain: towards closed, and towards open
+limp           zero gains of one side after the other, with a q far towards closed and then open
+unlike         steps of the other side meanwhile
+pull, push     a torque alone, without a position gain: towards closed, and towards open; one side
+               is pulled while the other one is pushed
 replay         a recorded session, as recorded
 single         commands that are sent once
 load           many commands a second, and a reader that is slow
@@ -41,6 +46,7 @@ company        a second client commands the same: steps of each side alone, and 
                opposite directions
 restart        the client goes away, another comes, and makes such steps; each kind of bad
                commands again
+regrip         a grip after all of this
 shutdown       the service is stopped and started again while the hand grips or moves
 restarted      no commands
 service-       such steps after that; silence again
@@ -56,7 +62,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
+from dexkit.conformance.stimuli.hand import ASIDE, ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
 from dexkit.models import ModeByte
@@ -86,6 +92,9 @@ _NEARLY = 0.15
 """Part of the stroke to which a free hand is closed before it is driven open."""
 _BACK = 0.13
 """Part of the stroke by which a free hand is commanded back after a restart of its service."""
+_FIRST_GRIP = 1.8
+"""Seconds of the first grip: until a driver has lowered its effort (DEX1-FORCE-10), and a little
+more."""
 _GRIP, _LONG_GRIP = 3.0, 30.0
 """Seconds of equal commands between two pushes; those of a thorough run."""
 _SQUEEZE = 1.3
@@ -97,6 +106,10 @@ _CAMERA_HZ = 30.0
 """Commands a second of a client that sends one for each picture of a camera."""
 _NUDGE, _NUDGE_SECONDS = 0.6, 0.3
 """A torque that pushes a hand that is held by kp, N m, and for how long, s."""
+_BACK_SECONDS = 0.15
+"""Seconds in which it comes back from there."""
+_LIMP_SECONDS = 0.25
+"""Seconds of zero gains with one q; the other side makes a step meanwhile, as in ``single``."""
 _SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (8.0, 0.2))
 """kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 1.6 N m each. The last
 is beyond what a byte holds in steps of 1/32, and about the lead of xr_teleoperate."""
@@ -104,8 +117,9 @@ _SOFT_SECONDS = 0.5
 _VENDORS_MODE = 1
 """Mode byte of the vendor's test programs; teleoperation sends 0
 (docs/sources/unitree-dex.md#b1)."""
-_ALONE_SECONDS = 0.15
-"""Seconds in which the first command after a silence is the only one."""
+_ALONE_SECONDS = 0.35
+"""Seconds in which the first command after a silence is the only one: a hand that has received it
+has begun to move by then (DEX1-MOVE-09)."""
 _BEYOND, _BEYOND_TAU, _BEYOND_AFTER = 0.05, 0.7, 0.3
 """A grip by a q below the closed end: by which part of the stroke, its torque, N m, and how much
 longer than a time-out it lasts, s: a command that is clamped is in force as any other."""
@@ -147,6 +161,8 @@ class GripperScript(HandScript):
                 yield from self._steps(side)
         if "ends" in self.plan.phases:
             yield from self._ends()
+        if self.plan.phases & {"grip", "stiffness"}:
+            yield from self._at_first()
         if "dead-zone" in self.plan.phases and self.plan.dialect.interface_specification:
             yield from self._dead_zones()
         if "fingerprint" in self.plan.phases:
@@ -157,9 +173,10 @@ class GripperScript(HandScript):
                 yield from self._bad(name)
         if "foreign" in self.plan.phases:
             yield from self._foreign()
+        yield from self._stiffness(sides)
         if "burst" in self.plan.phases:
             yield from self._flood()
-        if self.plan.phases & {"limp", "push", "drive"} and self._gains_used:
+        if self.plan.phases & {"limp", "unlike", "push", "drive"} and self._gains_used:
             yield from self._undriven()
         if not self._gains_used:
             self._gainless = True
@@ -239,6 +256,45 @@ class GripperScript(HandScript):
             phase = self._begin("ends", free, targets={s: {0: 0.0} for s in free})
             yield from self._until_settled(phase, free, least=0.6, most=2.8)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
+
+    def _at_first(self) -> Steps:
+        """How firmly the hand grips and holds before anything has disturbed it."""
+        sides = self.plan.sides
+        pressing = [s for s in sides if s in self.plan.objects and "grip" in self.plan.phases]
+        free = [s for s in sides if s not in pressing]
+        if pressing:
+            self._report("a first grip")
+            self._grip = self._by_the_lead(pressing)
+            beyond = {s: {0: motors[0].q} for s, motors in self._grip.items()}
+            phase = self._begin("grip", pressing, targets=beyond)
+            yield from self._hold(0.3)
+            yield from self._stiffness(free)
+            while self._elapsed(phase) < _FIRST_GRIP:
+                yield from self._command()
+            self._end(phase)
+            self._grip = {}
+            yield from self._turn(
+                "center", {s: self._home(s) for s in pressing}, least=0.5, stand=self._standing
+            )
+        else:
+            yield from self._stiffness(free)
+
+    def _stiffness(self, sides: Sequence[Side]) -> Steps:
+        """Push hands that are held in the free by a torque."""
+        if not sides or not self._gains_used or "stiffness" not in self.plan.phases:
+            return
+        phase = self._begin("stiffness", sides)
+        yield from self._hold(_NUDGE_SECONDS, self._pushed(sides))
+        self._end(phase)
+        yield from self._hold(_BACK_SECONDS)
+
+    def _pushed(self, sides: Sequence[Side]) -> dict[Side, Motors]:
+        return {s: (replace(self._motors(s, self._goal[s])[0], tau=_NUDGE),) for s in sides}
+
+    def _by_the_lead(self, sides: Sequence[Side]) -> dict[Side, Motors]:
+        """Commands into the objects of these sides by xr_teleoperate's lead."""
+        lead = LEAD * self._stroke
+        return {s: (Motor(q=max(self.plan.objects[s] - lead, 0.0)),) for s in sides}
 
     def _dead_zones(self) -> Steps:
         self._report("the zones that mean fully open and fully closed")
@@ -332,9 +388,11 @@ class GripperScript(HandScript):
     def _before_shutdown(self) -> Steps:
         """Grip and move: what was commanded last must not be in force after the restart."""
         sides = self.plan.sides
+        yield from self._stiffness(sides)
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
         self._grip = dict(self._squeeze(pressing))
+        regrip = self._begin("regrip", pressing) if pressing else None
         if free:
             nearly = dict.fromkeys(free, (_NEARLY * self._stroke,))
             yield from self._turn("center", nearly, least=0.5, stand=self._standing)
@@ -342,6 +400,8 @@ class GripperScript(HandScript):
             yield from self._drive(free, 0.16)
         elif pressing:
             yield from self._hold(0.5)
+        if regrip is not None:
+            self._end(regrip)
 
     def _not_restarted(self) -> Steps:
         self._grip = {}
@@ -363,7 +423,7 @@ class GripperScript(HandScript):
             return
         sides = self.plan.sides
         if "push" in self.plan.phases:
-            yield from self._pushes(sides, ("push",))
+            yield from self._pushes(dict.fromkeys(sides, "push"))
         yield from self._everyone("center", {s: (self._low(s),) for s in sides})
         pressing = [s for s in sides if s in self.plan.objects]
         self._grip = dict(self._squeeze(pressing))
@@ -386,37 +446,58 @@ class GripperScript(HandScript):
         """Commands without a position gain."""
         sides = self.plan.sides
         yield from self._everyone("center", dict.fromkeys(sides, (0.8 * self._stroke,)))
-        if "limp" in self.plan.phases:
+        if self.plan.phases & {"limp", "unlike"}:
             self._report("commands without force (zero gains): the hand must not be pulled")
-            # on either side of the hand: a weight pulls the same way at both
-            for places in ({s: self._low(s) for s in sides}, dict.fromkeys(sides, self._stroke)):
-                phase = self._begin("limp", sides, targets={s: {0: q} for s, q in places.items()})
-                limp = {s: (Motor(q=q, kp=0.0, kd=0.0),) for s, q in places.items()}
-                yield from self._hold(0.24, limp)
-                self._end(phase)
+            for side in sides:
+                yield from self._limp(side)
         if "push" in self.plan.phases:
-            yield from self._pushes(sides)
+            # in opposite directions, so that a torque of the other side's shows
+            for names in (("pull", "push"), ("push", "pull")):
+                yield from self._pushes(dict(zip(sides, names, strict=False)))
         if "drive" in self.plan.phases:
             yield from self._drive(sides, 0.16, seconds=0.35)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
-    def _pushes(self, sides: Sequence[Side], names: Sequence[str] = ("pull", "push")) -> Steps:
-        """Close and open by a torque alone, which grows until the hand moves."""
+    def _limp(self, side: Side) -> Steps:
+        """Zero gains of one side, with a q on either side of the hand, as a weight pulls the same
+        way at both; the others make steps by their own gains.
+        """
+        others = [s for s in self.plan.sides if s != side]
+        for q in (self._low(side), self._stroke):
+            phase = self._begin("limp", (side,), targets={side: {0: q}})
+            ends = [phase]
+            if others:
+                self._goal.update({s: self._aside(s, 0.4 * ASIDE) for s in others})
+                targets = {s: dict(enumerate(self._goal[s])) for s in others}
+                ends.append(self._begin("unlike", others, targets=targets))
+            yield from self._hold(_LIMP_SECONDS, {side: (Motor(q=q, kp=0.0, kd=0.0),)})
+            for ended in ends:
+                self._end(ended)
+
+    def _pushes(self, names: Mapping[Side, str]) -> Steps:
+        """Close or open each side by a torque alone, which grows until the hand moves.
+
+        :param names: ``pull`` or ``push`` for each side.
+        """
         self._report("a torque without a position gain: the hand must move with it")
-        for name in names:
-            way, end = (-1, 0.0) if name == "pull" else (1, self._stroke)
-            phase = self._begin(name, sides, targets={s: {0: end} for s in sides})
-            torque = dict.fromkeys(sides, _PUSH[0])
-            while self._elapsed(phase) < _PUSH_SECONDS:
-                for s in sides:
-                    if way * self._obs.dq.get(s, (0.0,))[0] < _PUSH_SPEED * self._stroke:
-                        torque[s] = min(torque[s] * 1.02, _PUSH[1])
-                yield from self._command(
-                    {
-                        s: (Motor(self._goal[s][0], tau=way * torque[s], kp=0.0, kd=_PUSH_DAMPING),)
-                        for s in sides
-                    }
-                )
+        ways = {s: -1 if name == "pull" else 1 for s, name in names.items()}
+        phases = []
+        for name in dict.fromkeys(names.values()):
+            mine = [s for s in names if names[s] == name]
+            end = 0.0 if name == "pull" else self._stroke
+            phases.append(self._begin(name, mine, targets={s: {0: end} for s in mine}))
+        torque = dict.fromkeys(names, _PUSH[0])
+        while self._elapsed(phases[0]) < _PUSH_SECONDS:
+            for s, way in ways.items():
+                if way * self._obs.dq.get(s, (0.0,))[0] < _PUSH_SPEED * self._stroke:
+                    torque[s] = min(torque[s] * 1.02, _PUSH[1])
+            yield from self._command(
+                {
+                    s: (Motor(self._goal[s][0], tau=way * torque[s], kp=0.0, kd=_PUSH_DAMPING),)
+                    for s, way in ways.items()
+                }
+            )
+        for phase in phases:
             self._end(phase)
 
     def _squeeze(self, sides: Sequence[Side]) -> dict[Side, Motors]:
@@ -465,12 +546,11 @@ class GripperScript(HandScript):
         long enough to show. A torque pushes the free hand at first and at last.
         """
         self._report("the same commands for long: they must stay in force")
-        lead = LEAD * self._stroke
-        self._grip = {s: (Motor(q=max(self.plan.objects[s] - lead, 0.0)),) for s in pressing}
+        self._grip = self._by_the_lead(pressing)
         period, self._period_ns = self._period_ns, round(1e9 / _CAMERA_HZ)
         beyond = {s: {0: motors[0].q} for s, motors in self._grip.items()}
         gripping = [self._begin("grip", pressing, targets=beyond)] if pressing else []
-        pushed = {s: (replace(self._motors(s, self._goal[s])[0], tau=_NUDGE),) for s in free}
+        pushed = self._pushed(free)
         nudged = free and self._gains_used
         yield from self._hold(_NUDGE_SECONDS)
         for seconds in (_LONG_GRIP if self._patient else _GRIP, 0.1):

@@ -75,6 +75,9 @@ class HandScript(Script[Side]):
         """Whether to wait for what takes a minute: once in a thorough run."""
         self._echoed = False
         """Whether a second client sends each command as well."""
+        self._divided = False
+        """Whether a second client commands all sides but the first, and the first client none of
+        them."""
         self._period_ns = round(1e9 / self._model.command_rate)
         session = plan.session if "replay" in plan.phases else None
         sides = [s for s in plan.sides if session and s in session.sides]
@@ -161,6 +164,16 @@ class HandScript(Script[Side]):
         if self._held[0] != self._goal:  # they are held for long, and encoded once
             hold = {s: self._motors(s, q) for s, q in self._goal.items()}
             self._held = (dict(self._goal), self._codec.encode(hold))
+        if self._divided:
+            first, *others = self.plan.sides
+            mine, theirs = (
+                self._codec.encode({s: self._motors(s, self._goal[s]) for s in sides})
+                for sides in ([first], others)
+            )
+            yield from self._send(mine)
+            self._next_ns += self._period_ns
+            yield from self._do(Send(theirs, self._next_ns, by=Role.RIVAL))
+            return
         yield from self._send(self._held[1])
         if self._echoed:
             self._next_ns += self._period_ns
@@ -245,9 +258,11 @@ class HandScript(Script[Side]):
             phase, self.plan.sides, least=least, most=most, stand=self._standing
         )
 
-    def _in_turn(self, name: str) -> Steps:
+    def _in_turn(self, name: str, *, divided: bool = False) -> Steps:
         """Steps of one side while the other rests, and of both in opposite directions, as phases
         of that name.
+
+        :param divided: another client commands the other side in the last of them.
         """
         home, away = dict(self._goal), self._other_place()
         first, *others = self.plan.sides
@@ -256,6 +271,7 @@ class HandScript(Script[Side]):
             turns[-1][side] = away[side]
             turns.append({side: home[side]})
         for goals in turns:
+            self._divided = divided and goals is turns[-1]
             yield from self._turn(name, goals, least=0.5, stand=self._standing)
 
     def _turn(
@@ -537,13 +553,14 @@ class HandScript(Script[Side]):
         yield from self._everyone("recover", dict(self._goal), most=1.5, after="two-writers")
 
     def _company(self) -> Steps:
-        """A second client sends each command as well."""
+        """A second client sends each command as well, or commands the other hand."""
         self._report("a second client commands the same: it must make no difference")
         yield from self._do(Join(Role.RIVAL))
         period = self._period_ns
         self._period_ns, self._echoed = period // 2, True
-        yield from self._in_turn("company")
-        self._period_ns, self._echoed = period, False
+        several = len(self.plan.sides) > 1 and not self._codec.shared
+        yield from self._in_turn("company", divided=several)
+        self._period_ns, self._echoed, self._divided = period, False, False
         yield from self._do(Leave(Role.RIVAL))
 
     def _beside(

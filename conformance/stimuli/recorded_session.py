@@ -17,7 +17,7 @@ from dexkit.traces import open_trace, sample_path
 
 __all__ = ["DEFAULT_SECONDS", "Session"]
 
-DEFAULT_SECONDS = 10.0
+DEFAULT_SECONDS = 5.5
 FINGERS_SECONDS = 5.0
 """The same for hands of several joints, whose other stimuli take longer."""
 

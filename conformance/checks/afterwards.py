@@ -1,0 +1,231 @@
+"""What a hand does after something has disturbed it: bad commands, silence, another client."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.firmness import STIFFNESS, nudges
+from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
+from dexkit.conformance.checks.safety import arrival
+from dexkit.conformance.median import median
+from dexkit.hand import Floats
+
+__all__: list[str] = []
+
+_AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
+_FAST_S = 0.05
+"""Seconds over which the fastest part of a step is measured: several states of the slowest rate."""
+
+
+@check("DEX1-ABUSE-01", "DEX3-ABUSE-01")
+def unchanged(ctx: Context) -> Outcome:
+    """Duration and speed of good steps after each abuse, and the displacement by a torque, compared
+    with those before any; and the errors of the steps between the phases.
+    """
+    between = [*ctx.phases("center"), *ctx.phases()]
+    for phase in (p for p in between if obeyed_before(ctx, p)):
+        for step in steps_of(ctx, phase):
+            if step.error > ctx.tolerance("max_error_stroke", step.joint):
+                return disobeyed(ctx, "between two phases", step)
+    first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
+    wrong = _slower(ctx, first) or _other_stiffness(ctx)
+    return wrong or _longer(ctx, first)
+
+
+def _like(first: list[Step], step: Step) -> list[Step]:
+    return [s for s in first if s.joint == step.joint and 0.7 < step.size / s.size < 1.4]
+
+
+def _longer(ctx: Context, first: list[Step]) -> Outcome:
+    """The duration of the slowest step, as a part of that of the same step before."""
+    worst: tuple[float, Step, float, float, float] | None = None
+    for phase in (p for name in _AFTER_ABUSE for p in ctx.phases(name)):
+        for step in steps_of(ctx, phase):
+            seconds = _duration(step)
+            known = [d for d in map(_duration, _like(first, step)) if d is not None]
+            if seconds is None or not known:
+                continue  # whether it arrives at all is judged by other requirements
+            slack = ctx.tolerance("slack_s" if phase.name == "recover" else "soft_start_s")
+            ratio = seconds / (max(known) + slack)
+            if worst is None or ratio > worst[0]:
+                worst = ratio, step, seconds, max(known), slack
+    if worst is None:
+        return ctx.skipped("no two steps that can be compared")
+    ratio, step, seconds, before, slack = worst
+    text = (
+        f"{step.name}{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {before:.2f} s in the "
+        "same step before any bad command"
+    )
+    longest = ctx.tolerance("max_ratio") * (before + slack)
+    if ratio <= ctx.tolerance("max_ratio"):
+        met = ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
+        return met.timed(seconds, longest, span=(step.begin, step.end))
+    return (
+        ctx.failed(
+            f"x {ratio:.1f}",
+            text,
+            ctx.at(ctx.states.topic, step.begin, step.end),
+            ratio=ratio,
+        )
+        .about(step.joint)
+        .timed(seconds, longest)
+        .if_late(seconds - longest)
+    )
+
+
+def _duration(step: Step) -> float | None:
+    """Seconds from 10 to 90 % of a step; None if it does not get there."""
+    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
+    if not (part >= 0.9).any():
+        return None
+    return float(step.t[np.argmax(part >= 0.9)] - step.t[np.argmax(part >= 0.1)])
+
+
+def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
+    """The failure of a hand whose steps after bad commands have lost speed."""
+    for phase in ctx.phases("recover"):
+        if not obeyed_before(ctx, phase):
+            continue
+        for step in steps_of(ctx, phase):
+            now = _fastest(step)
+            known = [
+                # a hand of constant speed is no faster on a longer way, one like a spring is
+                fast * min(1.0, abs(step.size / s.size))
+                for s in _like(first, step)
+                if (fast := _fastest(s)) is not None
+            ]
+            if now is None or not known:
+                continue
+            was, least = min(known), ctx.tolerance("min_speed_part") * min(known)
+            if now < least:
+                text = (
+                    f"{step.name}{now:.1f} {ctx.unit}/s at its fastest in a step at "
+                    f"{step.begin:.1f} s, {was:.1f} {ctx.unit}/s in the same step before any bad "
+                    "command"
+                )
+                place = ctx.at(ctx.states.topic, step.begin, step.end)
+                outcome = ctx.failed(f"{now:.1f} {ctx.unit}/s", text, place, speed_rad_s=now)
+                late = 0.8 * abs(step.size) * (1.0 / max(now, 1e-3) - 1.0 / least)
+                return outcome.about(step.joint).if_late(late)
+    return None
+
+
+def _fastest(step: Step) -> float | None:
+    """The speed of a step's fastest part, rad/s; None if it has no such part or does not arrive."""
+    part = (step.q - step.start) / step.size if step.size else np.zeros(0)
+    if not (part >= 0.9).any():
+        return None
+    later = np.searchsorted(step.t, step.t + _FAST_S)
+    whole = np.flatnonzero(later < len(step.t))
+    if not len(whole):
+        return None
+    took = step.t[later[whole]] - step.t[whole]
+    return abs(step.size) * float(np.max((part[later[whole]] - part[whole]) / took))
+
+
+def _other_stiffness(ctx: Context) -> Outcome | None:
+    """The failure of a hand that a torque displaces more or less than it did at first."""
+    pushed = [*ctx.phases(STIFFNESS), *ctx.phases("nudge")]
+    found = nudges(ctx, [p for p in pushed if obeyed_before(ctx, p)])
+    if len(found) < 2:
+        return None
+    first, *later = sorted(found, key=lambda n: n.begin)
+    if first.way < ctx.tolerance("min_motion_stroke"):
+        return None
+    least, most = ctx.tolerance("min_way_part"), ctx.tolerance("max_way_part")
+    for nudge in later:
+        if not least * first.way <= nudge.way <= most * first.way:
+            text = (
+                f"a torque displaced it by {nudge.way:.3f} {ctx.unit} at {nudge.begin:.1f} s, and "
+                f"by {first.way:.3f} {ctx.unit} before any bad command"
+            )
+            place = ctx.at(ctx.states.topic, nudge.begin, nudge.end)
+            figure = f"{nudge.way:.3f} {ctx.unit}"
+            return ctx.failed(figure, text, place, motion_rad=nudge.way)
+    return None
+
+
+@check("DEX1-WDOG-05")
+def first_command_counts(ctx: Context) -> Outcome:
+    """How far the first command after a pause moves the hand before the next one comes."""
+    worst: tuple[float, Step, float] | None = None
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        for step in steps_of(ctx, phase):
+            sent = ctx.commands.t[ctx.commands.t >= step.begin]
+            if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint) or len(sent) < 2:
+                continue
+            alone = float(sent[1] - sent[0])
+            if alone < ctx.tolerance("min_alone_s"):
+                continue
+            way = (step.q[step.t <= sent[1]] - step.start) * np.sign(step.size)
+            moved = float(way.max()) if len(way) else 0.0
+            if worst is None or moved < worst[0]:
+                worst = moved, step, alone
+    if worst is None:
+        return ctx.skipped("no command after a pause was alone for long enough")
+    moved, step, alone = worst
+    text = (
+        f"the first command after a pause, alone for {alone:.2f} s, moved it by {moved:.3f} "
+        f"{ctx.unit} towards {step.target:.2f} {ctx.unit}"
+    )
+    limit = ctx.tolerance("min_motion_stroke", step.joint)
+    if moved >= limit:
+        return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
+    place = ctx.at(ctx.states.topic, step.begin, step.begin + alone)
+    outcome = ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved)
+    return outcome.about(step.joint).placed(moved, limit, at_least=True).if_late(alone)
+
+
+@check("DEX1-SAFE-09", "DEX3-SAFE-10")
+def company(ctx: Context) -> Outcome:
+    """The steps of this hand while a second client sends the same commands, and after one has gone
+    that has commanded another place.
+    """
+    gone = [p for p in ctx.phases("recover") if p.params.get("after") == "two-writers"]
+    if gone:
+        after = arrival(ctx, "after a second client had gone", gone)
+        if after.met is False:
+            return after
+    return arrival(ctx, "while a second client commanded the same")
+
+
+@check("DEX1-WDOG-06")
+def in_force(ctx: Context) -> Outcome:
+    """Force, or speed, shortly before the time-out, as a part of that at the last command."""
+    window, states = ctx.tolerance("window_s"), ctx.states
+    good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
+    worst: tuple[float, str, float] | None = None
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        _, end = ctx.span(phase)
+        sent = good[good <= end]
+        if not len(sent) or end - sent[-1] < ctx.tolerance("until_s"):
+            continue
+        last = float(sent[-1])
+        late = last + ctx.tolerance("until_s") - window
+        spans = [states.between(a, a + window) for a in (last - window, late)]
+        if min(len(states.t[s]) for s in spans) < 5:
+            continue
+        found = []
+        if ctx.object_at is not None:
+            before, after = (median(np.abs(states.tau[s, 0])) for s in spans)
+            if before >= ctx.tolerance("min_tau_nm"):
+                found.append((after / before, f"presses with {after:.2f} N m, {before:.2f} N m"))
+        before, after = (_speed(states.t[s], states.q[s, 0]) for s in spans)
+        if not found and abs(before) >= ctx.tolerance("min_speed_stroke"):
+            unit = f"{ctx.unit}/s"
+            found.append((after / before, f"moves at {after:.2f} {unit}, {before:.2f} {unit}"))
+        for part, what in found:
+            if worst is None or part < worst[0]:
+                worst = part, what, late
+    if worst is None:
+        return ctx.skipped("it neither pressed nor moved when the commands stopped")
+    part, what, at = worst
+    text = f"{ctx.tolerance('until_s'):g} s after the last command it {what} at that command"
+    if part >= ctx.tolerance("min_part"):
+        return ctx.passed(f"{part:.0%}", text, part=part)
+    return ctx.failed(f"{part:.0%}", text, ctx.at(states.topic, at, at + window), part=part)
+
+
+def _speed(t: Floats, q: Floats) -> float:
+    return float(q[-1] - q[0]) / max(float(t[-1] - t[0]), 1e-3)

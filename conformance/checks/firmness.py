@@ -1,0 +1,133 @@
+"""How firmly a gripper holds and presses: by a torque that pushes at it, and on an object.
+
+A gripper that is held by kp is a spring. How far a torque displaces it in the free tells how stiff
+that spring is; on an object it must press as the same spring does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.median import median
+from dexkit.conformance.stimulus_record import Phase
+
+__all__ = ["Nudge", "nudges"]
+
+STIFFNESS = "stiffness"
+"""The phase of pushes that are spread over a run."""
+
+
+@dataclass(frozen=True)
+class Nudge:
+    """A push by a torque at a gripper that is held by kp.
+
+    :param way: rad, by which the torque displaces it; ``asked`` is that torque through kp.
+    """
+
+    begin: float
+    end: float
+    way: float
+    asked: float
+
+
+def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
+    """The pushes of these phases, by default of those that the requirement needs."""
+    found = []
+    for phase in ctx.phases() if phases is None else phases:
+        begin, end = ctx.span(phase)
+        before = ctx.states.q[ctx.states.between(begin - 0.15, begin), 0]
+        after = ctx.states.q[ctx.states.between(end - 0.1, end), 0]
+        given = (ctx.commands.t >= begin) & (ctx.commands.t < end)
+        if not len(before) or not len(after) or not given.any():
+            continue
+        kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
+        if kp > 0 and tau != 0:  # a damaged recording may hold another command here
+            way = (median(after) - median(before)) * (1 if tau > 0 else -1)
+            found.append(Nudge(begin, end, way, abs(tau) / kp))
+    return found
+
+
+@check("DEX1-HOLD-01")
+def held(ctx: Context) -> Outcome:
+    """The displacement by a push after a long hold, compared with that by the same push before."""
+    found = nudges(ctx)
+    if len(found) < 2:
+        return ctx.skipped("no state during two pushes")
+    least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
+    shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
+    if not shown:
+        return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
+    pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
+    for first, last in pairs:
+        text = (
+            f"a torque displaced it by {first.way:.3f} {ctx.unit}, and after "
+            f"{last.begin - first.end:.1f} "
+            f"s of equal commands by {last.way:.3f} {ctx.unit}"
+        )
+        if not least * first.way <= last.way <= most * first.way:
+            place = ctx.at(ctx.states.topic, last.begin, last.end)
+            return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
+    if not pairs:
+        return ctx.absent("the first push displaced it too little to compare the last with it")
+    return ctx.passed(f"{last.way:.3f} {ctx.unit}", text, motion_rad=last.way)
+
+
+@check("DEX1-GAIN-05")
+def stiffness(ctx: Context) -> Outcome:
+    """The largest displacement by a torque, as a part of that torque through kp."""
+    found = nudges(ctx, [*ctx.phases(), *ctx.phases(STIFFNESS)])
+    if not found:
+        return ctx.skipped("no state while it was pushed")
+    worst = max(found, key=lambda n: n.way / n.asked)
+    part = worst.way / worst.asked
+    text = (
+        f"a torque displaced it by {worst.way:.3f} {ctx.unit}, through kp by {worst.asked:.3f} "
+        f"{ctx.unit}"
+    )
+    limit = ctx.tolerance("max_part")
+    if part <= limit:
+        return ctx.passed(f"{part:.0%}", text, part=part).placed(worst.way, limit * worst.asked)
+    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
+    outcome = ctx.failed(f"{part:.0%}", text, place, part=part)
+    return outcome.placed(worst.way, limit * worst.asked)
+
+
+@check("DEX1-FORCE-18")
+def presses_as_it_holds(ctx: Context) -> Outcome:
+    """tau_est of each piece of contact, as a part of what the hand's own stiffness gives there."""
+    touch = ctx.object_at
+    if touch is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    found = nudges(ctx, [*ctx.phases(), *ctx.phases("nudge")])
+    shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
+    if not found:
+        return ctx.skipped("no state while it was pushed")
+    if len(shown) < len(found):
+        return ctx.absent("a torque does not displace this hand: it has a force of its own")
+    # in parts of kp; one that is stiffer than commanded may press more, and a softer one less
+    stiffest = max(1.0, *(n.asked / n.way for n in shown))
+    softest = min(1.0, *(n.asked / n.way for n in shown))
+    least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
+    worst: tuple[float, float, float, float, float, bool] | None = None
+    for piece in contacts(ctx, touch):
+        asked = piece.kp * (piece.q - piece.goal)
+        if asked < ctx.tolerance("min_asked_nm"):
+            continue
+        low = least * softest * min(asked, ctx.tolerance("max_asked_nm"))
+        high = most * stiffest * asked
+        for part, limit, over in ((piece.tau / high, high, True), (low / piece.tau, low, False)):
+            if worst is None or part > worst[0]:
+                worst = part, piece.tau, limit, piece.begin, piece.end, over
+    if worst is None:
+        return ctx.skipped("it never pressed on the object for long enough")
+    part, tau, limit, begin, end, over = worst
+    text = (
+        f"tau_est of {tau:.2f} N m in contact, where {'at most' if over else 'at least'} "
+        f"{limit:.2f} N m follow from the stiffness that it shows in the free"
+    )
+    if part <= 1.0:
+        return ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau).pressed(tau, limit, at_least=not over)
+    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
+    return outcome.pressed(tau, limit, at_least=not over)
