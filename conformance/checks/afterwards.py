@@ -7,7 +7,6 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.firmness import STIFFNESS, nudges
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
-from dexkit.conformance.checks.safety import arrival
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
@@ -175,19 +174,6 @@ def first_command_counts(ctx: Context) -> Outcome:
     place = ctx.at(ctx.states.topic, step.begin, step.begin + alone)
     outcome = ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved)
     return outcome.about(step.joint).placed(moved, limit, at_least=True).if_late(alone)
-
-
-@check("DEX1-SAFE-09", "DEX3-SAFE-10")
-def company(ctx: Context) -> Outcome:
-    """The steps of this hand while a second client sends the same commands, and after one has gone
-    that has commanded another place.
-    """
-    gone = [p for p in ctx.phases("recover") if p.params.get("after") == "two-writers"]
-    if gone:
-        after = arrival(ctx, "after a second client had gone", gone)
-        if after.met is False:
-            return after
-    return arrival(ctx, "while a second client commanded the same")
 
 
 @check("DEX1-WDOG-06")

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
+from dexkit.hand import Floats
 
 __all__ = ["Nudge", "nudges"]
 
 STIFFNESS = "stiffness"
 """The phase of pushes that are spread over a run."""
+_PEAKS_S, _FEW_PEAKS = 1.05, 3
+"""Seconds of contact in which peaks are counted, and how many are no single wrong value."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,36 @@ def stiffness(ctx: Context) -> Outcome:
     return outcome.placed(worst.way, limit * worst.asked)
 
 
+@dataclass(frozen=True)
+class _Peak:
+    """A piece of contact, and the states in which tau_est is above its limit, N m."""
+
+    begin: float
+    end: float
+    states: int
+    count: int
+    limit: float
+    above: Floats
+
+
+def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
+    """The failure of a hand that presses too hard again and again, each time for a moment only."""
+    for i, first in enumerate(peaks):
+        near = [p for p in peaks[i:] if p.end - first.begin <= _PEAKS_S]
+        count, states = sum(p.count for p in near), sum(p.states for p in near)
+        if count >= _FEW_PEAKS and count > ctx.tolerance("max_peaks_part") * states:
+            hit = next(p for p in near if p.count)
+            tau = float(hit.above.max())
+            text = (
+                f"tau_est of {tau:.2f} N m in contact in {count} of {states} states, where at most "
+                f"{hit.limit:.2f} N m follow from the stiffness that it shows in the free"
+            )
+            place = ctx.at(ctx.states.topic, near[0].begin, near[-1].end)
+            outcome = ctx.failed(f"{tau:.2f} N m", text, place, tau_nm=tau)
+            return outcome.pressed(tau, hit.limit)
+    return None
+
+
 @check("DEX1-FORCE-18")
 def presses_as_it_holds(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, as a part of what the hand's own stiffness gives there."""
@@ -111,15 +146,22 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
     softest = min(1.0, *(n.asked / n.way for n in shown))
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
     worst: tuple[float, float, float, float, float, bool] | None = None
+    peaks: list[_Peak] = []
     for piece in contacts(ctx, touch):
         asked = piece.kp * (piece.q - piece.goal)
         if asked < ctx.tolerance("min_asked_nm"):
             continue
         low = least * softest * min(asked, ctx.tolerance("max_asked_nm"))
         high = most * stiffest * asked
-        for part, limit, over in ((piece.tau / high, high, True), (low / piece.tau, low, False)):
+        for part, limit, over in (
+            (piece.tau / high, high, True),
+            (low / max(piece.tau, 1e-6), low, False),
+        ):
             if worst is None or part > worst[0]:
                 worst = part, piece.tau, limit, piece.begin, piece.end, over
+        tau = np.abs(ctx.states.tau[ctx.states.between(piece.begin, piece.end), 0])
+        above = tau[tau > high]
+        peaks.append(_Peak(piece.begin, piece.end, len(tau), len(above), high, above))
     if worst is None:
         return ctx.skipped("it never pressed on the object for long enough")
     part, tau, limit, begin, end, over = worst
@@ -128,6 +170,8 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
         f"{limit:.2f} N m follow from the stiffness that it shows in the free"
     )
     if part <= 1.0:
-        return ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau).pressed(tau, limit, at_least=not over)
+        return _hammers(ctx, peaks) or ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau).pressed(
+            tau, limit, at_least=not over
+        )
     outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
     return outcome.pressed(tau, limit, at_least=not over)

@@ -66,7 +66,12 @@ def late_joiner(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
 def restarted_client(ctx: Context) -> Outcome:
-    """The steps of a restarted client."""
+    """The steps of a restarted client, and of one that a second client has left alone again."""
+    alone = [p for p in ctx.phases("recover") if p.params.get("after") == "two-writers"]
+    if alone:
+        left = arrival(ctx, "after a second client had gone", alone)
+        if left.met is False:
+            return left
     for phase in ctx.phases():
         wrong = away_first(ctx, phase, "commanded by a restarted client")
         if wrong is not None:

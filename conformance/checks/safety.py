@@ -649,6 +649,12 @@ def two_writers(ctx: Context) -> Outcome:
     ).resting_on(*outcome.measures)
 
 
+@check("DEX1-SAFE-09", "DEX3-SAFE-10")
+def company(ctx: Context) -> Outcome:
+    """The steps of this hand while a second client sends the same, or commands the other hand."""
+    return arrival(ctx, "while a second client commanded the same")
+
+
 @check("DEX1-ORDER-02", "DEX3-ORDER-02")
 def old_stamps(ctx: Context) -> Outcome:
     """The step of a client whose clock is wrong."""

@@ -260,7 +260,7 @@ class GripperScript(HandScript):
     def _at_first(self) -> Steps:
         """How firmly the hand grips and holds before anything has disturbed it."""
         sides = self.plan.sides
-        pressing = [s for s in sides if s in self.plan.objects and "grip" in self.plan.phases]
+        pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
         if pressing:
             self._report("a first grip")

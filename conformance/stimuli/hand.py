@@ -101,7 +101,7 @@ class HandScript(Script[Side]):
         if OPERATOR in self.plan.phases:
             yield from operate(self)
             yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
-        if "two-writers" in self.plan.phases:
+        if self.plan.phases & {"two-writers", "restart"}:
             yield from self._two_writers()
         if "company" in self.plan.phases:
             yield from self._company()
