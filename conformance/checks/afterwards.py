@@ -13,6 +13,8 @@ from dexkit.hand import Floats
 __all__: list[str] = []
 
 _AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
+_AT_A_STOP = 0.05
+"""Part of the stroke from its ends in which a gripper may have come to its stop."""
 _FAST_S = 0.05
 """Seconds over which the fastest part of a step is measured: several states of the slowest rate."""
 
@@ -125,8 +127,7 @@ def _fastest(step: Step) -> float | None:
 
 def _other_stiffness(ctx: Context) -> Outcome | None:
     """The failure of a hand that a torque displaces more or less than it did at first."""
-    pushed = [*ctx.phases(STIFFNESS), *ctx.phases("nudge")]
-    found = nudges(ctx, [p for p in pushed if obeyed_before(ctx, p)])
+    found = nudges(ctx, [p for p in ctx.phases(STIFFNESS) if obeyed_before(ctx, p)])
     if len(found) < 2:
         return None
     first, *later = sorted(found, key=lambda n: n.begin)
@@ -198,7 +199,10 @@ def in_force(ctx: Context) -> Outcome:
             if before >= ctx.tolerance("min_tau_nm"):
                 found.append((after / before, f"presses with {after:.2f} N m, {before:.2f} N m"))
         before, after = (_speed(states.t[s], states.q[s, 0]) for s in spans)
-        if not found and abs(before) >= ctx.tolerance("min_speed_stroke"):
+        place, spec = median(states.q[spans[1], 0]), ctx.joints[0]
+        near = _AT_A_STOP * spec.stroke
+        free = spec.q_min + near < place < spec.q_max - near
+        if free and not found and abs(before) >= ctx.tolerance("min_speed_stroke"):
             unit = f"{ctx.unit}/s"
             found.append((after / before, f"moves at {after:.2f} {unit}, {before:.2f} {unit}"))
         for part, what in found:

@@ -373,10 +373,11 @@ def _course(ctx: Context, x: _Joint) -> tuple[Course, float]:
 
 
 def _unstable(ctx: Context) -> list[tuple[float, float]]:
-    """Begin and end of commands with negative gains: where they are put in force, the joint may
-    oscillate faster than the states show.
+    """Begin and end of commands with negative gains, and of those of two clients by turns: where
+    they are put in force, the joint may oscillate faster than the states show.
     """
-    return [ctx.span(p) for p in ctx.recording.phases("negative", ctx.side)]
+    names = ("negative", "two-writers")
+    return [ctx.span(p) for name in names for p in ctx.recording.phases(name, ctx.side)]
 
 
 def _factor(x: _Joint, c: Floats, lag: float) -> float:

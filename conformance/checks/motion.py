@@ -543,7 +543,10 @@ def by_its_own(ctx: Context) -> Outcome:
             if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
                 continue  # it was still under way, from where it was limp
             if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
-                part = (step.final - step.start) / step.size
+                # the step is short: its last states, not the median of some
+                final = float(np.median(step.q[step.t >= step.end - 0.03]))
+                step = replace(step, final=final)
+                part = (final - step.start) / step.size
                 if worst is None or part < worst[0]:
                     worst = part, step
                 if step.error > ctx.tolerance("max_error_stroke", step.joint):

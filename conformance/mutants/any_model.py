@@ -376,6 +376,8 @@ class Swapped(Service):
     ("DEX1-MOVE-06", "DEX3-MOVE-06"),
     also=(
         "DEX1-CMD-01",
+        "DEX1-LIFE-02",
+        "DEX3-LIFE-02",
         "DEX1-WDOG-03",
     ),
 )
@@ -471,7 +473,7 @@ class HomesWhenRestarted(_Moves):
 
 @wrong_hand(
     ("DEX1-STILL-01", "DEX3-STILL-01"),
-    also=("DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
+    also=("DEX1-FIELD-19", "DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
     sides=BOTH,
     whole=True,
     where=obeys_gains,
@@ -541,7 +543,13 @@ class DropsEverySecond(Service):
             super().motors(side, motors)
 
 
-@wrong_hand(("DEX1-CMD-01", "DEX3-CMD-01"), also=("DEX1-WDOG-04",))
+@wrong_hand(
+    ("DEX1-CMD-01", "DEX3-CMD-01"),
+    also=(
+        "DEX1-WDOG-03",
+        "DEX1-WDOG-04",
+    ),
+)
 class OneBehind(Service):
     """Obeys each command when the next one arrives."""
 
@@ -557,7 +565,7 @@ class OneBehind(Service):
 
 @wrong_hand(
     ("DEX1-SIDE-02", "DEX3-SIDE-02"),
-    also=("DEX1-MOVE-09", "DEX3-MOVE-08"),
+    also=("DEX1-WDOG-05", "DEX1-MOVE-09", "DEX3-MOVE-08"),
     sides=BOTH,
     where=takes_floats,
 )
@@ -600,6 +608,7 @@ class OneWatchdogForBoth(Service):
 @wrong_hand(
     ("DEX1-ABUSE-01", "DEX3-ABUSE-01"),
     also=(
+        "DEX1-FORCE-17",
         "DEX1-TRACK-02",
         "DEX1-FORCE-09",
         "DEX1-GAIN-04",
@@ -781,7 +790,6 @@ class StopsInABurst(Service):
 @wrong_hand(
     ("DEX1-SAFE-08", "DEX3-SAFE-09"),
     also=(
-        "DEX1-RATE-04",
         "DEX1-SAFE-09",
         "DEX3-SAFE-10",
         "DEX1-RATE-03",
@@ -805,7 +813,13 @@ class GivesUpOnTwo(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
-@wrong_hand(("DEX1-SAFE-08", "DEX3-SAFE-09"))
+@wrong_hand(
+    ("DEX1-SAFE-08", "DEX3-SAFE-09"),
+    also=(
+        "DEX3-LIFE-02",
+        "DEX1-LIFE-02",
+    ),
+)
 class StaysWithTheNewest(Service):
     """Obeys only the newest client, even when that one has gone."""
 
@@ -965,7 +979,13 @@ class ServesOnlyTheFirst(Service):
     serves_late_readers = False
 
 
-@wrong_hand(("DEX1-LIFE-02", "DEX3-LIFE-02"))
+@wrong_hand(
+    ("DEX1-LIFE-02", "DEX3-LIFE-02"),
+    also=(
+        "DEX3-SAFE-10",
+        "DEX1-SAFE-09",
+    ),
+)
 class BoundToOneClient(Service):
     """Obeys only the first client that ever commanded it."""
 
@@ -1069,6 +1089,7 @@ class ParksWhenItEnds(Service):
 @wrong_hand(
     ("DEX1-TRACK-01", "DEX3-TRACK-01"),
     also=(
+        "DEX1-PATH-01",
         "DEX1-CMD-01",
         "DEX3-CMD-01",
         "DEX1-WDOG-03",
@@ -1100,7 +1121,13 @@ class WaitsForRest(Service):
         )
 
 
-@wrong_hand(("DEX1-TRACK-02", "DEX3-TRACK-02"), also=("DEX1-GAIN-03",))
+@wrong_hand(
+    ("DEX1-TRACK-02", "DEX3-TRACK-02"),
+    also=(
+        "DEX1-GAIN-02",
+        "DEX1-GAIN-03",
+    ),
+)
 class Delayed(Service):
     """Obeys each command 0.15 s late."""
 

@@ -69,7 +69,7 @@ class Percent(_InUnit):
     takes = False
 
 
-@wrong_hand("DEX1-MOVE-01")
+@wrong_hand("DEX1-MOVE-01", also=("DEX1-FIELD-19",))
 class PercentCommands(_InUnit):
     """Obeys q as percent of the stroke instead of radians."""
 
@@ -501,7 +501,7 @@ class ShortStroke(ReferenceService):
         super().command(side, replace(motor, q=q))
 
 
-@wrong_hand("DEX1-SIDE-01")
+@wrong_hand("DEX1-SIDE-01", also=("DEX1-FORCE-18", "DEX1-SIDE-03", "DEX1-FORCE-12"))
 class Coupled(ReferenceService):
     """The left hand's goal leaks into the right hand's."""
 
@@ -810,7 +810,7 @@ class _WeakAgain(ReferenceHand):
         return 0.4 * tau if touches and self.contacts > 1 else tau
 
 
-@wrong_hand("DEX1-FORCE-09")
+@wrong_hand("DEX1-FORCE-09", also=("DEX1-FORCE-17",))
 class WeakAgain(ReferenceService):
     """Presses with 40 % of the force from its second contact on."""
 
@@ -840,7 +840,14 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
-@wrong_hand("DEX1-SAFE-02", also=("DEX1-PATH-01",), whole=True)
+@wrong_hand(
+    "DEX1-SAFE-02",
+    also=(
+        "DEX1-FIELD-19",
+        "DEX1-PATH-01",
+    ),
+    whole=True,
+)
 class NoLimits(ReferenceService):
     """Follows a q far outside the stroke."""
 
@@ -1184,7 +1191,7 @@ class _OldGoalFirst(ReferenceHand):
         super().command(self.old if self.old and self.now < self.until else motor)
 
 
-@wrong_hand("DEX1-WDOG-03")
+@wrong_hand("DEX1-WDOG-03", also=("DEX1-WDOG-05",))
 class OldGoalFirst(ReferenceService):
     """Carries out the command from before a silence for 0.3 s when the next ones come."""
 
@@ -1202,7 +1209,13 @@ class _BeginsAtZero(ReferenceHand):
         super().command(motor)
 
 
-@wrong_hand("DEX1-PATH-01", also=("DEX1-WDOG-03",))
+@wrong_hand(
+    "DEX1-PATH-01",
+    also=(
+        "DEX1-WDOG-05",
+        "DEX1-WDOG-03",
+    ),
+)
 class BeginsAtZero(ReferenceService):
     """Goes towards 0 for 0.2 s when the commands come again after a silence."""
 
@@ -1237,7 +1250,7 @@ class GainsOfTheOtherSide(ReferenceService):
             left.goal = replace(left.goal, kp=right.goal.kp, kd=right.goal.kd)
 
 
-@wrong_hand("DEX1-STILL-01", also=("DEX1-GAIN-05",))
+@wrong_hand("DEX1-STILL-01")
 class TakesTheOtherSides(ReferenceService):
     """Of commands that come at once it now and then gives the left hand the right one's."""
 

@@ -181,7 +181,7 @@ class _SlowToWake(_PerJoint):
 
 
 # nothing wakes it but a second command
-@wrong_hand("DEX1-OPER-05", also=("DEX1-CMD-01", "DEX1-WDOG-03"))
+@wrong_hand("DEX1-OPER-05", also=("DEX1-CMD-01", "DEX1-PATH-01", "DEX1-WDOG-03"))
 class SlowToWake(_SlowToWake, ReferenceService):
     """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
 
