@@ -159,9 +159,9 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
         ):
             if worst is None or part > worst[0]:
                 worst = part, piece.tau, limit, piece.begin, piece.end, over
-        tau = np.abs(ctx.states.tau[ctx.states.between(piece.begin, piece.end), 0])
-        above = tau[tau > high]
-        peaks.append(_Peak(piece.begin, piece.end, len(tau), len(above), high, above))
+        felt = np.abs(ctx.states.tau[ctx.states.between(piece.begin, piece.end), 0])
+        above = felt[felt > high]
+        peaks.append(_Peak(piece.begin, piece.end, len(felt), len(above), high, above))
     if worst is None:
         return ctx.skipped("it never pressed on the object for long enough")
     part, tau, limit, begin, end, over = worst

@@ -377,8 +377,8 @@ class Swapped(Service):
     also=(
         "DEX1-CMD-01",
         "DEX1-LIFE-02",
-        "DEX3-LIFE-02",
         "DEX1-WDOG-03",
+        "DEX3-WDOG-03",
     ),
 )
 @wrong_hand("BRAINCO-MOVE-06", also=("BRAINCO-PATH-01", "BRAINCO-WDOG-03"))
@@ -981,10 +981,7 @@ class ServesOnlyTheFirst(Service):
 
 @wrong_hand(
     ("DEX1-LIFE-02", "DEX3-LIFE-02"),
-    also=(
-        "DEX3-SAFE-10",
-        "DEX1-SAFE-09",
-    ),
+    also=("DEX1-SAFE-09",),
 )
 class BoundToOneClient(Service):
     """Obeys only the first client that ever commanded it."""
