@@ -173,6 +173,8 @@ def attach(port: int | str, busid: str) -> int:
 def detach(place: int) -> None:
     """Take a device away from the kernel, as pulling its cable does."""
     _attached.pop(place, None)
+    if place not in _used():
+        return  # vhci_hcd has dropped it itself
     (_VHCI / "detach").write_text(str(place))
     wait_for(lambda: place not in _used(), "vhci_hcd does not give the port back")
 
