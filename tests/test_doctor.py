@@ -450,7 +450,7 @@ def test_the_command_line(service: int) -> None:
     assert bad.return_value == 1
     data = json.loads(bad.stdout)
     assert not data["healthy"]
-    assert "DDS-NOBODY" in {f["id"] for f in data["findings"]}
+    assert "DDS-OTHER-HAND" in {f["id"] for f in data["findings"]}
     (domain,) = data["observations"]["domains"]
     assert domain["number"] == service
     assert "dexkit serve sim-dex1 --side both" in domain["participants"][0]["command"]

@@ -464,7 +464,8 @@ def test_the_wire_of_every_dialect(spoken: Dialect) -> None:
     stay = service.command(braked, Side.LEFT)
     assert stay is not None
     np.testing.assert_allclose(stay.q, q, atol=1e-5, err_msg="a brake moves nothing")
-    pressure = np.full((spec.n_sensors, 12), math.nan)
+    # of the state itself: tactile areas have a topic of their own
+    pressure = np.full((len(profile.sensors), 12), math.nan)
     for row, sensor in zip(pressure, profile.sensors, strict=True):
         row[list(sensor.slots)] = 1500.0
     state = HandState.from_values(
@@ -475,7 +476,7 @@ def test_the_wire_of_every_dialect(spoken: Dialect) -> None:
         temperature=40.0,
         mode=JointMode.FOC,
         fault=[int(MotorError.OVERCURRENT)] + [0] * (n - 1),
-        pressure=pressure if spec.n_sensors else None,
+        pressure=pressure if profile.sensors else None,
     )
     view = StateView(state, tuple(state.fault.tolist()))
     back = wire.decode(service.encode({Side.LEFT: view}), 3.0)
@@ -486,7 +487,7 @@ def test_the_wire_of_every_dialect(spoken: Dialect) -> None:
     np.testing.assert_allclose(back.tau_est, 0.1, rtol=1e-5)
     np.testing.assert_allclose(back.temperature, 40.0)
     assert back.fault.tolist() == state.fault.tolist()
-    if spec.n_sensors:
+    if profile.sensors:
         np.testing.assert_allclose(np.asarray(back.pressure), pressure)
 
 
