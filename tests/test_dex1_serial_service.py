@@ -45,14 +45,15 @@ def test_unplugged_hand_is_reported_and_ignores_stale_commands_on_return() -> No
             wait_until(lambda: node.sent)
             state = newest(node, side)
             assert state.q == pytest.approx(1.08, abs=0.01)
-            assert (state.temperature, state.lost) == (25, 0)
+            assert state.temperature == 25
             deliver_until(node, command, message(5.4), lambda: motor.q > 1.5)
+            before = newest(node, side).lost  # a busy machine may already have lost some
             motors.inject("unplug:for=1500ms")
             wait_until(lambda: not core.connected, what="the loss")
             sent = len(node.sent)
             wait_until(lambda: len(node.sent) > sent + 10)
             state = newest(node, side)
-            assert state.lost > 0
+            assert state.lost > before
             assert state.reserve[0] & LOST
             # the motor stops by itself; the last command does not count when the cable is back
             wait_until(lambda: motor.tripped, what="the protection")
