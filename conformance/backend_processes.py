@@ -10,8 +10,10 @@ import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from dexkit import child_processes
+from dexkit.backends import backend as find_backend
 from dexkit.conformance.known_backends import EMULATED, EXTERNAL, ROBOT_EMULATORS, SIMULATED
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side, Subject
@@ -104,6 +106,7 @@ class Rig:
         self.tools: list[Tool] = []
         self._services: list[Tool] = []
         self._ended: set[Tool] = set()
+        self._poses: Path | None = None
         self.devices: dict[Side, str] = dict(options.devices)
         """The device of each side: the value of ``--device``."""
 
@@ -124,6 +127,9 @@ class Rig:
 
     def _start_devices(self) -> None:
         options = self.options
+        described = find_backend(options.backend) if options.backend in SIMULATED else None
+        if described is not None and "pose" in described.settings:
+            self._poses = self._stack.enter_context(TemporaryFolder("poses"))
         if not options.emulated:
             return
         folder = self._stack.enter_context(TemporaryFolder("hands"))
@@ -195,10 +201,13 @@ class Rig:
                 arguments += ["--device", f"{place}{self.devices[side]}"]
         own = list(settings)
         if options.backend in SIMULATED:
+            keep = None if any(s.partition("=")[0].endswith("pose") for s in own) else self._poses
             for side in sides:
+                place = f"{side}." if len(sides) > 1 else ""
                 if side in options.objects:
-                    place = f"{side}." if len(sides) > 1 else ""
                     own.append(f"{place}object={options.objects[side]:g}")
+                if keep:  # its mechanics end with the service: the next one finds it there
+                    own.append(f"{place}pose={keep / f'{side}.json'}")
         for setting in own:
             arguments += ["--set", setting]
         return self._tool(

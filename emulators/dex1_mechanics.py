@@ -12,6 +12,7 @@ kp 5, kd 0.05, 500 Hz state) the gripper reaches 6.5 rad/s, moves from 10 to 90 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from dexkit.emulators.joint_mechanics import Joint, Wall
@@ -98,6 +99,11 @@ class Dex1Mechanics:
         self.joint.coulomb *= wear.friction
         self.limits = replace(self.limits, dq_max=self.limits.dq_max * wear.speed)
         self._powered = not wear.dead
+
+    def place(self, q: Sequence[float]) -> None:
+        """Put the joint at ``q[0]``, rad, at rest."""
+        (self.joint.q,) = q
+        self.joint.dq = 0.0
 
     def stop(self) -> None:
         """Set the speed to 0."""

@@ -233,6 +233,11 @@ class FingerMechanics:
         self._lived = STEP
         self._to_slow = _SLOW_STEPS
 
+    def place(self, q: Sequence[float]) -> None:
+        """Put the joints at ``q``, shape (n_joints,), at rest."""
+        for joint, at in zip(self.joints, q, strict=True):
+            joint.q, joint.dq = at, 0.0
+
     # -- commands ------------------------------------------------------------------------------
 
     def command(

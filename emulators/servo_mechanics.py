@@ -11,6 +11,7 @@ Not modelled: gravity, play, a hand that gives way, heat.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -168,6 +169,11 @@ class ServoMechanics:
         servo.friction *= wear.friction
         servo.spec = replace(servo.spec, dq_max=servo.spec.dq_max * wear.speed)
         servo.dead = wear.dead
+
+    def place(self, q: Sequence[float]) -> None:
+        """Put the joints at ``q``, shape (n_joints,), at rest."""
+        for servo, at in zip(self._servos, q, strict=True):
+            servo.q, servo.dq, servo.still = at, 0.0, False
 
     def brake(self) -> None:
         """Hold every joint where it is."""

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.emulators.servo_mechanics import SETTINGS
+from dexkit.emulators.simulated import COMMON_SETTINGS
 from dexkit.emulators.simulated_servos import SimulatedServos, make_servos
-from dexkit.emulators.wear import WEAR_SETTING
 from dexkit.models import BRAINCO_REVO2
 
 __all__ = ["SimBrainCo", "sim_brainco"]
@@ -34,5 +34,5 @@ sim_brainco = Backend(
     summary="Simulated BrainCo Revo2 hand: 6 position servos, no device",
     model=BRAINCO_REVO2.name,
     make=_make,
-    settings={**SETTINGS, **WEAR_SETTING},
+    settings={**SETTINGS, **COMMON_SETTINGS},
 )

@@ -9,8 +9,7 @@ from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP
-from dexkit.emulators.simulated import SimulatedHand, number, worn
-from dexkit.emulators.wear import WEAR_SETTING
+from dexkit.emulators.simulated import COMMON_SETTINGS, SimulatedHand, configured, number
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 
@@ -52,7 +51,7 @@ def _make(options: BackendOptions) -> SimDex3:
         start=number(options, "start"),
         supply_v=24.0 if supply is None else supply,
     )
-    return worn(hand, options)
+    return configured(hand, options)
 
 
 sim_dex3 = Backend(
@@ -61,7 +60,7 @@ sim_dex3 = Backend(
     make=_make,
     settings={
         **SETTINGS,
-        **WEAR_SETTING,
+        **COMMON_SETTINGS,
         "supply": "volts of the supply, 24 to 58 (default: 24)",
     },
 )

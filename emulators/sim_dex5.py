@@ -14,8 +14,7 @@ from __future__ import annotations
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP, FingerMechanics, MotorModel
-from dexkit.emulators.simulated import SimulatedHand, number, worn
-from dexkit.emulators.wear import WEAR_SETTING
+from dexkit.emulators.simulated import COMMON_SETTINGS, SimulatedHand, configured, number
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX5_1
 
@@ -87,12 +86,12 @@ def _make(options: BackendOptions) -> SimDex5:
     hand = SimDex5(
         options.side, object_at=number(options, "object"), start=number(options, "start")
     )
-    return worn(hand, options)
+    return configured(hand, options)
 
 
 sim_dex5 = Backend(
     summary="Simulated Dex5-1 hand: 20 joints, mechanics and heat, no device",
     model=DEX5_1.name,
     make=_make,
-    settings={**SETTINGS, **WEAR_SETTING},
+    settings={**SETTINGS, **COMMON_SETTINGS},
 )

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.dex1_mechanics import STEP, Dex1Mechanics
-from dexkit.emulators.simulated import SimulatedHand, number, worn
-from dexkit.emulators.wear import WEAR_SETTING
+from dexkit.emulators.simulated import COMMON_SETTINGS, SimulatedHand, configured, number
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
 
@@ -50,7 +49,7 @@ def _make(options: BackendOptions) -> SimHand:
         object_pct=number(options, "object"),
         start_pct=20.0 if start is None else start,
     )
-    return worn(hand, options)
+    return configured(hand, options)
 
 
 sim_dex1 = Backend(
@@ -60,6 +59,6 @@ sim_dex1 = Backend(
     settings={
         "object": "percent of opening at which an object is touched (default: no object)",
         "start": "percent of opening at first (default: 20)",
-        **WEAR_SETTING,
+        **COMMON_SETTINGS,
     },
 )

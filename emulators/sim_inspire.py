@@ -21,8 +21,8 @@ import numpy as np
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.emulators.servo_mechanics import SETTINGS, ServoMechanics
+from dexkit.emulators.simulated import COMMON_SETTINGS
 from dexkit.emulators.simulated_servos import SimulatedServos, make_servos
-from dexkit.emulators.wear import WEAR_SETTING
 from dexkit.hand import Floats, HandCommand, HandState, Side
 from dexkit.models import INSPIRE_DFX, INSPIRE_FTP
 
@@ -52,7 +52,7 @@ sim_inspire_dfx = Backend(
     summary="Simulated Inspire RH56DFX hand: 6 position servos, no device",
     model=INSPIRE_DFX.name,
     make=_make,
-    settings={**SETTINGS, **WEAR_SETTING},
+    settings={**SETTINGS, **COMMON_SETTINGS},
 )
 
 
@@ -122,5 +122,5 @@ sim_inspire_ftp = Backend(
     summary="Simulated Inspire RH56DFTP hand: 6 position servos, 17 tactile areas, no device",
     model=INSPIRE_FTP.name,
     make=_make_ftp,
-    settings={**SETTINGS, **WEAR_SETTING},
+    settings={**SETTINGS, **COMMON_SETTINGS},
 )

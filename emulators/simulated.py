@@ -5,17 +5,30 @@ The command in force stays in force until the next one, as in a real motor.
 
 from __future__ import annotations
 
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE
 from dexkit.emulators.joint_mechanics import FixedSteps
-from dexkit.emulators.wear import JointWear, Wear, Worn, parse_wear
+from dexkit.emulators.wear import WEAR_SETTING, JointWear, Wear, Worn, parse_wear
 from dexkit.errors import HandLost, UsageError
+from dexkit.escaping import one_line
 from dexkit.hand import HandCommand, HandSpec, HandState
 
-__all__ = ["Mechanics", "SimulatedHand", "number", "worn"]
+__all__ = ["COMMON_SETTINGS", "Mechanics", "SimulatedHand", "configured", "number"]
+
+COMMON_SETTINGS = {
+    **WEAR_SETTING,
+    "pose": "a file that keeps the joints' positions from one start to the next, as a real hand "
+    "does (default: none)",
+}
+"""The settings of every simulated hand."""
 
 
 class Mechanics(Protocol):
@@ -39,6 +52,9 @@ class Mechanics(Protocol):
     def wear(self, joint: int, wear: JointWear) -> None:
         """Wear a joint, play apart."""
 
+    def place(self, q: Sequence[float]) -> None:
+        """Put the joints at ``q``, shape (n_joints,), at rest."""
+
 
 class SimulatedHand:
     """A mechanics on a clock.
@@ -59,6 +75,27 @@ class SimulatedHand:
         self._last = 0.0  # when the last exchange was
         self._open = False
         self._worn: Worn | None = None
+        self._pose: Path | None = None
+
+    def keep_pose(self, file: Path) -> None:
+        """Start where the joints stood at the last ``close``, which ``file`` says, if there is one.
+
+        :raises UsageError: the file is not one that :meth:`close` wrote for such a hand.
+        """
+        self._pose = file
+        if not file.exists():
+            return
+        spec = self._spec
+        try:
+            q = [float(value) for value in json.loads(file.read_text(encoding="utf-8"))]
+        except (OSError, ValueError, TypeError) as error:
+            raise UsageError(f"pose: {file} is not readable: {one_line(str(error))}") from error
+        if len(q) != spec.n_joints or not all(map(math.isfinite, q)):
+            raise UsageError(
+                f"pose: {file} does not have the {spec.n_joints} positions of this hand",
+                hint="remove the file, or give each hand its own",
+            )
+        self._mechanics.place(q)
 
     def wear(self, wear: Wear) -> None:
         """Wear the hand, once: friction, speed and dead joints multiply."""
@@ -79,9 +116,23 @@ class SimulatedHand:
         self._open = True
 
     def close(self) -> None:
-        """Stop where it is."""
+        """Stop where it is.
+
+        :raises UsageError: the file of :meth:`keep_pose` cannot be written.
+        """
         self._open = False
         self._mechanics.stop()
+        if self._pose is not None:
+            self._save_pose(self._pose)
+
+    def _save_pose(self, file: Path) -> None:
+        q = self._mechanics.state(self._last).q.tolist()
+        part = file.with_name(f"{file.name}.part")
+        try:
+            part.write_text(json.dumps(q) + "\n", encoding="utf-8")
+            os.replace(part, file)  # whole, or as it was
+        except OSError as error:
+            raise UsageError(f"pose: {file} cannot be written: {error.strerror}") from error
 
     def exchange(self, command: HandCommand) -> HandState:
         """Advance to now under the last command, apply this one, and return the state.
@@ -103,13 +154,15 @@ class SimulatedHand:
 Simulated = TypeVar("Simulated", bound=SimulatedHand)
 
 
-def worn(hand: Simulated, options: BackendOptions) -> Simulated:
-    """The hand, worn as the setting ``wear`` says.
+def configured(hand: Simulated, options: BackendOptions) -> Simulated:
+    """The hand with the :data:`COMMON_SETTINGS` applied.
 
-    :raises UsageError: the setting is not understood.
+    :raises UsageError: a setting is not understood.
     """
     if text := options.settings.get("wear"):
         hand.wear(parse_wear(text, hand.spec))
+    if file := options.settings.get("pose"):
+        hand.keep_pose(Path(file))
     return hand
 
 

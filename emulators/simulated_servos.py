@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.servo_mechanics import STEP, ServoMechanics
-from dexkit.emulators.simulated import SimulatedHand, number, worn
+from dexkit.emulators.simulated import SimulatedHand, configured, number
 from dexkit.hand import Side
 from dexkit.models import HandModel
 
@@ -54,4 +54,4 @@ def make_servos(kind: type[Servos], options: BackendOptions) -> Servos:
     :raises UsageError: a setting is not understood.
     """
     hand = kind(options.side, object_at=number(options, "object"), start=number(options, "start"))
-    return worn(hand, options)
+    return configured(hand, options)
