@@ -23,6 +23,8 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.traces import sample_path
 
 FILES = 12
+LOOPBACK = "127.0.0.2"
+"""Clients of Ray replace 127.0.0.1 by an address that other machines reach."""
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,7 +40,7 @@ def two_nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     from ray.cluster_utils import Cluster
 
-    about = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": 80 * 2**20}
+    about = {"num_cpus": 1, "node_ip_address": LOOPBACK, "object_store_memory": 80 * 2**20}
     cluster = Cluster(initialize_head=True, head_node_args={**about, "include_dashboard": False})
     try:
         second = cluster.add_node(**about)
@@ -131,3 +133,17 @@ def test_no_cluster_at_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
         port = server.getsockname()[1]
     with pytest.raises(ConformanceError, match="no Ray cluster"):
         Limits().cluster(f"127.0.0.1:{port}")
+
+
+def test_a_head_node_that_only_listens_at_127_0_0_1_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ray itself would look for it at the machine's own address, for minutes."""
+    ray, util = ModuleType("ray"), ModuleType("ray.util")
+    util.get_node_ip_address = lambda: "127.0.0.3"  # type: ignore[attr-defined]
+    ray.util = util  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(ConformanceError, match=r"looks for it at 127\.0\.0\.3.*127\.0\.0\.2"):
+            Limits().cluster(f"127.0.0.1:{port}")

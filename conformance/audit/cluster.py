@@ -55,7 +55,7 @@ class Cluster:
             raise UsageError("--ray needs Ray", hint="pip install 'dexkit[ray]'") from None
         self._ray: Any = ray
         try:
-            _check_address(address)  # Ray itself would try for minutes
+            _check_address(address, ray)  # Ray itself would try for minutes
             ray.init(address, log_to_driver=False, logging_level="ERROR", include_dashboard=None)
         except (OSError, ValueError, RuntimeError) as error:
             raise ConformanceError(
@@ -111,11 +111,24 @@ class Cluster:
         self._ray.shutdown()
 
 
-def _check_address(address: str) -> None:
-    """Raise OSError if nothing answers at a ``host:port``."""
+def _check_address(address: str, ray: Any) -> None:
+    """Raise OSError if nothing answers at a ``host:port``, or where Ray looks for it."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host.strip("[]"), int(port)), _PATIENCE).close()
+    if not host or not port.isdecimal():
+        return
+    host = host.strip("[]")
+    socket.create_connection((host, int(port)), _PATIENCE).close()
+    if address.startswith("ray://") or host not in ("localhost", "127.0.0.1", "::1"):
+        return
+    # a driver of Ray replaces these names by an address that other machines reach
+    host = ray.util.get_node_ip_address()
+    try:
+        socket.create_connection((host, int(port)), _PATIENCE).close()
+    except OSError as error:
+        raise OSError(
+            f"Ray looks for it at {host}:{port}, where nothing answers; start the head node with "
+            f"--node-ip-address={host}, or with 127.0.0.2 and give that"
+        ) from error
 
 
 class _TooLong(BaseException):
