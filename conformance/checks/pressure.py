@@ -230,7 +230,11 @@ def pressure_lasts(ctx: Context) -> Outcome:
 
 @check("DEX3-SENS-10")
 def follows_the_force(ctx: Context) -> Outcome:
-    """How much of a change of a finger's torque its pressure shows, while it holds the object."""
+    """How much of a change of a finger's torque its pressure shows, while it holds the object.
+
+    A gearing with friction keeps what it has pressed. So a rise counts beyond the most torque of
+    the grip so far, and a fall where the finger gives way by a part of what it had gone forward.
+    """
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     phases = sorted(ctx.phases(), key=lambda p: p.begin_ns)
@@ -246,6 +250,8 @@ def follows_the_force(ctx: Context) -> Outcome:
         if not finger:  # they are all soft again
             continue
         for word, a, b in (("rises", begin, end), ("falls", end, later)):
+            if word == "falls" and not _gives_way(ctx, finger, begin, end, later):
+                continue
             found = _share(ctx, finger, free, a, b)
             if found is not None and (worst is None or found < worst[0]):
                 worst = found, finger, word, a, b
@@ -278,9 +284,14 @@ def _share(
     had, has = (np.abs(np.median(ctx.states.tau[r][:, joints], axis=0)) for r in (before, then))
     if end - begin < _BEFORE_S or had.min() < ctx.tolerance("min_tau_nm"):
         return None
-    part = float((has / had).max() if has.sum() > had.sum() else (has / had).min()) - 1.0
+    rises = bool(has.sum() > had.sum())
+    part = float((has / had).max() if rises else (has / had).min()) - 1.0
     if abs(part) < ctx.tolerance("min_change_part"):
         return None
+    if rises:
+        part = min(part, float((has / _most_torque(ctx, joints, begin)).max()) - 1.0)
+        if part < ctx.tolerance("min_change_part"):
+            return None
     felt, feels = np.nan_to_num(was - free)[mine], np.nan_to_num(now - free)[mine]
     most = float(max(felt.max(initial=0.0), feels.max(initial=0.0)))
     touched = np.maximum(felt, feels) >= ctx.tolerance("min_rise_part") * most
@@ -288,6 +299,29 @@ def _share(
         return 0.0
     changed = (feels[touched] - felt[touched]) / np.maximum(felt[touched], 1e-3 * most)
     return float((changed / part).max())
+
+
+def _most_torque(ctx: Context, joints: list[int], begin: float) -> Floats:
+    """The most torque of each joint in the grip that goes on at ``begin``, N m, shape (joints,)."""
+    tau = np.abs(ctx.states.tau[ctx.states.between(0.0, begin)][:, joints])
+    free = np.flatnonzero((tau < ctx.tolerance("min_tau_nm")).all(axis=1))
+    return np.asarray(tau[free[-1] + 1 if len(free) else 0 :].max(axis=0))
+
+
+def _gives_way(ctx: Context, finger: str, begin: float, end: float, later: float) -> bool:
+    """Whether a joint that went into the object from ``begin`` to ``end`` comes back until
+    ``later``, by a part of that.
+    """
+    joints = [i for i, j in enumerate(ctx.joints) if j.closing and j.name.startswith(finger)]
+    way = np.array([ctx.joints[i].closing / ctx.joints[i].stroke for i in joints])
+    soft, firm, again = (
+        np.median(ctx.states.q[ctx.states.between(t - _BEFORE_S, t)][:, joints], axis=0) * way
+        for t in (begin, end, later)
+    )
+    least = np.maximum(
+        ctx.tolerance("min_way_stroke"), ctx.tolerance("min_fall_part") * (firm - soft)
+    )
+    return bool((firm - again >= least).any())
 
 
 @check("DEX3-SENS-11")
