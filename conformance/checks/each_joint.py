@@ -4,11 +4,13 @@ its grip; and the low-rate copy of the state.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
-from dexkit.conformance.checks.motion import Step, steps
+from dexkit.conformance.checks.motion import Step, own_speed, steps
 from dexkit.conformance.checks.safety import stays
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte
@@ -75,6 +77,9 @@ def _status(ctx: Context, mode: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDA
     return mode, np.zeros(len(mode), dtype=np.bool_)
 
 
+_GOING = 0.9  # of the time of a phase; a step may begin with it
+
+
 @check("DEX3-MODE-05")
 def own_mode(ctx: Context) -> Outcome:
     """How far the joints go that are driven, while others are locked or have tripped."""
@@ -98,6 +103,12 @@ def own_mode(ctx: Context) -> Outcome:
             size = float(target[joint] - start[joint])
             if not driven or abs(size) < ctx.requirement.tolerance("min_step_stroke") * spec.stroke:
                 continue
+            # a slow joint makes the way that its speed allows, but for the time to get going
+            least = ctx.requirement.tolerance("min_step_stroke")
+            speed = own_speed(ctx, joint, least)
+            if speed is not None:
+                reach = _GOING * max(speed, ctx.tolerance("min_speed_rad_s")) * (end - begin)
+                size = math.copysign(min(abs(size), max(reach, least * spec.stroke)), size)
             part = float(final[joint] - start[joint]) / size
             found = (part, begin, end, joint, size)
             worst = found if worst is None or found < worst else worst

@@ -101,8 +101,10 @@ _SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.4, 0.15
 """A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
 _RAMP, _RAMP_SECONDS = 12, 0.24
 """Steps in which a soft hold becomes a firm one, and seconds for all of them."""
-_TOUCH_SECONDS = 0.36
-"""Seconds in which a finger presses on the object alone; a slow one gets more."""
+_TOUCH_SECONDS = 0.3
+"""Seconds in which a finger presses on the object alone."""
+_TOUCH_STANDS, _TOUCH_MORE = 0.1, 12
+"""Seconds in which it stands then, and how often it is waited for that."""
 _STATUSES = range(2, 8)
 """What fits into the three bits of the status and has no meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
@@ -625,6 +627,12 @@ class FingerScript(HandScript):
                 hands[s] = self._motors(s, tuple(pose))
             phase = self._begin("touch", pressing, targets=targets, finger=finger)
             yield from self._hold(_TOUCH_SECONDS + self._travel(targets), hands)
+            # a slow finger is still on its way
+            for _ in range(_TOUCH_MORE):
+                before = {s: self._obs.q.get(s, self._home(s)) for s in pressing}
+                yield from self._hold(_TOUCH_STANDS, hands)
+                if all(self._near(s, before[s], self._obs.q.get(s, before[s])) for s in pressing):
+                    break
             self._end(phase)
 
     def _travel(self, targets: Mapping[Side, Mapping[int, float]]) -> float:
