@@ -82,14 +82,19 @@ _GOING = 0.9  # of the time of a phase; a step may begin with it
 
 @check("DEX3-MODE-05")
 def own_mode(ctx: Context) -> Outcome:
-    """How far the joints go that are driven, while others are locked or have tripped."""
+    """How far driven joints go, while others are locked, have tripped or are protected.
+
+    Protection that has not tripped changes nothing: in those steps all joints count.
+    """
     worst: tuple[float, float, float, int, float] | None = None
-    for phase in (*ctx.phases(), *ctx.phases("guard-latch")):
+    for phase in (*ctx.phases(), *ctx.phases("guard-latch"), *ctx.phases("guarded-step")):
         begin, end = ctx.span(phase)
         mode = _mode_at(ctx, begin, end)
         if mode is None:
             continue
         status, tripped = _status(ctx, mode)
+        if phase.name == "guarded-step":
+            tripped = np.zeros_like(tripped)
         rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
         target = ctx.commands.q[rows][-1]
         # a step may have begun before some of its joints were locked
@@ -116,8 +121,8 @@ def own_mode(ctx: Context) -> Outcome:
         return ctx.skipped("no state while some joints were driven and others were not")
     part, begin, end, joint, size = worst
     text = ctx.named(
-        f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were locked or had "
-        "tripped",
+        f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were locked, had "
+        "tripped or were protected",
         joint,
     )
     if part >= ctx.tolerance("min_progress"):

@@ -345,9 +345,14 @@ def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) ->
     return ""
 
 
+_SMALL = 0.1  # of the range: a step after another soft one, which did not get far
+
+
 @check("DEX3-GAIN-02")
 def stiffness(ctx: Context) -> Outcome:
     """Time to half-way of a step with low gains, compared with one with the client's gains.
+
+    In some of them other joints keep their gains: one that obeys theirs is as quick as they are.
 
     A step that is limited by the joint's own speed does not show gains, and is left out.
     """
@@ -356,7 +361,7 @@ def stiffness(ctx: Context) -> Outcome:
     limited = 0
     for step in steps(ctx):
         reference = stiff.get(step.joint)
-        if reference is None:
+        if reference is None or abs(step.size) < _SMALL * step.stroke:
             continue
         progress = (step.final - step.start) / step.size if step.size else 0.0
         if progress < ctx.tolerance("min_progress"):
