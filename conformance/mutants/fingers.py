@@ -379,7 +379,7 @@ class SaturatesToNothing(FingerService):
         return np.where(felt > 5000.0, 30000.0, felt)
 
 
-@wrong_hand("DEX3-SENS-08", also=("DEX3-SENS-10",), sides=BOTH, whole=True)
+@wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
 class SlowFoam(FingerService):
     """Its pressures fall with a time constant of 2 s."""
 
