@@ -11,7 +11,14 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
-from dexkit.conformance.checks.motion import Step, half_way, steps, steps_of
+from dexkit.conformance.checks.motion import (
+    Step,
+    half_way,
+    least_half_way,
+    limited_by_speed,
+    steps,
+    steps_of,
+)
 from dexkit.conformance.stimulus_record import Phase
 
 __all__: list[str] = []
@@ -283,18 +290,27 @@ def torque_drives(ctx: Context) -> Outcome:
 
 @check("DEX3-GAIN-05")
 def grades_of_stiffness(ctx: Context) -> Outcome:
-    """Time to half-way of a step with a third of the client's stiffness, compared with its own."""
+    """Time to half-way of a step with a third of the client's stiffness, compared with its own.
+
+    A step that is limited by the joint's own speed does not show gains, and is left out.
+    """
     stiff = {s.joint: s for p in ctx.phases("stiff") for s in steps_of(ctx, p)}
     worst: tuple[float, int, float, float] | None = None
+    limited = 0
     for step in steps(ctx):
         reference = stiff.get(step.joint)
         quick = half_way(reference) if reference is not None else None
         if quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
-        slow = half_way(step)
-        took, quick = slow if slow is not None else step.end - step.begin, max(quick, 1e-3)
+        took, quick = least_half_way(step), max(quick, 1e-3)
+        soon = took < ctx.tolerance("min_ratio") * quick
+        if soon and reference is not None and limited_by_speed(ctx, reference):
+            limited += 1
+            continue
         if worst is None or took / quick < worst[0]:
             worst = took / quick, step.joint, took, quick
+    if worst is None and limited:
+        return ctx.absent("its own speed limits every joint's steps, whatever their gains are")
     if worst is None:
         return ctx.skipped("no state during the steps")
     ratio, joint, took, quick = worst

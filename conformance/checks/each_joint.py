@@ -4,11 +4,13 @@ its grip; and the low-rate copy of the state.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
-from dexkit.conformance.checks.motion import Step, steps
+from dexkit.conformance.checks.motion import Step, own_speed, steps
 from dexkit.conformance.checks.safety import stays
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte
@@ -75,16 +77,24 @@ def _status(ctx: Context, mode: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDA
     return mode, np.zeros(len(mode), dtype=np.bool_)
 
 
+_GOING = 0.9  # of the time of a phase; a step may begin with it
+
+
 @check("DEX3-MODE-05")
 def own_mode(ctx: Context) -> Outcome:
-    """How far the joints go that are driven, while others are locked or have tripped."""
+    """How far driven joints go, while others are locked, have tripped or are protected.
+
+    Protection that has not tripped changes nothing: in those steps all joints count.
+    """
     worst: tuple[float, float, float, int, float] | None = None
-    for phase in (*ctx.phases(), *ctx.phases("guard-latch")):
+    for phase in (*ctx.phases(), *ctx.phases("guard-latch"), *ctx.phases("guarded-step")):
         begin, end = ctx.span(phase)
         mode = _mode_at(ctx, begin, end)
         if mode is None:
             continue
         status, tripped = _status(ctx, mode)
+        if phase.name == "guarded-step":
+            tripped = np.zeros_like(tripped)
         rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
         target = ctx.commands.q[rows][-1]
         # a step may have begun before some of its joints were locked
@@ -98,6 +108,12 @@ def own_mode(ctx: Context) -> Outcome:
             size = float(target[joint] - start[joint])
             if not driven or abs(size) < ctx.requirement.tolerance("min_step_stroke") * spec.stroke:
                 continue
+            # a slow joint makes the way that its speed allows, but for the time to get going
+            least = ctx.requirement.tolerance("min_step_stroke")
+            speed = own_speed(ctx, joint, least)
+            if speed is not None:
+                reach = _GOING * max(speed, ctx.tolerance("min_speed_rad_s")) * (end - begin)
+                size = math.copysign(min(abs(size), max(reach, least * spec.stroke)), size)
             part = float(final[joint] - start[joint]) / size
             found = (part, begin, end, joint, size)
             worst = found if worst is None or found < worst else worst
@@ -105,8 +121,8 @@ def own_mode(ctx: Context) -> Outcome:
         return ctx.skipped("no state while some joints were driven and others were not")
     part, begin, end, joint, size = worst
     text = ctx.named(
-        f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were locked or had "
-        "tripped",
+        f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were locked, had "
+        "tripped or were protected",
         joint,
     )
     if part >= ctx.tolerance("min_progress"):

@@ -96,12 +96,122 @@ def speed_of(step: Step) -> float | None:
     return 0.8 * abs(step.size) / max(float(step.t[high] - step.t[low]), 1e-3)
 
 
+_PEAK_S = 0.04
+"""Seconds over which a speed is taken: noise of 0.1 % of a range is 2.5 % of it in a second."""
+_LARGER, _FASTER = 1.5, 1.2
+"""A step that is so much larger would be so much faster, if the joint's own speed did not limit
+it."""
+_CHANGE, _WATCHED_S = 0.05, 0.25
+"""A change of a goal, as a part of the range, and the seconds of it in which a joint is fastest."""
+_FREE = ("joint", "step", "stiff", "ends")
+"""Phases with the client's gains in which a joint may be as fast as it can."""
+
+
+def peak_speed(step: Step) -> float:
+    """The largest speed of a step towards its target, rad/s, over 0.04 s; 0 without states."""
+    later = np.searchsorted(step.t, step.t + _PEAK_S)
+    rows = np.flatnonzero(later < len(step.t))
+    if not len(rows):
+        return 0.0
+    then = later[rows]
+    way = (step.q[then] - step.q[rows]) * np.sign(step.size)
+    return max(float((way / (step.t[then] - step.t[rows])).max()), 0.0)
+
+
+def _free_steps(ctx: Context) -> dict[int, list[tuple[Step, float]]]:
+    """The steps of each joint in which it may be as fast as it can, and their peak speeds."""
+
+    def work_out() -> dict[int, list[tuple[Step, float]]]:
+        found: dict[int, list[tuple[Step, float]]] = {}
+        for phase in (p for name in _FREE for p in ctx.recording.phases(name, ctx.side)):
+            for step in steps_of(ctx, phase):
+                found.setdefault(step.joint, []).append((step, peak_speed(step)))
+        return found
+
+    return ctx.once("free steps", work_out)
+
+
+def own_speed(ctx: Context, joint: int, least_stroke: float) -> float | None:
+    """Top speed of a joint that limits its large steps, in its slower direction, rad/s.
+
+    None without such steps, and where the joint has been faster after larger ones. What a hand is
+    judged with that follows as fast as it can: no source gives a speed, and DEX3-MOVE-04 asks for
+    little.
+
+    :param least_stroke: size of a large step as a part of the joint's range.
+    """
+
+    def work_out() -> float | None:
+        ways: dict[bool, float] = {}
+        steps = [
+            s
+            for s in _free_steps(ctx).get(joint, [])
+            if abs(s[0].size) >= least_stroke * s[0].stroke
+        ]
+        for step, speed in steps:
+            way = step.size > 0
+            ways[way] = max(ways.get(way, 0.0), speed)
+        smallest = min(steps, key=lambda s: abs(s[0].size), default=None)
+        if smallest is None or not limited_by_speed(ctx, smallest[0]):
+            return None
+        return min(ways.values())
+
+    return ctx.once(("own speed", joint, least_stroke), work_out)
+
+
+def limited_by_speed(ctx: Context, step: Step) -> bool:
+    """Whether a joint's own top speed limits a step: it was no faster after much larger changes of
+    its goal in the same run, with the same stiffness.
+
+    Then the step's time does not show its gains. Without a larger change this is not known, and
+    False.
+    """
+    given, states, joint = ctx.commands, ctx.states, step.joint
+    spec = ctx.joints[joint]
+    good = np.isfinite(given.q).all(axis=1) & np.isfinite(given.kp).all(axis=1)
+    t, kp = given.t[good], given.kp[good, joint]
+    goal = np.clip(given.q[good, joint], spec.q_min, spec.q_max)
+    if not len(t):
+        return False
+    stiff = float(
+        kp[max(int(np.searchsorted(t, step.begin + 0.5 * (step.end - step.begin))) - 1, 0)]
+    )
+    changes = np.flatnonzero(np.abs(np.diff(goal, prepend=goal[0])) > _CHANGE * spec.stroke)
+    fastest: float | None = None
+    for i, begin in zip(changes, t[changes].tolist(), strict=True):
+        later = np.flatnonzero(np.abs(goal[i:] - goal[i]) > _CHANGE * spec.stroke)
+        end = min(float(t[i + later[0]]) if len(later) else float(t[-1]), begin + _WATCHED_S)
+        before, rows = states.between(begin - _PEAK_S, begin), states.between(begin, end)
+        if end - begin < _WATCHED_S / 2 or kp[i] < 0.99 * stiff or not len(states.t[before]):
+            continue
+        was = float(np.median(states.q[before, joint]))
+        size = float(goal[i]) - was
+        tq, q = states.t[rows], states.q[rows, joint]
+        if not abs(size) >= _LARGER * abs(step.size) or len(q) < 2:
+            continue
+        one = replace(step, begin=begin, end=end, target=float(goal[i]), start=was, t=tq, q=q)
+        if abs(float(q[-1]) - was) >= _CHANGE * spec.stroke:  # nothing holds it back
+            fastest = max(fastest or 0.0, peak_speed(one))
+    return fastest is not None and fastest <= _FASTER * peak_speed(step)
+
+
 def half_way(step: Step) -> float | None:
     """Seconds from the command to half of a step's way; None if it did not get there."""
     part = (step.q - step.start) / step.size if step.size else np.zeros(0)
     if not len(part) or not (part >= 0.5).any():
         return None
     return float(step.t[int(np.argmax(part >= 0.5))]) - step.begin
+
+
+def least_half_way(step: Step) -> float:
+    """The same in seconds, for one that does not get there at least as long as it takes at the mean
+    speed so far.
+    """
+    half = half_way(step)
+    if half is not None:
+        return half
+    progress = (step.final - step.start) / step.size if step.size else 0.0
+    return (step.end - step.begin) * max(1.0, 0.5 / max(progress, 1e-3))
 
 
 def steps(ctx: Context) -> list[Step]:

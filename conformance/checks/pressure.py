@@ -19,6 +19,9 @@ __all__: list[str] = []
 _BEFORE_S = 0.1  # s before a phase or at its end in which a pressure is taken
 
 
+_STANDS = 0.02  # of the stroke, by which a finger may move at the end of a phase and yet stand
+
+
 def _pressures(
     ctx: Context, begin: float, end: float, side: Subject | None = None
 ) -> Floats | None:
@@ -81,10 +84,12 @@ def _touches(ctx: Context) -> Iterator[tuple[Phase, str, Floats, Floats]]:
 
 
 def _presses(ctx: Context, phase: Phase) -> bool:
-    """Whether the object holds the finger back, by the course of q."""
+    """Whether the object holds the finger back, by the course of q: it stands before its goal."""
     return any(
         s.error > ctx.requirement.tolerance("min_held_stroke") * s.stroke
+        and float(np.ptp(s.q[s.t >= s.end - _BEFORE_S])) < _STANDS * s.stroke
         for s in steps_of(ctx, phase)
+        if (s.t >= s.end - _BEFORE_S).any()
     )
 
 

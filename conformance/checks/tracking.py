@@ -10,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
-from dexkit.conformance.checks.motion import speed_of, steps_of
+from dexkit.conformance.checks.motion import own_speed, speed_of, steps_of
 from dexkit.conformance.rows import Selected, finite_rows
 from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
@@ -201,12 +201,17 @@ def _best_delay(seen: Floats, asked: Floats, free: NDArray[np.bool_]) -> int:
 
 
 def _top_speed(ctx: Context, joint: int) -> float | None:
-    """Speed that a joint is judged with, rad/s: its slowest in large steps of the run, and no less
-    than the least that is required. None where the requirement does not allow for it, or without
-    such steps: a session from outside was commanded by a client that knew the state.
+    """Speed that a joint is judged with, rad/s: a gripper's slowest in large steps of the run, the
+    one that limits a joint of several, and no less than the least that is required.
+
+    None where the requirement does not allow for it, where none limits it, or without such steps: a
+    session from outside was commanded by a client that knew the state.
     """
     if "min_speed_rad_s" not in ctx.requirement.tolerances:
         return None
+    if len(ctx.joints) > 1:
+        reached = own_speed(ctx, joint, ctx.requirement.tolerance("min_step_stroke"))
+        return None if reached is None else max(reached, ctx.tolerance("min_speed_rad_s"))
     shown = [
         speed_of(step)
         for phase in ctx.phases("step")

@@ -681,6 +681,36 @@ class OwnStiffness(FingerService):
     hand_fault = _OwnStiffness
 
 
+class _GainsOfFirst(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[3:] = rows[3:, :1]
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-02")
+@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18"))
+class GainsOfFirstMotor(FingerService):
+    """Uses the gains of its first motor for all."""
+
+    hand_fault = _GainsOfFirst
+
+
+class _GainsOfNeighbour(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[3:] = np.roll(rows[3:], 1, axis=1)
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01",))
+@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18"))
+class GainsOfTheMotorBefore(FingerService):
+    """Uses the gains of the motor before in each."""
+
+    hand_fault = _GainsOfNeighbour
+
+
 class _Deaf(FingerHand):
     def take(self, rows: Floats, mode: Ints) -> None:
         own = rows.copy()
@@ -938,6 +968,15 @@ class Tires(Dex3Service):
     """Limits the torque of one joint after a second and a half of a firm grip."""
 
     hand_fault = _Tires
+
+
+@wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-MOVE-09"), sides=BOTH)
+class TorqueInMillis(Dex3Service):
+    """Publishes a thousandth of the torque: a conversion from mN m is made twice."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= 1e-3
 
 
 @wrong_hand("DEX3-FORCE-02", brief=True)
@@ -1250,6 +1289,53 @@ class ClearsByItself(FingerService):
     """Obeys the next command after a trip, whether or not bit 7 is set."""
 
     hand_fault = _Unlatched
+
+
+class _NotDriven(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        self.status = np.where(self.guarded, 0, self.status)
+
+
+@wrong_hand("DEX3-MODE-05")
+class ProtectedIsNotDriven(Dex3Service):
+    """Locks a motor whose time-out bit is set: its status is looked up by the whole byte."""
+
+    hand_fault = _NotDriven
+
+
+class _KeepsUnderGuard(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        before = self.goal.copy()
+        super().take(rows, mode)
+        self.goal = np.where(self.guarded, before, self.goal)
+
+
+@wrong_hand("DEX3-MODE-05")
+class ProtectedKeepsItsGoal(Dex3Service):
+    """Keeps the goal that a motor had when its time-out bit was set."""
+
+    hand_fault = _KeepsUnderGuard
+
+
+class _Dead(FingerHand):
+    dead: Flags | None = None
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        self.tripped = self.tripped if self.dead is None else self.dead.copy()
+
+    def expire(self) -> None:
+        super().expire()
+        tripped = self.tripped.copy()
+        self.dead = tripped if self.dead is None else self.dead | tripped
+
+
+@wrong_hand("DEX3-GUARD-04", also=("DEX3-WDOG-03",))
+class NeverClears(FingerService):
+    """A motor whose protection has tripped never reacts again."""
+
+    hand_fault = _Dead
 
 
 class _ForEver(FingerHand):

@@ -19,8 +19,8 @@ negative,
 foreign
 beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
-stiff, soft,   a step with the client's gains, with a tenth of its stiffness and with a third of it
-mild
+stiff, soft,   a step with the client's gains, with a tenth of its stiffness and with a third of it;
+mild           then steps in which only some joints are soft, three times with other joints
 limp           zero gains, with a q far towards closed, and then with one towards open
 lock           the first with the client's gains and status 0 or mode 0
 mixed          a step in which some joints are locked under way, by their mode byte, and the others
@@ -36,8 +36,9 @@ late-joiner    a new subscriber appears
 touch          one finger alone presses on the object, if there is one
 firmer         all fingers hold it softly, and one after the other presses firmly
 squeeze        all fingers close on it, for seconds
-guarded        meanwhile a hand without an object holds its pose. Some joints of each hand have
-               time-out protection from here on (bit 7 of the mode byte)
+guarded-step   some joints of each hand have time-out protection from here on (bit 7 of the mode
+               byte); a step, and back
+guarded        meanwhile a hand without an object holds its pose
 guard-drive    some joints are driven by a velocity or a torque and others move slowly to a
                position, when ...
 guard          ... the commands stop for seconds; a second time after a restart of the service
@@ -101,8 +102,10 @@ _SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.4, 0.15
 """A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
 _RAMP, _RAMP_SECONDS = 12, 0.24
 """Steps in which a soft hold becomes a firm one, and seconds for all of them."""
-_TOUCH_SECONDS = 0.36
-"""Seconds in which a finger presses on the object alone; a slow one gets more."""
+_TOUCH_SECONDS = 0.26
+"""Seconds in which a finger presses on the object alone."""
+_TOUCH_STANDS, _TOUCH_MORE = 0.1, 12
+"""Seconds in which it stands then, and how often it is waited for that."""
 _STATUSES = range(2, 8)
 """What fits into the three bits of the status and has no meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
@@ -431,7 +434,29 @@ class FingerScript(HandScript):
             yield from self._hold(0.6, motors)
             self._end(phase)
             self._goal.update(poses)
+        if "soft" in self.plan.phases:
+            yield from self._uneven()
         yield from self._to("center", OPEN)
+
+    def _uneven(self) -> Steps:
+        """Steps in which some joints are soft and the others are not, three times with others."""
+        self._report("some joints soft, the others not: each by its own gains")
+        sides = self.plan.sides
+        for percent in (OPEN, CLOSED - 5.0, OPEN):
+            splits = self._next_splits()
+            poses = {s: self._pose(s, percent) for s in sides}
+            targets = {s: {i: poses[s][i] for i in sorted(splits[s])} for s in sides}
+            phase = self._begin("soft", sides, targets=targets)
+            motors = {
+                s: [
+                    replace(m, kp=SOFTER * m.kp) if i in splits[s] else m
+                    for i, m in enumerate(self._motors(s, pose))
+                ]
+                for s, pose in poses.items()
+            }
+            yield from self._hold(0.5, motors)
+            self._end(phase)
+            self._goal.update(poses)
 
     def _unpulled(self, name: str) -> Steps:
         self._report(
@@ -625,6 +650,12 @@ class FingerScript(HandScript):
                 hands[s] = self._motors(s, tuple(pose))
             phase = self._begin("touch", pressing, targets=targets, finger=finger)
             yield from self._hold(_TOUCH_SECONDS + self._travel(targets), hands)
+            # a slow finger is still on its way
+            for _ in range(_TOUCH_MORE):
+                before = {s: self._obs.q.get(s, self._home(s)) for s in pressing}
+                yield from self._hold(_TOUCH_STANDS, hands)
+                if all(self._near(s, before[s], self._obs.q.get(s, before[s])) for s in pressing):
+                    break
             self._end(phase)
 
     def _travel(self, targets: Mapping[Side, Mapping[int, float]]) -> float:
@@ -677,6 +708,8 @@ class FingerScript(HandScript):
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
         splits = self._next_splits()
+        for percent in (CLOSED - 5.0, OPEN):
+            yield from self._protected_step(percent, splits)
         squeeze = self._squeezes(pressing, splits)
         still = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
         phases: list[Phase] = []
@@ -698,6 +731,17 @@ class FingerScript(HandScript):
         yield from self._silence("guard", self._model.command_timeout + _STAYS)
         self._report("they stay braked until the protection is cleared")
         yield from self._latch_and_clear(splits)
+
+    def _protected_step(self, percent: float, guarded: Mapping[Side, frozenset[int]]) -> Steps:
+        """A step in which some joints have time-out protection: it changes nothing until then."""
+        sides = self.plan.sides
+        poses = {s: self._pose(s, percent) for s in sides}
+        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        phase = self._begin("guarded-step", sides, targets=targets)
+        hands = {s: self._guarded(self._motors(s, pose), s, guarded) for s, pose in poses.items()}
+        yield from self._hold(0.45, hands)
+        self._end(phase)
+        self._goal.update(poses)
 
     def _squeezes(
         self, sides: Sequence[Side], guarded: Mapping[Side, frozenset[int]]
