@@ -87,6 +87,29 @@ class Hesitates(ReferenceService):
         return self.stood[2]
 
 
+class Coarse(ReferenceService):
+    """Measures q in steps of 1.5 % of the range, from another place on after a restart."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        fields = super().fields(side)
+        step = 0.015 * self.dialect.q_open
+        off = 0.03 if self.restarted else 0.0
+        return {**fields, "q": off + step * round((fields["q"] - off) / step)}
+
+
+class CoarseAndStale(Coarse):
+    """Measures such a q 17 times a second."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.measured: dict[Side, tuple[float, dict[str, Any]]] = {}
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        if self.now - self.measured.get(side, (-1.0, {}))[0] >= 0.06:
+            self.measured[side] = self.now, super().fields(side)
+        return self.measured[side][1]
+
+
 class Unhurried(ReferenceService):
     """Takes four and a half seconds from one end to the other."""
 
@@ -117,6 +140,13 @@ def test_hand_within_the_limits_never_fails(service: type[Service], warned: set[
     result = judged(service)
     assert blamed(result) == warned
     assert result.overall is Overall.PASS
+
+
+def test_steps_of_a_coarse_encoder_are_not_old_values() -> None:
+    assert {r.verdict for r in judged(Coarse).results if "-FRESH-" in r.requirement.id} == {
+        Verdict.PASS
+    }
+    assert result_of(judged(CoarseAndStale), "DEX1-FRESH-01").verdict is Verdict.FAIL
 
 
 def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
