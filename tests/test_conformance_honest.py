@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from random import Random
@@ -110,6 +111,27 @@ class CoarseAndStale(Coarse):
         return self.measured[side][1]
 
 
+class _Capped(ReferenceHand):
+    inertia = 0.0015
+
+    def step(self, dt: float) -> None:
+        before = self.q
+        super().step(dt)
+        if abs(self.dq) > 3.4:
+            self.dq = math.copysign(3.4, self.dq)
+            self.q = before + dt * self.dq
+
+
+class Capped(ReferenceService):
+    """Moves at 3.4 rad/s at most, which a subclass sets after the reference's step."""
+
+    hand = _Capped
+
+
+class CappedAndCoarse(Capped, Coarse):
+    """Shows this motion in steps of 1.5 % of the range."""
+
+
 class Unhurried(ReferenceService):
     """Takes four and a half seconds from one end to the other."""
 
@@ -147,6 +169,11 @@ def test_steps_of_a_coarse_encoder_are_not_old_values() -> None:
         Verdict.PASS
     }
     assert result_of(judged(CoarseAndStale), "DEX1-FRESH-01").verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize("service", [Capped, CappedAndCoarse])
+def test_acceleration_of_a_slow_or_coarse_hand_agrees_with_q(service: type[Service]) -> None:
+    assert result_of(judged(service), "DEX1-FIELD-06").verdict is not Verdict.WARN
 
 
 def test_hand_at_rest_at_its_command_is_not_frozen() -> None:

@@ -34,6 +34,8 @@ OWN_RATE_RULE = ("load", "burst", "shutdown")
 """
 _GAP = 0.1  # s; longer intervals are gaps, which RATE-03 judges
 _STRIDE = 0.1  # s from one window to the next
+COARSEST = 0.02
+"""Part of a joint's range: the coarsest encoder that good hands have."""
 _FEW_CHANGES = 10
 """Changes of q from which on they show an encoder's step."""
 _ON_LATTICE = 0.9
@@ -389,6 +391,13 @@ def order(ctx: Context) -> Outcome:
     )
 
 
+def encoder_step(ctx: Context, joint: int) -> float:
+    """The step of the encoder of a joint, rad; 0 where q shows none of up to 2 % of the range."""
+    coarsest = COARSEST * ctx.joints[joint].stroke
+    course = _Course.from_context(ctx, joint)
+    return ctx.once(("encoder", joint), lambda: course.encoder_step(coarsest))
+
+
 @dataclass(frozen=True, eq=False)
 class _Course:
     """The positions of a joint that are numbers, and where they change.
@@ -574,7 +583,7 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
         return ctx.skipped("the hand does not move in this recording")
     least = ctx.tolerance("min_change_stroke", joint)
     # the joint has moved by less than one step of a coarse encoder meanwhile: no value is old
-    explained = 1.5 * course.encoder_step(ctx.tolerance("max_step_stroke", joint))
+    explained = 1.5 * encoder_step(ctx, joint)
     big = np.abs(size) >= max(least, explained)
     # a value repeated between two large changes in one direction was old
     moving = np.flatnonzero(big[1:] & big[:-1])
