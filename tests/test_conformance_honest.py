@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from random import Random
@@ -87,6 +88,50 @@ class Hesitates(ReferenceService):
         return self.stood[2]
 
 
+class Coarse(ReferenceService):
+    """Measures q in steps of 1.5 % of the range, from another place on after a restart."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        fields = super().fields(side)
+        step = 0.015 * self.dialect.q_open
+        off = 0.03 if self.restarted else 0.0
+        return {**fields, "q": off + step * round((fields["q"] - off) / step)}
+
+
+class CoarseAndStale(Coarse):
+    """Measures such a q 17 times a second."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.measured: dict[Side, tuple[float, dict[str, Any]]] = {}
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        if self.now - self.measured.get(side, (-1.0, {}))[0] >= 0.06:
+            self.measured[side] = self.now, super().fields(side)
+        return self.measured[side][1]
+
+
+class _Capped(ReferenceHand):
+    inertia = 0.0015
+
+    def step(self, dt: float) -> None:
+        before = self.q
+        super().step(dt)
+        if abs(self.dq) > 3.4:
+            self.dq = math.copysign(3.4, self.dq)
+            self.q = before + dt * self.dq
+
+
+class Capped(ReferenceService):
+    """Moves at 3.4 rad/s at most, which a subclass sets after the reference's step."""
+
+    hand = _Capped
+
+
+class CappedAndCoarse(Capped, Coarse):
+    """Shows this motion in steps of 1.5 % of the range."""
+
+
 class Unhurried(ReferenceService):
     """Takes four and a half seconds from one end to the other."""
 
@@ -117,6 +162,18 @@ def test_hand_within_the_limits_never_fails(service: type[Service], warned: set[
     result = judged(service)
     assert blamed(result) == warned
     assert result.overall is Overall.PASS
+
+
+def test_steps_of_a_coarse_encoder_are_not_old_values() -> None:
+    assert {r.verdict for r in judged(Coarse).results if "-FRESH-" in r.requirement.id} == {
+        Verdict.PASS
+    }
+    assert result_of(judged(CoarseAndStale), "DEX1-FRESH-01").verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize("service", [Capped, CappedAndCoarse])
+def test_acceleration_of_a_slow_or_coarse_hand_agrees_with_q(service: type[Service]) -> None:
+    assert result_of(judged(service), "DEX1-FIELD-06").verdict is not Verdict.WARN
 
 
 def test_hand_at_rest_at_its_command_is_not_frozen() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.timing import encoder_step
 from dexkit.conformance.median import median
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.sums import total
@@ -20,6 +21,9 @@ from dexkit.hand import Floats
 __all__: list[str] = []
 
 _HG = "HandState_"
+_STEPS = 3.0
+"""Steps of an encoder in a second difference of q from which on it shows an acceleration: three
+rounded positions make up to two of them, with a standard deviation of 0.7."""
 
 
 def _motors(ctx: Context, *names: str) -> list[str]:
@@ -163,7 +167,9 @@ def acceleration(ctx: Context) -> Outcome:
         # integrated twice, so that it can be compared with q over the same window
         dq = _integral(t, states.ddq[:, joint])
         reported, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
-        busy = np.abs(seen) > ctx.tolerance("min_ddq_rad_s2")
+        # what the steps of a coarse encoder look like is no acceleration
+        rounding = _STEPS * encoder_step(ctx, joint) / window**2
+        busy = np.abs(seen) > max(ctx.tolerance("min_ddq_rad_s2"), rounding)
         if busy.sum() < 20:
             continue
         judged = True

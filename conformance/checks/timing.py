@@ -34,6 +34,15 @@ OWN_RATE_RULE = ("load", "burst", "shutdown")
 """
 _GAP = 0.1  # s; longer intervals are gaps, which RATE-03 judges
 _STRIDE = 0.1  # s from one window to the next
+COARSEST = 0.02
+"""Part of a joint's range: the coarsest encoder that good hands have."""
+_FEW_CHANGES = 10
+"""Changes of q from which on they show an encoder's step."""
+_ON_LATTICE = 0.9
+"""Part of the changes that must be multiples of an encoder's step: noise makes others."""
+_OFF_LATTICE = 0.05
+"""Parts of an encoder's step by which a multiple of it may be off, as published values are
+rounded."""
 _IN_A_ROW = 5  # held positions, in the median of which one outlier does not count
 
 
@@ -382,6 +391,13 @@ def order(ctx: Context) -> Outcome:
     )
 
 
+def encoder_step(ctx: Context, joint: int) -> float:
+    """The step of the encoder of a joint, rad; 0 where q shows none of up to 2 % of the range."""
+    coarsest = COARSEST * ctx.joints[joint].stroke
+    course = _Course.from_context(ctx, joint)
+    return ctx.once(("encoder", joint), lambda: course.encoder_step(coarsest))
+
+
 @dataclass(frozen=True, eq=False)
 class _Course:
     """The positions of a joint that are numbers, and where they change.
@@ -407,6 +423,32 @@ class _Course:
         steps = np.diff(q)
         rows = np.flatnonzero(steps != 0)  # of bits: several times as fast
         return cls(t, q, rows + 1, steps[rows])
+
+    def encoder_step(self, coarsest: float) -> float:
+        """The step of the encoder that these positions come from, rad; 0 where they show none.
+
+        With an encoder, changes are multiples of its step, and the positions lie on a lattice: on
+        two, where it is homed again when the service restarts. Old values of a finer encoder may
+        change by equal amounts while the joint has a constant speed, but they lie anywhere.
+
+        :param coarsest: the largest step that counts as an encoder's, rad.
+        """
+        size = np.abs(self.steps)
+        if len(size) < _FEW_CHANGES:
+            return 0.0
+        step = percentile(size, 5)
+        if not 0.0 < step <= (1 + _OFF_LATTICE) * coarsest:
+            return 0.0
+        times = np.rint(size / step)
+        step = median(size[times == 1])
+        times = np.rint(size / step)
+        on = (times >= 1) & (np.abs(size - times * step) <= _OFF_LATTICE * step)
+        if on.mean() < _ON_LATTICE:
+            return 0.0
+        step = float(size[on].sum() / times[on].sum())
+        phases = np.mod(self.q[self.changes], step) / step
+        bins = np.sort(np.bincount((20 * phases).astype(np.intp) % 20, minlength=20))
+        return step if bins[-4:].sum() >= _ON_LATTICE * len(phases) else 0.0
 
     def held(self, samples: float, which: NDArray[np.bool_]) -> bool:
         """Whether one of these changes comes after so many states of the same position."""
@@ -540,7 +582,9 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     if len(changes) < 3:
         return ctx.skipped("the hand does not move in this recording")
     least = ctx.tolerance("min_change_stroke", joint)
-    big = np.abs(size) >= least
+    # the joint has moved by less than one step of a coarse encoder meanwhile: no value is old
+    explained = 1.5 * encoder_step(ctx, joint)
+    big = np.abs(size) >= max(least, explained)
     # a value repeated between two large changes in one direction was old
     moving = np.flatnonzero(big[1:] & big[:-1])
     moving = moving[np.sign(size[moving + 1]) == np.sign(size[moving])]

@@ -43,6 +43,8 @@ class ReferenceHand:
         self.now = 0.0
         self.goal: Motor | None = None
         self.heard = -math.inf
+        self._shown = 0.0, 0.0
+        """When a state was made last, and dq in it."""
 
     def command(self, motor: Motor) -> None:
         """Take a command; one field that is not finite rejects it."""
@@ -80,8 +82,7 @@ class ReferenceHand:
         damping = self.viscous + kd + (self.brake if braking else 0.0)
         dq = (self.dq + dt * force / self.inertia) / (1.0 + dt * damping / self.inertia)
         slip = dt * self.coulomb / self.inertia
-        was, self.dq = self.dq, 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
-        self.ddq = (self.dq - was) / dt
+        self.dq = 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
         self.q += dt * self.dq
 
     def release(self) -> None:
@@ -98,7 +99,15 @@ class ReferenceHand:
         return 0.0
 
     def fields(self) -> dict[str, float]:
-        """The state's fields."""
+        """The state's fields.
+
+        ddq, rad/s², is the change of dq since the state before: what happened between two states
+        is in it, also where a subclass changes dq after a step.
+        """
+        then, was = self._shown
+        if self.now > then:
+            self.ddq = (self.dq - was) / (self.now - then)
+            self._shown = self.now, self.dq
         return {
             "mode": int(not self.braking),
             "q": self.q,
