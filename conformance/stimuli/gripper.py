@@ -399,7 +399,8 @@ class GripperScript(HandScript):
         if free and self._gains_used:
             yield from self._drive(free, 0.16)
         elif pressing:
-            yield from self._hold(0.5)
+            # on its own the last grip has to come from the open, and to be felt
+            yield from self._hold(0.5 if free else 1.5)
         if regrip is not None:
             self._end(regrip)
 
