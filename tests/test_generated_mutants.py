@@ -381,7 +381,20 @@ def test_an_outsider_that_fails_is_an_error(tmp_path: Path) -> None:
         _HEAD + "@hand('good', dialects='unitree_go')\nclass A(ReferenceService):\n" + body
     )
     with pytest.raises(ConformanceError, match="A failed: RuntimeError: mine"):
-        list(outsiders.try_all(outsiders.load(str(path))))
+        outsiders.try_hand(outsiders.load(str(path))[0])
+    with pytest.raises(ConformanceError, match="A failed: RuntimeError: mine") as caught:
+        list(outsiders.try_all(str(path), 1, jobs=1))
+    assert "hands.py" in caught.value.hint
+
+
+def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "hands.py"
+    body = "    def live(self, dt):\n        import os\n        os._exit(0)\n"
+    path.write_text(
+        _HEAD + "@hand('good', dialects='unitree_go')\nclass A(ReferenceService):\n" + body
+    )
+    with pytest.raises(ConformanceError, match="ended the process"):
+        list(outsiders.try_all(str(path), 1, jobs=1))
 
 
 # ------------------------------------------------------------------------------------ soak

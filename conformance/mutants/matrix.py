@@ -96,8 +96,8 @@ def _blamed(key: tuple[str, str, str]) -> set[str]:
     return TRIALS[mutant.layer].blamed(mutant, short=False)
 
 
-def _ignore_interrupts() -> None:
-    # Ctrl-C goes to every process of the terminal; the first one ends the others
+def ignore_interrupts() -> None:
+    """Ignore Ctrl-C, which goes to every process of the terminal; the first ends the others."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -118,7 +118,7 @@ class Score:
         """
         context = multiprocessing.get_context("spawn")
         ordered = sorted(given, key=lambda m: -cost(m))
-        pool = ProcessPoolExecutor(jobs, context, _ignore_interrupts)
+        pool = ProcessPoolExecutor(jobs, context, ignore_interrupts)
         try:
             waiting = {pool.submit(_blamed, mutant.key): mutant for mutant in ordered}
             while waiting and not stop:

@@ -9,15 +9,20 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import json
+import multiprocessing
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 from rich.markup import escape
 
+from dexkit.conformance.mutants.matrix import ignore_interrupts
 from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import Level, catalogue
@@ -40,6 +45,7 @@ __all__ = [
     "load",
     "print_verdicts",
     "try_all",
+    "try_hand",
     "write_verdicts",
 ]
 
@@ -241,26 +247,60 @@ def blame(result: RunResult) -> Blame:
     return Blame(**{key: tuple(sorted(ids)) for key, ids in found.items()})
 
 
-def try_all(hands: Sequence[Outsider], stop: object = None) -> Iterator[Verdicts]:
-    """Judge each hand by every requirement, in a run of both sides with an object in the right one.
+def try_hand(each: Outsider) -> Verdicts:
+    """Judge a hand by every requirement, in a run of both sides with an object in the right one.
 
-    :param stop: ends it early when it becomes true.
-    :raises ConformanceError: a hand's own code failed.
+    :raises ConformanceError: the hand's own code failed.
     """
-    for each in hands:
-        if stop:
-            return
-        plan = plan_for(each.dialect.name, sides=tuple(Side))
-        try:
-            result = run_mutant(each.made, plan)
-        except Exception as error:  # the code of others may raise anything
-            raise ConformanceError(
-                f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
-            ) from error
-        summary = (each.made.__doc__ or "").strip().partition("\n")[0]
-        yield Verdicts(
-            each.name, summary, each.dialect.name, each.grade, each.expects, *blame(result)
-        )
+    plan = plan_for(each.dialect.name, sides=tuple(Side))
+    try:
+        result = run_mutant(each.made, plan)
+    except Exception as error:  # the code of others may raise anything
+        raise ConformanceError(
+            f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
+        ) from error
+    summary = (each.made.__doc__ or "").strip().partition("\n")[0]
+    return Verdicts(each.name, summary, each.dialect.name, each.grade, each.expects, *blame(result))
+
+
+def try_all(
+    source: str, count: int, stop: object = None, jobs: int | None = None
+) -> Iterator[tuple[int, Verdicts]]:
+    """Judge every hand of a source in worker processes; yield each, with its index in
+    :func:`load`, when it is done.
+
+    :param count: how many hands it has.
+    :param stop: ends it early when it becomes true.
+    :param jobs: processes; one per processor by default.
+    :raises ConformanceError: a hand's own code failed, or ended its process.
+    """
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, ignore_interrupts)
+    try:
+        waiting = {pool.submit(_try_one, source, index): index for index in range(count)}
+        while waiting and not stop:
+            for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                index, found = waiting.pop(future), future.result()
+                if not isinstance(found, Verdicts):
+                    raise ConformanceError(found[0], hint=found[1])
+                yield index, found
+    except BrokenProcessPool:
+        raise ConformanceError(
+            "a hand ended the process that tried it", hint="--jobs 1 shows after which hand"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_loaded = cache(load)
+
+
+def _try_one(source: str, index: int) -> Verdicts | tuple[str, str]:
+    """The verdicts of a hand, or why there are none: not every error can be sent on."""
+    try:
+        return try_hand(_loaded(source)[index])
+    except DexkitError as error:
+        return error.message, error.hint
 
 
 def print_verdicts(console: Console, found: Sequence[Verdicts]) -> None:

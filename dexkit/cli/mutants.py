@@ -49,20 +49,21 @@ def _end_with(
     sys.exit(0 if result.perfect else 1)
 
 
-def _try_outsiders(source: str, console: Console, json_path: Path | None) -> None:
+def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: int | None) -> None:
     """Try the hands of a file or module, and end with the exit code."""
     from dexkit.conformance.mutants import outsiders
 
     hands = outsiders.load(source)
-    found: list[Verdicts] = []
+    by_index: dict[int, Verdicts] = {}
 
     def each() -> Iterator[Verdicts]:
-        for verdicts in outsiders.try_all(hands, stop):
-            found.append(verdicts)
+        for index, verdicts in outsiders.try_all(source, len(hands), stop, jobs):
+            by_index[index] = verdicts
             yield verdicts
 
     with stop_on_signals() as stop:
         _follow(len(hands), each(), stop)
+    found = [by_index[index] for index in sorted(by_index)]
     outsiders.print_verdicts(console, found)
     if json_path:
         outsiders.write_verdicts(json_path, found)
@@ -158,7 +159,7 @@ def command(
     check_output_paths([json_path, resume])
     console = Console()
     if source is not None:
-        _try_outsiders(source, console, json_path)
+        _try_outsiders(source, console, json_path, jobs)
         return
     # Python's worker processes begin with the working folder in front of their import path
     os.chdir("/")
