@@ -177,9 +177,10 @@ class Columns:
                 leaf, places = group.places(steps)
                 rows = group.where(self._n)
                 columns[len(places) :, rows] = np.nan
-                for column, at in zip(columns, places, strict=False):
-                    for part, values in group.words.parts(leaf, at):
-                        column[part if isinstance(rows, slice) else rows[part]] = values
+                with np.errstate(invalid="ignore"):  # a signalling NaN stays a NaN
+                    for column, at in zip(columns, places, strict=False):
+                        for part, values in group.words.parts(leaf, at):
+                            column[part if isinstance(rows, slice) else rows[part]] = values
         return out
 
     def extremes(self, path: str) -> tuple[float, float]:
