@@ -47,6 +47,16 @@ class Step:
         """Distance from the target at the end, rad."""
         return abs(self.final - self.target)
 
+    def arrives_within(self, seconds: float) -> bool:
+        """Whether it moves to its target at the end, fast enough to be there in ``seconds``."""
+        late = self.t >= self.end - 0.1
+        if late.sum() < 2:
+            return False
+        t, q = self.t[late], self.q[late]
+        speed = float(q[-1] - q[0]) / max(float(t[-1] - t[0]), 1e-3)
+        left = self.target - float(q[-1])
+        return left * speed >= 0.0 and abs(left) <= abs(speed) * seconds
+
     def __str__(self) -> str:
         return (
             f"{self.name}commanded from {self.start:.2f} to {self.target:.2f} {self.unit}, q went "

@@ -500,10 +500,16 @@ def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
     return None
 
 
-def arrival(ctx: Context, when: str, phases: Sequence[Phase] | None = None) -> Outcome:
+_SOON_S = 0.25  # s from the end of a step in which a hand that is under way arrives
+
+
+def arrival(
+    ctx: Context, when: str, phases: Sequence[Phase] | None = None, *, soon_s: float = 0.0
+) -> Outcome:
     """Whether the steps of these phases reach their targets.
 
     :param phases: None for those that the requirement needs.
+    :param soon_s: a joint that arrives in this time, at the speed that it has, counts as there.
     """
     judged = [p for p in (ctx.phases() if phases is None else phases) if obeyed_before(ctx, p)]
     if not judged:
@@ -511,7 +517,10 @@ def arrival(ctx: Context, when: str, phases: Sequence[Phase] | None = None) -> O
     found = [s for p in judged for s in steps_of(ctx, p)]
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
-    worst = max(found, key=lambda s: s.error / s.stroke)
+    there = [s for s in found if not (soon_s and s.arrives_within(soon_s))]
+    worst = max(there or found, key=lambda s: s.error / s.stroke)
+    if not there:
+        return ctx.passed("under way", f"{when}: {worst}, and is about to arrive")
     if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
         met = ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
         return met.placed(worst.error, ctx.tolerance("max_error_stroke", worst.joint))
@@ -520,8 +529,12 @@ def arrival(ctx: Context, when: str, phases: Sequence[Phase] | None = None) -> O
 
 @check("DEX1-SIDE-02", "DEX3-SIDE-02")
 def beside(ctx: Context) -> Outcome:
-    """The steps of this hand while the other one gets bad commands, or none."""
-    return arrival(ctx, "while the other hand got bad commands, or none")
+    """The steps of this hand while the other one gets bad commands, or none.
+
+    They last as long as those commands, whatever way this hand has to go: one that is slow, but
+    about to arrive, obeys.
+    """
+    return arrival(ctx, "while the other hand got bad commands, or none", soon_s=_SOON_S)
 
 
 # ------------------------------------------------------------------------------ crowded topics
