@@ -219,7 +219,7 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("FTP-SAFE-10",), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("FTP-SAFE-10", "DEX3-GAIN-03"), whole=True)
 class StaleLater(StaleState):
     """Measures five times a second from 12 s on."""
 
@@ -249,7 +249,7 @@ class FrozenAtFirst(Service):
         return self.first.setdefault(sides, newest) if frozen else newest
 
 
-@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), also=("DEX1-FIELD-20",), whole=True)
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), also=("DEX1-FIELD-20", "DEX5-FIELD-19"), whole=True)
 class FreezesOnce(Service):
     """Publishes the same values for 0.3 s when it first begins to move."""
 

@@ -208,7 +208,7 @@ class _OpenEnd(_PerJoint):
 @wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05"))
 @wrong_hand("BRAINCO-OPER-01", also=("BRAINCO-OPER-05",))
 # its session begins at the open end
-@wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01", "DEX5-MOVE-08"))
+@wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01", "DEX5-MOVE-08", "DEX5-MODE-05"))
 class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range per second."""
 

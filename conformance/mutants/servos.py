@@ -271,7 +271,7 @@ class _Opens(ServoHand):
         self.goal = np.array([j.straight for j in self.model.joints[self.side]])
 
 
-@wrong_hand("BRAINCO-WDOG-01")
+@wrong_hand("BRAINCO-WDOG-01", also=("DFX-PATH-01", "FTP-PATH-01"))
 class OpensInSilence(ServoService):
     """Opens a second after the last command."""
 
