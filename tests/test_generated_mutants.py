@@ -326,6 +326,14 @@ def test_options_that_make_no_sense_are_errors(arguments: list[str], why: str) -
 # ------------------------------------------------------------------------- of other people
 
 
+def test_the_documented_mixin_is_of_two_models(tmp_path: Path) -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(\"\"\"A fault in two models.*?)```", text, re.DOTALL)
+    (tmp_path / "halfway.py").write_text(example)
+    loaded = outsiders.load(str(tmp_path / "halfway.py"))
+    assert [o.dialect.name for o in loaded] == ["dex3", "dex5"]
+
+
 def test_the_documented_example_is_tried(tmp_path: Path) -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     (example,) = re.findall(r"<!-- example: .* -->\n```python\n(.*?)```", text, re.DOTALL)

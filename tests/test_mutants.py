@@ -15,6 +15,7 @@ from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import Outcome, Score, chosen, cost, essential, try_one
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
+from dexkit.errors import UsageError
 from dexkit.hand import Side
 from tests.each import each
 
@@ -151,3 +152,16 @@ def test_command_prints_and_writes_the_score(tmp_path: Path) -> None:
     score = json.loads(path.read_text())
     assert score["perfect"] is True
     assert score["requirements"]["DEX3USB-DESC-01"]["killed_by"] == ["OtherSide"]
+
+
+def test_list_names_hands_and_tries_none() -> None:
+    run = CliRunner().invoke(command, ["--model", "dex1-1", "--require", "DEX1-FIELD-08", "--list"])
+    assert run.exit_code == 0, run.output
+    assert "HotByte" in run.output
+    assert "DEX1-FIELD-08" in run.output
+    assert "left and right" in run.output
+    good = CliRunner().invoke(command, ["--generated", "3", "--good", "--list"])
+    assert good.exit_code == 0, good.output
+    assert good.output.count("good   ") == 3
+    refused = CliRunner().invoke(command, ["--list", "--json", "x.json"])
+    assert isinstance(refused.exception, UsageError)

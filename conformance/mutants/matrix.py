@@ -23,7 +23,7 @@ from dexkit.conformance.requirements import Level, Requirement, catalogue, selec
 from dexkit.console import Console
 from dexkit.documents import write_file
 
-__all__ = ["Outcome", "Score", "chosen", "cost", "essential", "try_one"]
+__all__ = ["Outcome", "Score", "chosen", "cost", "essential", "print_list", "try_one"]
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,19 @@ def chosen(
     requirements = select(catalogue(model, None), prefixes=prefixes)
     wanted = {r.id for r in requirements}
     return requirements, tuple(m for m in mutants() if m.kills in wanted)
+
+
+def print_list(console: Console, given: Sequence[Mutant]) -> None:
+    """Print wrong hands with their models, the requirements that must find them, and sides."""
+    table = Table(box=None, header_style="bold", title_justify="left")
+    for name in ("wrong hand", "model", "kills", "sides", "what it does wrong"):
+        table.add_column(name, overflow="fold", no_wrap=name in ("model", "kills"))
+    for m in given:
+        sides = " and ".join(dict.fromkeys(str(s) for s in m.sides))
+        spoken = f" ({m.dialect})" if m.dialect else ""
+        table.add_row(m.name, m.model + spoken, m.kills, sides, escape(m.summary))
+    console.print(table)
+    console.print(f"{len(given)} wrong hands", highlight=False)
 
 
 def cost(mutant: Mutant) -> float:

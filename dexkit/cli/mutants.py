@@ -109,6 +109,12 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
 @click.option(
     "--from", "source", metavar="FILE_OR_MODULE", help="Try the hands of a Python file or module."
 )
+@click.option(
+    "--list",
+    "listed",
+    is_flag=True,
+    help="Print the hands, with model, requirement and sides, and try none.",
+)
 @click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the score as JSON.")
 @click.option(
     "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
@@ -126,6 +132,7 @@ def command(
     names: tuple[str, ...],
     resume: Path | None,
     source: str | None,
+    listed: bool,
     json_path: Path | None,
     jobs: int | None,
     verbose: bool,
@@ -152,6 +159,8 @@ def command(
         raise UsageError("--quick and --thorough are two runs: choose one")
     if source is not None and model is not None:
         raise UsageError("--from says which models its hands are of", hint="leave out --model")
+    if listed and (json_path or source is not None or resume):
+        raise UsageError("--list tries no hand: it goes with --model, --require and --generated")
     if json_path:
         json_path = json_path.absolute()
     if resume:
@@ -174,14 +183,22 @@ def command(
         if generated is not None:
             spoken = dialects(model, dialect)
             hands += (sample_good if good else sample)(generated, seed, spoken)
+        if listed:
+            for each in hands:
+                grade = "good" if each.good else "wrong"
+                console.print(f"{grade:5}  {each.name}", markup=False, highlight=False)
+            return
         kind = RunKind.QUICK if quick else RunKind.THOROUGH if thorough else RunKind.DEFAULT
         campaign = Campaign(seed, resume, kind=kind)
         with stop_on_signals() as stop:
             _follow(len(hands), campaign.run(hands, stop, jobs), stop)
         _end_with(campaign, console, json_path, verbose=verbose)
-    from dexkit.conformance.mutants.matrix import Score, chosen
+    from dexkit.conformance.mutants.matrix import Score, chosen, print_list
 
     requirements, trials = chosen(model, require)
+    if listed:
+        print_list(console, trials)
+        return
     score = Score(requirements)
     with stop_on_signals() as stop:
         _follow(len(trials), score.run(trials, stop, jobs), stop)
