@@ -18,7 +18,7 @@ from dexkit.traces import open_trace, sample_path
 __all__ = ["DEFAULT_SECONDS", "Session"]
 
 DEFAULT_SECONDS = 5.5
-FINGERS_SECONDS = 5.0
+FINGERS_SECONDS = 3.9
 """The same for hands of several joints, whose other stimuli take longer."""
 
 
