@@ -30,6 +30,9 @@ COMMON_SETTINGS = {
 }
 """The settings of every simulated hand."""
 
+_POSE_CHARACTERS = 65_536
+"""More than the positions of any hand take; a longer file is not a pose."""
+
 
 class Mechanics(Protocol):
     """Mechanics on steps instead of a clock."""
@@ -83,16 +86,20 @@ class SimulatedHand:
         :raises UsageError: the file is not one that :meth:`close` wrote for such a hand.
         """
         self._pose = file
-        if not file.exists():
-            return
-        spec = self._spec
+        spec, name = self._spec, one_line(str(file), 200)
         try:
-            q = [float(value) for value in json.loads(file.read_text(encoding="utf-8"))]
-        except (OSError, ValueError, TypeError) as error:
-            raise UsageError(f"pose: {file} is not readable: {one_line(str(error))}") from error
+            if not file.exists():
+                return
+            if not file.is_file():  # a device or a pipe would never end
+                raise ValueError("it is not a regular file")
+            with file.open(encoding="utf-8") as stream:
+                q = [float(value) for value in json.loads(stream.read(_POSE_CHARACTERS))]
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            why = one_line(str(error), 200)
+            raise UsageError(f"pose: {name} is not readable: {why}") from error
         if len(q) != spec.n_joints or not all(map(math.isfinite, q)):
             raise UsageError(
-                f"pose: {file} does not have the {spec.n_joints} positions of this hand",
+                f"pose: {name} does not have the {spec.n_joints} positions of this hand",
                 hint="remove the file, or give each hand its own",
             )
         self._mechanics.place(q)
@@ -131,8 +138,9 @@ class SimulatedHand:
         try:
             part.write_text(json.dumps(q) + "\n", encoding="utf-8")
             os.replace(part, file)  # whole, or as it was
-        except OSError as error:
-            raise UsageError(f"pose: {file} cannot be written: {error.strerror}") from error
+        except (OSError, ValueError) as error:
+            name, why = one_line(str(file), 200), one_line(str(error), 200)
+            raise UsageError(f"pose: {name} cannot be written: {why}") from error
 
     def exchange(self, command: HandCommand) -> HandState:
         """Advance to now under the last command, apply this one, and return the state.
