@@ -1,4 +1,4 @@
-"""Drive an Inspire RH56, however it is reached (docs/inspire.md).
+"""Drive an Inspire RH56 over any register transport (docs/inspire.md).
 
 Each exchange writes the goals where they have changed and reads the angles; some exchanges read
 errors and temperatures as well. :mod:`dexkit.drivers.inspire_serial` and
@@ -29,7 +29,7 @@ __all__ = ["COMMON_SETTINGS", "InspireHand", "InspireSettings"]
 log = logging.getLogger(__name__)
 
 _HEALTH_EVERY = 20
-"""Exchanges of which one reads errors and temperatures."""
+"""Errors and temperatures are read once in so many exchanges."""
 _HEALTH = int(Register.TEMPERATURE) + rh56.JOINTS - int(Register.ERROR)
 """Bytes from the errors to the end of the temperatures."""
 
@@ -38,7 +38,7 @@ _HEALTH = int(Register.TEMPERATURE) + rh56.JOINTS - int(Register.ERROR)
 class InspireSettings:
     """Settings of an :class:`InspireHand`.
 
-    :param device: where it is; see the driver.
+    :param device: path or address; see the driver.
     :param id: of the hand on the line, or Modbus' unit.
     :param speed: of every joint, 0 to 1000; None leaves what the device has.
     :param force: limit of every joint, 0 to 1000; None leaves what the device has.
@@ -62,12 +62,12 @@ class InspireSettings:
 
     @property
     def ids(self) -> range:
-        """The ids that there are."""
+        """Valid ids."""
         return rh56.IDS
 
 
 class InspireHand(GoalHand):
-    """An Inspire RH56, however it is reached.
+    """An Inspire RH56 over any register transport.
 
     :param side: which hand.
     :param configuration: place, id, speed, limit of force and time-out.
@@ -95,16 +95,16 @@ class InspireHand(GoalHand):
     def _write(
         self, channel: Channel, register: Register, data: bytes, before: WriteDeadline | None
     ) -> None:
-        """Write bytes to the registers from one on.
+        """Write bytes to consecutive registers.
 
-        :raises HandError: they were not, or nobody knows.
+        :raises HandError: the write failed, or was not acknowledged.
         """
 
     @abstractmethod
     def _read(self, channel: Channel, register: Register, count: int) -> bytes:
-        """So many bytes of the registers from one on.
+        """Read ``count`` bytes of consecutive registers.
 
-        :raises HandError: there are none.
+        :raises HandError: there is no answer.
         """
 
     # --- one hand

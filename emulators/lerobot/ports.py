@@ -1,7 +1,7 @@
 """The ports on ZeroMQ in front of an emulated G1 on DDS: sockets and threads.
 
-Each socket belongs to one thread. Stop and restart of the robot behind it need no care here: states
-come when there are some, and commands are written whether or not somebody reads them.
+Each socket belongs to one thread. A restart of the robot on DDS needs no handling here: states are
+forwarded when they arrive, and commands are written whether or not they are read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["PORTS", "Counters", "LerobotPorts", "Ports"]
 
 log = logging.getLogger("dexkit.lerobot")
 
-_TICK = 50  # ms after which a thread looks whether it is to stop
+_TICK = 50  # ms between checks whether a thread is to stop
 _JOIN = 5.0
 
 
@@ -45,12 +45,12 @@ class Ports:
 
 
 PORTS = Ports()
-"""Those that LeRobot's client has in its source."""
+"""The ports hard-coded in LeRobot's client."""
 
 
 @dataclass
 class Counters:
-    """What happened.
+    """Counters of the ports.
 
     :ivar states: sent.
     :ivar commands: received.
@@ -71,8 +71,8 @@ class Counters:
 class LerobotPorts:
     """LeRobot's ports for the G1 on a DDS domain; a context manager.
 
-    :param node: where the emulated G1 is. Commands are written there, so it must not be the
-        network of a real one.
+    :param node: where the emulated G1 is. Commands are written there, so it must not be the network
+        of a real robot.
     :param address: which of this machine's addresses to listen on.
     :param camera: also send pictures.
     :raises ExtraMissing: pyzmq or Pillow is not installed.
@@ -102,7 +102,7 @@ class LerobotPorts:
             self._commands = self._socket(self._zmq.PULL)
             self._commands.setsockopt(self._zmq.CONFLATE, 1)
             self._commands.setsockopt(self._zmq.MAXMSGSIZE, MOST)
-            # connections are told of before their first message can be received
+            # connections are reported before their first message can be received
             self._monitor = self._commands.get_monitor_socket()
             self._states = self._socket(self._zmq.PUB)
             self._pictures = self._socket(self._zmq.PUB)
@@ -187,7 +187,7 @@ class LerobotPorts:
                     payload = self._commands.recv(zmq.NOBLOCK)
                 except zmq.Again:
                     pass
-                # after it was received: whoever sent it has been told of by now
+                # after the receive: its sender's connection has been reported by now
                 self._look_at_connections()
                 if self._stream.look():
                     self.counters.pauses += 1
