@@ -507,7 +507,7 @@ LEFT = ["--side", "left"]
         (["sim-dex1", *LEFT, "--dialect", "unitree_go"], "without DDS"),
         (["--external", *LEFT, "--dialect", "dex3", "--device", "x"], "for a backend"),
         (["sim-dex1", *LEFT, "--joint", "thumb"], "no joint 'thumb'"),
-        (["sim-dex3", *LEFT], "nobody is at a terminal"),
+        (["sim-dex3", *LEFT], "there is no terminal"),
         (["sim-dex1", *LEFT, "--baseline", "other.json"], "its side is right"),
         (["sim-dex1", *LEFT, "--baseline", "junk.json"], "not a self-test"),
         (["sim-dex1", *LEFT, "--baseline", "mine.json", "--json", "mine.json"], "an input"),

@@ -95,7 +95,7 @@ def emulate_all(
       dexkit emulate all --for lerobot --hands none
 
     Prints "ready: ..." when all topics are up, and what to start next. Ctrl-C or SIGTERM ends
-    it. When one part ends, all do, with its error and exit code.
+    it. When one part ends, all parts end, with its error and exit code.
     """  # noqa: D301  # click wants the backspace itself
     for_lerobot = client == _LEROBOT
     hands = hands or (_LEROBOT_HANDS if for_lerobot else _XR_HANDS)

@@ -65,7 +65,7 @@ def line_options(
             type=click.IntRange(9600, most),
             default=baudrate,
             metavar="B",
-            help=f"Bits a second that the {device} understands.",
+            help=f"Baud rate of the {device}.",
         ),
         line_time_option(),
         click.option(
@@ -73,7 +73,7 @@ def line_options(
             type=Number(0, 1000),
             default=0.0,
             metavar="MS",
-            help=f"From a request to its answer; what the real {device} needs is not known.",
+            help=f"Time from a request to its answer; that of the real {device} is not known.",
         ),
         latency_timer_option(latency_timer),
         fault_options(faults),
