@@ -81,6 +81,7 @@ class Backend:
     :param needs_device: refuse to start without a device.
     :param settings: name and help of each ``--set`` setting.
     :param bringup: makes the :class:`~dexkit.bringup.Bench` of ``dexkit bringup``, or None.
+    :param udev_rules: makes the udev rules that give users access to its USB device, or None.
     """
 
     summary: str
@@ -90,6 +91,7 @@ class Backend:
     needs_device: bool = False
     settings: dict[str, str] = field(default_factory=dict)
     bringup: Lazy[Callable[[BackendOptions], Bench]] | None = None
+    udev_rules: Lazy[Callable[[], str]] | None = None
 
     def create(self, options: BackendOptions) -> Hand:
         """Make the hand; nothing is opened yet.

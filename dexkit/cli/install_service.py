@@ -22,7 +22,7 @@ from dexkit.cli.options import (
 from dexkit.documents import write_file
 from dexkit.errors import OutputError, UsageError
 from dexkit.hand import Side
-from dexkit.systemd_units import device_link, serial_rule, unit, unit_name, usb_rules
+from dexkit.systemd_units import device_link, serial_rule, unit, unit_name
 
 __all__ = ["command"]
 
@@ -116,8 +116,8 @@ def command(
         files[(directory or _UNITS) / unit_name(side)] = unit(
             side, words, user=name, what=backend_name
         )
-    if backend_name == "dex3-usb" and not no_udev:
-        rules += usb_rules()
+    if kind.udev_rules is not None and not no_udev:
+        rules += kind.udev_rules.load()()
     if rules:
         files[(directory or _RULES) / "71-dexkit.rules"] = rules
     for path, text in files.items():
