@@ -20,7 +20,7 @@ from dexkit.drivers.ezgripper.scaling import current_of_effort, joint_of_ticks, 
 from dexkit.emulators.mx64 import Firmware, GripperMechanics, Physics, Servo
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
-from dexkit.service.core import Estimation, HandCore
+from dexkit.service.hand_core import Estimation, HandCore
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import Instruction, Packet

@@ -16,9 +16,9 @@ from dexkit.conformance.audit import objects, sessions
 from dexkit.conformance.audit.audit import Audit, Outcome, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.page import Summary, render
 from dexkit.conformance.audit.records import FINDING, FileRecord, State
 from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.workers import Lost, Pool
 from dexkit.conformance.judge import judge

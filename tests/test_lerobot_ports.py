@@ -129,7 +129,7 @@ def spaced(stream: CommandStream, clock: ManualClock, period: float, count: int)
     found = []
     for _ in range(count):
         clock.advance(period)
-        stream.look()
+        stream.detect_pause()
         found.append(stream.counts())
     return found
 
@@ -137,7 +137,7 @@ def spaced(stream: CommandStream, clock: ManualClock, period: float, count: int)
 def test_commands_count_after_a_second_without_a_gap() -> None:
     clock = ManualClock()
     stream = CommandStream(clock)
-    stream.look()
+    stream.detect_pause()
     stream.connected(7)
     assert spaced(stream, clock, 0.125, 12) == [False] * 9 + [True] * 3
     assert spaced(stream, clock, 0.375, 3) == [False] * 3

@@ -124,7 +124,7 @@ def examined(
     hand = Over(inner, change)
     hand.alter = alter
     hand.open()
-    setup = Setup.of(hand.spec, rate=100.0)
+    setup = Setup.from_spec(hand.spec, rate=100.0)
     speed = 1.0 if setup.servo else 0.25
     test = SelfTest(Procedure(setup, joints=joints, speed=speed, touch=touch))
     run(hand, test, clock=clock, turn=turn)
@@ -198,7 +198,7 @@ def check_load(name: str, seed: int, joints: Sequence[int] | None = None) -> Non
 
 
 def test_no_motor_gives_more_than_its_lead_allows() -> None:
-    setup = Setup.of(SimHand().spec)
+    setup = Setup.from_spec(SimHand().spec)
     most = float(setup.kp[0]) * LEAD
     state: HandState | None = None
 
@@ -327,7 +327,7 @@ def test_a_failure_of_the_caller_leaves_the_hand_at_rest() -> None:
     clock = ManualClock(7.0)
     hand = Over(HANDS["dex1"](clock), same)
     hand.open()
-    test = SelfTest(Procedure(Setup.of(hand.spec)))
+    test = SelfTest(Procedure(Setup.from_spec(hand.spec)))
     with pytest.raises(KeyboardInterrupt):
         run(hand, test, clock=clock, turn=fail)
     assert hand.commands[-1].is_brake

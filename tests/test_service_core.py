@@ -15,7 +15,7 @@ from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
-from dexkit.service.core import Estimation, HandCore
+from dexkit.service.hand_core import Estimation, HandCore
 from tests.each import each
 
 TIMEOUT = DEX1_1.command_timeout

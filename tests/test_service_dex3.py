@@ -31,9 +31,9 @@ from dexkit.hand import (
 from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import HandService, Publisher
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.finger_state import FingerStateEncoder
+from dexkit.service.hand_core import HandCore
 from tests.each import each
 from tests.service_helpers import FakeNode, deliver_until, wait_until
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
 from dexkit.conformance.audit.journal import Entry, Journal
-from dexkit.conformance.audit.page import Summary, render
 from dexkit.conformance.audit.records import FileRecord, State
 from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.tables import write_tables
 from dexkit.conformance.audit.workers import Lost, Pool
 from dexkit.documents import write_file

@@ -65,7 +65,7 @@ class Setup:
     lead: float = LEAD
 
     @classmethod
-    def of(
+    def from_spec(
         cls,
         spec: HandSpec,
         *,

@@ -137,7 +137,7 @@ class Procedure:
         self._at_rest(still)
         everything = set(range(self.setup.spec.n_joints))
         for j in self.chosen:
-            self._tell(f"{self._joint(j).name}: which joint moves, and which way", 0.0)
+            self._report_progress(f"{self._joint(j).name}: which joint moves, and which way", 0.0)
             # the others brake: one that turns the wrong way would run off while it is held
             self.bench.limp = everything - {j}
             yield from self._nudge(j)
@@ -148,10 +148,10 @@ class Procedure:
             yield from self._thoroughly(j, k, len(live))
         if self.touch:
             yield from self._feel()
-        self._tell("at rest", 1.0)
+        self._report_progress("at rest", 1.0)
         self._temperatures(still, (yield from self.bench.watch(0.3)))
 
-    def _tell(self, doing: str, part: float) -> None:
+    def _report_progress(self, doing: str, part: float) -> None:
         self.doing, self.part = doing, part
 
     def _usable(self, j: int) -> bool:
@@ -197,7 +197,7 @@ class Procedure:
 
     def _open(self) -> Turns[None]:
         """Open the hand slowly, finger by finger, so that no joint is in another's way."""
-        self._tell("opening the hand", 0.0)
+        self._report_progress("opening the hand", 0.0)
         for j in range(self.setup.spec.n_joints):
             if self._usable(j):
                 yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
@@ -245,7 +245,7 @@ class Procedure:
             ("speed", self._speeds),
         )
         for n, (title, test) in enumerate(tests):
-            self._tell(f"{joint.name}: {title}", (k + n / len(tests)) / of)
+            self._report_progress(f"{joint.name}: {title}", (k + n / len(tests)) / of)
             yield from test(j)
         yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
 
@@ -411,7 +411,7 @@ class Procedure:
             missing = [str(e.slot) for e in elements if not e.answered]
             if not missing:
                 break
-            self._tell(f"touch: {place}", 1.0)
+            self._report_progress(f"touch: {place}", 1.0)
             self.question = f"press each element of the {place} (missing: {', '.join(missing)})"
             (state,) = (yield from bench.watch(0.0))[-1:]
             if state.pressure is None:

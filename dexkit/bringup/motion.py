@@ -38,7 +38,9 @@ class Effort:
             raise UsageError(f"speed is 0.02 to 2 rad/s, not {self.speed:g}")
 
     @classmethod
-    def of(cls, plan: Plan, torque: float | None = None, speed: float | None = None) -> Effort:
+    def from_plan(
+        cls, plan: Plan, torque: float | None = None, speed: float | None = None
+    ) -> Effort:
         """What is asked for, or else what the plan has.
 
         :raises UsageError: it is more than the plan allows.

@@ -45,7 +45,7 @@ class Session:
         self.doing = ""
         self.moves = False
         self.done = False
-        self._effort = effort or Effort.of(plan)
+        self._effort = effort or Effort.from_plan(plan)
         self._fault: HandFault | None = None
         self._widest = plan.widest
         self._script = script(plan, motors, findings)

@@ -110,7 +110,7 @@ def command(
     options = BackendOptions(sides[0], device, texts)
     options.refuse_unknown(kind.settings)
     bench: Bench = kind.bringup.load()(options)
-    effort = Effort.of(bench.plan, torque, speed)
+    effort = Effort.from_plan(bench.plan, torque, speed)
     if dry_run:
         _print_plan(bench, effort, (), attended=not unattended)
         return

@@ -158,7 +158,7 @@ def command(backend_name: str | None, **given: Any) -> int:
                 return 130
             raise
         stack.callback(hand.close)
-        setup = Setup.of(
+        setup = Setup.from_spec(
             hand.spec,  # opening may have refined its rate
             dialect=spoken,
             joint_speeds=getattr(hand, "joint_speeds", None),

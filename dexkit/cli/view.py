@@ -115,7 +115,7 @@ def command(
 
     # names the extra before anything else is done
     if to is None:
-        from dexkit.view.page import Page
+        from dexkit.view.browser_page import Page
     elif to == "rerun":
         from dexkit.view.rerun_viewer import RerunViewer
     else:

@@ -65,10 +65,10 @@ def result_of(code: int, output: str) -> Installed:
 
 def main(send: bool) -> None:
     """Find out, and print it."""
-    print(json.dumps(dataclasses.asdict(_look(send))))
+    print(json.dumps(dataclasses.asdict(_probe(send))))
 
 
-def _look(send: bool) -> Installed:
+def _probe(send: bool) -> Installed:
     try:
         version = metadata.version("cyclonedds")
     except metadata.PackageNotFoundError:

@@ -52,7 +52,7 @@ class Mounting:
                 raise UsageError(f"a ratio is {_RATIOS[0]:g} to {_RATIOS[1]:g}, not {ratio:g}")
 
     @classmethod
-    def of(cls, joints: Sequence[JointSpec]) -> Mounting:
+    def default(cls, joints: Sequence[JointSpec]) -> Mounting:
         """The default mounting: motors turn as their joints do, from the same zero."""
         n = len(joints)
         return cls((1,) * n, (0.0,) * n, tuple(joint.gear_ratio for joint in joints))

@@ -40,7 +40,7 @@ class Wiring:
     @classmethod
     def assumed(cls, side: Side) -> Wiring:
         """The wiring that dexkit assumes for a real hand."""
-        return cls(DEFAULT_BUS_MAP, Mounting.of(DEX3_1.joints[side]))
+        return cls(DEFAULT_BUS_MAP, Mounting.default(DEX3_1.joints[side]))
 
     @classmethod
     def random(cls, seed: int) -> Wiring:

@@ -33,7 +33,7 @@ class CommandStream:
         self._last = 0.0
         self.clients: set[int] = set()
 
-    def look(self) -> float:
+    def detect_pause(self) -> float:
         """Detect a pause of this program. Call it periodically, and before :meth:`counts`.
 
         :returns: seconds that this program was paused until now, or 0.

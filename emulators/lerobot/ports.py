@@ -166,7 +166,7 @@ class LerobotPorts:
     def _record_failure(self, error: Exception) -> None:
         self.failure = self.failure or error
 
-    def _tell(self, kind: str, text: str) -> None:
+    def _warn_once(self, kind: str, text: str) -> None:
         if kind not in self._told:
             self._told.add(kind)
             log.warning("%s (counted, logged once)", text)
@@ -189,9 +189,9 @@ class LerobotPorts:
                     pass
                 # after the receive: its sender's connection has been reported by now
                 self._look_at_connections()
-                if self._stream.look():
+                if self._stream.detect_pause():
                     self.counters.pauses += 1
-                    self._tell("pause", "this program was paused: commands count again in 1 s")
+                    self._warn_once("pause", "this program was paused: commands count again in 1 s")
                 if payload is None:
                     continue
                 data = self._admit(payload)
@@ -206,11 +206,13 @@ class LerobotPorts:
             data = low_level.encode_with_crc(command_from(payload))
         except WireError as error:
             self.counters.refused += 1
-            self._tell("refused", f"a command was refused: {error}")
+            self._warn_once("refused", f"a command was refused: {error}")
             return None
         counts = self._stream.counts()
         if len(self._stream.clients) > 1:
-            self._tell("clients", "two clients are connected: no command counts until one leaves")
+            self._warn_once(
+                "clients", "two clients are connected: no command counts until one leaves"
+            )
         return data if counts else None
 
     def _look_at_connections(self) -> None:
@@ -234,7 +236,7 @@ class LerobotPorts:
                     try:
                         payload = state_json(sample.message)
                     except WireError as error:
-                        self._tell("state", f"a state cannot be read: {error}")
+                        self._warn_once("state", f"a state cannot be read: {error}")
                         continue
                     self._states.send(payload)  # to clients that keep up; it never waits
                     self.counters.states += 1

@@ -132,7 +132,7 @@ class HandCodec:
     :param joints: in the order of commands and states, with their gear ratios.
     :param layout: of the command frames that are encoded; both are decoded.
     :param head: of the command frames that are encoded.
-    :param mounting: direction, zero and gearing of the motors; by default :meth:`Mounting.of`.
+    :param mounting: direction, zero and gearing of the motors; by default :meth:`Mounting.default`.
     :param poll_sensors: whether the command frames that are encoded address the sensors, too.
 
     After each :meth:`decode`: ``problems``, what was lost of that frame; ``missing_motors`` and
@@ -150,7 +150,7 @@ class HandCodec:
         mounting: Mounting | None = None,
         poll_sensors: bool = False,
     ) -> None:
-        mounting = Mounting.of(joints) if mounting is None else mounting
+        mounting = Mounting.default(joints) if mounting is None else mounting
         for found, what in ((bus_map.motors, "the bus map"), (mounting.signs, "the mounting")):
             if len(joints) != len(found):
                 raise UsageError(f"{len(joints)} joint(s), but {what} has {len(found)} motor(s)")
