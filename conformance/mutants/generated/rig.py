@@ -277,9 +277,6 @@ class Faulty(Service):
         """Connect the mechanics with the hooks."""
         raise AssertionError  # overridden
 
-    def _active(self, what: What) -> bool:
-        return what.since is not None
-
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         """Take a command message; note whose it is and whether it has the usual length."""
         self.client = client
