@@ -341,7 +341,7 @@ class Recording:
         return self.stimulus.time_error(self.log_time(begin), self.log_time(end))
 
     def lost(self, begin: float, end: float) -> Lost | None:
-        """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
+        """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
         if self.stimulus is None:
             return None
         return self.stimulus.beats.lost(self.log_time(begin), self.log_time(end))

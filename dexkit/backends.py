@@ -71,12 +71,12 @@ class BackendOptions:
 
 @dataclass(frozen=True)
 class Backend:
-    """A way to be a hand.
+    """A driver or simulated hand, with its settings.
 
     :param summary: one line for ``dexkit backends``.
     :param model: hand model that it implements; empty where it is known only after the hand was
         made.
-    :param needs: what must be there: ``"--device PATH or serial number"``, or empty.
+    :param needs: the device that is needed: ``"--device PATH or serial number"``, or empty.
     :param make: makes the hand, without opening it.
     :param needs_device: refuse to start without a device.
     :param settings: name and help of each ``--set`` setting.

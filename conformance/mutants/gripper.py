@@ -1252,7 +1252,7 @@ class GainsOfTheOtherSide(ReferenceService):
 
 @wrong_hand("DEX1-STILL-01")
 class TakesTheOtherSides(ReferenceService):
-    """Of commands that come at once it now and then gives the left hand the right one's."""
+    """When commands arrive together, the left hand sometimes gets the right hand's command."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)

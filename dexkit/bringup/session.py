@@ -103,7 +103,7 @@ class Session:
             self.doing = f"press and hold the {self._touch.action.place} now"
 
     def step(self, now: float, snapshot: Snapshot, held: bool) -> Drive | None:
-        """What to send next: one motor's command, or None to lock every motor.
+        """Return the next command to one motor, or None to lock every motor.
 
         :param now: monotonic seconds, of the snapshot.
         :param held: the dead-man key.

@@ -243,7 +243,7 @@ def _touch(name: str, wanted: bool) -> bool:
 
 
 def _outputs(given: dict[str, Any], model: str) -> tuple[Path, Path]:
-    """Where the result and the page go; never over an earlier run unless a name is given."""
+    """Paths of result and page; an earlier run is overwritten only if a name is given."""
     stem = f"selftest-{model}-{given['side']}-{datetime.now():%Y%m%d-%H%M%S}"
     json_path, page = given["json_path"], given["html_path"]
     if json_path is None:

@@ -155,7 +155,7 @@ def command(
 
 
 class _Written:
-    """How much of a recording is written, on the status line."""
+    """Show the progress of writing a recording on the status line."""
 
     def __init__(self) -> None:
         self._line = StatusLine(quiet=False)

@@ -186,7 +186,7 @@ class TouchArea:
 
     @property
     def elements(self) -> int:
-        """How many elements it has."""
+        """Number of elements."""
         return self.rows * self.columns
 
 
@@ -231,7 +231,7 @@ class Finger:
 
     @property
     def end(self) -> tuple[float, float]:
-        """Where it ends."""
+        """Position of its tip."""
         return self.along(len(self.joints) - 1 + self.tip)
 
 

@@ -675,7 +675,7 @@ class HandService:
         return payload
 
     def _compose_touch(self) -> bytes | None:
-        """What the hands' tactile areas feel now; None without a state, or where they do not."""
+        """Message of the hands' tactile areas; None without a state, or without such areas."""
         views = tuple(unit.core.view() for unit in self._units)
         encoded_views, payload = self._touch
         if len(views) == len(encoded_views) and all(

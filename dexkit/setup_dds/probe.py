@@ -49,7 +49,7 @@ def _start(python: str, folder: str, call: str) -> list[str]:
 
 
 def result_of(code: int, output: str) -> Installed:
-    """What the child has found.
+    """Parse the child's result.
 
     :param code: its exit code; negative: of which signal it died.
     """

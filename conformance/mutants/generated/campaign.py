@@ -41,7 +41,7 @@ GOOD = "good"
 
 @dataclass(frozen=True)
 class Trial:
-    """What became of one hand.
+    """Result of the trial of one hand.
 
     :param severity: ``must-breaking``, ``lesser``, ``equivalent``, or ``good``.
     :param in_kit: the severity of what shows under the kit's own stimulus alone.

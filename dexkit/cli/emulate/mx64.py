@@ -227,7 +227,7 @@ class _EepromFile:
                 ) from error
 
     def load(self, index: int) -> bytes | None:
-        """What servo ``index`` on the line had, or None."""
+        """The stored EEPROM of servo ``index`` on the line, or None."""
         return self._contents[index] if index < len(self._contents) else None
 
     def save(self, contents: list[bytes]) -> None:

@@ -1,4 +1,4 @@
-"""What the emulators of devices on a line have in common: their options, and how they run."""
+"""Options and run loop shared by the emulators of devices on a line."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ class Served(Protocol):
 
     @property
     def ready_lines(self) -> Sequence[str]:
-        """What says that it is there."""
+        """Lines to print when it is ready."""
 
     @property
     def error(self) -> BaseException | None:
-        """What ended its service, or None."""
+        """The error that ended its service, or None."""
 
     @property
     def failure(self) -> Exception | None:
         """The first exception that its service has survived, or None."""
 
     def inject(self, spec: str) -> None:
-        """Have a fault."""
+        """Inject a fault."""
 
     def summaries(self) -> Sequence[str]:
-        """What was seen, a line each."""
+        """Counters, one line each."""
 
     def close(self) -> None:
         """Stop. May be called twice."""
