@@ -45,7 +45,7 @@ MOTOR = st.fixed_dictionaries(
 # ------------------------------------------------------------------------------------ JSON
 
 
-def test_state_has_what_lerobot_reads() -> None:
+def test_state_has_the_fields_that_lerobot_reads() -> None:
     state = LowState_(
         mode_machine=5,
         motor_state=[MotorState_(q=0.5, dq=-1.0, tau_est=2.0, temperature=(30, 41))] * G1.slots,
@@ -67,7 +67,7 @@ def test_state_has_what_lerobot_reads() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(MOTOR, max_size=3), BYTE, BYTE)
-def test_command_is_what_was_written(
+def test_parsed_command_equals_the_written_one(
     motors: list[dict[str, float]], mode_pr: int, machine: int
 ) -> None:
     data = {"mode_pr": mode_pr, "mode_machine": machine, "motor_cmd": motors}
@@ -104,7 +104,7 @@ def test_command_is_what_was_written(
         command_json({}) + b" " * MOST,
     ],
 )
-def test_what_is_no_command_is_refused(payload: bytes) -> None:
+def test_invalid_commands_are_refused(payload: bytes) -> None:
     with pytest.raises(WireError):
         command_from(payload)
 

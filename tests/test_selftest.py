@@ -336,7 +336,7 @@ def test_a_failure_of_the_caller_leaves_the_hand_at_rest() -> None:
 # ------------------------------------------------------------------------------------- measuring
 
 
-def test_lost_motion_is_what_friction_does_not_explain() -> None:
+def test_lost_motion_excludes_friction() -> None:
     below, above = [Rest(1.0, 0.1)], [Rest(1.09, -0.1)]
     assert measure.lost_motion(below, above, 5.0, 5.0) == pytest.approx(0.05)
     assert measure.lost_motion(below, above, 5.0, math.nan) == pytest.approx(0.09)
@@ -424,7 +424,7 @@ def test_nothing_measured_is_not_good() -> None:
     assert replace(good(), spoiled=1).verdict is Verdict.INCOMPLETE
 
 
-def test_the_page_says_what_is_worse_and_loads_nothing() -> None:
+def test_page_lists_changes_for_the_worse_and_loads_nothing() -> None:
     result = worn("play=0.05")
     page = render_selftest(result, good())
     assert "Worn" in page

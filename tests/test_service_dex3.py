@@ -199,7 +199,7 @@ class TestState:
         assert tuple(m.error) == (0x10, 3)
         assert len(mapping().encode({LEFT: self.VIEW})) == 1428  # docs/sources/unitree-dex.md#a4
 
-    def test_the_message_is_what_is_encoded(self) -> None:
+    def test_the_message_equals_the_encoded_values(self) -> None:
         m = mapping()
         assert m.state({LEFT: self.VIEW}) == STATES.decode(m.encode({LEFT: self.VIEW}))
 
