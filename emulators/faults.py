@@ -48,8 +48,9 @@ __all__ = [
 class FaultKind:
     """One kind of fault.
 
-    :param keys: its own keys with their default values. :param lasting: it lasts until ``for`` has
-        passed; otherwise it happens once and the device stays damaged.
+    :param keys: its own keys with their default values.
+    :param lasting: it lasts until ``for`` has passed; otherwise it happens once and the device
+        stays damaged.
     :param targets_device: ``id`` selects a device; otherwise the fault affects the line.
     """
 

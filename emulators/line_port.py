@@ -34,7 +34,8 @@ def line_port(
         as of :class:`~dexkit.emulators.serial_port.Port`.
     :param serial: serial number of the adapter.
     :param fast: an FT232H, which does 12 Mbaud, instead of an FT232R, which does 3.
-    :raises UsageError: the address is invalid. :raises EmulatorError: it cannot be opened.
+    :raises UsageError: the address is invalid.
+    :raises EmulatorError: it cannot be opened.
     """
     if not isinstance(link, str) or not link.startswith(SCHEME):
         return Port(line, link, check_baudrate=check_baudrate)

@@ -228,13 +228,15 @@ class Trace:
     """A recording. Made by :func:`open_trace`; holds an index, not the messages.
 
     :ivar path: the file.
-    :ivar truncated: the file ends before its end record: the recorder was killed, is still
-        running, or the file is a partial copy.
+    :ivar truncated: the file ends before its end record: the recorder was killed, is still running,
+        or the file is a partial copy.
     :ivar damage: contradictions and unreadable parts, as sentences with the place; more may be
         found while messages are read. Empty: everything read so far agrees with the file's
         checksums.
-    :ivar warnings: the same, and other irregularities. :ivar notes: what cannot be checked.
+    :ivar warnings: the same, and other irregularities.
+    :ivar notes: what cannot be checked.
     :ivar metadata: metadata records by name; of several with one name, later keys win.
+    :ivar mixed_types: by topic with several types, the warning about it.
     :ivar library: the writing library, as named in the file.
     :ivar profile: mcap profile, ``"ros2"`` in ROS 2 bags and in dexkit's own recordings.
     """
@@ -246,6 +248,7 @@ class Trace:
         self.truncated = self._file.truncated
         self.damage = self._file.damage
         self.warnings = self._file.warnings
+        self.mixed_types: dict[str, str] = {}
         self.notes = self._file.notes
         self.metadata = self._file.metadata
         self.library = self._file.library
@@ -533,7 +536,9 @@ class Trace:
         for topic, names in types.items():
             if len(names) > 1:
                 some = ", ".join(sorted(names)[:5]) + ", ..." * (len(names) > 5)
-                self._file.warn(f"{topic} carries {len(names)} types: {some}")
+                text = f"{topic} carries {len(names)} types: {some}"
+                self._file.warn(text)
+                self.mixed_types[topic] = text
 
 
 def open_trace(path: str | os.PathLike[str], open_file: OpenFile | None = None) -> Trace:

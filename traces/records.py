@@ -234,9 +234,10 @@ def walk(
     after damage, start another walk there.
 
     :param source: the bytes, or a function that reads them from a file: (offset, count) -> bytes.
-        :param at: offset of the first record. :param stop: end of the last one; needed for a file.
-        :param messages: list that takes the offset of each whole message; they are not yielded
-        then, which is three times as fast.
+    :param at: offset of the first record.
+    :param stop: end of the last one; needed for a file.
+    :param messages: list that takes the offset of each whole message; they are not yielded then,
+        which is three times as fast.
     """
     message, least = (-1 if messages is None else int(Opcode.MESSAGE)), LEAST[Opcode.MESSAGE]
     places: list[int] = [] if messages is None else messages

@@ -90,12 +90,12 @@ def rate_measure(
 class Late:
     """Size of a failure: the delay of a conforming hand that would cause the same failure.
 
-    :param seconds: at each of the failure's places, or one for all of them; infinite where no
-        delay causes such a failure. For a missing motion, the seconds that a conforming hand
-        takes for it: :data:`STROKE_S` for a stroke.
+    :param seconds: at each of the failure's places, or one for all of them; infinite where no delay
+        causes such a failure. For a missing motion, the seconds that a conforming hand takes for
+        it: :data:`STROKE_S` for a stroke.
     :param how: ``total``: a single delay at that place; ``mean``: a repeated delay, as it lowers a
-        rate; ``p99``: in one of a hundred. :param best: the same for the best quarter of repeated
-        events; 0 if unknown.
+        rate; ``p99``: in one of a hundred.
+    :param best: the same for the best quarter of repeated events; 0 if unknown.
     """
 
     seconds: tuple[float, ...]
@@ -114,9 +114,10 @@ class Outcome:
     :param absent: the hand lacks this unit: a failure if the vendor claims the unit, whatever
         ``met`` is otherwise.
     :param joints: indices of the joints concerned, the most important first; empty if none in
-        particular. :param plots: the plots that show it, if they differ from the requirement's.
-        :param retry: another run may give another outcome. :param measures: the measured values
-        with limits behind it, one for each place; may be empty.
+        particular.
+    :param plots: the plots that show it, if they differ from the requirement's.
+    :param retry: another run may give another outcome.
+    :param measures: the measured values with limits behind it, one for each place; may be empty.
     """
 
     met: bool | None

@@ -402,9 +402,10 @@ def _factor(x: _Joint, c: Floats, lag: float) -> float:
 class _Pressing:
     """A stretch of states in which a gripper is commanded into its object.
 
-    :param begin: seconds; likewise ``end``. :param tau: median of abs(tau_est), N m. :param q:
-        median, rad; likewise ``goal``, clamped to the stroke. :param kp: the lowest commanded, N
-        m/rad.
+    :param begin: seconds; likewise ``end``.
+    :param tau: median of abs(tau_est), N m.
+    :param q: median, rad; likewise ``goal``, clamped to the stroke.
+    :param kp: the lowest commanded, N m/rad.
     """
 
     begin: float

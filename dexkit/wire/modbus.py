@@ -120,8 +120,8 @@ class Request:
 def parse_request(pdu: bytes) -> Request:
     """Read the PDU of a request.
 
-    :raises Refusal: a device refuses it: unsupported function, or a number out of range. :raises
-        WireError: wrong length for its function.
+    :raises Refusal: a device refuses it: unsupported function, or a number out of range.
+    :raises WireError: wrong length for its function.
     """
     if not pdu:
         raise TruncatedError("an empty Modbus request")

@@ -71,8 +71,8 @@ class RecordedCommands:
     :param first_ns: time of the first command, ns since the epoch; 0 where it is unknown.
     :param states: (t, q) of each hand, in the same seconds.
     :param others: other contents, which are not played.
-    :param corrections: what an import has changed; ``problems``: what it could not import. :param
-        damage: of the file.
+    :param corrections: what an import has changed; ``problems``: what it could not import.
+    :param damage: of the file.
     """
 
     name: str

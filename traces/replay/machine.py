@@ -114,8 +114,8 @@ class Guards:
 class Progress:
     """Counters of a replay.
 
-    :ivar sent: commands, all hands together; ``passes``: complete passes over the session. :ivar
-        held: seconds for which session time was held, pauses not included.
+    :ivar sent: commands, all hands together; ``passes``: complete passes over the session.
+    :ivar held: seconds for which session time was held, pauses not included.
     :ivar farthest: by side, the largest distance of a joint from its command while playing, rad,
         with the joint's index and the session's time.
     """

@@ -73,8 +73,9 @@ _VERSIONS = {
 class Options:
     """How to import.
 
-    :param rate: frames per second instead of the file's; None to use the file's. :param hand: the
-        model's name; ``"none"`` for no model; None to detect it by the number of joints.
+    :param rate: frames per second instead of the file's; None to use the file's.
+    :param hand: the model's name; ``"none"`` for no model; None to detect it by the number of
+        joints.
     :param correct: exchange sides where version and data say that they are swapped.
     """
 

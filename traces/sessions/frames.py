@@ -39,8 +39,8 @@ _LEAST = 2  # frames of a run
 class Pictures:
     """The single pictures of a camera.
 
-    :param load: returns the encoded picture at an index; None if it is not available. :param paths:
-        their files, present or former, relative to the session.
+    :param load: returns the encoded picture at an index; None if it is not available.
+    :param paths: their files, present or former, relative to the session.
     """
 
     camera: str
@@ -54,7 +54,8 @@ class Source:
     """A recording to be sampled.
 
     :param streams: those with at least two samples.
-    :param lost: data that frames cannot represent. :param problems: data that cannot be read.
+    :param lost: data that frames cannot represent.
+    :param problems: data that cannot be read.
     """
 
     trace: Trace
