@@ -239,7 +239,10 @@ def _identity(path: Path) -> object:
     try:
         status = path.stat()
     except OSError:
-        return path.absolute().resolve()
+        try:
+            return path.absolute().resolve()
+        except RuntimeError:  # a loop of links (Python 3.10)
+            return path.absolute()
     return status.st_dev, status.st_ino
 
 

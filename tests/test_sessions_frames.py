@@ -104,6 +104,14 @@ def test_every_value_of_a_dataset_is_that_of_the_recording(tmp_path: Path, part:
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
 
 
+def test_a_task_that_is_no_text_is_escaped(tmp_path: Path, part: Path) -> None:
+    out = tmp_path / "d"
+    task = b"pick \xff".decode("utf-8", "surrogateescape")  # as the command line has it
+    assert dexkit("export", part, "--to", "lerobot", "--out", out, "--task", task)[0] == 0
+    tasks = pq.read_table(out / "meta" / "tasks.parquet").to_pylist()
+    assert [row["task"] for row in tasks] == ["pick \\udcff"]
+
+
 def test_several_recordings_are_one_dataset(tmp_path: Path, part: Path) -> None:
     out = tmp_path / "d"
     other = sample_path("dex1_hand_dropout")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -341,6 +344,26 @@ def test_json_lines_with_times(tmp_path: Path) -> None:
     assert len(streams(trace)["left_hand", STATE]) == 10
 
 
+def test_times_that_no_message_can_hold_are_not_used(tmp_path: Path) -> None:
+    """A ROS stamp ends in January 2038."""
+    late = document(frames=3, cameras=0)
+    for i, item in enumerate(late["data"]):
+        item["timestamp_ns"] = 2**62 - 10 + i
+    late["info"]["date"] = "2099-01-01"
+    far = document(frames=3, cameras=0, fps=0.1)
+    for i, item in enumerate(far["data"]):
+        item["idx"] = 10**9 - 9 + i
+    for name, found, why in (
+        ("late", late, "whose time is missing or none; nominal ones are used (item 0, and 2 more)"),
+        ("far", far, "(idx) are too large"),
+    ):
+        source = episode(tmp_path / name, whole(found))
+        code, output = dexkit("import", source, tmp_path / f"{name}.mcap")
+        assert (code, why in output) == (1, True), output
+        trace = open_trace(tmp_path / f"{name}.mcap")
+        assert trace.duration == pytest.approx(2 / (30 if name == "late" else 0.1))
+
+
 # -- LeRobot -------------------------------------------------------------------------------------
 
 G1_DEX3 = [
@@ -438,6 +461,7 @@ def test_lerobot_columns_of_other_kinds_are_reported(tmp_path: Path) -> None:
     matrix = np.full((5, len(NAMES)), 0.1)
     cases: dict[str, dict[str, Any]] = {
         "strings": {"action": ["a"] * 5},
+        "digits": {"action": [["0.1"] * 28] * 5},
         "mixed": {"action": [[0.1] * 28, [0.1] * 27, *[[0.1] * 28] * 3]},
         "doubles": {"action": pa.array(matrix.tolist(), pa.list_(pa.float64()))},
         "nulls": {"action": [[None] * 28] * 5},
@@ -470,6 +494,22 @@ def test_datasets_that_cannot_be_read_are_refused(
     code, output = dexkit("import", source, tmp_path / "out.mcap")
     assert code == 2
     assert why in output
+
+
+@each("pattern", ["data/{episode_index:9999999999d}", "data/{episode_index:{episode_index}}"])
+def test_no_path_of_a_dataset_fills_the_memory(tmp_path: Path, pattern: str) -> None:
+    source = dataset(tmp_path / "d", "v2.1", NAMES, np.zeros((3, 28)))
+    info = json.loads((source / "meta" / "info.json").read_text())
+    (source / "meta" / "info.json").write_text(json.dumps({**info, "data_path": pattern}))
+    code, output = dexkit("import", source, tmp_path / "out.mcap")
+    assert (code, "a path that cannot be used" in output) == (2, True), output
+
+
+def test_frame_numbers_beyond_all_times_are_counted(tmp_path: Path) -> None:
+    numbers = [1e300, 2e300, 3e300]
+    source = dataset(tmp_path / "d", "v2.1", NAMES, np.full((3, 28), 0.1), frame_index=numbers)
+    code, output = dexkit("import", source, tmp_path / "out.mcap")
+    assert (code, "frames are counted instead" in output) == (1, True), output
 
 
 def test_a_dataset_does_not_lead_elsewhere(tmp_path: Path) -> None:
@@ -554,8 +594,6 @@ def test_a_bag_without_schemas_is_read_by_the_layout_that_fits(when: str) -> Non
 
 def test_a_bag_without_schemas_is_imported(tmp_path: Path) -> None:
     """A .db3 as ROS 2 before Iron writes it: no table of message definitions."""
-    import sqlite3
-
     path = tmp_path / "old.db3"
     with sqlite3.connect(path) as db:
         db.executescript(
@@ -591,7 +629,82 @@ def test_a_damaged_bag_is_refused(tmp_path: Path) -> None:
         assert not (tmp_path / "out.mcap").exists()
 
 
+def of_states(path: Path, payload: bytes = b"") -> Path:
+    """The database of a bag of five states of a left Dex3-1."""
+    mt = message_type(HG)
+    topics = {"/dex3/left/state": (mt.ros_name, mt.ros2msg, [payload] * 5)}
+    return next(bag(path, StoragePlugin.SQLITE3, topics).glob("*.db3"))
+
+
+@each(
+    "change,why",
+    [
+        ("UPDATE messages SET data = 'text' WHERE id = 2", "that are no bytes"),
+        ("UPDATE messages SET timestamp = -5 WHERE id = 2", "without a time"),
+    ],
+    ids=str,
+)
+def test_a_row_of_a_bag_that_is_no_message_is_left_out(
+    tmp_path: Path, change: str, why: str
+) -> None:
+    mt = message_type(HG)
+    payload = mt.encode(mt.of_motors([MotorState_()] * 7))
+    with sqlite3.connect(of_states(tmp_path / "b", payload)) as db:
+        db.execute(change)
+    code, output = dexkit("import", tmp_path / "b", tmp_path / "out.mcap")
+    assert (code, why in output) == (1, True), output
+    assert open_trace(tmp_path / "out.mcap").message_count == 4
+
+
 # -- the rest ------------------------------------------------------------------------------------
+
+
+def piped(path: Path) -> None:
+    """Put a pipe that nobody writes in a file's place."""
+    path.unlink(missing_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    os.mkfifo(path)
+
+
+def test_no_source_waits_for_a_pipe(tmp_path: Path) -> None:
+    matrix = np.full((3, 28), 0.1)
+
+    def of(version: str, file: str) -> Callable[[Path], None]:
+        return lambda root: piped(dataset(root, version, NAMES, matrix) / file)
+
+    def of_bag(root: Path) -> None:
+        piped(of_states(root))
+
+    def of_tables(file: str) -> Callable[[Path], None]:
+        def make(root: Path) -> None:
+            recording = imported(root.parent / f"{root.name}_of", whole(document(frames=3))).path
+            assert dexkit("export", recording, "--to", "csv", "--out", root)[0] == 0
+            for path in [root / file] if file else root.glob("*.csv"):
+                piped(path)
+
+        return make
+
+    sources: dict[str, tuple[str, Callable[[Path], None]]] = {
+        "lines.jsonl": ("jsonl", piped),
+        "episode": ("episodes", lambda root: piped(root / "data.json")),
+        "info": ("lerobot", of("v2.1", "meta/info.json")),
+        "rows": ("lerobot", of("v2.1", "meta/episodes.jsonl")),
+        "frames": ("lerobot", of("v2.1", "data/chunk-000/episode_000000.parquet")),
+        "bag": ("rosbag2", of_bag),
+        "about": ("tables", of_tables("session.json")),
+        "csv": ("tables", of_tables("")),
+    }
+    for name, (form, make) in sources.items():
+        make(tmp_path / name)
+        code, output = dexkit("import", tmp_path / name, tmp_path / "out.mcap", "--from", form)
+        assert (code, "ordinary file" in output or "no list" in output) == (2, True), output
+
+
+def test_another_format_than_the_sources_is_refused(tmp_path: Path) -> None:
+    source = episode(tmp_path / "e", whole(document(frames=3)))
+    for form in ("jsonl", "lerobot", "rosbag2", "tables"):
+        code, output = dexkit("import", source, tmp_path / "out.mcap", "--from", form)
+        assert (code, str(source) in output) == (2, True), output
 
 
 def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

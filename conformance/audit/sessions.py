@@ -14,7 +14,7 @@ from typing import Any
 from dexkit.conformance.audit.objects import Object, file_system, tag_of
 from dexkit.conformance.audit.records import FileRecord, State
 from dexkit.digests import file_pieces
-from dexkit.errors import DexkitError, TraceUnreadable
+from dexkit.errors import DexkitError, TraceUnreadable, UsageError
 from dexkit.escaping import one_line
 from dexkit.temporary_folder import TemporaryFolder
 from dexkit.traces.container import OpenFile
@@ -55,11 +55,13 @@ def find(location: str, working_folder: Path | None = None) -> Iterator[Session 
 
     :param location: a file, a folder or a URL.
     :param working_folder: what a relative path is relative to; None for the process' own.
-    :raises UsageError: a URL without fsspec, or of a kind that is not installed.
+    :raises UsageError: an empty path; a URL without fsspec, or of a kind that is not installed.
     """
     if is_url(location):
         yield from _find_objects(location)
         return
+    if not location:
+        raise UsageError("'' is no path", hint="'.' is this folder")
     name = Path(location)
     base = Path(os.path.abspath((working_folder or Path()) / name))
     if not base.is_dir():

@@ -58,7 +58,9 @@ def command(
     from dexkit.traces.sessions import rosbag, tables
 
     if form in ("lerobot", "episodes"):
-        return _frames(sessions, form, out, fps, task)
+        # bytes of the command line that are no UTF-8 are escaped, as those of recordings are
+        text = None if task is None else task.encode("utf-8", "backslashreplace").decode()
+        return _frames(sessions, form, out, fps, text)
     if fps is not None or task is not None:
         raise UsageError(f"--fps and --task are for lerobot and episodes, not for {form}")
     several = len(sessions) > 1

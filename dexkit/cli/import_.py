@@ -76,7 +76,7 @@ def command(
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             report = entry.convert(target, embed_pictures, force)
-        except DexkitError as error:
+        except (DexkitError, OSError) as error:
             if len(entries) == 1:
                 raise
             trouble = True

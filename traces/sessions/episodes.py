@@ -36,6 +36,7 @@ from dexkit.traces.sessions.model import (
     models_by_joints,
 )
 from dexkit.traces.sessions.pictures import safe_path
+from dexkit.traces.sessions.ros_types import LAST_NS
 from dexkit.traces.sessions.sides import swap_states, swapped_sides
 from dexkit.traces.sessions.streams import COMMAND, HAND, STATE
 
@@ -56,8 +57,10 @@ _LARGEST = 1 << 30
 _DIRECTIONS = {"states": STATE, "actions": COMMAND}
 _COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
 _PICTURES = ("colors", "depths")
+_STAMPS = ("timestamp_ns", "timestamp", "time", "t")  # the first in ns, the others in seconds
 _HANDS = {f"{side}_{end}": f"{side}{HAND}" for side in Side for end in ("ee", "hand")}
 _NS = 10**9
+_DAY = 86_400 * _NS
 # Plausible frame rates of a file, Hz.
 _RATES = (0.1, 2000.0)
 # Share of samples that must lie within a model's limits, and how far beyond they may lie, rad.
@@ -309,12 +312,19 @@ def _times(
             period = float(np.median(np.diff(found))) if len(found) > 1 else _NS / rate
             return found, MEASURED, _NS / period, None
         problems.add("the times of the frames do not ascend; nominal ones are used")
+    elif any(key in item for item in items for key in _STAMPS):
+        places = [_place(item) for item, s in zip(items, stamps, strict=True) if s is None]
+        for place in places:
+            problems.add("frames whose time is missing or none; nominal ones are used", place)
     indexes = [_index(item) for item in items]
     numbers = [n for n in indexes if n is not None]
     if len(numbers) < len(items) or any(a >= b for a, b in pairwise(numbers)):
         problems.add("the numbers of the frames (idx) do not ascend; they are counted instead")
         numbers = list(range(len(items)))
     first = _day(document.info.get("date"))
+    if first + numbers[-1] * _NS / rate >= LAST_NS:
+        problems.add("the numbers of the frames (idx) are too large; they are counted instead")
+        numbers = list(range(len(items)))
     times_ns = np.array([first + round(n * _NS / rate) for n in numbers], dtype=np.int64)
     return times_ns, NOMINAL, rate, first
 
@@ -327,12 +337,16 @@ def _index(item: Mapping[str, Any]) -> int | None:
 
 def _stamp(item: Mapping[str, Any]) -> int | None:
     """The time of a frame, ns since the epoch, where the source has one."""
-    value = item.get("timestamp_ns")
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**62:
+    value = item.get(_STAMPS[0])
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < LAST_NS:
         return value
-    for key in ("timestamp", "time", "t"):
+    for key in _STAMPS[1:]:
         value = item.get(key)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < 4e9:
+        if (
+            isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and 0 <= value < LAST_NS / _NS
+        ):
             return round(value * _NS)
     return None
 
@@ -341,7 +355,8 @@ def _day(date: object) -> int:
     """Midnight of the file's date, UTC, in ns; :data:`EPOCH_NS` where it has none."""
     try:
         found = datetime.strptime(str(date), "%Y-%m-%d").replace(tzinfo=timezone.utc)
-        return max(int(found.timestamp()) * _NS, EPOCH_NS)
+        day = int(found.timestamp()) * _NS
+        return day if EPOCH_NS <= day < LAST_NS - _DAY else EPOCH_NS
     except (ValueError, OverflowError):
         return EPOCH_NS
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from dexkit.documents import read_bytes
 from dexkit.errors import SessionError
 from dexkit.traces.sessions.episodes import DEFAULT, Document, Options, session_of
 from dexkit.traces.sessions.model import Session
@@ -47,13 +48,7 @@ def read_lines(path: Path, options: Options = DEFAULT) -> Session:
 
     :raises SessionError: it cannot be read, or has no frame.
     """
-    try:
-        data = path.read_bytes() if path.stat().st_size <= _LARGEST else None
-    except OSError as error:
-        raise SessionError(f"cannot read {path}: {error.strerror}") from error
-    if data is None:
-        raise SessionError(f"cannot read {path}: it is larger than {_LARGEST >> 30} GB")
-    document, bad = parse_lines(data)
+    document, bad = parse_lines(read_bytes(path, _LARGEST, error=SessionError))
     if not document.items:
         raise SessionError(f"{path} has no frame: no line has 'states' or 'actions'")
     session = session_of(document, path, path.parent, "JSON lines", options)

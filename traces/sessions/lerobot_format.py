@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from dexkit.errors import ExtraMissing
+from dexkit.errors import ExtraMissing, SessionError
 
 __all__ = [
     "ACTION",
@@ -15,6 +16,7 @@ __all__ = [
     "PRESSURE",
     "STATE_COLUMN",
     "parquet_library",
+    "read_parquet",
 ]
 
 ACTION, STATE_COLUMN = "action", "observation.state"
@@ -45,3 +47,22 @@ def parquet_library() -> tuple[ModuleType, Any]:
             "Parquet files need the library pyarrow", hint="pip install 'dexkit[lerobot]'"
         ) from error
     return pyarrow, pyarrow.parquet
+
+
+def read_parquet(path: Path) -> Any:
+    """The table in a Parquet file.
+
+    :raises ExtraMissing: pyarrow is not installed.
+    :raises SessionError: it is missing, no ordinary file, or no Parquet.
+    """
+    arrow, parquet = parquet_library()
+    try:
+        if not path.is_file():  # a pipe would be waited for
+            why = "is no ordinary file" if path.exists() else "is missing"
+            raise SessionError(f"{path} {why}")
+        table = parquet.read_table(path)
+        table.column_names  # noqa: B018 - decodes them
+    except (OSError, ValueError, arrow.lib.ArrowException) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
+    return table

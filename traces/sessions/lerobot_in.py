@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.documents import read_bytes
 from dexkit.errors import SessionError
 from dexkit.hand import Floats, Side
 from dexkit.models import DIALECTS, HandModel, model
@@ -28,9 +29,11 @@ from dexkit.traces.sessions.lerobot_format import (
     EXTENSION,
     PICTURES,
     parquet_library,
+    read_parquet,
 )
 from dexkit.traces.sessions.model import Camera, Part, Problems, Session
 from dexkit.traces.sessions.pictures import safe_path
+from dexkit.traces.sessions.ros_types import LAST_NS
 from dexkit.traces.sessions.streams import HAND
 
 __all__ = ["Dataset", "is_dataset"]
@@ -63,7 +66,7 @@ class Dataset:
     """
 
     def __init__(self, root: Path, options: Options = DEFAULT) -> None:
-        _, self._parquet = parquet_library()
+        parquet_library()  # told before anything is read
         self.root = root
         self.options = options
         info = _read_json(root / "meta" / "info.json")
@@ -186,22 +189,8 @@ class Dataset:
 
     def _open(self, path: Path) -> Any:
         if path not in self._tables:
-            try:
-                table = self._parquet.read_table(path)
-                table.column_names  # noqa: B018 - decodes them
-                self._tables = {path: table}
-            except FileNotFoundError:
-                raise SessionError(f"{path} is missing") from None
-            except (OSError, ValueError, self._arrow_error) as error:
-                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
+            self._tables = {path: read_parquet(path)}
         return self._tables[path]
-
-    @property
-    def _arrow_error(self) -> type[Exception]:
-        pyarrow, _ = parquet_library()
-        found: type[Exception] = pyarrow.lib.ArrowException
-        return found
 
     def _table(self, episode: int, row: Mapping[str, Any]) -> tuple[Path, Any]:
         pattern = str(self.info.get("data_path") or "")
@@ -225,6 +214,9 @@ class Dataset:
 
     def _path(self, pattern: str, values: Mapping[str, Any]) -> Path:
         try:
+            # a field may be a few digits wide, as LeRobot has them, and not a gigabyte
+            if re.search(r":[^}]{5}", pattern):
+                raise ValueError(pattern)
             name = pattern.format(**values)
         except (KeyError, IndexError, ValueError, AttributeError) as error:
             raise SessionError(
@@ -239,10 +231,16 @@ class Dataset:
 
     def _times(self, table: Any, problems: Problems) -> NDArray[np.int64]:
         numbers = _column(table, "frame_index")
-        if numbers is None or len(numbers) != table.num_rows or (np.diff(numbers) <= 0).any():
-            problems.add("frame_index does not ascend; frames are counted instead")
-            numbers = np.arange(table.num_rows, dtype=np.float64)
         period = 1e9 / self.fps
+        if (
+            numbers is None
+            or len(numbers) != table.num_rows
+            or (np.diff(numbers) <= 0).any()
+            or (numbers < 0).any()
+            or (numbers * period >= LAST_NS - EPOCH_NS).any()
+        ):
+            problems.add("frame_index does not ascend from 0; frames are counted instead")
+            numbers = np.arange(table.num_rows, dtype=np.float64)
         times = np.array([round(n * period) for n in numbers.tolist()], dtype=np.int64)
         stamps = _column(table, "timestamp")
         if stamps is None or np.abs(stamps - times / 1e9).max(initial=0.0) > 0.5 / self.fps:
@@ -444,26 +442,22 @@ def _embedded(name: str, key: str, table: Any) -> Camera | None:
 
 
 def _read_json(path: Path) -> Any:
+    data = read_bytes(path, _MAX_JSON, error=SessionError)
     try:
-        if path.stat().st_size > _MAX_JSON:
-            raise SessionError(f"{path} is too large")
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SessionError(f"cannot read {path}: {error.strerror}") from error
+        return json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise SessionError(f"{path} is not valid JSON: {error}") from error
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:
     found = []
+    data = read_bytes(path, _MAX_JSON, error=SessionError)
     try:
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in data.decode("utf-8").splitlines():
             if line.strip():
                 row = json.loads(line)
                 if isinstance(row, dict):
                     found.append(row)
-    except OSError as error:
-        raise SessionError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise SessionError(f"{path} is not valid JSON lines: {error}") from error
     return found
@@ -473,22 +467,28 @@ def _column(table: Any, name: str) -> Floats | None:
     """A column of numbers; None if it is not one."""
     if name not in table.column_names:
         return None
-    try:
-        values = np.asarray(table[name].to_pylist(), dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return values if values.ndim == 1 and np.isfinite(values).all() else None
+    values = _as_numbers(table[name].to_pylist())
+    return values if values is not None and values.ndim == 1 and np.isfinite(values).all() else None
 
 
 def _matrix(table: Any, name: str) -> Floats | None:
     """A column of vectors (or of single numbers) as a table; None if it is anything else."""
-    try:
-        values = np.asarray(table[name].to_pylist(), dtype=np.float64)
-    except (TypeError, ValueError):
+    values = _as_numbers(table[name].to_pylist())
+    if values is None:
         return None
     if values.ndim == 1:
         values = values[:, None]
     return values if values.ndim == 2 and values.shape[1] else None
+
+
+def _as_numbers(rows: list[Any]) -> Floats | None:
+    """Rows of numbers as an array; None if they are of different lengths, or texts."""
+    try:
+        values = np.asarray(rows)
+        # numpy would take the text "1" for a number
+        return values.astype(np.float64) if values.dtype.kind in "fiub" else None
+    except (TypeError, ValueError):
+        return None
 
 
 def _names(feature: Mapping[str, Any], count: int) -> tuple[str, ...] | None:

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit import __version__
+from dexkit.errors import SessionError
 from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS, Dialect, HandModel, ModeByte, model
@@ -205,7 +206,11 @@ def messages(
     """The messages of a session in order of time: time, channel, payload.
 
     Adds channels to the recording, and facts for the metadata record to the session.
+
+    :raises SessionError: a time cannot be written.
     """
+    if session.times_ns.min() < 0 or session.times_ns.max() >= ros_types.LAST_NS:
+        raise SessionError(f"{session.source} has times before 1970 or after January 2038")
     sources: list[tuple[int, Callable[[int], bytes | None]]] = []
     for part in session.parts:
         for kind in (STATE, COMMAND):

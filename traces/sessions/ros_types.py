@@ -17,6 +17,7 @@ from dexkit.traces.reader import Definition
 __all__ = [
     "COMPRESSED_IMAGE",
     "JOINT_STATE",
+    "LAST_NS",
     "STRING",
     "CompressedImage",
     "JointState",
@@ -99,6 +100,10 @@ class CompressedImage:
     frame_id: str
     form: str
     data: bytes
+
+
+LAST_NS = 2**31 * 10**9
+"""Where the stamps of ROS messages end, ns since the epoch: in January 2038."""
 
 
 def group_topic(part: str, what: str) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dexkit import __version__
-from dexkit.errors import ExtraMissing, SessionError, TraceUnsupported, WireError
+from dexkit.errors import DexkitError, ExtraMissing, SessionError, TraceUnsupported, WireError
 from dexkit.messages import message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.traces import schemas
@@ -63,6 +63,10 @@ def import_bag(
     :raises SessionError: it cannot be read, or nothing in it can be used.
     """
     library = _library()
+    files = [source, *(source.iterdir() if source.is_dir() else ())]
+    for path in files:
+        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
+            raise SessionError(f"cannot read {path}: it is not an ordinary file")
     problems = Problems()
     corrections: list[str] = []
     with RecordingWriter(out, overwrite=overwrite) as writer:
@@ -78,7 +82,7 @@ def import_bag(
                 if wanted:
                     _copy(reader.messages(wanted), channels, writer, problems)
                 _write_metadata(writer, reader, source, problems, corrections)
-        except (SessionError, OSError):
+        except DexkitError:
             raise
         except Exception as error:  # the library raises many kinds for damaged files
             raise SessionError(f"{source} cannot be read as a ROS 2 bag: {error}") from error
@@ -98,6 +102,16 @@ def _copy(
 ) -> None:
     for connection, time_ns, data in messages:
         number, convert = channels[connection.id]
+        if not isinstance(data, bytes | bytearray | memoryview):  # SQLite gives what is there
+            problems.add(
+                f"{connection.topic}: messages that are no bytes are left out", f"at {time_ns} ns"
+            )
+            continue
+        if not 0 <= time_ns < 2**63:
+            problems.add(
+                f"{connection.topic}: messages without a time are left out", f"at {time_ns} ns"
+            )
+            continue
         payload = bytes(data)
         if convert is not None:
             try:
@@ -145,7 +159,7 @@ def _channel(
         return ours, convert
     some = []
     for _, _, data in reader.messages([connection]):
-        some.append(bytes(data))
+        some.append(bytes(data) if isinstance(data, bytes | bytearray | memoryview) else b"")
         if len(some) == _TRIED:
             break
     layout = old_layouts.matching_layout(type_name, some)

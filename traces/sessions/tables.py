@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.documents import write_file
-from dexkit.errors import DexkitError, ExtraMissing, SessionError
+from dexkit.documents import read_bytes, write_file
+from dexkit.errors import DexkitError, ExtraMissing, SessionError, UsageError
 from dexkit.messages import MessageType, message_type
 from dexkit.messages.columns import encode_columns
 from dexkit.messages.layout import Primitive, Struct
 from dexkit.traces.reader import ChannelInfo, Definition, Trace
-from dexkit.traces.sessions.lerobot_format import parquet_library
+from dexkit.traces.sessions.lerobot_format import parquet_library, read_parquet
 from dexkit.traces.sessions.model import Problems
 from dexkit.traces.writer import RecordingWriter, definition
 
@@ -34,6 +34,7 @@ _ABOUT = "session.json"
 _KEY = "dexkit_tables"
 _TIMES = ("log_time_ns", "publish_time_ns")
 _PAYLOAD = "payload"
+_LARGEST = 1 << 30
 # Largest number of sequence elements with columns.
 _LONGEST = 256
 
@@ -58,9 +59,8 @@ class _Leaf:
 def is_tables(source: Path) -> bool:
     """Whether it looks like a folder of tables."""
     try:
-        text = (source / _ABOUT).read_text(encoding="utf-8")
-        return _KEY in json.loads(text)
-    except (OSError, ValueError, TypeError):
+        return _KEY in json.loads(read_bytes(source / _ABOUT, _LARGEST))
+    except (UsageError, ValueError, TypeError, RecursionError):
         return False
 
 
@@ -230,15 +230,14 @@ def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: they cannot be read, or nothing in them can be used.
     """
+    data = read_bytes(source / _ABOUT, _LARGEST, error=SessionError)
     try:
-        about = json.loads((source / _ABOUT).read_text(encoding="utf-8"))
+        about = json.loads(data)
         topics = [e for e in about["topics"] if isinstance(e, dict)]
         metadata = {
             str(name): {str(k): str(v) for k, v in values.items()}
             for name, values in about.get("metadata", {}).items()
         }
-    except OSError as error:
-        raise SessionError(f"cannot read {source / _ABOUT}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise SessionError(
             f"{source / _ABOUT} is not what dexkit export writes: {error}"
@@ -404,13 +403,11 @@ def _number(value: Any, kind: np.dtype[Any]) -> Any:
 
 def _read_csv(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise SessionError(f"cannot read {path}: {error.strerror}") from error
+        text = read_bytes(path, _LARGEST, error=SessionError).decode("utf-8")
     except UnicodeDecodeError as error:
         raise SessionError(f"{path} is not UTF-8 text") from error
     try:
-        header, *rows = csv.reader(text.splitlines()) or [[]]
+        header, *rows = list(csv.reader(text.splitlines())) or [[]]
     except (ValueError, csv.Error) as error:
         raise SessionError(f"{path} cannot be read as CSV: {error}") from error
     width = len(header)
@@ -420,12 +417,7 @@ def _read_csv(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
 
 
 def _read_parquet(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
-    arrow, parquet = parquet_library()
-    try:
-        table = parquet.read_table(path)
-    except (OSError, ValueError, arrow.lib.ArrowException) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
+    table = read_parquet(path)
     try:
         return list(table.column_names), [c.to_pylist() for c in table.columns]
     except UnicodeDecodeError as error:
