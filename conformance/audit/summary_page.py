@@ -167,7 +167,10 @@ def _day(recorded_at: str) -> float:
 
 
 def _where(facts: Mapping[str, Any]) -> str:
-    labels = [f"{key} {value}" for key, value in facts.get("labels", {}).items()]
+    labels = [
+        value if value.lower().startswith(key) else f"{key} {value}"
+        for key, value in facts.get("labels", {}).items()
+    ]
     recorded = facts.get("recorded_at", "")[:16].replace("T", " ")  # to the minute, UTC
     parts = [recorded, facts.get("dialect", ""), *labels]
     return ", ".join(part for part in parts if part)

@@ -23,6 +23,7 @@ from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
+from dexkit.conformance.rows import Selected, finite_rows
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
 
@@ -306,6 +307,14 @@ class Context(BaseContext[Recording, SideView]):
             known[name] = work_out()
         found: T = known[name]
         return found
+
+    def known_states(self, joint: int, *members: str) -> Selected:
+        """The states in which these members (``q``, ``dq``) of a joint are numbers."""
+        states = self.states
+        return self.once(
+            ("known states", joint, members),
+            lambda: finite_rows(*(getattr(states, m)[:, joint] for m in members)),
+        )
 
     def tolerance(self, name: str, joint: int = 0) -> float:
         """A tolerance of the requirement; ``NAME_stroke`` in radians of that joint."""

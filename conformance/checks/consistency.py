@@ -89,22 +89,24 @@ class _Joint:
 
     def integrals(self, speeds: Floats) -> tuple[Floats, Floats]:
         """The integrals of speeds and of their absolute values up to each measurement, rad."""
-        found = np.zeros(len(speeds), dtype=np.complex128)
-        for part, column in ((found.real, speeds), (found.imag, np.abs(speeds))):
-            steps = column[1:] + column[:-1]
-            steps /= 2
-            steps *= self._steps
-            part[1:] = steps
-        # complex addition is as fast as real addition, so both sums take the time of one
-        np.cumsum(found[1:], out=found[1:])
-        return found.real.copy(), found.imag.copy()
+        return self._integral(speeds), self._integral(np.abs(speeds))
+
+    def _integral(self, speeds: Floats) -> Floats:
+        found = np.empty(len(speeds))
+        found[:1] = 0.0
+        steps = found[1:]
+        np.add(speeds[1:], speeds[:-1], out=steps)
+        steps *= 0.5
+        steps *= self._steps
+        np.cumsum(steps, out=steps)
+        return found
 
 
 def _measurements(ctx: Context, joint: int) -> Rows:
     """The states with a new measurement; a state that repeats q and a non-zero dq has none."""
     states = ctx.states
     q, dq = states.q[:, joint], states.dq[:, joint]
-    good = finite_rows(q, dq)
+    good = ctx.known_states(joint, "q", "dq")
     t, q, dq = states.clock[good], q[good], dq[good]
     rows = np.arange(len(states))[good]
     if len(t):
@@ -129,8 +131,8 @@ def _fastest(ctx: Context, joint: int) -> float:
 
 def _reported_speed(ctx: Context, joint: int) -> float | None:
     """The quantile :data:`_FAST` of abs(dq); None if dq is not filled."""
-    dq = np.abs(ctx.states.dq[:, joint])
-    dq = dq[finite_rows(dq)]
+    dq = ctx.states.dq[:, joint]
+    dq = np.abs(dq[finite_rows(dq)])
     if not len(dq) or not dq.any():
         return None
     row = int(_FAST * (len(dq) - 1))
@@ -143,7 +145,7 @@ def jumps(ctx: Context) -> Outcome:
     states = ctx.states
     worst: tuple[float, float, float, int, float, float] | None = None
     for joint in range(len(ctx.joints)):
-        good = finite_rows(states.q[:, joint])
+        good = ctx.known_states(joint, "q")
         t, q = states.clock[good], states.q[good, joint]
         if len(t) < _FEW:
             continue
@@ -197,7 +199,7 @@ def alternates(ctx: Context) -> Outcome:
     fought = [ctx.span(p) for n in FOUGHT_OVER for p in ctx.phases(n)]
     worst: tuple[int, float, int, float] | None = None
     for joint in range(len(ctx.joints)):
-        good = finite_rows(ctx.states.q[:, joint])
+        good = ctx.known_states(joint, "q")
         t, q = ctx.states.t[good], ctx.states.q[:, joint][good]
         for begin, end in fought:
             kept = (t < begin) | (t > end)
@@ -385,12 +387,13 @@ def _factor(x: _Joint, c: Floats, lag: float) -> float:
     :param c: the integral of dq.
     """
     starts, ends = x.windows(4 * lag, 0.5 * lag)
-    said, moved = c.take(ends) - c[starts], x.q.take(ends) - x.q[starts]
+    said = c.take(ends) - c[starts]
     reach = float(np.ptp(x.q))
-    moving = np.abs(said) > 0.05 * reach
-    if int(moving.sum()) < _FEW or not reach:
+    moving = np.flatnonzero(np.abs(said) > 0.05 * reach)
+    if len(moving) < _FEW or not reach:
         return 1.0
-    ratios = np.sort(moved[moving] / said[moving])
+    moved = x.q.take(ends[moving]) - x.q[starts].take(moving)
+    ratios = np.sort(moved / said.take(moving))
     low, middle, high = (float(ratios[int(p * (len(ratios) - 1))]) for p in (0.25, 0.5, 0.75))
     return middle if middle and high - low <= 0.2 * abs(middle) else 1.0
 

@@ -12,7 +12,7 @@ from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import joints_of
-from dexkit.conformance.rows import Times, finite_rows
+from dexkit.conformance.rows import Times
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
@@ -76,7 +76,7 @@ def in_stroke(ctx: Context) -> Outcome:
     widest: tuple[float, Outcome] | None = None
     for joint, spec in enumerate(ctx.joints):
         column = states.q[:, joint]
-        q = column[finite_rows(column)]
+        q = column[ctx.known_states(joint, "q")]
         if not len(q):
             continue
         low, high = float(q.min()), float(q.max())
@@ -204,7 +204,7 @@ def _windows(times: Times, window: float) -> Windows:
 def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     states = ctx.states
     q, dq = states.q[:, joint], states.dq[:, joint]
-    good = finite_rows(q, dq)
+    good = ctx.known_states(joint, "q", "dq")
     t, q, dq = states.clock[good], q[good], dq[good]
     if len(t) < 10 or float(t[-1] - t[0]) <= 0:
         return ctx.skipped("too few states")
@@ -220,11 +220,21 @@ def _velocity(ctx: Context, joint: int, known: dict[bytes, Windows]) -> Outcome:
     starts, ends, span = known[which]
     if not len(starts):
         return ctx.skipped("the states are too far apart to derive a velocity")
-    slope = (q.take(ends) - q.take(starts)) / span
+    # nearly always all rows up to the last window
+    first = slice(len(starts)) if int(starts[-1]) == len(starts) - 1 else starts
+    slope = q.take(ends)
+    slope -= q[first]
+    slope /= span
     moving = np.flatnonzero(np.abs(slope) > 0.5)
     if len(moving) < 50:
         return ctx.skipped("the hand hardly moves in this recording")
-    cumulated = np.concatenate(([0.0], np.cumsum((dq[1:] + dq[:-1]) / 2 * np.diff(t))))
+    cumulated = np.empty(len(dq))
+    cumulated[0] = 0.0
+    steps = cumulated[1:]
+    np.add(dq[1:], dq[:-1], out=steps)
+    steps *= 0.5
+    steps *= t[1:] - t[:-1]
+    np.cumsum(steps, out=steps)
 
     def mean(rows: NDArray[np.intp]) -> Floats:
         passed = cumulated.take(ends[rows]) - cumulated.take(starts[rows])

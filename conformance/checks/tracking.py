@@ -248,9 +248,9 @@ def _free(ctx: Context, joint: int, at: NDArray[np.intp], goal: Floats) -> NDArr
         if len(ctx.joints) == 1:
             q = states.q[:, joint][at]
             return np.asarray((goal > ctx.object_at + 0.2) | (q > ctx.object_at + 0.3))
-    presses = np.abs(states.tau[:, joint]) >= ctx.tolerance("blocked_tau_nm")
-    stands = np.abs(states.dq[:, joint]) < ctx.tolerance("blocked_speed_rad_s")
-    return np.asarray(~(presses & stands)[at])
+    presses = np.abs(states.tau[:, joint][at]) >= ctx.tolerance("blocked_tau_nm")
+    stands = np.abs(states.dq[:, joint][at]) < ctx.tolerance("blocked_speed_rad_s")
+    return np.asarray(~(presses & stands))
 
 
 @check("DEX1-TRACK-01", "DEX3-TRACK-01")

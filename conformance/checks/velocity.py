@@ -6,14 +6,20 @@ dq that alternates between twice the speed and 0, and one that is stuck while th
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import FOUGHT_OVER, filled
-from dexkit.conformance.rows import finite_rows
+from dexkit.conformance.rows import Rows, Selected
 from dexkit.hand import Floats
 
 __all__: list[str] = []
+
+T = TypeVar("T")
 
 _FEW = 10
 """Fewest states for a verdict."""
@@ -24,17 +30,39 @@ _CALMS_S = 0.2
 def _series(ctx: Context, joint: int) -> tuple[Floats, Floats, Floats]:
     """Times, q and dq of a joint where both are numbers."""
     states = ctx.states
-    good = finite_rows(states.q[:, joint], states.dq[:, joint])
+    good = ctx.known_states(joint, "q", "dq")
     return states.clock[good], states.q[good, joint], states.dq[good, joint]
 
 
-def _outside(ctx: Context, t: Floats) -> Floats:
+def _outside(ctx: Context, t: Floats) -> Selected:
     """Rows whose times are in no phase of bad or contradictory commands, nor right after one."""
+    spans = [ctx.span(p) for name in (*FOUGHT_OVER, "foreign") for p in ctx.phases(name)]
+    if not spans:
+        return slice(None)
     kept = np.ones(len(t), dtype=np.bool_)
-    for name in (*FOUGHT_OVER, "foreign"):
-        for begin, end in map(ctx.span, ctx.phases(name)):
-            kept &= (t < begin) | (t > end + _CALMS_S)
-    return np.asarray(kept)
+    for begin, end in spans:
+        kept &= (t < begin) | (t > end + _CALMS_S)
+    return kept
+
+
+def _by_times(ctx: Context, name: str, t: Floats, work_out: Callable[[], T]) -> T:
+    """What depends on times alone is worked out once: they are nearly always those of all joints.
+
+    :param name: with all that it depends on beside the times.
+    """
+    if len(t) < len(ctx.states):
+        return work_out()
+    return ctx.once((name, ctx.requirement.id), work_out)
+
+
+def _cells(t: Floats, cell: float) -> Rows:
+    """The number of the cell in which each time but the first lies."""
+    return np.asarray(np.maximum(((t[1:] - t[0]) / cell).astype(np.intp), 0))
+
+
+def _rows_from(t: Floats, times: Floats) -> Rows:
+    """The first row that is not before each of some times."""
+    return np.asarray(np.searchsorted(t, times))
 
 
 @check("DEX1-FIELD-19", "DEX3-FIELD-18")
@@ -51,13 +79,12 @@ def one_course(ctx: Context) -> Outcome:
         t, q, dq = t[kept], q[kept], dq[kept]
         if len(t) < _FEW:
             continue
-        cells = ((t[1:] - t[0]) / cell).astype(np.intp)
-        cells = np.maximum(cells, 0)
+        cells = _by_times(ctx, "cells", t, partial(_cells, t, cell))
         most = max(count, int(cells.max()) + 1)
         change = np.diff(dq)
         up, down = (
-            np.bincount(cells, weights=np.maximum(way * change, 0.0), minlength=most)
-            for way in (1, -1)
+            np.bincount(cells, weights=np.maximum(part, 0.0), minlength=most)
+            for part in (change, -change)
         )
         speed = np.bincount(cells, weights=np.abs(np.diff(q)), minlength=most) / cell
         back = np.minimum(up, down)
@@ -98,8 +125,8 @@ def at_rest(ctx: Context) -> Outcome:
         t, q, dq = t[kept], q[kept], dq[kept]
         if len(t) < _FEW or float(t[-1] - t[0]) < 2 * count * cell:
             continue
-        edges = np.arange(float(t[0]), float(t[-1]), cell)
-        rows = np.searchsorted(t, edges)
+        edges: Floats = np.asarray(np.arange(float(t[0]), float(t[-1]), cell))
+        rows = _by_times(ctx, "edges", t, partial(_rows_from, t, edges))
         full = np.diff(rows) >= ctx.tolerance("min_states")
         if not full.any():
             continue

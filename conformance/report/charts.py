@@ -179,14 +179,20 @@ def _label(css: str, where: str, text: str) -> str:
 
 
 def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str) -> list[str]:
-    """Labels below; every other one is for wide pages only."""
+    """Labels below; every other one, and what the unit covers on phones, is for wide pages only."""
+
+    def is_free(at: float, text: str, width: float) -> bool:
+        """Whether the unit, at the right end, leaves room for a label."""
+        return at / 100 * width + _LETTER * (0.5 * len(text) + len(unit) + 1) <= width
+
     found = []
     for i, tick in enumerate(ticks):
         at = axes.across(tick)
         text = f"{tick:g}"
-        if at > 93 and len(ticks) > 1:  # the unit is there
+        if len(ticks) > 1 and (at > 93 or not is_free(at, text, _DESK)):
             continue
-        found.append(_label("x wide" if i % 2 else "x", f"left:{at:.2f}%", text))
+        wide = i % 2 or not is_free(at, text, _PHONE)
+        found.append(_label("x wide" if wide else "x", f"left:{at:.2f}%", text))
     found.append(_label("x unit", "left:100%", unit))
     return found
 

@@ -95,7 +95,7 @@ def import_bag(
 
 
 def _copy(
-    messages: Iterable[tuple[Connection, int, bytes]],
+    messages: Iterable[tuple[Connection, int, object]],
     channels: dict[int, tuple[int, Convert | None]],
     writer: RecordingWriter,
     problems: Problems,
