@@ -137,8 +137,8 @@ class BackendInfo:
     error: str = ""
 
 
-def _select(name: str) -> EntryPoint | None:
-    unique = {(e.value, origin(e)): e for e in entry_points(GROUP) if e.name == name}
+def _select(name: str, registered: Iterable[EntryPoint]) -> EntryPoint | None:
+    unique = {(e.value, origin(e)): e for e in registered if e.name == name}
     entries = list(unique.values())
     own = [e for e in entries if is_own(e)]
     if own and len(entries) > len(own):
@@ -250,9 +250,10 @@ def backend(name: str) -> Backend:
         if here not in sys.path and "" not in sys.path:
             sys.path.append(here)
         return _load(name)
-    entry = _select(name)
+    registered = entry_points(GROUP)
+    entry = _select(name, registered)
     if entry is None:
-        known = ", ".join(sorted({e.name for e in entry_points(GROUP)})) or "none"
+        known = ", ".join(sorted({e.name for e in registered})) or "none"
         raise UnknownBackend(
             f"no backend {name!r}",
             hint=f"installed: {known}; see 'dexkit backends', or give package.module:Object",
@@ -263,14 +264,15 @@ def backend(name: str) -> Backend:
 def list_backends() -> list[BackendInfo]:
     """Every registered backend, built-in and plug-in, with what is wrong with it, if anything."""
     rows = []
+    registered = entry_points(GROUP)
     for entry in sorted(
-        {(e.name, e.value, origin(e)): e for e in entry_points(GROUP)}.values(),
+        {(e.name, e.value, origin(e)): e for e in registered}.values(),
         key=lambda e: (not is_own(e), e.name),
     ):
         loaded: Backend | None = None
         error = ""
         try:
-            _select(entry.name)
+            _select(entry.name, registered)
             loaded = _load(entry.value)
         except (BackendBroken, BackendConflict) as exc:
             error = exc.message

@@ -334,9 +334,15 @@ def test_the_documented_mixin_is_of_two_models(tmp_path: Path) -> None:
     assert [o.dialect.name for o in loaded] == ["dex3", "dex5"]
 
 
-def test_the_documented_example_is_tried(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "spoken", ["unitree_go", pytest.param("every dialect", marks=pytest.mark.soak)]
+)
+def test_the_documented_example_is_tried(tmp_path: Path, spoken: str) -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     (example,) = re.findall(r"<!-- example: .* -->\n```python\n(.*?)```", text, re.DOTALL)
+    if spoken == "unitree_go":
+        assert example.count("expects=") == 1
+        example = example.replace("expects=", 'dialects="unitree_go", expects=')
     (tmp_path / "grippers.py").write_text(example)
     path = tmp_path / "verdicts.json"
     arguments = ["--from", str(tmp_path / "grippers.py"), "--json", str(path)]

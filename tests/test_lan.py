@@ -32,6 +32,7 @@ from dexkit.dds import DdsNode
 from dexkit.errors import DdsSetupError
 from tests.dds_helpers import free_domain
 from tests.namespaces import Host, Link, connect, network, unavailable
+from tests.slow_hand import SLOW
 
 ROOT = Path(__file__).parent.parent
 NET0 = Link("robot", "net0", "10.9.0.1", "friend", "port0", "10.9.0.2")
@@ -172,7 +173,7 @@ def received(program: Program) -> int:
     return int(counters["received"])
 
 
-GRIPPER = ("serve", "sim-dex1", "--side", "left")
+GRIPPER = ("serve", *SLOW, "--side", "left")
 
 
 def test_packets_of_another_network_are_ignored_and_clients_obeyed(hosts: dict[str, Host]) -> None:

@@ -41,21 +41,33 @@ def imported(path: Path) -> frozenset[str]:
     None if it imports neither a package nor CycloneDDS. What is imported for type checking only
     is left out: a program never loads it.
     """
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     if not _OF_INTEREST.search(text):  # parsing every file takes seconds
         return frozenset()
     names = set()
     tree = ast.parse(text, str(path))
-    for block in [n for n in ast.walk(tree) if isinstance(n, ast.If)]:
-        if isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING":
-            block.body = [ast.Pass()]
-    for node in ast.walk(tree):
+    for node in statements(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}:{node.lineno}: imports are absolute here"
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
     return frozenset(names)
+
+
+def statements(block: ast.AST) -> Iterator[ast.stmt]:
+    """Every statement, but for those of type checking; expressions import nothing."""
+    for node in ast.iter_child_nodes(block):
+        if not isinstance(node, ast.stmt | ast.excepthandler | ast.match_case):
+            continue
+        if isinstance(node, ast.stmt):
+            yield node
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+            for other in node.orelse:
+                yield other
+                yield from statements(other)
+        else:
+            yield from statements(node)
 
 
 def packages_imported(path: Path) -> set[str]:

@@ -12,7 +12,6 @@ import pytest
 
 from dexkit.child_processes import Tool
 from tests.dds_helpers import free_domain
-from tests.each import each
 from tests.patience import PATIENCE
 
 if find_spec("unitree_sdk2py") is None:  # importing the bare package fails: tests.unitree_sdk
@@ -29,9 +28,13 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-@each(
+@pytest.mark.parametrize(
     ("example", "backend", "goal"),
-    [("move_dex3.py", "sim-dex3", [-0.8] * 4), ("move_dex1.py", "sim-dex1", [1.8])],
+    [
+        # the other test of the SDK with a Dex3-1 is in tests/test_service_dex3.py
+        pytest.param("move_dex3.py", "sim-dex3", [-0.8] * 4, marks=pytest.mark.soak),
+        ("move_dex1.py", "sim-dex1", [1.8]),
+    ],
 )
 def test_the_hand_gets_there(example: str, backend: str, goal: list[float]) -> None:
     domain = str(free_domain())

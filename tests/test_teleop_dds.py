@@ -53,7 +53,7 @@ def served(backend: str, side: str) -> Iterator[int]:
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Callable[[str], int]]:
-    """Serves both hands of a backend, one backend at a time; returns its domain."""
+    """Serves a Dex1-1 pair or a left Dex3-1, one at a time; returns its domain."""
     running: dict[str, int] = {}
     with ExitStack() as stack:
 
@@ -61,7 +61,8 @@ def server() -> Iterator[Callable[[str], int]]:
             if backend not in running:
                 stack.close()
                 running.clear()
-                running[backend] = stack.enter_context(served(backend, "both"))
+                side = "both" if backend == "sim-dex1" else "left"
+                running[backend] = stack.enter_context(served(backend, side))
             return running[backend]
 
         yield serve
@@ -220,7 +221,8 @@ def test_recording_can_be_played_as_operator_input(dex1: int) -> None:
 
 @pytest.mark.soak
 def test_fist_profile_moves_a_dex3(dex3: int) -> None:
-    result = teleop("fist", "--dialect", "dex3", "--domain", dex3, "--duration", 2.0)
+    arguments = ("--dialect", "dex3", "--side", "left", "--domain", dex3, "--duration", 2.0)
+    result = teleop("fist", *arguments)
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()
     assert any(line.startswith("left: the client ran at") for line in lines)
@@ -240,7 +242,10 @@ def test_interrupt_locks_a_dex3_at_its_position(dex3: int) -> None:
     with DdsNode(domain=dex3, interface="lo") as node:
         reader = node.reader(topic, spoken.cmd_type)
         with subprocess.Popen(
-            [*TELEOP, "sine", "--dialect", "dex3", "--domain", str(dex3), "--duration", "90"],
+            [
+                *(*TELEOP, "sine", "--dialect", "dex3", "--side", "left"),
+                *("--domain", str(dex3), "--duration", "90"),
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

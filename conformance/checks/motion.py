@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
+from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
@@ -89,8 +90,8 @@ def steps_of(ctx: Context, phase: Phase) -> list[Step]:
                 begin=begin,
                 end=end,
                 target=target,
-                start=float(np.median(earlier)) if len(earlier) else float(q[0]),
-                final=float(np.median(q[late])) if late.any() else float(q[-1]),
+                start=median(earlier) if len(earlier) else float(q[0]),
+                final=median(q[late]) if late.any() else float(q[-1]),
                 t=t,
                 q=q,
                 unit=ctx.unit,
@@ -197,7 +198,7 @@ def limited_by_speed(ctx: Context, step: Step) -> bool:
         before, rows = states.between(begin - _PEAK_S, begin), states.between(begin, end)
         if end - begin < _WATCHED_S / 2 or kp[i] < 0.99 * stiff or not len(states.t[before]):
             continue
-        was = float(np.median(states.q[before, joint]))
+        was = median(states.q[before, joint])
         size = float(goal[i]) - was
         tq, q = states.t[rows], states.q[rows, joint]
         if not abs(size) >= _LARGER * abs(step.size) or len(q) < 2:
@@ -665,7 +666,7 @@ def by_its_own(ctx: Context) -> Outcome:
                 continue  # it was still under way, from where it was limp
             if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
                 # the step is short: its last states, not the median of some
-                final = float(np.median(step.q[step.t >= step.end - 0.03]))
+                final = median(step.q[step.t >= step.end - 0.03])
                 step = replace(step, final=final)
                 part = (final - step.start) / step.size
                 if worst is None or part < worst[0]:

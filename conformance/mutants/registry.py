@@ -10,7 +10,7 @@ them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -83,7 +83,8 @@ class _Declaration:
     where: Callable[[HandModel], bool] | None
 
 
-_References = Mapping[tuple[str, str], type[Any]]  # by layer and model
+_Place = tuple[str, str]  # layer and model
+_References = Mapping[_Place, type[Any]]
 _declared: list[_Declaration] = []
 
 
@@ -144,23 +145,20 @@ def expand() -> tuple[Mutant, ...]:
     every = catalogue(None, None)
     places = dict.fromkeys((r.layer, r.model) for r in every)
     references = {(name, model): layer(name).reference(model) for name, model in places}
-    found = [m for d in _declared for m in _mutants(d, every, references)]
+    index = _Index(every)
+    found = [m for d in _declared for m in _mutants(d, index, references)]
     order = {r.id: i for i, r in enumerate(every)}
     return tuple(sorted(found, key=lambda m: order[m.kills]))
 
 
-def _mutants(
-    declared: _Declaration, every: tuple[Requirement, ...], references: _References
-) -> Iterator[Mutant]:
+def _mutants(declared: _Declaration, index: _Index, references: _References) -> Iterator[Mutant]:
     base = _base(declared.made, references)
     names = [name for other in _declared if other.made is declared.made for name in other.kills]
     for i, name in enumerate(declared.kills):
-        for requirement in every:
+        for requirement, steps in index.like(name):
             place = requirement.layer, requirement.model
-            if _steps(requirement, name) == math.inf:
-                continue
             # the id of a model, or of one that it is more like, has precedence
-            if len(names) > 1 and _steps(requirement, name) > _nearest(names, place, every):
+            if len(names) > 1 and steps > index.nearest(names, place):
                 continue
             if declared.where and not declared.where(model(requirement.model)):
                 continue
@@ -171,12 +169,7 @@ def _mutants(
                 *place,
                 mix(declared.made, reference),
                 requirement.id,
-                tuple(
-                    r.id
-                    for other in declared.also
-                    for r in every
-                    if (r.layer, r.model) == place and _steps(r, other) < math.inf
-                ),
+                tuple(r.id for other in declared.also for r, _ in index.like(other, place)),
                 declared.sides or reference.fault_sides,
                 declared.dialect,
                 not declared.whole and (declared.brief or i > 0),
@@ -184,16 +177,25 @@ def _mutants(
             )
 
 
-def _nearest(names: Iterable[str], place: tuple[str, str], every: tuple[Requirement, ...]) -> float:
-    """The least number of steps of ``like`` from a model's requirements to one of these ids."""
-    mine = [r for r in every if (r.layer, r.model) == place]
-    return min((_steps(r, name) for name in names for r in mine), default=math.inf)
+class _Index:
+    """Requirements by each id that they have or are ``like``, with the steps of ``like`` to it."""
 
+    def __init__(self, every: Iterable[Requirement]) -> None:
+        self._found: dict[tuple[str, _Place | None], list[tuple[Requirement, int]]] = {}
+        for requirement in every:
+            place = requirement.layer, requirement.model
+            for steps, name in enumerate((requirement.id, *requirement.lineage)):
+                for key in ((name, None), (name, place)):
+                    self._found.setdefault(key, []).append((requirement, steps))
 
-def _steps(requirement: Requirement, name: str) -> float:
-    """Steps of ``like`` from a requirement to the named one, infinite where there is none."""
-    names = (requirement.id, *requirement.lineage)
-    return names.index(name) if name in names else math.inf
+    def like(self, name: str, place: _Place | None = None) -> Sequence[tuple[Requirement, int]]:
+        """Those of a layer and model, or all, in the order of the catalogues."""
+        return self._found.get((name, place), ())
+
+    def nearest(self, names: Iterable[str], place: _Place) -> float:
+        """The least number of steps from one of a model's requirements to one of these ids."""
+        steps = (steps for name in names for _, steps in self.like(name, place))
+        return min(steps, default=math.inf)
 
 
 def _base(made: type[Any], references: _References) -> type[Any]:

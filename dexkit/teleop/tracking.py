@@ -211,13 +211,17 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
         return math.nan, math.nan
     if float(np.ptp(position[use])) < _FOLLOWS * float(np.ptp(goal[use])):
         return math.nan, math.nan  # it does not follow at all
-    best = (math.nan, math.inf)
+    best, least = (math.nan, math.inf), math.inf
+    there = position[use]
     for shift in range(back + 1):
+        away = there - goal[use - shift]
+        if float(away @ away) > least * (1.0 + 1e-9):
+            continue  # far beyond what rounding changes
         # exact, so that it is the same with every NumPy
-        squares = (position[use] - goal[use - shift]) ** 2
-        rms = math.sqrt(math.fsum(squares.tolist()) / len(use))
+        squares = math.fsum((away**2).tolist())
+        rms = math.sqrt(squares / len(use))
         if rms < best[1]:
-            best = (shift * GRID, rms)
+            best, least = (shift * GRID, rms), squares
     return best
 
 

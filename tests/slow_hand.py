@@ -1,0 +1,27 @@
+"""A simulated Dex1-1 for tests of programs, not of motion.
+
+50 exchanges a second instead of 1000 take a fraction of the processor time.
+"""
+
+from __future__ import annotations
+
+from dexkit.emulators.sim_hand import SimHand
+from dexkit.hand import HandSpec, Side
+from dexkit.models import DEX1_1
+
+__all__ = ["SLOW", "SlowHand"]
+
+SLOW = ("tests.slow_hand:SlowHand", "--state-rate", "50")
+"""What ``dexkit serve`` is given for it."""
+
+
+class SlowHand(SimHand):
+    """The simulated gripper at 50 Hz."""
+
+    def __init__(self, side: Side) -> None:
+        super().__init__(side)
+        self._slow = DEX1_1.spec(side, io_rate=50.0, simulated=True)
+
+    @property
+    def spec(self) -> HandSpec:
+        return self._slow
