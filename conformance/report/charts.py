@@ -178,13 +178,16 @@ def _label(css: str, where: str, text: str) -> str:
     return f'<span class="{css}" style="{where}">{escape(text)}</span>'
 
 
+_UNIT_WIDTH = 3.3  # percent of a narrow chart that a letter of a unit takes
+
+
 def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str) -> list[str]:
     """Labels below; every other one is for wide pages only."""
     found = []
     for i, tick in enumerate(ticks):
         at = axes.across(tick)
         text = f"{tick:g}"
-        if at > 93 and len(ticks) > 1:  # the unit is there
+        if at > 95 - _UNIT_WIDTH * len(unit) and len(ticks) > 1:  # the unit is there
             continue
         found.append(_label("x wide" if i % 2 else "x", f"left:{at:.2f}%", text))
     found.append(_label("x unit", "left:100%", unit))
