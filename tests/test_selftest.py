@@ -23,7 +23,7 @@ from dexkit.conformance.report.selftest import findings, render_selftest
 from dexkit.conformance.selftest import measure
 from dexkit.conformance.selftest.bench import LEAD, Setup
 from dexkit.conformance.selftest.external import HandWire
-from dexkit.conformance.selftest.figures import KINDS
+from dexkit.conformance.selftest.figures import KINDS, Figure
 from dexkit.conformance.selftest.live import run
 from dexkit.conformance.selftest.machine import End, SelfTest
 from dexkit.conformance.selftest.measure import Rest
@@ -450,6 +450,22 @@ def test_page_lists_changes_for_the_worse_and_loads_nothing() -> None:
     assert "play 0.0500 rad, was " in page
     assert page.count("<svg") == 6
     assert "http" not in page.replace("http-equiv", "")
+
+
+@each(
+    "case",
+    [
+        ("brainco-revo2", "current to start, q rising 0.0240 A"),
+        ("inspire-ftp", "force to start, q rising 2.40 %"),
+        ("dex3-1", "torque to start, q rising 0.0240 N·m"),
+    ],
+)
+def test_efforts_are_named_by_what_the_hand_reports(case: tuple[str, str]) -> None:
+    name, what = case
+    stiff = Figure("start+", 0.024, 0.04, good=False)
+    joint = replace(good().joints[0], figures=(stiff,))
+    result = replace(good(), hand={**good().hand, "model": name}, joints=(joint,))
+    assert [f.what.partition(" (")[0] for f in findings(result)] == [what]
 
 
 # ------------------------------------------------------------------------------------- on DDS

@@ -39,7 +39,8 @@ _WRONG = {
     Condition.REVERSED: "moves against its commands",
     Condition.OTHER: "its commands move another joint",
 }
-_TRAVEL, _AMPERE = "full travel", "A"  # units of a profile
+_TRAVEL, _FORCE = "full travel", "full force"  # units of a profile
+_EFFORTS = {"A": "current", _FORCE: "force"}  # what a hand reports in the place of torques, by unit
 _LACKS = {Touch.DEAD: "does not answer to touch", Touch.NO_VALUE: "has no value"}
 
 
@@ -99,8 +100,12 @@ def _sentence(figure: Figure, profile: HandModel) -> str:
 
 
 def _titled(text: str, profile: HandModel) -> str:
-    """A title, of a current where the hand reports currents."""
-    return text.replace("torque", "current") if profile.torque_unit == _AMPERE else text
+    """A title, of a current or a force where the hand reports that."""
+    return text.replace("torque", _EFFORTS.get(profile.torque_unit, "torque"))
+
+
+def _torque_unit(profile: HandModel) -> str:
+    return profile.torque_unit.replace("N m", "N·m")
 
 
 def _value(figure: Figure, profile: HandModel, *, before: bool = False) -> str:
@@ -115,9 +120,10 @@ def _value(figure: Figure, profile: HandModel, *, before: bool = False) -> str:
     of_travel = profile.unit == _TRAVEL
     if unit is Unit.SPEED:
         return f"{100 * value:.0f} %/s" if of_travel else f"{value:.2f} {profile.unit}/s"
-    if unit is Unit.Q and of_travel:
+    of_force = profile.torque_unit == _FORCE
+    if (unit is Unit.Q and of_travel) or (unit is Unit.TORQUE and of_force):
         return f"{100 * value + 0.0:.2f} %"
-    name = profile.torque_unit.replace(" ", "·") if unit is Unit.TORQUE else profile.unit
+    name = _torque_unit(profile) if unit is Unit.TORQUE else profile.unit
     digits = 4 if abs(value) < 0.1 else 3
     return f"{round(value, digits) + 0.0:.{digits}f} {name}"  # without -0.0000
 
@@ -240,7 +246,8 @@ def _joints(result: SelfTestResult, profile: HandModel) -> str:
     both = any(len(names) > 1 for names in columns.values())
     about = "<p>Of two figures, the first is with q rising.</p>" if both else ""
     if profile.unit == _TRAVEL:
-        about += "<p>Positions are percent of the full travel.</p>"
+        of_force = " and forces" if profile.torque_unit == _FORCE else ""
+        about += f"<p>Positions{of_force} are percent of the full ones.</p>"
     about += f"<p>Not tested: {escape(', '.join(rest))}.</p>" if rest else ""
     heads = ("joint", "moves", *map(escape, columns))
     return f"<h2>Joints</h2>{about}" + table(heads, rows)
@@ -296,7 +303,7 @@ def _pascal(value: float) -> str:
 
 def _joint(joint: JointResult, spec: JointSpec, profile: HandModel, old: JointResult | None) -> str:
     before = old.curves if old else {}
-    unit, torque = profile.unit, profile.torque_unit.replace(" ", "·")
+    unit, torque = profile.unit, _torque_unit(profile)
     force = _titled("torque", profile)
     charts = [
         _effort(joint, spec, before.get("sweep"), unit, torque, force),
