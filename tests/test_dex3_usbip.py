@@ -389,6 +389,10 @@ def submit(sock: socket.socket, seqnum: int, direction: int, ep: int, data: byte
     sock.sendall(struct.pack(">IIIIIIiiii8s", *command, bytes(8)) + data)
 
 
+def unlink(sock: socket.socket, seqnum: int, transfer: int) -> None:
+    sock.sendall(struct.pack(">IIIIII24x", protocol.CMD_UNLINK, seqnum, 0x10002, 0, 0, transfer))
+
+
 def reply(sock: socket.socket) -> tuple[int, int, int, int]:
     """(command, seqnum, status, length) of the next reply's header."""
     raw = protocol._recvall(sock, 48)
@@ -400,7 +404,7 @@ def reply(sock: socket.socket) -> tuple[int, int, int, int]:
 def test_pending_read_can_be_unlinked() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
         submit(sock, 1, IN, 1, b"")
-        sock.sendall(struct.pack(">IIIIII24x", protocol.CMD_UNLINK, 2, 0x10002, 0, 0, 1))
+        unlink(sock, 2, 1)
         assert reply(sock)[:3] == (protocol.RET_UNLINK, 2, -errno.ECONNRESET)
         # its answer goes to the next read
         submit(sock, 3, OUT, 2, brake())
@@ -409,8 +413,36 @@ def test_pending_read_can_be_unlinked() -> None:
         assert reply(sock) == (protocol.RET_SUBMIT, 4, 0, STATE.size)
         protocol._recvall(sock, STATE.size)
         # too late for one that is done
-        sock.sendall(struct.pack(">IIIIII24x", protocol.CMD_UNLINK, 5, 0x10002, 0, 0, 4))
+        unlink(sock, 5, 4)
         assert reply(sock)[:3] == (protocol.RET_UNLINK, 5, 0)
+
+
+@pytest.mark.parametrize("newest", [1, 0x7FFFFFFF, 0xFFFFFFFF])
+def test_transfer_that_comes_after_its_unlink(newest: int) -> None:
+    read, early, write, last = ((newest + k) & 0xFFFFFFFF for k in range(1, 5))
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        submit(sock, newest, OUT, 2, brake())
+        assert reply(sock)[:3] == (protocol.RET_SUBMIT, newest, 0)
+        # vhci_hcd gives a transfer back at this reply, if it has sent it meanwhile
+        unlink(sock, early, read)
+        submit(sock, read, IN, 1, b"")  # an answer waits for it
+        assert reply(sock) == (protocol.RET_UNLINK, early, -errno.ECONNRESET, 0)
+        unlink(sock, last, write)
+        submit(sock, write, OUT, 2, brake())
+        assert reply(sock) == (protocol.RET_UNLINK, last, -errno.ECONNRESET, 0)
+        assert inside(hands).device().counters.frames == 1
+        submit(sock, last + 1 & 0xFFFFFFFF, IN, 1, b"")  # nothing else came for either
+        assert reply(sock) == (protocol.RET_SUBMIT, last + 1 & 0xFFFFFFFF, 0, STATE.size)
+
+
+def test_unlinks_of_transfers_that_never_come_are_limited() -> None:
+    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
+        with contextlib.suppress(ConnectionError):
+            for number in range(MAX_PARKED + 1):
+                unlink(sock, 10**6 + number, number + 1)
+            assert protocol._recvall(sock, 1) is None
+        with host(inside(hands).port) as computer:
+            exchange(computer.find())
 
 
 def test_an_exchange_in_one_message() -> None:

@@ -12,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import Clock, ManualClock
+from dexkit.emulators.sim_brainco import SimBrainCo
 from dexkit.emulators.sim_dex3 import SimDex3
 from dexkit.emulators.sim_dex5 import SimDex5
 from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.sim_inspire import SimInspireDfx, SimInspireFtp
 from dexkit.emulators.simulated import SimulatedHand
 from dexkit.errors import EncodeError
 from dexkit.hand import HandCommand, HandState, Side
@@ -30,6 +32,9 @@ HANDS: tuple[Callable[[Side, Clock], SimulatedHand], ...] = (
     lambda side, clock: SimHand(side, object_pct=30.0, clock=clock),
     lambda side, clock: SimDex3(side, object_at=30.0, clock=clock),
     lambda side, clock: SimDex5(side, object_at=30.0, clock=clock),
+    lambda side, clock: SimBrainCo(side, object_at=30.0, clock=clock),
+    lambda side, clock: SimInspireDfx(side, object_at=30.0, clock=clock),
+    lambda side, clock: SimInspireFtp(side, object_at=30.0, clock=clock),
 )
 
 # a goal as a fraction of the range, whether the drive is stiff, seconds until the next
@@ -121,14 +126,18 @@ def check_message(
     mapping = dialect_map(dialect, {side: spec})
     kind = message_type(dialect.state_type)
     message = kind.decode(mapping.encode({side: StateView(state, fault)}))
-    first = dialect.index[side] if spec.n_joints == 1 else 0
+    first = dialect.index[side]
     motors = getattr(message, kind.motor_sequence)[first : first + spec.n_joints]
+    if not hasattr(motors[0], "q"):  # whole thousandths in lists of their own
+        close(motors, state.q * 1000, 0.5, "q")
+        return
     scale = dialect.q_open / spec.joints[0].q_max if dialect.name == "unitree_hg" else 1.0
     units_of_tau = np.array(dialect.torque_units or 1.0)
     tau = state.tau_est / units_of_tau
     float32 = 1e-5
     close([m.q for m in motors], state.q * scale, float32, "q")
-    close([m.dq for m in motors], state.dq * scale, 1e-3, "dq")
+    dq = state.dq * scale / np.array(dialect.speed_units or 1.0)
+    close([m.dq for m in motors], dq, 1e-3, "dq")
     close(
         [m.tau_est for m in motors],
         np.abs(tau) if dialect.name == "unitree_hg" else tau,

@@ -93,3 +93,23 @@ def test_a_record_counts_only_set_points_that_change_and_drive() -> None:
     assert record.since(again)["setpoints"] == 0
     record.setpoint(0, 1.0)
     assert record.since(again)["setpoints"] == 1
+
+
+def test_a_record_says_when_the_joints_stood_still_and_no_motor_was_driven() -> None:
+    place = [0.0]
+    record = Record(lambda: place)
+    record.setpoint(0, 1.0)
+    record.setpoint(1, 1.0)
+    start = record.now()["t"]
+    record.look()
+    place[0] = 0.5
+    record.rests(0)
+    assert record.stopped(start)["released"] is None
+    record.rests(1)
+    stopped = record.stopped(start)
+    assert stopped["still"] is not None
+    assert stopped["released"] is not None
+    assert 0 < stopped["still"] < stopped["released"] < record.now()["t"] - start
+    later = record.now()["t"]
+    record.rests(1)
+    assert record.stopped(later) == {"still": 0.0, "released": 0.0}

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from functools import cache
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from dexkit.conformance.report.selftest import findings, render_selftest
 from dexkit.conformance.selftest import measure
 from dexkit.conformance.selftest.bench import LEAD, Setup
 from dexkit.conformance.selftest.external import HandWire
-from dexkit.conformance.selftest.figures import KINDS
+from dexkit.conformance.selftest.figures import KINDS, Figure
 from dexkit.conformance.selftest.live import run
 from dexkit.conformance.selftest.machine import End, SelfTest
 from dexkit.conformance.selftest.measure import Rest
@@ -195,6 +196,24 @@ def check_load(name: str, seed: int, joints: Sequence[int] | None = None) -> Non
     lost = [f for j in after.joints for f in j.figures if math.isnan(f.value)]
     had = [f for j in before.joints for f in j.figures if math.isnan(f.value)]
     assert bool(len(lost) > len(had)) <= bool(after.spoiled)
+    spoiled = [n for j in after.joints for n in j.notes if "spoiled by pauses" in n]
+    assert len(spoiled) == after.spoiled
+
+
+class Hopeless(ManualClock):
+    """A clock of a machine that comes back late in the middle of every measurement."""
+
+    def sleep_until(self, deadline: float) -> None:
+        super().sleep_until(deadline + (0.3 if int(deadline) > int(self.now()) else 0.0))
+
+
+def test_what_pauses_have_spoiled_is_named() -> None:
+    result = result_of(examined("dex1", clock=Hopeless(7.0))[0], {})
+    assert result.verdict is Verdict.INCOMPLETE
+    (joint,) = result.joints
+    assert result.spoiled == len(joint.notes) > 0
+    assert all(note.endswith(": spoiled by pauses of this machine") for note in joint.notes)
+    assert escape(joint.notes[0]) in render_selftest(result)
 
 
 def test_no_motor_gives_more_than_its_lead_allows() -> None:
@@ -431,6 +450,22 @@ def test_page_lists_changes_for_the_worse_and_loads_nothing() -> None:
     assert "play 0.0500 rad, was " in page
     assert page.count("<svg") == 6
     assert "http" not in page.replace("http-equiv", "")
+
+
+@each(
+    "case",
+    [
+        ("brainco-revo2", "current to start, q rising 0.0240 A"),
+        ("inspire-ftp", "force to start, q rising 2.40 %"),
+        ("dex3-1", "torque to start, q rising 0.0240 N·m"),
+    ],
+)
+def test_efforts_are_named_by_what_the_hand_reports(case: tuple[str, str]) -> None:
+    name, what = case
+    stiff = Figure("start+", 0.024, 0.04, good=False)
+    joint = replace(good().joints[0], figures=(stiff,))
+    result = replace(good(), hand={**good().hand, "model": name}, joints=(joint,))
+    assert [f.what.partition(" (")[0] for f in findings(result)] == [what]
 
 
 # ------------------------------------------------------------------------------------- on DDS

@@ -39,6 +39,8 @@ _WRONG = {
     Condition.REVERSED: "moves against its commands",
     Condition.OTHER: "its commands move another joint",
 }
+_TRAVEL, _FORCE = "full travel", "full force"  # units of a profile
+_EFFORTS = {"A": "current", _FORCE: "force"}  # what a hand reports in the place of torques, by unit
 _LACKS = {Touch.DEAD: "does not answer to touch", Touch.NO_VALUE: "has no value"}
 
 
@@ -87,7 +89,7 @@ def _element(e: ElementResult) -> str:
 
 def _sentence(figure: Figure, profile: HandModel) -> str:
     kind = BY_NAME[figure.name]
-    text = f"{kind.title} {_value(figure, profile)}"
+    text = f"{_titled(kind.title, profile)} {_value(figure, profile)}"
     if figure.wear is Wear.WORN:
         text += f", was {_value(figure, profile, before=True)}"
     if not figure.good:
@@ -95,6 +97,15 @@ def _sentence(figure: Figure, profile: HandModel) -> str:
         limit = Figure(figure.name, kind.limit * figure.scale, figure.scale, good=True)
         text += f" ({word} {_value(limit, profile)})"
     return text
+
+
+def _titled(text: str, profile: HandModel) -> str:
+    """A title, of a current or a force where the hand reports that."""
+    return text.replace("torque", _EFFORTS.get(profile.torque_unit, "torque"))
+
+
+def _torque_unit(profile: HandModel) -> str:
+    return profile.torque_unit.replace("N m", "N·m")
 
 
 def _value(figure: Figure, profile: HandModel, *, before: bool = False) -> str:
@@ -106,9 +117,13 @@ def _value(figure: Figure, profile: HandModel, *, before: bool = False) -> str:
         return f"{1e3 * value:.0f} ms"
     if unit is Unit.KELVIN:
         return f"{value:.1f} K"
+    of_travel = profile.unit == _TRAVEL
     if unit is Unit.SPEED:
-        return f"{value:.2f} {profile.unit}/s"
-    name = profile.torque_unit.replace(" ", "·") if unit is Unit.TORQUE else profile.unit
+        return f"{100 * value:.0f} %/s" if of_travel else f"{value:.2f} {profile.unit}/s"
+    of_force = profile.torque_unit == _FORCE
+    if (unit is Unit.Q and of_travel) or (unit is Unit.TORQUE and of_force):
+        return f"{100 * value + 0.0:.2f} %"
+    name = _torque_unit(profile) if unit is Unit.TORQUE else profile.unit
     digits = 4 if abs(value) < 0.1 else 3
     return f"{round(value, digits) + 0.0:.{digits}f} {name}"  # without -0.0000
 
@@ -136,7 +151,7 @@ def render_selftest(result: SelfTestResult, baseline: SelfTestResult | None = No
             for j in result.joints
             if j.curves and j.name in specs
         ),
-        _meaning(result),
+        _meaning(result, profile),
     ]
     _, title = _TITLES[result.verdict]
     return document(f"{title}: {_name(result)} (self-test)", "".join(sections))
@@ -217,7 +232,8 @@ def _joints(result: SelfTestResult, profile: HandModel) -> str:
     columns: dict[str, list[str]] = {}
     for kind in KINDS:
         if any(_has(j, kind.name) for j in result.joints):
-            columns.setdefault(kind.title.partition(",")[0], []).append(kind.name)
+            title = _titled(kind.title, profile)
+            columns.setdefault(title.partition(",")[0], []).append(kind.name)
     rows = []
     rest = [j.name for j in result.joints if j.condition is Condition.UNTESTED]
     for joint in result.joints:
@@ -229,6 +245,9 @@ def _joints(result: SelfTestResult, profile: HandModel) -> str:
         rows.append((unbroken(escape(joint.name)), moves, *cells))
     both = any(len(names) > 1 for names in columns.values())
     about = "<p>Of two figures, the first is with q rising.</p>" if both else ""
+    if profile.unit == _TRAVEL:
+        of_force = " and forces" if profile.torque_unit == _FORCE else ""
+        about += f"<p>Positions{of_force} are percent of the full ones.</p>"
     about += f"<p>Not tested: {escape(', '.join(rest))}.</p>" if rest else ""
     heads = ("joint", "moves", *map(escape, columns))
     return f"<h2>Joints</h2>{about}" + table(heads, rows)
@@ -284,9 +303,10 @@ def _pascal(value: float) -> str:
 
 def _joint(joint: JointResult, spec: JointSpec, profile: HandModel, old: JointResult | None) -> str:
     before = old.curves if old else {}
-    unit, torque = profile.unit, profile.torque_unit.replace(" ", "·")
+    unit, torque = profile.unit, _torque_unit(profile)
+    force = _titled("torque", profile)
     charts = [
-        _effort(joint, spec, before.get("sweep"), unit, torque),
+        _effort(joint, spec, before.get("sweep"), unit, torque, force),
         *(
             _over_time(joint, name, title, before.get(name), unit)
             for name, title in (
@@ -296,7 +316,7 @@ def _joint(joint: JointResult, spec: JointSpec, profile: HandModel, old: JointRe
             )
         ),
         *(
-            _start(joint, name, title, before.get(name), torque)
+            _start(joint, name, title, before.get(name), torque, force)
             for name, title in (("start+", "rising"), ("start-", "falling"))
         ),
     ]
@@ -305,7 +325,7 @@ def _joint(joint: JointResult, spec: JointSpec, profile: HandModel, old: JointRe
 
 
 def _effort(
-    joint: JointResult, spec: JointSpec, before: Series | None, unit: str, torque: str
+    joint: JointResult, spec: JointSpec, before: Series | None, unit: str, torque: str, force: str
 ) -> str:
     s = joint.curves.get("sweep")
     if s is None or not np.isfinite(s.tau).any():
@@ -314,7 +334,7 @@ def _effort(
     css = {"q rising": "state", "q falling": "cmd"}
     lines += [Line(way, css[way], x, y) for way, x, y in _ways(s)]
     return chart(
-        f"{joint.name}: torque over its range, moved slowly",
+        f"{joint.name}: {force} over its range, moved slowly",
         lines,
         y_unit=torque,
         x_unit=unit,
@@ -343,18 +363,20 @@ def _over_time(joint: JointResult, name: str, title: str, before: Series | None,
     )
 
 
-def _start(joint: JointResult, name: str, title: str, before: Series | None, torque: str) -> str:
+def _start(
+    joint: JointResult, name: str, title: str, before: Series | None, torque: str, force: str
+) -> str:
     s = joint.curves.get(name)
     if s is None or not np.isfinite(s.tau).any():
         return ""
     lines = [Line("earlier run", "other", before.t, before.tau)] if before else []
-    lines.append(Line("torque", "force", s.t, s.tau))
+    lines.append(Line(force, "force", s.t, s.tau))
     figure = next((f for f in joint.figures if f.name == name), None)
     sign = 1 if name.endswith("+") else -1
     known = figure is not None and math.isfinite(figure.value)
-    levels = [Level(sign * figure.value, "torque to start")] if known and figure else []
+    levels = [Level(sign * figure.value, f"{force} to start")] if known and figure else []
     return chart(
-        f"{joint.name}: torque under a command that creeps away, q {title}",
+        f"{joint.name}: {force} under a command that creeps away, q {title}",
         lines,
         y_unit=torque,
         span=(0.0, float(s.t[-1]) or 1.0),
@@ -364,9 +386,10 @@ def _start(joint: JointResult, name: str, title: str, before: Series | None, tor
     )
 
 
-def _meaning(result: SelfTestResult) -> str:
+def _meaning(result: SelfTestResult, profile: HandModel) -> str:
     items = "".join(
-        f"<li><b>{escape(k.title)}</b>: {escape(k.help)}. {escape(_limits(k.name))}</li>"
+        f"<li><b>{escape(_titled(k.title, profile))}</b>: {escape(f'{k.help}. {_limits(k.name)}')}"
+        "</li>"
         for k in KINDS
     )
     return (

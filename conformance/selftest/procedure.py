@@ -7,7 +7,7 @@ driven any more: nothing faster happens before that test.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from dexkit.command_age import PAUSE
 from dexkit.conformance.selftest import measure
-from dexkit.conformance.selftest.bench import SETTLE, Bench, Series, Setup, Turns
+from dexkit.conformance.selftest.bench import SETTLE, Bench, Series, Setup, T, Turns
+from dexkit.conformance.selftest.figures import BY_NAME
 from dexkit.conformance.selftest.measure import Rest
 from dexkit.hand import Floats, HandCommand, HandState, JointSpec
 from dexkit.models import model
@@ -272,11 +273,22 @@ class Procedure:
         yield from bench.move(j, self._at(j, 0.5), float(bench.slow[j]), settle=True)
         found = []
         for name, direction in (("start+", 1), ("start-", -1)):
-            one = yield from bench.undisturbed(partial(self._start, j, direction))
+            one = yield from self._measured(
+                j, BY_NAME[name].title, partial(self._start, j, direction)
+            )
             joint.figures[name] = math.nan if one is None else one.torque
             found += [] if one is None else [one]
         best = max(found, key=lambda s: s.swing, default=measure.Start(math.nan))
         joint.figures["stiffness"] = best.stiffness
+
+    def _measured(
+        self, j: int, what: str, attempt: Callable[[], Turns[T | None]]
+    ) -> Turns[T | None]:
+        """A measurement of a joint, with a note that names it if this machine's pauses spoil it."""
+        found = yield from self.bench.undisturbed(attempt)
+        if found is None:
+            self.found.joints[j].notes.append(f"{what}: spoiled by pauses of this machine")
+        return found
 
     def _start(self, j: int, direction: int) -> Turns[measure.Start | None]:
         bench, stroke = self.bench, float(self.setup.stroke[j])
@@ -296,7 +308,9 @@ class Procedure:
         rests: dict[int, list[Rest]] = {1: [], -1: []}
         for _ in range(_REPEATS):
             for direction, found in rests.items():
-                one = yield from self.bench.undisturbed(partial(self._return, j, direction))
+                one = yield from self._measured(
+                    j, "repeatability and play", partial(self._return, j, direction)
+                )
                 if one is None:
                     return
                 found.append(one)
@@ -322,7 +336,7 @@ class Procedure:
     def _lags(self, j: int) -> Turns[None]:
         found = []
         for direction in (1, -1, 1, -1):
-            value = yield from self.bench.undisturbed(partial(self._lag, j, direction))
+            value = yield from self._measured(j, "a lag", partial(self._lag, j, direction))
             found.append(math.nan if value is None else value)
         known = [value for value in found if math.isfinite(value)]
         self.found.joints[j].figures["lag"] = float(np.median(known)) if known else math.nan
@@ -358,7 +372,9 @@ class Procedure:
                 asked = level * float(self.found.asked_speed[j, column])
                 if name not in going or (asked <= 2 * slow and level < _LEVELS[-1]):
                     continue
-                found = yield from bench.undisturbed(partial(self._fast, j, begin, goal, asked))
+                found = yield from self._measured(
+                    j, BY_NAME[name].title, partial(self._fast, j, begin, goal, asked)
+                )
                 reached[name], beyond = found or (math.nan, 0.0)
                 if not (reached[name] >= _KEPT * asked and beyond <= _OVERSHOT):
                     going.discard(name)

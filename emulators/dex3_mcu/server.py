@@ -8,6 +8,13 @@ only while a client sends requests.
 Only one client at a time can import a device, as on a real host: a second import is refused as
 busy.
 
+An unlinked transfer gets one reply, RET_UNLINK with -ECONNRESET; with 0 if RET_SUBMIT went out
+before it. Linux' vhci_hcd can send an unlink *before* the transfer that it is for: its thread sends
+all queued transfers, then all queued unlinks, and both may be queued in between (``vhci_tx.c``).
+Such an unlink waits here for its transfer, which is then not carried out. If it were answered at
+once, vhci_hcd would give the transfer back at that answer, and drop the device at the later
+RET_SUBMIT ("cannot find a urb of seqnum").
+
 A client's use of memory and connections is bounded:
 
 * :data:`MAX_PARKED` transfers that wait for data; one more ends with -ENOMEM, as a host
@@ -78,6 +85,7 @@ _ST_DEV_BUSY = 2  # of Linux' usbip_common.h
 _RETURN = struct.Struct(">IIIIIi24x")
 _SET_CONFIGURATION = b"\x00\x09"
 _ACCEPT_PAUSE = 0.1  # seconds without accepting after the system ran out of file descriptors
+_NUMBERS = 0xFFFFFFFF
 _UNLINKED = -errno.ECONNRESET  # status of an unlinked transfer that Linux' vhci expects
 _TICK = 4e-3
 _SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
@@ -341,17 +349,29 @@ class Server:
         urb = protocol.read_cmd(connection)
         device = connection.plug.device
         if urb.command == protocol.CMD_UNLINK:
-            # its flags field is the number of the transfer to unlink
-            late = connection.complete(urb.flags)
-            if not late:
-                device.cancel_urb(urb.flags)
-            connection.unlinked(urb, 0 if late else _UNLINKED)
+            self._unlink(connection, device, urb)
         else:
             self._submit(connection, device, urb)
         return True
 
+    def _unlink(self, connection: _Connection, device: USBDevice, urb: Any) -> None:
+        number = urb.flags  # this field is the number of the transfer to unlink
+        if connection.is_to_come(number):
+            if len(connection.unlinked_early) >= MAX_PARKED:
+                raise _NotUsbIp
+            connection.unlinked_early[number] = urb
+            return
+        late = connection.complete(number)
+        if not late:
+            device.cancel_urb(number)
+        connection.unlinked(urb, 0 if late else _UNLINKED)
+
     def _submit(self, connection: _Connection, device: USBDevice, urb: Any) -> None:
         parked = connection.parked
+        connection.newest = urb.seqnum
+        if (unlink := connection.unlinked_early.pop(urb.seqnum, None)) is not None:
+            connection.unlinked(unlink, _UNLINKED)
+            return
         if urb.seqnum in parked:  # whose answer would be whose?
             raise _NotUsbIp
         if urb.direction == protocol.IN and urb.ep and len(parked) >= MAX_PARKED:
@@ -442,6 +462,8 @@ class _Connection:
         self.outbox = bytearray()
         self.plug: Plug | None = None
         self.parked: dict[int, Any] = {}  # transfers under way, by number
+        self.newest: int | None = None  # number of the last transfer that came
+        self.unlinked_early: dict[int, Any] = {}  # unlinks by number of a transfer still to come
         self.until = until  # when it is closed without an import
         self.closing = False
         self.waiting = False
@@ -469,6 +491,10 @@ class _Connection:
 
     def sendall(self, data: bytes) -> None:
         self.outbox += data
+
+    def is_to_come(self, seqnum: int) -> bool:
+        """Whether a transfer of this number has not come yet: numbers rise, and wrap."""
+        return self.newest is None or 0 < (seqnum - self.newest) & _NUMBERS <= _NUMBERS // 2
 
     def complete(self, seqnum: int) -> bool:
         """Remove a transfer from the list; return True if it was completed before."""

@@ -57,6 +57,8 @@ class Control:
             return self._devices.records[message["device"]].now()
         elif kind == "since":
             return self._devices.records[message["device"]].since(message["t"])
+        elif kind == "stopped":
+            return self._devices.records[message["device"]].stopped(message["t"])
         return {}
 
     def close(self) -> None:

@@ -33,6 +33,7 @@ _PERIOD = 0.01  # seconds between two looks at the joints
 _HEARD, _SHOWN = 1000, 60  # messages on a serial line that are remembered; bytes that are shown
 _LOOK_STEPS = 20  # of a motor's mechanics, 10 ms
 _FOC = 1
+_MOTION = 1e-3  # of a joint, in the record's unit, that is none
 
 
 class Record:
@@ -46,7 +47,8 @@ class Record:
         self._places: list[tuple[float, list[float]]] = []
         self._setpoints: list[tuple[float, tuple[object, ...]]] = []
         self._heard: deque[tuple[float, bytes]] = deque(maxlen=_HEARD)
-        self._last: dict[int, tuple[object, ...]] = {}
+        self._last: dict[int, tuple[object, ...]] = {}  # of the joints that are driven
+        self._released = 0.0  # when the last of them was no longer
         self._clock = RealClock()
         self._lock = threading.Lock()
 
@@ -70,7 +72,8 @@ class Record:
 
     def rests(self, joint: int) -> None:
         """Note that ``joint`` was told to brake, or has no torque."""
-        self._last.pop(joint, None)
+        if self._last.pop(joint, None) is not None and not self._last:
+            self._released = self._clock.now()
 
     def now(self) -> dict[str, Any]:
         """The time, and where the joints are."""
@@ -95,6 +98,24 @@ class Record:
             "heard": len(heard),
             "first": repr(heard[:_SHOWN])[2:-1],
         }
+
+    def stopped(self, start: float) -> dict[str, float | None]:
+        """How long after ``start`` the joints moved, and a motor was driven.
+
+        :returns: seconds ``still`` until no joint moved any more, and ``released`` until no motor
+            was driven; ``released`` is None while one is.
+        """
+        self.look()
+        with self._lock:
+            places = [(t, place) for t, place in self._places if t >= start]
+            released = None if self._last else max(0.0, self._released - start)
+        rest = places[-1][1]
+        moving = [
+            t
+            for t, place in places
+            if any(abs(q - end) > _MOTION for q, end in zip(place, rest, strict=True))
+        ]
+        return {"still": moving[-1] - start if moving else 0.0, "released": released}
 
 
 class Devices:

@@ -29,6 +29,7 @@ from tools.lab.guest.bench import (
 from tools.lab.guest.client import DOMAIN, Client
 from tools.lab.guest.faults import Subject, table
 from tools.lab.guest.power import autosuspend, freeze_processes, runtime_status, suspend_refused
+from tools.lab.guest.stops import run_stops
 
 __all__ = ["run_dex3"]
 
@@ -58,6 +59,7 @@ def run_dex3(bench: Bench) -> None:
             bench.skip("dex3", name, "it was not compiled: see what make lab printed")
         elif not bench.case("dex3", name, do) and do == lab.enumerate:
             return
+    run_stops(bench, lambda: detach(lab.places[Side.LEFT]), lambda: lab.plug(Side.LEFT))
     if not bench.case("dex3", "dexkit serve dex3-usb, both hands", lab.serve):
         return
     try:

@@ -20,6 +20,7 @@ from pathlib import Path
 __all__ = ["MODULES", "Program", "prepare"]
 
 MODULES = (
+    "dexkit.cli.bringup",
     "dexkit.cli.calibrate",
     "dexkit.cli.doctor",
     "dexkit.cli.doctor_devices",
@@ -27,6 +28,7 @@ MODULES = (
     "dexkit.dds",
     "dexkit.drivers.dex1_serial",
     "dexkit.drivers.dex3_usb",
+    "dexkit.drivers.dex3_usb.bringup",
     "dexkit.drivers.ezgripper",
     "dexkit.messages.unitree_go",
     "dexkit.messages.unitree_hg",
@@ -58,15 +60,22 @@ class Program:
         :mod:`tools.lab.guest.probe`.
     :param user: who runs it, with this group of the same number; None for root.
     :param groups: that the user is in, too.
+    :param terminal: path of the terminal that it is started in; without one it has no input.
 
     :ivar out: the file with what it prints, on both outputs.
     """
 
-    def __init__(self, *words: str, user: int | None = None, groups: Sequence[int] = ()) -> None:
+    def __init__(
+        self,
+        *words: str,
+        user: int | None = None,
+        groups: Sequence[int] = (),
+        terminal: str = "",
+    ) -> None:
         self.words = words
         self.out = Path(f"/tmp/program-{time.monotonic_ns()}.log")
         self.out.touch()
-        arguments = (str(self.out), words, user, tuple(groups))
+        arguments = (str(self.out), words, user, tuple(groups), terminal)
         self._process = _context().Process(target=_main, args=arguments)
         self._process.start()
 
@@ -105,7 +114,13 @@ class Program:
                 self._process.join()
 
 
-def _main(out: str, words: Sequence[str], user: int | None, groups: Sequence[int]) -> None:
+def _main(
+    out: str, words: Sequence[str], user: int | None, groups: Sequence[int], terminal: str
+) -> None:
+    if terminal:
+        os.setsid()
+        os.dup2(os.open(terminal, os.O_RDWR), 0)  # it becomes the session's terminal
+        sys.stdin = os.fdopen(0, closefd=False)
     descriptor = os.open(out, os.O_WRONLY | os.O_APPEND)
     for number in (1, 2):
         os.dup2(descriptor, number)
