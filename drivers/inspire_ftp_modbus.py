@@ -4,8 +4,9 @@
 are commanded as well, and forces, states of the motors and the tactile areas are read
 (docs/sources/unitree-dex.md#j3).
 
-An area takes one request. The hand answers so many hundred requests a second that not all areas fit
-between two states: each exchange reads some of them, in turn, and a state holds the newest of each.
+An area takes one request, and a hand that answers some hundred requests a second has no time for
+all of them between two states: each exchange reads some, in turn, and a state holds the newest of
+each.
 """
 
 from __future__ import annotations
