@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
@@ -81,7 +82,7 @@ class InspireFtpModbus(InspireModbus):
         self._speeds = [self._most] * JOINTS
         """What the device has."""
         self._forces: Floats = np.zeros(JOINTS)
-        self._moving = np.zeros(JOINTS, dtype=bool)
+        self._moving: NDArray[np.bool_] = np.zeros(JOINTS, dtype=np.bool_)
         self._stamp = math.nan
         self._next_area = 0
         self._pressure: Floats = np.full((len(_AREAS), max(a.elements for a in _AREAS)), np.nan)

@@ -243,7 +243,7 @@ class _Topic:
         """The fields of each sample, from all their numbers."""
         if len(self._paths) > len(self.fields):
             numbers = np.fmax.reduceat(numbers, self._starts, axis=1)
-        return numbers * self._factors
+        return np.asarray(numbers * self._factors)
 
     def _times(self, received: Floats, sent: Floats, writers: Times) -> Floats:
         t = received.copy()
