@@ -82,8 +82,6 @@ INSPIRE_DFX = HandModel(
 _FINGER_AREAS = (("tip", 3, 3), ("top", 12, 8), ("palm", 10, 8))
 _THUMB_AREAS = (("tip", 3, 3), ("top", 12, 8), ("middle", 3, 3), ("palm", 12, 8))
 _COUNTED = {"pinky": "one", "ring": "two", "middle": "three", "index": "four", "thumb": "five"}
-_FTP_FULL_TRAVEL_S = 0.6  # docs/sources/unitree-dex.md#j3
-_FTP_JOINTS = tuple(replace(joint, dq_max=1.0 / _FTP_FULL_TRAVEL_S) for joint in _JOINTS)
 _AREAS = (
     *(
         TouchArea(f"{finger} {part}", f"finger{number}_{part}_touch", rows, columns)
@@ -98,7 +96,6 @@ INSPIRE_FTP = replace(
     name="inspire-ftp",
     title="Inspire FTP hand",
     other_short_name="inspire-ftp",
-    joints=dict.fromkeys(Side, _FTP_JOINTS),
     dialects=(
         Dialect(
             name="inspire_ftp",
