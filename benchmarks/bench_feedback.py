@@ -20,14 +20,14 @@ from dexkit.drivers.ezgripper.scaling import current_of_effort, joint_of_ticks, 
 from dexkit.emulators.mx64 import Firmware, GripperMechanics, Physics, Servo
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
-from dexkit.service.core import Estimation, HandCore
+from dexkit.service.hand_core import Estimation, HandCore
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import Instruction, Packet
 
 _ZERO = 1510
 _EFFORT = 50.0  # percent, the driver's default while moving
-_LEAD = 0.18  # rad (docs/sources/unitree-dex.md#b1)
+_LEAD = 0.18  # rad (docs/sources/unitree-dex.md#b3)
 _WEIGHTS = (0.5, 0.3, 0.2)  # newest first (docs/sources/unitree-dex.md#b1)
 _FROM, _TO = 0.05, 0.95  # of the stroke: where the time is taken
 _STROKE = DEX1_1.joints[Side.LEFT][0].stroke

@@ -1,1 +1,1 @@
-"""Room of dexkit: imported as dexkit.conformance."""
+"""The conformance kit, imported as ``dexkit.conformance``."""

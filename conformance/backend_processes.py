@@ -65,7 +65,7 @@ class RigOptions:
 
     @property
     def usb_server(self) -> str:
-        """Where a setting says that USB devices are, or empty."""
+        """USB/IP server named by a setting, or empty."""
         settings = dict(s.partition("=")[::2] for s in self.settings)
         return settings.get("usb", "")
 

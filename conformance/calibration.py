@@ -59,7 +59,7 @@ class Loopback:
         self._thread.join()
 
     def result(self) -> Calibration:
-        """What was measured, once all messages were sent."""
+        """The result, once all messages were sent."""
         self._thread.join()
         return Calibration(
             sent=len(self._late),

@@ -1,4 +1,4 @@
-"""Where a joint moves further than its reported speed allows: looked for only where it can be.
+"""Find where a joint moves further than its reported speed allows, searching only possible windows.
 
 A window begins at one measurement and ends at another, a given time later. What q moved in it
 beyond the integral of dq is worked out for every window of a recording, or, several times as
@@ -40,7 +40,7 @@ class Excess:
 
 
 class Course:
-    """What a joint did and what it reported.
+    """Measured and reported motion of a joint.
 
     :param times: of its measurements, rising.
     :param q: rad.

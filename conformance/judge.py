@@ -146,7 +146,7 @@ def _harness(recording: Recording) -> dict[str, float]:
 
 
 def _score(recording: Recording, results: Sequence[Result]) -> Score:
-    """How many wrong hands a run with these results catches."""
+    """Number of wrong hands that a run with these results catches."""
     return score_of(
         recording.model.name,
         recording.dialect.name,

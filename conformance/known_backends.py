@@ -21,8 +21,8 @@ class Emulation:
     """How to emulate a backend's device: one process a hand.
 
     :param arguments: of ``dexkit emulate``, without object; ``{side}`` is the hand's.
-    :param linked: whether it is reached by a path that it is told (``--link``). Otherwise it says
-        where it is, in the first word after ``ready:``, and is told its side.
+    :param linked: whether its path is given by ``--link``. Otherwise it prints its address as the
+        first word after ``ready:``, and gets ``--side``.
     :param settings: that the backend needs to go with it.
     """
 

@@ -15,7 +15,7 @@ __all__ = ["Plot", "PlotKind"]
 
 
 class PlotKind(str, Enum):
-    """What a plot shows; "the place" is the first one in the recording that the check names."""
+    """Kinds of plots; "the place" is the first place in the recording named by the check."""
 
     ENDPOINTS = "endpoints"
     """Table of the endpoints that a client needs, and of those that discovery found."""
@@ -28,13 +28,13 @@ class PlotKind(str, Enum):
     SESSION = "session"
     """Command and state of the replayed session, and about the place."""
     OPERATOR = "operator"
-    """Where the modelled operator wants the joint, the client's commands, and the state."""
+    """The modelled operator's target for the joint, the client's commands, and the state."""
     SAMPLES = "samples"
     """The single samples of a joint's position about the place."""
     RATE = "rate"
     """Rate of the state in windows of half a second."""
     INTERVAL_HISTOGRAM = "interval-histogram"
-    """How often each interval between states occurs."""
+    """Histogram of the intervals between states."""
     INTERVALS = "intervals"
     """Each interval between states over the whole run."""
     GAP = "gap"

@@ -142,7 +142,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(args: list[str]) -> None:
-    """Let ``--trace FILE.mcap`` name the session: pytest's own ``--trace`` takes no value."""
+    """Accept ``--trace FILE.mcap`` as the session: pytest's own ``--trace`` takes no value."""
     for i, (option, value) in enumerate(pairwise(args)):
         if option == "--trace" and value.endswith(".mcap"):
             args[i : i + 2] = [_TRACE, value]

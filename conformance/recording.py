@@ -251,8 +251,8 @@ class Recording:
         # the kit itself publishes another type in the phase 'foreign'
         phases = stimulus.phases if stimulus else []
         foreign = {s for p in phases if p.name == "foreign" for s in p.sides}
-        own = tuple(f"{chosen.topics(s)[0]} carries " for s in foreign)
-        notes = [text for text in trace.warnings if not text.startswith(own)]
+        own = {trace.mixed_types.get(chosen.topics(s)[0]) for s in foreign}
+        notes = [text for text in trace.warnings if text not in own]
         if trace.truncated:
             notes.append("the recording is unfinished; it is judged as far as it goes")
         imported = trace.metadata.get(IMPORTED, {})
@@ -341,7 +341,7 @@ class Recording:
         return self.stimulus.time_error(self.log_time(begin), self.log_time(end))
 
     def lost(self, begin: float, end: float) -> Lost | None:
-        """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
+        """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
         if self.stimulus is None:
             return None
         return self.stimulus.beats.lost(self.log_time(begin), self.log_time(end))

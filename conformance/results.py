@@ -274,7 +274,7 @@ class Grade:
 
     @property
     def total(self) -> int:
-        """How many requirements of the kind the run has."""
+        """Number of requirements of this kind in the run."""
         return sum(self.counts.values())
 
     @property

@@ -214,7 +214,8 @@ def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
             _commands(model, commands, origin),
             tuple(model.joint(slot) for slot in model.used),
         )
-    notes = [text for text in trace.warnings if not text.startswith(f"{model.cmd_topic} carries ")]
+    own = trace.mixed_types.get(model.cmd_topic)
+    notes = [text for text in trace.warnings if text != own]
     if trace.truncated:
         notes.append("the recording is unfinished; it is judged as far as it goes")
     return RobotRecording(

@@ -82,7 +82,7 @@ def run_record(
 
 @cache
 def catalogue_digest() -> str:
-    """What identifies the requirements that this dexkit judges: SHA-256 of all of them, hex."""
+    """SHA-256, hex, of all requirements of this version of dexkit."""
     every = [
         {k: str(v) if k in ("level", "kind", "plots") else v for k, v in asdict(r).items()}
         for layer in sorted(LAYERS)

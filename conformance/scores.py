@@ -1,4 +1,4 @@
-"""How many wrong hands a run like this one catches, as a sentence for every report.
+"""Describe, for every report, how many wrong hands a run like this one catches.
 
 ``scores.json`` beside this module holds what ``python -m tools.scores`` has found out: it tries
 generated wrong hands (docs/mutants.md) in runs of each kind, on the virtual clock. A figure of the
@@ -63,7 +63,7 @@ _DIGESTED = (
 
 
 class Setting(str, Enum):
-    """What else a run needs beside its kind, in which trials differ."""
+    """Setting of a run, besides its kind, that trials vary."""
 
     WHOLE = "whole"
     """The kit starts and ends the service, and there is an object in one hand."""
@@ -82,7 +82,7 @@ class Setting(str, Enum):
 
 @dataclass(frozen=True)
 class Caught:
-    """How many of the hands of one grade were caught.
+    """Number of caught hands of one grade.
 
     :param interval: 95 % confidence interval of their part, 0 to 1 (Wilson's score).
     """

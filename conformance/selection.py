@@ -20,7 +20,7 @@ THOROUGH_ROUNDS = 10
 
 
 class RunKind(str, Enum):
-    """How much a run of the suite does."""
+    """Extent of a run of the suite."""
 
     QUICK = "quick"
     DEFAULT = "default"
@@ -31,7 +31,7 @@ class RunKind(str, Enum):
 
     @property
     def rounds(self) -> int:
-        """How often a hand goes through the stimuli."""
+        """Number of times that a hand gets the stimuli."""
         return THOROUGH_ROUNDS if self is RunKind.THOROUGH else 1
 
     def requirements(self, every: Sequence[Requirement]) -> tuple[Requirement, ...]:

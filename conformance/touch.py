@@ -1,4 +1,4 @@
-"""What a recording holds of the tactile areas of a hand that has a topic for them."""
+"""Read the tactile areas of a hand from a recording of their topic."""
 
 from __future__ import annotations
 

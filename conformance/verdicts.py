@@ -49,14 +49,15 @@ from dexkit.hand import Subject
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]
 
 HARDEST = 2.0
-"""How many times as late as the kit's own timer a hand's process may have been: it has more than
-one thread, and waits for its device."""
+"""Assumed lateness of a hand's process as a multiple of that of the kit's timer: it has several
+threads, and waits for its device."""
 BUSY_SHARE = 0.5
 """Part of a failure's time with programs waiting for a processor that makes a machine busy."""
 OVERLOADED = 3e-3
 """Seconds by which the kit's own timer, of 10 ms, is late on average on an overloaded machine."""
 _STILL = ("nothing", "endpoints", "state")
-"""What requirements need that a hand cannot fail for lack of time, unless they are of real time."""
+"""Needs of requirements that a hand cannot fail for lack of processor time, unless they are
+real-time requirements."""
 NOTABLE = 0.1
 """Part of a failure that the machine must explain to be mentioned."""
 SHORT = 1.0
@@ -73,14 +74,14 @@ _NOT_MET = (Verdict.FAIL, Verdict.WARN)
 
 
 class Machine(Protocol):
-    """What a recording says of the machine that the kit ran on."""
+    """Data in a recording about the machine that the kit ran on."""
 
     def starved(self, begin: float, end: float) -> float:
         """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         ...
 
     def lost(self, begin: float, end: float) -> Lost | None:
-        """By how much the kit's own timer was late in it; None if that is not known."""
+        """Lateness of the kit's own timer in it, s; None if unknown."""
         ...
 
 

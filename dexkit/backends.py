@@ -71,16 +71,17 @@ class BackendOptions:
 
 @dataclass(frozen=True)
 class Backend:
-    """A way to be a hand.
+    """A driver or simulated hand, with its settings.
 
     :param summary: one line for ``dexkit backends``.
     :param model: hand model that it implements; empty where it is known only after the hand was
         made.
-    :param needs: what must be there: ``"--device PATH or serial number"``, or empty.
+    :param needs: the device that is needed: ``"--device PATH or serial number"``, or empty.
     :param make: makes the hand, without opening it.
     :param needs_device: refuse to start without a device.
     :param settings: name and help of each ``--set`` setting.
     :param bringup: makes the :class:`~dexkit.bringup.Bench` of ``dexkit bringup``, or None.
+    :param udev_rules: makes the udev rules that give users access to its USB device, or None.
     """
 
     summary: str
@@ -90,6 +91,7 @@ class Backend:
     needs_device: bool = False
     settings: dict[str, str] = field(default_factory=dict)
     bringup: Lazy[Callable[[BackendOptions], Bench]] | None = None
+    udev_rules: Lazy[Callable[[], str]] | None = None
 
     def create(self, options: BackendOptions) -> Hand:
         """Make the hand; nothing is opened yet.

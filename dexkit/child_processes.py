@@ -98,7 +98,7 @@ class Tool:
         self.place = ""
         """The first word after ``ready:``."""
         self.ready_line = ""
-        """What it printed when it was ready."""
+        """Its ready line."""
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=40)
         # closed when this process ends, even by SIGKILL

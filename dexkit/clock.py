@@ -77,7 +77,7 @@ class ManualClock:
         return self._now + self._suspended
 
     def suspend(self, seconds: float) -> None:
-        """Let time pass that :meth:`now` does not see."""
+        """Advance the time that counts suspension, but not :meth:`now`."""
         with self._lock:
             self._suspended += seconds
 

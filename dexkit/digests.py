@@ -22,7 +22,7 @@ _PIECE = 1 << 20  # bytes
 
 @dataclass(frozen=True)
 class Digest:
-    """What a content is known by.
+    """Size and checksums of a content.
 
     :param size: bytes.
     :param sha256: 64 hexadecimal digits, lower case.

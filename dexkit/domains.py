@@ -16,7 +16,7 @@ from dexkit.errors import DexkitError
 __all__ = ["AUTOMATIC_DOMAINS", "ReservedDomain", "reserve_free_domain"]
 
 AUTOMATIC_DOMAINS = range(100, 231)
-"""Where a domain is looked for when none is given: the highest that have all their ports."""
+"""Range of domains to choose from when none is given: the highest with all their ports."""
 
 _PORT = 248  # discovery of the last participant, 119 (RTPS 9.6.1.1); dexkit uses 0 to 60
 
@@ -40,7 +40,7 @@ class ReservedDomain:
             raise
 
     def close(self) -> None:
-        """Let others have it. Idempotent."""
+        """Release it. Idempotent."""
         self._socket.close()
 
     def __enter__(self) -> ReservedDomain:

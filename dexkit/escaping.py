@@ -60,7 +60,7 @@ _COMMAND = re.compile(
     re.IGNORECASE,
 )
 _CLEAR_LINE = "\r\x1b[K"
-"""How a status line begins: it goes over the one before."""
+"""Begin of a status line: it overwrites the one before."""
 
 
 def _escaped(match: re.Match[str]) -> str:

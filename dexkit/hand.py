@@ -54,7 +54,7 @@ class Side(str, Enum):
 
 
 class RobotSubject(str, Enum):
-    """What a robot has where a hand has its side."""
+    """The subject of a robot, in place of a hand's side."""
 
     ROBOT = "robot"
 
@@ -65,7 +65,7 @@ class RobotSubject(str, Enum):
 ROBOT: Final = RobotSubject.ROBOT
 
 Subject: TypeAlias = Side | RobotSubject
-"""What a conformance run judges: one hand, named by its side, or a robot."""
+"""The subject of a conformance run: a hand, named by its side, or a robot."""
 
 
 class JointMode(IntEnum):

@@ -48,7 +48,7 @@ HINT = (
     "this needs Linux, and a sandbox that permits SO_ATTACH_FILTER. Where no other machine is on "
     f"any network of this machine, {ALL_INTERFACES}=1 goes on without"
 )
-"""What to do when the system has no such filter."""
+"""Advice for systems without such a filter."""
 
 _SO_ATTACH_FILTER = 26
 _SO_GET_FILTER = 26
@@ -145,7 +145,7 @@ def program(indices: Sequence[int]) -> bytes:
 
 
 def accept_only(sock: socket.socket, indices: Sequence[int]) -> None:
-    """Let in what comes by interfaces with these indices only, from now on.
+    """Accept packets only from interfaces with these indices, from now on.
 
     :raises OSError: the system has no such filter.
     """
@@ -165,7 +165,7 @@ def accept_only(sock: socket.socket, indices: Sequence[int]) -> None:
 
 
 def restrict(sock: socket.socket, interface: str) -> None:
-    """Let in what comes by ``interface`` and by loopback only, from now on.
+    """Accept packets only from ``interface`` and loopback, from now on.
 
     Connections that a listening socket accepts inherit it.
 

@@ -174,7 +174,7 @@ class Skeleton:
         return [e.segment for e in self.elements], places
 
     def element_places(self, poses: Floats) -> Floats:
-        """Where the sensor elements are for :meth:`poses`, shape (n_elements, 3)."""
+        """Positions of the sensor elements for :meth:`poses`, shape (n_elements, 3)."""
         segments, places = self._element_places
         return np.asarray((poses[segments] @ places)[:, :3, 0])
 

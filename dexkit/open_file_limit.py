@@ -40,7 +40,7 @@ def require_open_files(count: int, what: str) -> None:
 
 
 def _free(count: int) -> int:
-    """How many descriptors can be had, up to ``count``."""
+    """Number of descriptors that can still be opened, up to ``count``."""
     taken: list[int] = []
     try:
         while len(taken) < count:

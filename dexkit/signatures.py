@@ -51,7 +51,7 @@ _US = "signer"  # the principal of a bare public key
 
 @dataclass(frozen=True)
 class PublicKey:
-    """What a signature is checked with.
+    """A key that checks signatures.
 
     :param tool: the tool whose key it is.
     :param text: lines of an allowed_signers file, or minisign's key in base64.
@@ -100,7 +100,7 @@ class PublicKey:
 
 @dataclass(frozen=True)
 class Checked:
-    """What the check of a signature found.
+    """Result of the check of a signature.
 
     :param good: the signature is of these data, and of a key that was given.
     :param intact: the signature is of these data, whatever the key.
@@ -271,6 +271,6 @@ def _run(
 
 
 def _last_line(done: subprocess.CompletedProcess[str]) -> str:
-    """What a tool said last: the reason of a failure."""
+    """Last line of a tool's output: the reason of a failure."""
     lines = [t for line in (done.stdout + "\n" + done.stderr).splitlines() if (t := line.strip())]
     return one_line(lines[-1], 200) if lines else f"exit code {done.returncode}"

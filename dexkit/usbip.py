@@ -247,7 +247,7 @@ class Connection:
         self._end += count
 
     def _limit(self, option: int, deadline: float) -> None:
-        """Let the next call wait until ``deadline``, a millisecond at least."""
+        """Set the socket's time-out to ``deadline``, a millisecond at least."""
         wait = max(1, math.ceil((deadline - time.monotonic()) * 1000))
         if self._waits.get(option) != wait:
             self._sock.setsockopt(

@@ -1,4 +1,4 @@
-"""The ways to a device: a serial port, or a TCP connection; both without waiting."""
+"""Byte channels to a device: a serial port or a TCP connection, both non-blocking."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class Channel(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """What has come; empty if nothing has, and at the end, where it is readable all the same.
+        """Read received bytes; empty if there are none, or at end of file.
 
         :raises OSError: it has gone away.
         """
 
     @abstractmethod
     def write(self, data: bytes) -> int:
-        """Write what can be written at once; return how much.
+        """Write without blocking; return the number of bytes taken.
 
         :raises OSError: it has gone away.
         """
@@ -64,7 +64,7 @@ class Channel(ABC):
 
 
 class SerialChannel(Channel):
-    """A serial port, which nobody else may use meanwhile.
+    """A serial port, opened exclusively.
 
     :param device: path, or USB serial number of the adapter.
     :raises HandNotFound: there is none.
@@ -105,12 +105,12 @@ class SerialChannel(Channel):
 class TcpChannel(Channel):
     """A TCP connection.
 
-    A system keeps sending what was once written, for many minutes: a goal that was written while
-    the network was away would move the hand when it is back. So bytes that the peer has not
-    acknowledged are ``unsent``, and closing drops them.
+    The operating system retransmits written data for many minutes: a goal written during a network
+    outage would move the hand when the network returns. So bytes that the peer has not acknowledged
+    count as ``unsent``, and closing drops them.
 
     :param timeout: seconds to connect.
-    :raises HandNotFound: nobody listens there, or there is no way.
+    :raises HandNotFound: the connection is refused, or the host cannot be reached.
     """
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
@@ -154,7 +154,7 @@ class TcpChannel(Channel):
         return count[0]
 
     def close(self) -> None:
-        """Close the connection; what is unsent is dropped."""
+        """Close the connection and drop unsent bytes."""
         with contextlib.suppress(OSError, HandLost):
             if self.unsent:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
@@ -165,7 +165,7 @@ def tcp_address(text: str, port: int) -> tuple[str, int]:
     """The host and port of ``HOST[:PORT]``.
 
     :param port: where none is given.
-    :raises UsageError: it is none.
+    :raises UsageError: the text is not an address.
     """
     try:
         parts = urlsplit(f"//{text}")

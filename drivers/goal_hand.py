@@ -1,8 +1,8 @@
-"""Base of drivers whose device goes to the goals in its registers, and has no time-out.
+"""Base class of drivers for devices with goal registers and no command time-out.
 
-Each exchange writes the goals where they have changed, and reads what is measured. The device goes
-to its last goal and stays there, whoever is gone: a joint that is to hold gets the position at
-which it was measured last as its goal, and ``close`` has every joint hold.
+Each exchange writes the goals where they have changed, and reads what is measured. The device moves
+to its last goal and stays there, even if the host has gone. To hold a joint, the driver writes its
+last measured position as its goal; ``close`` does so for every joint.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["GoalHand"]
 
 log = logging.getLogger(__name__)
 
-_ATTEMPTS = 3  # to prepare a hand that is opened
+_ATTEMPTS = 3  # while a hand is being opened
 
 FoundT = TypeVar("FoundT")
 SelfT = TypeVar("SelfT", bound="GoalHand")
@@ -57,9 +57,9 @@ class GoalHand(ABC):
         )
         joints = len(self._spec.joints)
         self._positions = [0] * joints
-        """Measured last, in the device's counts."""
+        """Last measured positions, device counts."""
         self._held: list[int | None] = [None] * joints
-        """Where joints hold, while they do."""
+        """Goals of joints that hold; device counts."""
 
     @property
     def spec(self) -> HandSpec:
@@ -84,23 +84,23 @@ class GoalHand(ABC):
 
     @abstractmethod
     def _absent(self, place: str) -> HandNotFound:
-        """What to say of a place where no hand answers."""
+        """Error text for a place where no hand answers."""
 
     @abstractmethod
     def _goals(self, command: HandCommand) -> list[int]:
-        """The registers that make the device do what is commanded."""
+        """Convert a command to goal registers."""
 
     @abstractmethod
     def _put_goals(self, goals: list[int], before: WriteDeadline | None = None) -> None:
-        """Write what :meth:`_goals` gave."""
+        """Write goal registers as returned by :meth:`_goals`."""
 
     @abstractmethod
     def _holding_goals(self) -> list[int]:
-        """The registers that make every joint hold where it is measured now."""
+        """Goal registers that hold every joint at its measured position."""
 
     @abstractmethod
     def _measure(self, command: HandCommand) -> HandState:
-        """Read the state of a hand that does what is commanded."""
+        """Read the state under the given command."""
 
     # --- opening and closing
 
@@ -165,7 +165,7 @@ class GoalHand(ABC):
     # --- exchanging
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Write the goals if they have changed, and read what is measured.
+        """Write the goals if they have changed, and read the state.
 
         :raises HandLost: the device has gone away, or is not open.
         :raises HandTimeout: no intact answer in time, or this program was paused before the goals
@@ -182,14 +182,14 @@ class GoalHand(ABC):
         return self._measure(command)
 
     def _hold(self, joint: int) -> int:
-        """Where a joint holds: where it was when it began to."""
+        """Position at which a joint began to hold; device counts."""
         held = self._held[joint]
         if held is None:
             held = self._held[joint] = self._positions[joint]
         return held
 
     def _ask(self, request: Callable[[Channel], FoundT]) -> FoundT:
-        """Do one request; a device that has gone is closed."""
+        """Run one request; close the channel if the device has gone."""
         channel = self._channel
         if channel is None:
             raise HandLost("the hand is not open", hint="call open() first")

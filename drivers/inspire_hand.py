@@ -1,4 +1,4 @@
-"""Drive an Inspire RH56, however it is reached (docs/inspire.md).
+"""Drive an Inspire RH56 over any register transport (docs/inspire.md).
 
 Each exchange writes the goals where they have changed and reads the angles; some exchanges read
 errors and temperatures as well. :mod:`dexkit.drivers.inspire_serial` and
@@ -37,7 +37,7 @@ _HEALTH = int(Register.TEMPERATURE) + rh56.JOINTS - int(Register.ERROR)
 class InspireSettings:
     """Settings of an :class:`InspireHand`.
 
-    :param device: where it is; see the driver.
+    :param device: path or address; see the driver.
     :param id: of the hand on the line, or Modbus' unit.
     :param speed: of every joint, 0 to 1000; None leaves what the device has.
     :param force: limit of every joint, 0 to 1000; None leaves what the device has.
@@ -61,12 +61,12 @@ class InspireSettings:
 
     @property
     def ids(self) -> range:
-        """The ids that there are."""
+        """Valid ids."""
         return rh56.IDS
 
 
 class InspireHand(GoalHand):
-    """An Inspire RH56, however it is reached; its class names the model.
+    """An Inspire RH56 over any register transport; its class names the model.
 
     :param side: which hand.
     :param configuration: place, id, speed, limit of force and time-out.
@@ -77,7 +77,7 @@ class InspireHand(GoalHand):
 
     model: ClassVar[HandModel] = INSPIRE_DFX
     health_every: ClassVar[int] = 20
-    """Exchanges of which one reads errors and temperatures."""
+    """Errors and temperatures are read once in so many exchanges."""
 
     def __init__(
         self,
@@ -98,16 +98,16 @@ class InspireHand(GoalHand):
     def _write(
         self, channel: Channel, register: Register, data: bytes, before: WriteDeadline | None
     ) -> None:
-        """Write bytes to the registers from one on.
+        """Write bytes to consecutive registers.
 
-        :raises HandError: they were not, or nobody knows.
+        :raises HandError: the write failed, or was not acknowledged.
         """
 
     @abstractmethod
     def _read(self, channel: Channel, register: int, count: int) -> bytes:
-        """So many bytes of the registers from one on.
+        """Read ``count`` bytes of consecutive registers.
 
-        :raises HandError: there are none.
+        :raises HandError: there is no answer.
         """
 
     # --- one hand

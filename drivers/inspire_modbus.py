@@ -1,10 +1,10 @@
 """Driver of an Inspire RH56 with a network port, by Modbus on TCP (docs/inspire.md).
 
-The registers are those of the serial line; :mod:`dexkit.drivers.inspire_hand` says what is done
-with them. A Modbus register is the two bytes from its address on, the first one low
+The registers are those of the serial line; :mod:`dexkit.drivers.inspire_hand` uses them. A Modbus
+register is the two bytes from its address on, the first one low
 (docs/sources/unitree-dex.md#j2).
 
-A device that answers but refuses, or answers something else, costs one exchange, as silence does.
+A refusal or an unexpected answer fails one exchange, as a time-out does.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from dexkit.wire.rh56 import Register
 __all__ = ["PARSERS", "PORT", "SETTINGS", "InspireModbus", "InspireModbusSettings", "backend"]
 
 PORT = 6000
-"""Where the hand listens (docs/sources/unitree-dex.md#j2)."""
+"""Default address of the hand (docs/sources/unitree-dex.md#j2)."""
 _CONNECT = 1.0  # s to wait for a connection
 
 
@@ -46,7 +46,7 @@ class InspireModbusSettings(InspireSettings):
 
     @property
     def ids(self) -> range:
-        """The units that there are."""
+        """Valid units."""
         return range(256)
 
 

@@ -1,7 +1,6 @@
 """Driver of Inspire's RH56DFX on a serial port of its own (docs/inspire.md).
 
-The frames are in :mod:`dexkit.wire.rh56`, what is done with them in
-:mod:`dexkit.drivers.inspire_hand`.
+The frames are in :mod:`dexkit.wire.rh56`, their use in :mod:`dexkit.drivers.inspire_hand`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ class InspireSerialSettings(InspireSettings):
 
     :param baudrate: bits a second.
 
-    The id is 1 of both hands of a G1, which have a line each.
+    Both hands of a G1 have id 1, each on its own line.
     """
 
     baudrate: int = rh56.BAUD_RATE
@@ -82,7 +81,7 @@ class InspireSerial(InspireHand):
     def _exchange(
         self, channel: Channel, request: Frame, count: int, before: WriteDeadline | None
     ) -> bytes:
-        """Send a request, and return the data of its answer, so many bytes."""
+        """Send a request and return the ``count`` data bytes of its answer."""
         wanted = (request.device, request.operation, request.address)
 
         def match(answer: Frame) -> bytes | None:

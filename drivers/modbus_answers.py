@@ -1,4 +1,4 @@
-"""Judge the answers of a Modbus device, for the drivers."""
+"""Check the answers of a Modbus device, for the drivers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["accept"]
 
 
 def accept(answer: Adu, request: Request) -> tuple[int, ...] | None:
-    """The registers in the answer to a request; None if it answers something else.
+    """Return the registers in the answer to a request; None if it answers another request.
 
     :raises HandTimeout: the device refuses the request, which costs this exchange.
     """

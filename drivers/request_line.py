@@ -1,4 +1,4 @@
-"""Ask a device and wait for its answer, for the drivers of hands that speak when asked."""
+"""Send requests and wait for answers, for drivers of request/response devices."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class RequestStatistics:
 
 
 class RequestLine:
-    """One request after the other, each with its answer.
+    """Runs requests one at a time.
 
     :param statistics: is counted in.
     :param timeout: seconds to wait for an answer.
@@ -65,7 +65,7 @@ class RequestLine:
         self._late = True
 
     def restart(self) -> None:
-        """The line is new: something of before may still come."""
+        """Start over on a new channel, on which old answers may still arrive."""
         self._late = True
 
     def ask(
@@ -79,9 +79,9 @@ class RequestLine:
         """Send a request and return its answer.
 
         :param match: what an answer holds; None for one that answers something else.
-        :param before: until when the request may be written.
-        :raises HandTimeout: no answer in time; or nothing was written, as it is too late for it.
-        :raises HandLost: the channel has gone away, or may deliver the request some time later.
+        :param before: deadline for writing the request.
+        :raises HandTimeout: no answer in time, or the deadline for writing has passed.
+        :raises HandLost: the channel has gone away, or may still deliver the request later.
         """
         with port_errors(channel.place):
             return self._ask(channel, request, parser, match, before)

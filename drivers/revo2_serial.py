@@ -3,7 +3,7 @@
 Each exchange writes goals and speeds where they have changed, and reads position, speed, current
 and status of every motor in one request. The registers are in :mod:`dexkit.wire.revo2`.
 
-No source tells of a time-out of the device.
+No source mentions a command time-out of the device.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Revo2Settings:
     :param device: path of the serial port or USB serial number of its adapter.
     :param id: Modbus unit; None for that of the side.
     :param baudrate: bits a second.
-    :param speed: most of every joint, a part of the full speed; commands are limited to it.
+    :param speed: speed limit of every joint, as a part of the full speed.
     :param timeout: seconds to wait for an answer.
     """
 

@@ -1,4 +1,5 @@
-"""Simulate the mechanics of a Dex1-1: jaws, friction, stops, an object, and the motor's law.
+"""Simulate the mechanics of a Dex1-1: jaws, friction, stops, an object, and the motor's control
+law.
 
 ``sim-dex1`` uses it without a protocol, the emulated M4010 behind its serial protocol.
 

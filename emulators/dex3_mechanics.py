@@ -1,7 +1,7 @@
 """Simulate the mechanics of a Dex3-1: motors, supply and pressure sensors.
 
-:mod:`dexkit.emulators.finger_mechanics` has the joints. Whoever owns a hand's mechanics calls
-``step`` as time passes: ``sim-dex3`` directly, the emulated USB device behind its protocol.
+:mod:`dexkit.emulators.finger_mechanics` has the joints. The owner of the mechanics calls ``step``
+as time passes: ``sim-dex3`` directly, the emulated USB device behind its protocol.
 
 largest current, the sensors' number and range, the joints' angles. Everything else here is
 tuned or assumed and says so: inertia, friction, heat, the geometry of a grip.
@@ -149,7 +149,7 @@ class Dex3Mechanics(FingerMechanics):
         power = _STATIC_POWER
         for motor in self._motors:
             part = motor.torque / motor.model.tau_max
-            # what a braking motor gives back stays in its losses
+            # regenerated power is lost in the motor
             power += motor.model.copper_loss * part * part + max(0.0, motor.torque * motor.joint.dq)
         return min(power / self.supply_v, _CURRENT_MAX)
 
@@ -173,7 +173,8 @@ class Dex3Mechanics(FingerMechanics):
         """Pa, shape (9, 12), NaN where there is no element, 0 where nothing is touched.
 
         The first joint of a finger (thumb_1 for the thumb) presses its pad against the object,
-        the second its tip. An element feels 10 g to 2500 g: less is 0, more is the most.
+        the second its tip. An element measures 10 g to 2500 g: less reads as 0, more as the
+        maximum.
         """
         torques = [motor.contact() for motor in self._motors]
         key = torques + self._presses
@@ -192,7 +193,7 @@ class Dex3Mechanics(FingerMechanics):
 
     @property
     def sensor_temperature(self) -> Floats:
-        """°C, shape (9, 12), NaN where there is no element: always that of the air."""
+        """Air temperature, °C, shape (9, 12), NaN where there is no element."""
         return _SENSOR_TEMPERATURE.copy()
 
     def _extra_state(self) -> dict[str, Any]:

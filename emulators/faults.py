@@ -1,4 +1,4 @@
-"""Faults that can be injected into an emulated device, at a time or at once.
+"""Faults that can be injected into an emulated device, now or at a given time.
 
 A fault is written ``KIND[@TIME][:KEY=VALUE[,KEY=VALUE...]]``::
 
@@ -11,9 +11,9 @@ A fault is written ``KIND[@TIME][:KEY=VALUE[,KEY=VALUE...]]``::
 
 Times count from the moment the emulator is ready. ``for`` limits a fault that can end by
 itself; ``id`` picks one servo of several, or one motor of a hand, and ``side`` one hand of two.
-Chance is seeded, so a run can be repeated.
+Random numbers are seeded, so a run can be repeated.
 
-Each family of devices has its kinds: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`,
+The fault kinds of each device family: :data:`MX64_FAULTS`, :data:`DEX3_FAULTS`,
 :data:`M4010_FAULTS`, :data:`RH56_FAULTS`, :data:`RH56_TCP_FAULTS`, :data:`REVO2_FAULTS`.
 """
 
@@ -49,9 +49,9 @@ class FaultKind:
     """One kind of fault.
 
     :param keys: its own keys with their default values.
-    :param lasting: it goes on until ``for`` has passed; otherwise it happens once and the
-        device keeps the damage.
-    :param targets_device: ``id`` picks a device; otherwise it strikes the line.
+    :param lasting: it lasts until ``for`` has passed; otherwise it happens once and the device
+        stays damaged.
+    :param targets_device: ``id`` selects a device; otherwise the fault affects the line.
     """
 
     name: str
@@ -66,8 +66,8 @@ class FaultFamily:
     """The faults that one family of emulated devices can have.
 
     :param kinds: in the order of the help text.
-    :param max_id: largest ``id`` of what a fault can pick.
-    :param sided: ``side`` picks one of two devices, for every kind.
+    :param max_id: largest ``id`` that a fault can select.
+    :param sided: ``side`` selects one of two devices, for every kind.
     """
 
     name: str
@@ -181,7 +181,7 @@ RH56_FAULTS = FaultFamily(
 RH56_TCP_FAULTS = FaultFamily(
     "rh56-tcp", tuple(kind for kind in RH56_FAULTS.kinds if kind is not _CORRUPT), max_id=0
 )
-"""Faults of one on TCP, which delivers no spoilt bytes."""
+"""Faults of an RH56 on TCP, which never delivers corrupted bytes."""
 
 REVO2_FAULTS = FaultFamily("revo2", (_DROP, _CORRUPT, _DELAY, _UNPLUG), max_id=0)
 """Faults of an emulated BrainCo Revo2."""
@@ -192,7 +192,7 @@ FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kin
 _SPEC = re.compile(r"(?P<kind>[a-z-]+)(?:@(?P<time>[^:]+))?(?::(?P<args>.*))?", re.DOTALL)
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)(ms|s)?")
 _LONGEST = 1e6
-"""Seconds, eleven days: no emulator runs longer with a fault that is planned."""
+"""Largest time of a planned fault, seconds: eleven days."""
 
 
 def grammar(family: FaultFamily = MX64_FAULTS) -> str:
@@ -216,9 +216,9 @@ class Fault:
     :param at: seconds after the start.
     :param duration: seconds, or None for ever.
     :param params: the kind's own keys.
-    :param device: id of the device it strikes, or None for all.
+    :param device: id of the device that it affects, or None for all.
     :param lasting: it goes on until ``duration`` has passed (:class:`FaultKind`).
-    :param side: which of two hands it strikes, or None for both.
+    :param side: which of two hands it affects, or None for both.
     """
 
     kind: str
@@ -246,7 +246,7 @@ def _duration(value: str) -> float:
 def parse_fault(text: str, family: FaultFamily = MX64_FAULTS) -> Fault:
     """The fault that ``text`` describes.
 
-    :param family: of the device that shall have it.
+    :param family: of the device to be disturbed.
     :raises UsageError: it does not follow the grammar, which the hint states.
     """
     try:
@@ -278,7 +278,7 @@ def _parse(text: str, family: FaultFamily) -> Fault:
         if key == "for" and kind.lasting:
             duration = _duration(value)
         elif key == "id" and kind.targets_device:
-            # of other scripts' digits, and of thousands of them, int() does not want to know
+            # int() rejects digits of other scripts, and thousands of digits
             if not re.fullmatch("[0-9]{1,3}", value) or int(value) > family.max_id:
                 raise _Bad(f"{one_line(value, 40)!r} is not an id (0 to {family.max_id})")
             device = int(value)
@@ -302,7 +302,7 @@ def _parse(text: str, family: FaultFamily) -> Fault:
 
 
 class FaultSchedule:
-    """Says which faults begin and end as time passes.
+    """Tells which faults begin and end as time passes.
 
     :param faults: to come, their times counted from ``start``.
     :param start: seconds on the caller's clock.

@@ -88,7 +88,7 @@ _STOP_MARGIN = math.radians(2.0)  # hard stops beyond the limits of the model; a
 _STOP_STIFFNESS, _STOP_DAMPING = 200.0, 0.1
 _OBJECT_STIFFNESS, _OBJECT_DAMPING = 60.0, 0.1
 
-# Heat, assumed: at full torque a winding goes to some 90 °C in minutes, its case to some 70.
+# Heat, assumed: at full torque a winding reaches about 90 °C within minutes, its case about 70.
 AMBIENT = 25.0
 """°C around the hand."""
 _SLOW_STEPS = 20  # heat and fans are stepped once in so many steps
@@ -356,7 +356,7 @@ class FingerMechanics:
         self._motors[joint].brake()
 
     def heat(self, joint: int, celsius: float) -> None:
-        """Set the temperature of a motor's case and winding; it cools from there."""
+        """Set the temperature of a motor's case and winding; they cool from there."""
         motor = self._motors[joint]
         motor.case = motor.winding = celsius
         self._check_temperature(motor)
@@ -383,7 +383,7 @@ class FingerMechanics:
         if wear.dead:
             self.power(joint, False)
 
-    # -- what can be seen ----------------------------------------------------------------------
+    # -- measured values ----------------------------------------------------------------------
 
     @property
     def q(self) -> Floats:
@@ -402,7 +402,7 @@ class FingerMechanics:
 
     @property
     def tau(self) -> Floats:
-        """Torques of the motors, as their current tells it, N·m, shape (n_joints,)."""
+        """Motor torques by their current, N·m, shape (n_joints,)."""
         return np.array([motor.torque for motor in self._motors])
 
     @property
@@ -417,12 +417,12 @@ class FingerMechanics:
 
     @property
     def temperature(self) -> Floats:
-        """Of the motors' cases, °C, shape (n_joints,)."""
+        """Temperature of the motors' cases, °C, shape (n_joints,)."""
         return np.array([motor.case for motor in self._motors])
 
     @property
     def winding_temperature(self) -> Floats:
-        """Of their windings, °C, shape (n_joints,)."""
+        """Temperature of the motors' windings, °C, shape (n_joints,)."""
         return np.array([motor.winding for motor in self._motors])
 
     @property

@@ -1,4 +1,4 @@
-"""Where an emulated serial line is served: on a pseudo-terminal, or behind an FTDI adapter."""
+"""Choose how an emulated serial line is served: on a pseudo-terminal, or behind an FTDI adapter."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def line_port(
         as of :class:`~dexkit.emulators.serial_port.Port`.
     :param serial: serial number of the adapter.
     :param fast: an FT232H, which does 12 Mbaud, instead of an FT232R, which does 3.
-    :raises UsageError: no such address.
-    :raises EmulatorError: it cannot be had.
+    :raises UsageError: the address is invalid.
+    :raises EmulatorError: it cannot be opened.
     """
     if not isinstance(link, str) or not link.startswith(SCHEME):
         return Port(line, link, check_baudrate=check_baudrate)
@@ -48,7 +48,7 @@ def line_port(
         raise UsageError(
             f"{one_line(link, 80)} is no address of a server", hint=f"{SCHEME}127.0.0.1:{_PORT}"
         ) from error
-    # here, not above: a pseudo-terminal needs none of the USB packages
+    # imported here, because a pseudo-terminal needs none of the USB packages
     from dexkit.emulators.ftdi import FT232H, FT232R, FtdiPort, FtdiUsb
 
     model = FT232H if fast else FT232R

@@ -1,4 +1,4 @@
-"""Serve an emulated line in a thread, wherever its client comes from."""
+"""Serve an emulated line to clients of any transport, in a thread."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ BUSY_TICK = 4e-3
 _SPIN = 120e-6  # a sleep ends some 50 to 100 us late: poll for the rest
 _IDLE_TICK = 20e-3
 _MAX_BACKLOG = 0.1
-"""Seconds of line time from which nothing more is read: a client that floods the line waits for
-it, as it waits for the buffers of an adapter, instead of filling this program's memory."""
+"""Backlog, seconds of line time, above which reading stops: a client that floods the line is
+throttled, as by an adapter's buffers, instead of filling this program's memory."""
 
 
 class LineServer(ABC):
-    """Runs a line; whoever derives from it has the descriptor on which its client is.
+    """Base class of servers of a line; a derived class has the client's file descriptor.
 
     :param line: with its devices.
     :param clock: the line's clock.
@@ -34,7 +34,7 @@ class LineServer(ABC):
     class calls :meth:`_plug` at the end of its ``__init__``, and is ready then.
 
     :ivar overruns: bytes lost because no client read them.
-    :ivar error: what ended the service in the thread, if anything has.
+    :ivar error: the error that ended the service, or None.
     """
 
     name = "line"
@@ -51,34 +51,34 @@ class LineServer(ABC):
         self._injected: list[Fault] = []
         self._lock = threading.Lock()
 
-    # --- what a derived class has
+    # --- for the derived class
 
     @property
     @abstractmethod
     def path(self) -> str:
-        """What a client opens."""
+        """Path or address that a client opens."""
 
     @property
     @abstractmethod
     def place(self) -> str:
-        """What a ready line says of it."""
+        """Description for the ready line."""
 
     @property
     @abstractmethod
     def _descriptor(self) -> int:
-        """What is waited on; -1 while unplugged."""
+        """The client's file descriptor; -1 while unplugged."""
 
     @abstractmethod
     def _plug(self) -> None:
-        """Be there for clients."""
+        """Become available to clients."""
 
     @abstractmethod
     def _unplug(self) -> None:
-        """Be gone. May be called twice."""
+        """Disappear for clients. May be called twice."""
 
     @abstractmethod
     def _read(self) -> None:
-        """Take what is to be read on the descriptor."""
+        """Read received bytes from the descriptor."""
 
     @abstractmethod
     def _write(self, data: bytes) -> None:
@@ -101,7 +101,7 @@ class LineServer(ABC):
             os.write(self._wake_write, b"x")
 
     def inject(self, fault: Fault) -> None:
-        """Have a fault, its time counted from now; from any thread."""
+        """Inject a fault, its time counted from now; from any thread."""
         with self._lock:
             self._injected.append(fault)
         with contextlib.suppress(OSError):
@@ -129,7 +129,7 @@ class LineServer(ABC):
             self._wait(line.next_time)
 
     def _wait(self, next_time: float | None) -> None:
-        """Sleep until something is to be done, and take what the client sent."""
+        """Sleep until the next event, and read what the client sent."""
         deadline = self._clock.now() + (BUSY_TICK if self.line.busy else _IDLE_TICK)
         sharp = next_time is not None and next_time < deadline
         if sharp and next_time is not None:
@@ -152,7 +152,7 @@ class LineServer(ABC):
                 return
 
     def close(self) -> None:
-        """Stop, and be gone. May be called twice."""
+        """Stop, and disappear for clients. May be called twice."""
         if self._closed:
             return
         self.stop()

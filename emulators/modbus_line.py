@@ -13,23 +13,23 @@ __all__ = ["Registers", "rtu_answers", "tcp_answers"]
 
 
 class Registers(Protocol):
-    """A device's registers, of 16 bits."""
+    """Access to a device's 16-bit registers."""
 
     def read_registers(self, function: Function, address: int, count: int) -> list[int]:
-        """So many registers from an address on.
+        """Read ``count`` registers from an address.
 
-        :raises Refusal: there are none.
+        :raises Refusal: one of them does not exist.
         """
 
     def write_registers(self, address: int, values: tuple[int, ...]) -> None:
         """Write registers from an address on.
 
-        :raises Refusal: it cannot be.
+        :raises Refusal: the device does not accept them.
         """
 
 
 def _answer(device: Registers, pdu: bytes) -> bytes | None:
-    """The PDU that answers one; None to a request of a wrong length."""
+    """The PDU that answers a request; None for a request of wrong length."""
     try:
         request = modbus.parse_request(pdu)
         if request.function in (Function.WRITE, Function.WRITE_ONE):
@@ -44,7 +44,7 @@ def _answer(device: Registers, pdu: bytes) -> bytes | None:
 
 
 def tcp_answers(device: Registers) -> Callable[[Adu], bytes | None]:
-    """The answers on TCP, where whoever is connected is meant: any unit is answered."""
+    """Answer requests on TCP, to any unit: the connection itself selects the device."""
 
     def answer(adu: Adu) -> bytes | None:
         pdu = _answer(device, adu.pdu)
@@ -56,7 +56,7 @@ def tcp_answers(device: Registers) -> Callable[[Adu], bytes | None]:
 
 
 def rtu_answers(device: Registers, unit: Callable[[], int]) -> Callable[[Adu], bytes | None]:
-    """The answers on a serial line, to requests to the device's own unit."""
+    """Answer requests on a serial line, to the device's own unit only."""
 
     def answer(adu: Adu) -> bytes | None:
         if adu.unit != unit():

@@ -22,10 +22,10 @@ class EmulatorProcess:
     :param arguments: of that command.
     :param faults: the faults that the device can have.
     :param timeout: seconds until it must have said that it is ready.
-    :raises EmulatorError: it did not; the hint is what it said instead.
+    :raises EmulatorError: it did not become ready; the hint is its output.
 
     :ivar ready_line: the first line that it printed.
-    :ivar output: after :meth:`close`: what it printed behind that line.
+    :ivar output: after :meth:`close`: what it printed after that line.
     :ivar errors: likewise to standard error.
     """
 
@@ -62,7 +62,8 @@ class EmulatorProcess:
             piece = os.read(stdout.fileno(), 1) if ready else b""
             if not piece:
                 try:
-                    self.process.wait(left)  # an output that was closed ends soon, and says why
+                    # a process that closed its output ends soon and reports why
+                    self.process.wait(left)
                 except subprocess.TimeoutExpired:
                     self.process.kill()
                 _, stderr = self.process.communicate()
@@ -74,11 +75,11 @@ class EmulatorProcess:
         return line.decode().strip()
 
     def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now).
+        """Inject a fault now (or at its ``@TIME`` from now).
 
         :raises UsageError: there is no such fault.
         """
-        parse_fault(spec, self._faults)  # complain here, not over there
+        parse_fault(spec, self._faults)  # report a bad specification here, not in the child process
         stdin: IO[bytes] | None = self.process.stdin
         assert stdin is not None
         stdin.write(spec.encode() + b"\n")

@@ -1,7 +1,7 @@
-"""An emulated device alone on its line, which speaks when it is asked; and its port.
+"""Emulate a single request/response device on its line, and serve it on a port.
 
-The same for each protocol of requests and answers: a parser finds requests in the bytes, a function
-answers them.
+Used for every request/response protocol: a parser finds requests in the bytes, a function answers
+them.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class AskedDevice(Protocol):
 
     @property
     def resting(self) -> bool:
-        """Whether nothing of it moves."""
+        """Whether nothing moves."""
 
     def advance_to(self, now: float) -> None:
         """Advance the device to ``now``."""
 
     def strike(self, kind: str) -> None:
-        """Apply a fault that only this device has."""
+        """Apply a fault kind specific to this device."""
 
 
 class Parser(Protocol[FoundFrameT]):
@@ -65,7 +65,7 @@ class RequestLine(SerialLine, Generic[FrameT]):
 
     :param parser: of requests.
     :param answer: the bytes that answer a request; None where the device is silent.
-    :param baudrate: that the device has; without line time it has none.
+    :param baudrate: of the device; unused without line time.
     :param answer_time: seconds from a request to its answer.
 
     Other parameters as :class:`~dexkit.emulators.serial_line.SerialLine`.
@@ -114,11 +114,13 @@ class RequestLine(SerialLine, Generic[FrameT]):
 
     @property
     def broken(self) -> bool:
-        """Whether nothing that follows can be understood."""
+        """Whether the byte stream is out of step for good, so that the connection must be
+        closed.
+        """
         return getattr(self._parser, "broken", False)
 
     def disconnected(self) -> None:
-        """The client has gone."""
+        """The client has disconnected."""
         super().disconnected()
         self._parser.reset()
 
@@ -153,8 +155,8 @@ class ServedDevice:
     """A device on a port that is served in a thread; a context manager.
 
     :param port: not started yet.
-    :param family: faults that it can have.
-    :param description: what its ready line says beside the path.
+    :param family: fault kinds of the device.
+    :param description: text of the ready line after the path.
     """
 
     def __init__(self, port: LineServer, family: FaultFamily, description: str) -> None:
@@ -165,12 +167,12 @@ class ServedDevice:
 
     @property
     def path(self) -> str:
-        """What a client opens."""
+        """Path or address that a client opens."""
         return self.port.path
 
     @property
     def error(self) -> BaseException | None:
-        """What ended its service, or None."""
+        """The error that ended its service, or None."""
         return self.port.error
 
     @property
@@ -180,20 +182,20 @@ class ServedDevice:
 
     @property
     def ready_lines(self) -> list[str]:
-        """Its path and what it is."""
+        """Its path and description."""
         return [f"ready: {self.path} {self._description}"]
 
     def summaries(self) -> list[str]:
-        """Its path and what was seen there."""
+        """Its path and counters."""
         text = self.port.line.counters.summary() or "nothing was sent"
         if self.port.overruns:
             text += f", {self.port.overruns} bytes not read by the client"
         return [f"{self.path}: {text}"]
 
     def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now).
+        """Inject a fault now (or at its ``@TIME`` from now).
 
-        :raises UsageError: it cannot be.
+        :raises UsageError: the fault is invalid.
         """
         self.port.inject(parse_fault(spec, self._family))
 

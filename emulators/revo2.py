@@ -1,11 +1,11 @@
 """An emulated BrainCo Revo2 on its serial line (Modbus RTU): registers and joints.
 
-:mod:`dexkit.emulators.servo_mechanics` moves the joints. The registers that are there are those of
-:mod:`dexkit.wire.revo2`, in parts of the travel; any other is refused (illegal address), as is the
-unit mode of degrees. No source says what the device does with those.
+:mod:`dexkit.emulators.servo_mechanics` moves the joints. Implemented registers are those of
+:mod:`dexkit.wire.revo2`, in parts of the travel. Any other register is refused (illegal address),
+and so is the unit mode of degrees; no source says what the device does there.
 
 The current is the mechanics', in thousandths of the limit. Not modelled: the calibration after
-power-on, in which the real hand opens and obeys nothing; control by time, current and PWM; turbo
+power-on, in which the real hand opens and ignores commands; control by time, current and PWM; turbo
 mode, gestures, protection currents, tactile sensors, and storing of settings.
 """
 
@@ -42,8 +42,8 @@ from dexkit.wire.revo2 import (
 
 __all__ = ["Revo2", "Revo2Hand"]
 
-# one that a hand was seen with, and the letters of a model without tactile sensors
-# (docs/sources/unitree-dex.md#j1): BrainCo's library asks for both
+# observed on a hand, and the letters of a model without tactile sensors
+# (docs/sources/unitree-dex.md#j1): BrainCo's library reads both
 _FIRMWARE = "1.0.14.U"
 _SERIAL_NUMBER = {Side.LEFT: "BCXRL000000DEXKIT", Side.RIGHT: "BCXRR000000DEXKIT"}
 _NEAR = 0.01  # of the travel within which a joint that stands has arrived
@@ -80,7 +80,7 @@ class Revo2:
         self._steps = FixedSteps(STEP)
         self._steps.restart(now)
         self.goals: list[int | None] = [None] * JOINTS
-        """What each joint goes to; None before it was told."""
+        """Goal of each joint; None before the first command."""
         self.speeds = [FULL] * JOINTS
         self._now = now
 
@@ -95,13 +95,13 @@ class Revo2:
         return not self.mechanics.state(self._now).dq.any()
 
     def strike(self, kind: str) -> None:
-        """It has no fault of its own."""
+        """Do nothing: the device has no fault kind of its own."""
         raise ValueError(kind)
 
     def read_registers(self, function: Function, address: int, count: int) -> list[int]:
-        """So many registers from an address on.
+        """Read ``count`` registers from an address.
 
-        :raises Refusal: one of them is not there.
+        :raises Refusal: one of them does not exist.
         """
         found = self._inputs() if function is Function.READ_INPUT else self._holdings()
         try:
@@ -112,7 +112,7 @@ class Revo2:
     def write_registers(self, address: int, values: tuple[int, ...]) -> None:
         """Write positions and speeds, the unit mode, or the id.
 
-        :raises Refusal: another register, or a value that cannot be.
+        :raises Refusal: another register, or an invalid value.
         """
         if address == Holding.POSITION_AND_SPEED and len(values) == _PAIRS:
             if max(values) > FULL:
@@ -181,7 +181,7 @@ class Revo2Hand(ServedDevice):
     :param number: Modbus unit; None for that of its side.
     :param faults: specifications, see :mod:`dexkit.emulators.faults`.
     :raises EmulatorError: the link cannot be made.
-    :raises UsageError: a fault or a figure that cannot be.
+    :raises UsageError: a fault or a value is invalid.
     """
 
     def __init__(

@@ -3,8 +3,8 @@
 :mod:`dexkit.emulators.servo_mechanics` moves the joints, :mod:`dexkit.wire.rh56` has the frames;
 a hand with tactile areas feels what its fingers press on as a simulated one does
 (:mod:`dexkit.emulators.sim_inspire`).
-The registers that are there are those of :class:`~dexkit.wire.rh56.Register`; others read as 0, and
-writes to them are answered and change nothing. No source says what the device does with them.
+Implemented registers are those of :class:`~dexkit.wire.rh56.Register`. Others read as 0, and writes
+to them are answered without effect; no source says what the device does there.
 
 Forces are those of the mechanics, in thousandths; currents and temperatures are assumed. Not
 modelled: how far a fast finger exceeds its limit of force, and storing of settings.
@@ -81,7 +81,7 @@ class Rh56:
         self._steps = FixedSteps(STEP)
         self._steps.restart(now)
         self.goals: list[int | None] = [None] * JOINTS
-        """What each joint goes to; None while it stays where it is."""
+        """Goal of each joint; None while it stays where it is."""
         self.words = {
             Register.FORCE_SET: [FULL] * JOINTS,
             Register.SPEED_SET: [FULL] * JOINTS,
@@ -102,7 +102,7 @@ class Rh56:
         return not self.mechanics.state(self._now).dq.any()
 
     def strike(self, kind: str) -> None:
-        """Have the fault ``locked``."""
+        """Apply the fault ``locked``."""
         if kind == "locked":
             self.lock()
 
@@ -112,7 +112,7 @@ class Rh56:
         self._drive()
 
     def handle(self, frame: Frame) -> Frame | None:
-        """The answer to a frame; None to one of another device, or that makes no sense."""
+        """Answer a frame; None for an invalid frame, or one to another device."""
         if frame.device != self.number or frame.answer:
             return None
         data = bytes([DONE])
@@ -125,7 +125,7 @@ class Rh56:
         return Frame(self.number, frame.operation, frame.address, data, answer=True)
 
     def write(self, address: int, data: bytes) -> None:
-        """Write bytes to the registers from an address on."""
+        """Write bytes to consecutive registers from an address."""
         if address == Register.CLEAR_ERROR and data[:1] == b"\x01":
             self.errors = [Error(0)] * JOINTS
             self._drive()
@@ -159,7 +159,7 @@ class Rh56:
         self.write(address, np.array(values, "<u2").tobytes())
 
     def _drive(self) -> None:
-        """Put goals and speeds in force."""
+        """Apply goals and speeds."""
         driven = [g is not None and not e for g, e in zip(self.goals, self.errors, strict=True)]
         speeds = np.array(self.words[Register.SPEED_SET]) / FULL * self._full
         command = HandCommand.position([(goal or 0) / FULL for goal in self.goals], dq=speeds)
@@ -167,7 +167,7 @@ class Rh56:
         self.mechanics.apply(command)
 
     def read(self, address: int, count: int) -> bytes:
-        """So many bytes of the registers from an address on."""
+        """Read ``count`` bytes of registers from an address."""
         state = self.mechanics.state(self._now)
         angles = np.round(state.q * FULL).astype(int).tolist()
         forces = np.round(np.abs(state.tau_est) * FULL).astype(int).tolist()

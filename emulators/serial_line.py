@@ -2,10 +2,10 @@
 
 A byte takes its ten bits at the baud rate, both ways, and what the devices send goes through a
 USB-serial adapter, which is modelled as an FTDI chip (docs/sources/mx64-ezgripper.md#c2): bytes are
-handed to the host at the ticks of a free-running timer, or as soon as 62 of them are there. On the
-way an answer may meet a fault.
+handed to the host at the ticks of a free-running timer, or as soon as 62 of them are there. Faults
+may alter an answer on its way.
 
-Not modelled: USB scheduling beyond that, collisions of a host that talks while a device answers.
+Not modelled: USB scheduling beyond that, and collisions when a host sends while a device answers.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ _USB_PACKET = 62  # data bytes of a full-speed FTDI packet
 
 @dataclass
 class LineCounters:
-    """What the line has seen and done."""
+    """Counters of the line."""
 
     bytes_in: int = 0
     bytes_out: int = 0
-    garbled: int = 0  # bytes that came at a baud rate no device has
+    garbled: int = 0  # bytes at a baud rate that no device has
     dropped: int = 0
     corrupted: int = 0
     delayed: int = 0
     failures: int = 0  # messages on which a device failed inside
 
     def summary(self) -> str:
-        """One line for the end of a run: what is not zero."""
+        """The counters that are not zero, as one line."""
         return ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in vars(self).items() if v)
 
 
 class SerialLine(ABC):
     """Timing, faults and host connection of a serial line; a subclass adds the devices.
 
-    :param line_time: bytes and latency take their time; otherwise everything is there at once.
+    :param line_time: simulate byte times and latency; otherwise everything arrives at once.
     :param latency_timer: seconds; 0 for an adapter without one.
     :param faults: to come, times counted from ``start``.
     :param start: time on the caller's clock.
-    :param seed: of the faults' chance.
+    :param seed: of the faults' random numbers.
     :raises UsageError: the latency timer is negative.
 
     :ivar host_baudrate: bits a second that the host has set, or None if that is not known;
-        devices at another rate hear nothing.
-    :ivar unplugged: the adapter is away.
+        devices at another rate receive nothing.
+    :ivar unplugged: the adapter is unplugged.
     :ivar failure: the first exception inside a device, a mistake in the emulator, if any.
     """
 
@@ -97,7 +97,7 @@ class SerialLine(ABC):
     @property
     @abstractmethod
     def busy(self) -> bool:
-        """Whether a device moves or holds, so that time should be let pass often."""
+        """Whether a device moves or holds, so that :meth:`advance_to` should be called often."""
 
     @abstractmethod
     def receive(self, data: bytes, now: float) -> None:
@@ -108,18 +108,20 @@ class SerialLine(ABC):
 
     @property
     def broken(self) -> bool:
-        """Whether nothing that follows can be understood, so that a connection is to be closed."""
+        """Whether the byte stream is out of step for good, so that the connection must be
+        closed.
+        """
         return False
 
     def disconnected(self) -> None:
-        """The client has gone; what was on its way to it is lost."""
+        """The client has disconnected; bytes on their way to it are lost."""
         self._out.clear()
 
     # --- to the host
 
     @property
     def next_time(self) -> float | None:
-        """When ``due`` or a fault has something next, or None."""
+        """Time of the next byte that is due or the next fault, or None."""
         times = [self._out[0][0]] if self._out else []
         fault = self.schedule.next_time
         if fault is not None:
@@ -139,19 +141,19 @@ class SerialLine(ABC):
         return out
 
     def _apply_plug(self) -> None:
-        """Take note of an ``unplug`` that began or ended; what was on its way is lost."""
+        """Handle the begin or end of an ``unplug``; bytes on their way are lost."""
         self.unplugged = bool(self.schedule.active_of("unplug"))
         self._out.clear()
 
     def _record_failure(self, error: Exception, message: object) -> None:
-        """A device failed inside on ``message``: say so, and go on without an answer."""
+        """Log that a device raised an exception on ``message``, and continue without an answer."""
         self.counters.failures += 1
         if self.failure is None:
             self.failure = error
             log.error("the emulated device failed on %r (said once)", message, exc_info=error)
 
     def _send(self, begin: float, data: bytes, rate: int) -> None:
-        """Send ``data`` from a device, its first bit at ``begin``; a fault may strike it."""
+        """Send ``data`` from a device, its first bit at ``begin``; a fault may alter it."""
         chance = self._random.random
         end = begin + len(data) * BITS_PER_BYTE / rate if self.line_time else begin
         self._line_free = max(self._line_free, end)

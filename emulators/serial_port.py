@@ -47,7 +47,7 @@ class Port(LineServer):
     :param line: with its devices.
     :param link: where to put the symbolic link; None for a name in a temporary directory.
     :param clock: the line's clock.
-    :param check_baudrate: a client at another baud rate than a device's is not understood.
+    :param check_baudrate: a client at another baud rate than the device's gets no answer.
     :raises EmulatorError: ``link`` is something else than a dangling symbolic link, or its
         directory is missing or not writable, or there are no pseudo-terminals.
     """
@@ -94,7 +94,7 @@ class Port(LineServer):
 
     @property
     def place(self) -> str:
-        """What a ready line says of it."""
+        """Description for the ready line."""
         return f"pty={self._terminal}"
 
     # --- plugging
@@ -104,7 +104,7 @@ class Port(LineServer):
             self._master, self._slave = os.openpty()
         except OSError as error:
             raise EmulatorError(f"no pseudo-terminal: {error.strerror}") from error
-        # raw before anybody sees it; the open slave keeps the master alive between clients
+        # raw mode before a client opens it; the open slave keeps the master alive between clients
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self._terminal = os.ttyname(self._slave)
@@ -116,7 +116,7 @@ class Port(LineServer):
             raise EmulatorError(
                 f"{path} exists and is not a link", hint="choose another path, or remove it"
             )
-        # a link to the terminal that is ours now was left by an emulator that was killed
+        # a link that already names our terminal was left by a killed emulator
         if path.exists() and os.readlink(path) != self._terminal:
             raise EmulatorError(
                 f"{path} is a link to {os.readlink(path)}, which exists",
@@ -137,7 +137,7 @@ class Port(LineServer):
     def _unplug(self) -> None:
         if self._terminal:
             with contextlib.suppress(OSError):
-                # somebody else may have taken the name since
+                # another program may have taken the name since
                 if os.readlink(self.path) == self._terminal:
                     os.unlink(self.path)
         self._terminal = ""

@@ -1,7 +1,7 @@
 """Simulate a hand of position servos: each joint goes to its goal with at most a given speed.
 
-In the model's own unit of q, which need not be rad: such a hand takes goals in parts of its travel,
-and no source says what forces are behind it. A joint has a speed, an acceleration and a motor
+Quantities are in the model's own unit of q, which need not be rad: such a hand takes goals in parts
+of its travel, and its forces are not documented. A joint has a speed, an acceleration and a motor
 current; it comes to rest at its goal without overshoot, and stands still at an object while the
 current rises to its limit. Without a goal it holds where it is.
 
@@ -28,8 +28,8 @@ STEP = 1e-3
 """Integration step, seconds."""
 
 # assumed
-_ACCELERATION = 30.0  # full speeds a second: full speed within 33 ms
-_APPROACH = 0.02  # s; near its goal a joint is as fast as it would need this long for the rest
+_ACCELERATION = 30.0  # full speeds per second: full speed within 33 ms
+_APPROACH = 0.02  # s; near its goal a joint's speed is the remaining distance divided by this
 _IDLE, _MOVING = 0.02, 0.15  # of the current limit: holding still, and moving at full speed
 _STALL = 0.02  # s in which the current rises to its limit at an object
 
@@ -50,13 +50,13 @@ class _Servo:
     current: float = 0.0
     still: bool = False
     contact: float = 0.0
-    """With what part of the current limit it presses on the object."""
+    """Current with which it presses on the object, as a part of the limit."""
     friction: float = 1.0
     """Factor of the current that it takes to move."""
     dead: bool = False
 
     def step(self, dt: float) -> None:
-        """Let ``dt`` seconds pass."""
+        """Advance by ``dt`` seconds."""
         if self.dead:
             self.still = True
             return
@@ -65,7 +65,7 @@ class _Servo:
         want = 0.0
         if not math.isnan(self.goal):
             way = self.goal - self.q
-            # exactly there rather than nearly for ever
+            # snap to the goal instead of approaching it without end
             want = way / max(_APPROACH, dt) if abs(way) > 1e-5 else way / dt
             want = min(max(want, -speed), speed)
         most = _ACCELERATION * full * dt
@@ -101,7 +101,7 @@ class _Servo:
 class ServoMechanics:
     """A hand of position servos without its electronics.
 
-    Of a command, q and dq count: where to, and how fast at most.
+    It obeys q (the goal) and dq (the largest speed) of a command.
 
     :param model: which hand.
     :param side: which of the two.
@@ -141,12 +141,12 @@ class ServoMechanics:
 
     @property
     def q(self) -> Floats:
-        """Positions, shape (n_joints,), as they are and not as they are reported."""
+        """True positions, before rounding to the reported resolution, shape (n_joints,)."""
         return np.array([servo.q for servo in self._servos])
 
     @property
     def contacts(self) -> list[float]:
-        """With what part of its current limit each joint presses on the object."""
+        """Current with which each joint presses on the object, as a part of its limit."""
         return [servo.contact for servo in self._servos]
 
     def apply(self, command: HandCommand) -> None:
@@ -181,13 +181,13 @@ class ServoMechanics:
             servo.goal, servo.still = math.nan, False
 
     def stop(self) -> None:
-        """Hold, and stand still at once."""
+        """Hold every joint and set its speed to 0."""
         self.brake()
         for servo in self._servos:
             servo.dq = 0.0
 
     def step(self, n: int = 1) -> None:
-        """Live ``n`` times :data:`STEP`."""
+        """Advance by ``n`` times :data:`STEP`."""
         for servo in self._servos:
             for _ in range(n):
                 if servo.still:

@@ -4,8 +4,8 @@
 the steps of q the thousandths in which the hand reports it (docs/sources/unitree-dex.md#j1); how a
 motor accelerates, and which current it takes, is assumed.
 
-Not modelled: fingers that meet each other, tactile sensors, the thumb's lock, and that the vendor's
-service goes on with the last command for ever (docs/decisions.md).
+Not modelled: collisions of fingers, tactile sensors, the thumb's lock, and that the vendor's
+service repeats the last command without end (docs/decisions.md).
 """
 
 from __future__ import annotations

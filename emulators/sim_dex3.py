@@ -1,6 +1,6 @@
 """``sim-dex3``: a simulated Dex3-1, mechanics only, without a device protocol.
 
-See :mod:`dexkit.emulators.dex3_mechanics` for what is modelled, tuned and not there.
+:mod:`dexkit.emulators.dex3_mechanics` says what is modelled, tuned and left out.
 """
 
 from __future__ import annotations

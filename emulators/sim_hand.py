@@ -1,7 +1,7 @@
 """``sim-dex1``: a simulated Dex1-1 gripper, mechanics only, without a device protocol.
 
-The command in force stays in force until the next one, as in the real motor. Nothing is said about
-temperature, voltage or noise of the product; those stay NaN.
+The command in force stays in force until the next one, as in the real motor. Temperature, voltage
+and noise of the product are unknown and stay NaN.
 """
 
 from __future__ import annotations

@@ -3,14 +3,13 @@ servos, without device or bus.
 
 :mod:`dexkit.emulators.servo_mechanics` has the mechanics. The full speed is the one of the device's
 highest setting, and the steps of q its thousandths (docs/sources/unitree-dex.md#j2); how a motor
-accelerates is assumed. Of a DFX only q is measured, as on Unitree's topics; of an FTP the forces
-and what its 17 tactile areas feel, too. A finger that presses on the object is felt by the two
-large areas of its last joints, most in the middle of each, in proportion to its force; how much a
-real area counts is not known. The small areas and the palm feel nothing.
+accelerates is assumed. A DFX reports only q, as on Unitree's topics; an FTP also forces and 17
+tactile areas. A finger that presses on the object loads the two large areas of its last joints,
+most in the middle of each, in proportion to its force; the counts of a real area are not known. The
+small areas and the palm read 0.
 
-Not modelled: the fingers' coupled links, that fingers and thumb meet each other, force limits and
-how far a fast finger exceeds them, the errors that stop a joint until they are cleared, and the
-latency of the serial line.
+Not modelled: coupled links, collisions of fingers and thumb, force limits and their overshoot at
+speed, errors that stop a joint until they are cleared, and the latency of the serial line.
 """
 
 from __future__ import annotations
@@ -56,12 +55,12 @@ sim_inspire_dfx = Backend(
 )
 
 
-_COUNTS = 1000.0  # of the middle of an area at the full force; assumed
-_WIDTH = 0.35  # of an area: how far from its middle it is pressed; assumed
+_COUNTS = 1000.0  # counts in the middle of an area at full force; assumed
+_WIDTH = 0.35  # half width of the pressed region, as a part of an area; assumed
 
 
 def _bump(elements: int) -> Floats:
-    """How much of the most each of so many elements in a row feels, the middle most."""
+    """Pressure profile along a row of elements, as parts of the maximum in its middle."""
     away = (np.arange(elements) + 0.5) / elements - 0.5
     return np.exp(-0.5 * (away / _WIDTH) ** 2)
 
@@ -78,10 +77,10 @@ def _touch_shares() -> Floats:
 
 
 class FtpMechanics(ServoMechanics):
-    """Position servos whose fingers feel what they press on."""
+    """Position servos with tactile areas on the fingers."""
 
     _shares = _touch_shares()
-    # the joints that press each area: those of its finger; the palm's area has none
+    # the joints that press each area: those of its finger; none press the palm
     _joints = tuple(
         [
             i

@@ -31,20 +31,20 @@ COMMON_SETTINGS = {
 """The settings of every simulated hand."""
 
 _POSE_CHARACTERS = 65_536
-"""More than the positions of any hand take; a longer file is not a pose."""
+"""Largest pose file, bytes; more than the positions of any hand need."""
 
 
 class Mechanics(Protocol):
-    """Mechanics on steps instead of a clock."""
+    """Mechanics that advance in fixed steps."""
 
     def brake(self) -> None:
         """Brake every joint."""
 
     def stop(self) -> None:
-        """Stand still at once."""
+        """Set all speeds to 0."""
 
     def step(self, n: int = 1) -> None:
-        """Live ``n`` steps."""
+        """Advance by ``n`` steps."""
 
     def apply(self, command: HandCommand) -> None:
         """Apply ``command`` until the next one."""
@@ -53,19 +53,19 @@ class Mechanics(Protocol):
         """The state, measured at ``stamp``."""
 
     def wear(self, joint: int, wear: JointWear) -> None:
-        """Wear a joint, play apart."""
+        """Apply the wear of a joint, except for play."""
 
     def place(self, q: Sequence[float]) -> None:
         """Put the joints at ``q``, shape (n_joints,), at rest."""
 
 
 class SimulatedHand:
-    """A mechanics on a clock.
+    """A hand whose mechanics follow a clock.
 
     :param step: seconds of one step of the mechanics.
-    :param clock: real time unless given; with a manual clock the hand is deterministic. A caller
-        that stays away for more than a quarter of a second finds it braked since, and of more
-        than half a second only the end is lived through.
+    :param clock: real time unless given; with a manual clock the hand is deterministic. After a
+        pause of the caller of more than a quarter of a second the hand has braked since; of more
+        than half a second only the end is simulated.
     """
 
     def __init__(
@@ -75,13 +75,14 @@ class SimulatedHand:
         self._mechanics = mechanics
         self._clock: Clock = clock or RealClock()
         self._steps = FixedSteps(step, most=0.5)
-        self._last = 0.0  # when the last exchange was
+        self._last = 0.0  # time of the last exchange
         self._open = False
         self._worn: Worn | None = None
         self._pose: Path | None = None
 
     def keep_pose(self, file: Path) -> None:
-        """Start where the joints stood at the last ``close``, which ``file`` says, if there is one.
+        """Keep the pose in ``file``: ``open`` starts with the pose of the last ``close``, if the
+        file exists.
 
         :raises UsageError: the file is not one that :meth:`close` wrote for such a hand.
         """
@@ -90,7 +91,7 @@ class SimulatedHand:
         try:
             if not file.exists():
                 return
-            if not file.is_file():  # a device or a pipe would never end
+            if not file.is_file():  # reading a device or a pipe would never end
                 raise ValueError("it is not a regular file")
             with file.open(encoding="utf-8") as stream:
                 q = [float(value) for value in json.loads(stream.read(_POSE_CHARACTERS))]
@@ -105,25 +106,25 @@ class SimulatedHand:
         self._mechanics.place(q)
 
     def wear(self, wear: Wear) -> None:
-        """Wear the hand, once: friction, speed and dead joints multiply."""
+        """Apply wear. Call it once: factors of friction and speed multiply."""
         for index, joint in wear.joints.items():
             self._mechanics.wear(index, joint)
         self._worn = Worn(wear, self._spec.n_joints)
 
     @property
     def spec(self) -> HandSpec:
-        """What this hand is."""
+        """Side, joints, rates and time-outs of this hand."""
         return self._spec
 
     def open(self) -> None:
-        """Start to live; brakes until the first command."""
+        """Start the simulation; the hand brakes until the first command."""
         self._mechanics.brake()
         self._last = self._clock.now()
         self._steps.restart(self._last)
         self._open = True
 
     def close(self) -> None:
-        """Stop where it is.
+        """Stop the hand at its present position.
 
         :raises UsageError: the file of :meth:`keep_pose` cannot be written.
         """
@@ -137,13 +138,13 @@ class SimulatedHand:
         part = file.with_name(f"{file.name}.part")
         try:
             part.write_text(json.dumps(q) + "\n", encoding="utf-8")
-            os.replace(part, file)  # whole, or as it was
+            os.replace(part, file)  # replaced atomically
         except (OSError, ValueError) as error:
             name, why = one_line(str(file), 200), one_line(str(error), 200)
             raise UsageError(f"pose: {name} cannot be written: {why}") from error
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Advance to now under the last command, apply this one, and return the state.
+        """Advance to the present time under the last command, apply this one, and return the state.
 
         :raises HandLost: the hand is not open.
         """
@@ -175,9 +176,9 @@ def configured(hand: Simulated, options: BackendOptions) -> Simulated:
 
 
 def number(options: BackendOptions, key: str) -> float | None:
-    """A setting that is a number; None where it is not given.
+    """Parse a numeric setting; None if it is not given.
 
-    :raises UsageError: it is not one.
+    :raises UsageError: it is not a number.
     """
     text = options.settings.get(key)
     if text is None:

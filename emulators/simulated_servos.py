@@ -1,4 +1,4 @@
-"""A simulated hand of position servos, of any model."""
+"""Simulated hand of position servos, for any model."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ Servos = TypeVar("Servos", bound=SimulatedServos)
 
 
 def make_servos(kind: type[Servos], options: BackendOptions) -> Servos:
-    """The hand of a backend's options.
+    """Make the hand from a backend's options.
 
-    :raises UsageError: a setting is not understood.
+    :raises UsageError: a setting is invalid.
     """
     hand = kind(options.side, object_at=number(options, "object"), start=number(options, "start"))
     return configured(hand, options)

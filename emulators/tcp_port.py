@@ -1,7 +1,7 @@
 """Run an emulated device on a TCP port of this machine.
 
-One client is served at a time; others wait until it has gone. While unplugged, the client's
-connection is reset and nobody listens.
+One client is served at a time; others wait until it disconnects. While unplugged, the client's
+connection is reset and new ones are refused.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dexkit.errors import EmulatorError
 
 __all__ = ["TcpPort"]
 
-_HOST = "127.0.0.1"  # nobody else's: what is emulated has no password
+_HOST = "127.0.0.1"  # loopback only: an emulated device has no password
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: drop what was not sent yet
 
 
@@ -25,8 +25,8 @@ class TcpPort(LineServer):
     """Runs a line on a TCP port.
 
     :param line: with its device; it has no line time.
-    :param port: to listen on; 0 for a free one, which it keeps.
-    :raises EmulatorError: the port cannot be had.
+    :param port: to listen on; 0 for a free one, which is kept across unplugging.
+    :raises EmulatorError: the port cannot be opened.
     """
 
     name = "TCP port"
@@ -49,7 +49,7 @@ class TcpPort(LineServer):
 
     @property
     def place(self) -> str:
-        """What a ready line says of it."""
+        """Description for the ready line."""
         return f"tcp={self.path}"
 
     @property
@@ -105,7 +105,7 @@ class TcpPort(LineServer):
             self.line.disconnected()
         elif not self.line.unplugged:
             self.line.receive(data, now)
-            if self.line.broken:  # bytes of no protocol: nothing after them can be understood
+            if self.line.broken:  # not the protocol: nothing after these bytes can be parsed
                 self._drop(reset=True)
                 self.line.disconnected()
 

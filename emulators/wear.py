@@ -1,7 +1,7 @@
 """Wear of an emulated hand: friction, play, slow and dead joints, dead tactile elements.
 
-For trying what finds wear: ``--set wear=friction@index_0=3,play@index_1=0.04,dead@thumb_2``. The
-figures are chosen by who sets them; how a product wears is not known.
+Use it to test programs that detect wear: ``--set
+wear=friction@index_0=3,play@index_1=0.04,dead@thumb_2``. How real products wear is not known.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ __all__ = ["WEAR_SETTING", "JointWear", "Wear", "Worn", "parse_wear"]
 SLOTS = 12
 """Values of a packet of tactile elements."""
 _NUMBERS = {"friction": (0, 1000), "speed": (0.01, 1), "play": (0, 10)}
-"""Wear in numbers, and from where to where."""
+"""Kinds of wear with a value, and the range of the value."""
 WEAR_SETTING = {
     "wear": "friction=FACTOR, speed=PART, play=RAD, dead, each of all joints or @JOINT; "
     "element=PACKET.SLOT (dead); e.g. friction@index_0=3,dead@index_1"
 }
-"""The setting of a backend whose hand can be worn."""
+"""The setting of backends whose hand supports wear."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class JointWear:
     """Wear of one joint.
 
     :param friction: factor of its Coulomb friction.
-    :param speed: part of its top speed that is left.
-    :param play: between the motor, which follows the commands, and the reported q; unit of q.
+    :param speed: remaining part of its top speed.
+    :param play: play between the motor and the reported q; unit of q.
     :param dead: its motor has no power.
     """
 
@@ -64,7 +64,7 @@ class Wear:
 def parse_wear(text: str, spec: HandSpec) -> Wear:
     """Read the setting ``wear``.
 
-    :raises UsageError: it is not of the form that :data:`WEAR_SETTING` shows.
+    :raises UsageError: the text has another form than :data:`WEAR_SETTING` shows.
     """
     names = [joint.name for joint in spec.joints]
     joints: dict[int, JointWear] = {}
@@ -107,9 +107,9 @@ def _element(text: str, spec: HandSpec) -> tuple[int, int]:
 
 
 class Worn:
-    """Turns the states of a hand into those of a worn one: play, and dead elements.
+    """Adds play and dead tactile elements to the states of a hand.
 
-    Play: what is reported follows the motor only when the motor has crossed it.
+    With play, the reported q follows the motor only after the motor has crossed the play.
     """
 
     def __init__(self, wear: Wear, n_joints: int) -> None:

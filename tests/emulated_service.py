@@ -10,8 +10,8 @@ from dexkit.conformance.virtual.service import TopicDevice
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import model
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import dialect_map
+from dexkit.service.hand_core import HandCore
 from dexkit.traces import TraceEndpoint
 
 __all__ = ["EmulatedService"]

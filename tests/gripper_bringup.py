@@ -28,7 +28,7 @@ class Watched:
         self.bench, self.clock = bench, clock
         self._opening, self._belongs = opening, belongs
         bench.open()
-        self.effort = effort or Effort.of(bench.plan)
+        self.effort = effort or Effort.from_plan(bench.plan)
         self.begin(Findings())
 
     def begin(self, findings: Findings) -> None:

@@ -16,9 +16,9 @@ from dexkit.conformance.audit import objects, sessions
 from dexkit.conformance.audit.audit import Audit, Outcome, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.page import Summary, render
 from dexkit.conformance.audit.records import FINDING, FileRecord, State
 from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.workers import Lost, Pool
 from dexkit.conformance.judge import judge
@@ -151,7 +151,7 @@ def test_tables(tmp_path: Path) -> None:
         assert pq.read_table(out / f"{name}.parquet").to_pylist() == expected
 
 
-def test_what_is_unchanged_is_not_judged_again(
+def test_unchanged_files_are_not_judged_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive, out = tmp_path / "archive", tmp_path / "out"
@@ -208,7 +208,7 @@ def test_a_stop_leaves_a_partial_result_that_the_next_audit_completes(tmp_path: 
     assert len((out / "files.jsonl").read_text().splitlines()) == 3
 
 
-def test_a_journal_is_an_audits_own(tmp_path: Path) -> None:
+def test_two_audits_cannot_share_a_journal(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     with Journal(path), pytest.raises(UsageError, match="another audit"):
         Journal(path)

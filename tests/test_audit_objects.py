@@ -42,7 +42,7 @@ def memory() -> Iterator[MemoryFileSystem]:
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_a_file_of_ranges_reads_what_the_object_holds(memory: MemoryFileSystem) -> None:
+def test_range_file_reads_the_contents_of_the_object(memory: MemoryFileSystem) -> None:
     data = random.Random(1).randbytes(50_000)
     memory.pipe("/ranges/a", data)
     source = Object("memory://ranges/a")

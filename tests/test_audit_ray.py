@@ -94,7 +94,7 @@ def test_a_node_is_killed_and_nothing_is_lost_or_done_twice(
 
 
 @pytest.mark.soak
-def test_a_stop_leaves_what_is_done_and_the_next_audit_goes_on(
+def test_stopped_audit_keeps_results_and_the_next_one_continues(
     tmp_path: Path, two_nodes: tuple[Any, Any]
 ) -> None:
     files = archive(tmp_path / "archive")

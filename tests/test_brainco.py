@@ -29,8 +29,8 @@ from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_go
 from dexkit.models import BRAINCO_REVO2, dialect
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.topics import roles
 from dexkit.watch.fields import parts_of
@@ -63,7 +63,7 @@ def test_topics_belong_to_the_dialect() -> None:
     assert (state.kind, state.dialect.name, state.sides) == ("state", "brainco", (LEFT,))
 
 
-def test_nothing_is_told_in_radians() -> None:
+def test_messages_do_not_mention_radians() -> None:
     text = CliRunner().invoke(cli, ["models", "brainco-revo2"]).output
     assert "full travel/s" in text
     assert not RADIANS.search(text)
@@ -176,7 +176,7 @@ def test_dq_is_a_part_of_the_full_speed(dq: float, part: float) -> None:
 
 
 @each(("field", "value"), [(f, v) for f in ("q", "dq") for v in (math.nan, math.inf, -math.inf)])
-def test_core_rejects_what_is_not_finite(field: str, value: float) -> None:
+def test_core_rejects_values_that_are_not_finite(field: str, value: float) -> None:
     core = HandCore(BRAINCO_REVO2.spec(LEFT, io_rate=500.0), BRAINCO_REVO2, ManualClock())
     core.opened(core.spec)
     command = mapping().command(message(**{"q": 0.5, "dq": 1.0, field: value}), LEFT)
@@ -234,7 +234,7 @@ def test_client_sends_q_and_full_speed_and_waits_for_no_pose() -> None:
 # ------------------------------------------------------------------------------------ conformance
 
 
-def test_vibration_and_swapped_states_are_found_and_told_in_parts_of_the_travel() -> None:
+def test_vibration_and_swapped_states_are_found_and_reported_in_parts_of_the_travel() -> None:
     plan = replace(plan_for("brainco"), phases=frozenset(["listen", "joint", "step"]))
     for fault, wanted in ((Vibrates, "BRAINCO-STILL-02"), (StatesSwapped, "BRAINCO-SIDE-01")):
         result = run_mutant(mix(fault, BrainCoService), plan)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.bridge.core import PATIENCE, SILENT, Commands, Outgoing, States
+from dexkit.bridge.forwarding import PATIENCE, SILENT, Commands, Outgoing, States
 from dexkit.bridge.translate import PartCodec, Reachable, translator
 from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type, unitree_go, unitree_hg

@@ -63,7 +63,7 @@ def test_one_press_is_not_held_and_silence_releases() -> None:
     [(b"x", 0.01), (b" x ", 0.01), (b"\x1b[A", 0.01), (b" " * 60, PAUSE + 0.01)],
     ids=["another key", "among spaces", "an arrow", "a pause with old presses"],
 )
-def test_what_stops_at_once(data: bytes, gap: float) -> None:
+def test_events_that_stop_the_motion_at_once(data: bytes, gap: float) -> None:
     key = DeadMan()
     last = hold(key, 0.0, 1.0)
     assert key.held(last + 0.011, b" ")
@@ -199,7 +199,7 @@ def test_a_fault_ends_it_for_good(moving: Bring) -> None:
     assert len(moving.driven) == sent
 
 
-def test_what_else_ends_it(moving: Bring) -> None:
+def test_other_events_that_end_a_bringup(moving: Bring) -> None:
     active = next(i for i, mode in enumerate(moving.mcu.mechanics.mode) if mode)
     other = (active + 1) % 7
     moving.mcu.mechanics.joints[other].q += 0.3
@@ -226,7 +226,7 @@ def test_heat_and_silence_end_it(tmp_path: Path) -> None:
         stuck.until_question()
 
 
-def test_motion_that_nobody_saw_ends_it(tmp_path: Path) -> None:
+def test_unseen_motion_ends_the_bringup(tmp_path: Path) -> None:
     bring = Bring(tmp_path)
     question = bring.until_question()
     assert question is not None

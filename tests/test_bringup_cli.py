@@ -131,7 +131,7 @@ def test_a_released_key_stops_the_motor(emulated: Dex3Hands, tmp_path: Path) -> 
     assert emulated.failure is None
 
 
-def test_the_driver_uses_what_was_found(tmp_path: Path) -> None:
+def test_the_driver_uses_the_findings(tmp_path: Path) -> None:
     """A wiring in the file is the one in which the driver drives, whatever it assumes otherwise."""
     wiring, config = Wiring.random(6), tmp_path / "dex3.json"
     texts = {
@@ -165,7 +165,7 @@ def test_the_driver_uses_what_was_found(tmp_path: Path) -> None:
             Dex3Usb(Side.LEFT, replace(plain, config=config)).open()
 
 
-def test_what_is_refused_without_a_person(emulated: Dex3Hands, tmp_path: Path) -> None:
+def test_unattended_bringup_refuses_real_hands(emulated: Dex3Hands, tmp_path: Path) -> None:
     (tmp_path / "answers.json").write_text('{"motor 0.0 joint": "thumb"}')
     (tmp_path / "none.json").write_text("[1]")
     place = ["bringup", "dex3-usb", "--side", "left", "--usb", emulated.url, *PATIENT]

@@ -147,7 +147,7 @@ def test_a_fault_of_any_motor_ends_it_for_good(tmp_path: Path) -> None:
             bring.cycle()
 
 
-def test_what_blocks_the_jaws_ends_it(tmp_path: Path) -> None:
+def test_blocked_jaws_end_the_bringup(tmp_path: Path) -> None:
     """An object between the jaws is not taken for the closed stop."""
     wiring = Wiring.assumed()
     line, bring = watched(tmp_path, wiring)
@@ -182,7 +182,7 @@ def test_it_resumes_where_it_was(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------ the driver
 
 
-def test_the_driver_uses_what_was_found(tmp_path: Path) -> None:
+def test_the_driver_uses_the_findings(tmp_path: Path) -> None:
     """Behind a pseudo-terminal: ids, direction, zero and gearing of the file are obeyed."""
     wiring, config = Wiring.random(7), tmp_path / "dex1.json"
     mounting = wiring.mountings[Side.LEFT]

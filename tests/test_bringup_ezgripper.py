@@ -142,7 +142,9 @@ def test_wirings_differ_and_repeat() -> None:
 
 
 def test_release_and_a_fault_stop_it(tmp_path: Path) -> None:
-    grippers, bring = watched(tmp_path, Wiring.random(0), Side.RIGHT, Effort.of(plan_of(Side.LEFT)))
+    grippers, bring = watched(
+        tmp_path, Wiring.random(0), Side.RIGHT, Effort.from_plan(plan_of(Side.LEFT))
+    )
     while not any(servo.torque for servo in grippers.servos.values()):
         bring.cycle()
     assert sum(servo.torque for servo in grippers.servos.values()) == 1
@@ -192,7 +194,7 @@ def test_its_torque_is_a_current_limit(tmp_path: Path) -> None:
         current = grippers.servos[int(motor)].get(mx64.GOAL_CURRENT)
         assert 0 < current <= most
     with pytest.raises(UsageError, match="torque"):
-        Effort.of(plan_of(Side.LEFT), torque=2.5)
+        Effort.from_plan(plan_of(Side.LEFT), torque=2.5)
 
 
 @pytest.mark.soak

@@ -24,7 +24,7 @@ from dexkit.command_age import (
 from dexkit.errors import HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX1_1
-from dexkit.service.core import HandCore
+from dexkit.service.hand_core import HandCore
 from tests.each import each
 
 EPOCH = 1_795_000_000.0

@@ -109,7 +109,7 @@ def test_verdicts_have_same_name_in_all_reports() -> None:
         ((), {}, "inconclusive, 0 of 0 pass"),
     ],
 )
-def test_badge_states_only_what_was_judged(
+def test_badge_states_only_the_judged_grade(
     verdicts: tuple[Verdict, ...], subject: dict[str, str], text: str
 ) -> None:
     run = run_named("h", "", **dict(zip(("TOPIC_01", "TOPIC_02"), verdicts, strict=False)))

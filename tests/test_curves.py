@@ -89,7 +89,9 @@ def test_info_takes_several_files_and_writes_a_page(
     assert "is also an input" in str(refused.exception)
 
 
-def test_diff_draws_what_differs_most_first(traces: tuple[Trace, Trace], tmp_path: Path) -> None:
+def test_diff_draws_the_largest_differences_first(
+    traces: tuple[Trace, Trace], tmp_path: Path
+) -> None:
     a, b = (str(t.path) for t in traces)
     out = tmp_path / "diff.html"
     result = CliRunner().invoke(cli, ["diff", a, b, "--html", str(out)])

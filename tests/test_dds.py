@@ -112,7 +112,7 @@ def test_a_callback_may_close_its_reader_and_its_node(dds_domain: int) -> None:
         node.close()
 
 
-def test_failing_callback_is_logged_and_the_node_goes_on(
+def test_failing_callback_is_logged_and_the_node_continues(
     dds_node: DdsNode, caplog: pytest.LogCaptureFixture
 ) -> None:
     called = threading.Semaphore(0)

@@ -145,7 +145,7 @@ motor_places = st.permutations([(b, i) for b in range(4) for i in range(4)]).map
     st.sampled_from(d.COMMAND_LAYOUTS),
     motor_places,
 )
-def test_encode_is_what_packets_say(
+def test_encode_equals_packets(
     cmd: HandCommand, timeout: Any, layout: d.CommandLayout, places: Any
 ) -> None:
     """The fast path against the slow one, through any bus map."""

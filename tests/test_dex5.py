@@ -24,8 +24,8 @@ from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX5_1, dialect
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.client_codec import ClientWire
 from dexkit.topics import roles

@@ -181,7 +181,7 @@ class TestGoState:
         7,
     )  # fmt: skip
 
-    def test_what_is_known_is_filled(self) -> None:
+    def test_known_fields_are_filled(self) -> None:
         motor = one("unitree_go").state({LEFT: self.FULL}).states[0]
         assert (motor.mode, motor.ddq, motor.temperature, motor.lost) == (1, 2.0, 31, 7)
         assert tuple(motor.reserve) == (0x80000001, 1)
@@ -191,11 +191,11 @@ class TestGoState:
         assert motor == unitree_go.MotorState_(q=1.5, dq=0.25, tau_est=-0.5)
 
     @each(("celsius", "sent"), [(math.nan, 0), (-12.0, 0), (126.6, 127), (200.0, 127)])
-    def test_temperature_stays_what_the_sdk_can_pack(self, celsius: float, sent: int) -> None:
+    def test_temperature_fits_the_sdks_signed_byte(self, celsius: float, sent: int) -> None:
         motor = one("unitree_go").state({LEFT: view(temperature=celsius)}).states[0]
         assert motor.temperature == sent
 
-    def test_what_is_unknown_is_zero_and_never_nan(self) -> None:
+    def test_unknown_fields_are_zero_and_never_nan(self) -> None:
         motor = one("unitree_go").state({LEFT: view(dq=math.nan, tau_est=math.nan)}).states[0]
         assert (motor.dq, motor.tau_est) == (0.0, 0.0)
 

@@ -225,7 +225,7 @@ def test_commands_of_a_document_run(document: str, host: Host, files: Path, tmp_
     assert not wrong, "\n".join(wrong)
 
 
-def test_what_is_not_run_is_in_the_documents() -> None:
+def test_commands_that_are_not_run_are_in_the_documents() -> None:
     shown = [" ".join(s.words) for s in shown_commands() if s.program == "dexkit"]
     for pattern, why in ELSEWHERE:
         assert any(re.search(pattern, s) for s in shown), (pattern, why)

@@ -421,7 +421,7 @@ def test_a_command_drives_a_motor(name: str, mode: int, kp: float, expected: boo
     assert is_driven(SimpleNamespace(mode=mode, kp=kp), DIALECTS[name]) is expected
 
 
-def test_state_of_a_robot_that_nobody_publishes_is_named_with_its_publisher() -> None:
+def test_missing_robot_state_is_named_with_its_usual_publisher() -> None:
     (found,) = [f for f in diagnose(_seen(_waiting())) if f.severity is Severity.ERROR]
     assert found.id == "DDS-UNPUBLISHED"
     assert "client.py" in found.seen

@@ -77,7 +77,7 @@ def test_special_file_is_refused(tmp_path: Path) -> None:
         documents.read_text(tmp_path / "none")
 
 
-def test_what_cannot_be_read_leaves_no_descriptor_open(tmp_path: Path) -> None:
+def test_unreadable_file_leaves_no_descriptor_open(tmp_path: Path) -> None:
     before = os.listdir("/proc/self/fd")
     with pytest.raises(UsageError, match="Is a directory"):
         documents.read_text(tmp_path)

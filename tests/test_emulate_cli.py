@@ -238,7 +238,7 @@ def test_helper_gives_up_waiting_for_a_silent_emulator() -> None:
         Dex3Process(["--port=0"], timeout=0.01)
 
 
-def test_helper_refuses_what_it_cannot_do() -> None:
+def test_helper_refuses_unsupported_options() -> None:
     with pytest.raises(UsageError), emulated_ezgripper(process=True, firmware=Firmware()):
         pass
     with pytest.raises(UsageError), emulated_ezgripper(extra=["--id=2"]):

@@ -144,7 +144,7 @@ def check_message(
     st.booleans(),
     st.lists(st.integers(0, 6), max_size=7),
 )
-def test_what_a_backend_does_not_know_is_sent_as_0(
+def test_values_unknown_to_a_backend_are_sent_as_0(
     unknown: set[str], no_heat: bool, no_imu: bool, joints: list[int]
 ) -> None:
     (state,) = states(HANDS[1], Side.LEFT, [])

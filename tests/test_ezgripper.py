@@ -594,7 +594,7 @@ def test_reset_by_supply_dip_is_recovered(tmp_path: Path) -> None:
         drive(hand, OPEN, at(5.4))
 
 
-def test_low_voltage_is_reported_and_exchange_goes_on(tmp_path: Path) -> None:
+def test_low_voltage_is_reported_and_exchange_continues(tmp_path: Path) -> None:
     with (
         emulated() as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,

@@ -119,7 +119,7 @@ def test_a_short_answer_waits_for_the_timer_and_a_full_packet_does_not() -> None
     assert ready(chip, 0.0481) == [b"\xb1\x60" + bytes(38)]
 
 
-def test_what_nobody_reads_overruns_and_says_so_once() -> None:
+def test_unread_bytes_overrun_and_are_reported_once() -> None:
     chip = FtdiChip(FT232R)
     chip.receive(bytes(300))
     assert chip.overruns == 44
@@ -274,7 +274,7 @@ def test_a_client_finds_the_adapter_on_the_server() -> None:
         assert port.failure is None
 
 
-def test_a_line_is_served_where_its_link_says(tmp_path: Path) -> None:
+def test_line_is_served_at_its_link(tmp_path: Path) -> None:
     now = RealClock().now()
     bus = Bus([Servo(1, now=now)], start=now)
     with line_port(bus, "usbip://127.0.0.1:0", serial="DK3") as port:

@@ -89,7 +89,7 @@ def test_a_name_that_is_no_hand_is_an_error(name: str, why: str) -> None:
         parse(name)
 
 
-def test_every_fault_condition_and_deviation_says_what_it_is() -> None:
+def test_every_fault_condition_and_deviation_has_a_description() -> None:
     for made in (*FAULTS.values(), *DEVIATIONS.values(), *WHENS.values()):
         assert made.title
         assert made.summary

@@ -112,7 +112,7 @@ class TestCommand:
 
 
 class TestState:
-    def test_what_is_not_known_is_nan(self) -> None:
+    def test_unknown_values_are_nan(self) -> None:
         s = HandState.from_values([1.0, 2.0], stamp=3.0)
         assert s.dq.shape == (2,)
         assert np.isnan(s.temperature).all()
@@ -157,7 +157,7 @@ class TestSpec:
 
 
 class TestModels:
-    def test_dex1_is_what_the_fact_sheet_says(self) -> None:
+    def test_dex1_profile_agrees_with_its_sources(self) -> None:
         """docs/sources/unitree-dex.md#a1, docs/sources/unitree-dex.md#b1,
         docs/sources/unitree-dex.md#b2, docs/sources/unitree-dex.md#b3.
         """

@@ -69,7 +69,7 @@ def test_the_longest_fast_read_is_answered() -> None:
     assert len(answer.params) == 2 + longest  # error (no such range), id, and its place
 
 
-def test_exception_in_one_device_is_logged_and_the_line_goes_on(
+def test_exception_in_one_device_is_logged_and_the_line_continues(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     bus = fast_bus()

@@ -157,7 +157,7 @@ def test_many_random_announcements_do_not_stop_discovery() -> None:
         fuzz(free_domain(), seed, 100)
 
 
-def test_a_recorder_goes_on_recording(tmp_path: Path) -> None:
+def test_recorder_continues_to_record(tmp_path: Path) -> None:
     domain = free_domain()
     with (
         DdsNode(domain) as hand,

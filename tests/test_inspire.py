@@ -34,8 +34,8 @@ from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_go
 from dexkit.models import INSPIRE_DFX, dialect
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
+from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.client_codec import ClientWire
 from dexkit.topics import roles
@@ -72,7 +72,7 @@ def test_one_topic_is_of_both_sides() -> None:
     assert (state.kind, state.dialect.name, set(state.sides)) == ("state", "inspire_dfx", set(Side))
 
 
-def test_nothing_is_told_in_radians() -> None:
+def test_messages_do_not_mention_radians() -> None:
     text = CliRunner().invoke(cli, ["models", "inspire-dfx"]).output
     assert "12 motors in a message: 6 to 11 left, 0 to 5 right" in text
     assert not RADIANS.search(text)
@@ -185,7 +185,7 @@ def test_one_served_hand_leaves_the_other_ones_places_0() -> None:
 
 
 @each("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_rejects_one_hand_alone(value: float) -> None:
+def test_non_finite_values_reject_one_hand_only(value: float) -> None:
     commands = message(*[0.3] * 5, value, *[0.6] * N)
     for side, good in ((RIGHT, False), (LEFT, True)):
         core = HandCore(INSPIRE_DFX.spec(side, io_rate=100.0), INSPIRE_DFX, ManualClock())
@@ -262,7 +262,7 @@ def catalogue_of(model: str) -> dict[str, object]:
     return {r.id: r.tolerances for r in catalogue(model)}
 
 
-def test_reversed_scale_is_found_and_told_in_parts_of_the_travel() -> None:
+def test_reversed_scale_is_found_and_reported_in_parts_of_the_travel() -> None:
     plan = replace(plan_for("inspire_dfx"), phases=frozenset(["listen", "joint", "short", "long"]))
     result = run_mutant(mix(ReversedScale, InspireService), plan)
     failed = {r.requirement.id: r for r in result.results if r.verdict is Verdict.FAIL}

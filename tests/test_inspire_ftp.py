@@ -126,7 +126,7 @@ def test_topics_have_the_side_as_a_letter() -> None:
     assert len({m.short_name for m in MODELS.values()}) == len(MODELS)
 
 
-def test_nothing_is_told_in_radians() -> None:
+def test_messages_do_not_mention_radians() -> None:
     text = CliRunner().invoke(cli, ["models", "inspire-ftp"]).output
     assert "rt/inspire_hand/ctrl/{l,r}" in text
     assert "rt/inspire_hand/touch/{l,r}" in text
@@ -196,7 +196,7 @@ def test_angles_are_thousandths_both_ways(angles: list[int]) -> None:
         ([ctrl([300] * N, 9, speed_set=[0] * N)], [0.3] * N, 0.0),
     ],
 )
-def test_what_is_not_written_keeps_its_value(
+def test_unwritten_registers_keep_their_value(
     messages: list[inspire_hand_ctrl], q: list[float] | None, dq: float | None
 ) -> None:
     spoken = mapping()

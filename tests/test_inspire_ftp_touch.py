@@ -301,7 +301,7 @@ def found_in(*endpoints: Endpoint, streams: tuple[Stream, ...] = ()) -> dict[str
         ("inspire_ftp", "dex3", "inspire_ftp"),
     ],
 )
-def test_doctor_says_that_another_hand_is_there(served: str, asked: str, option: str) -> None:
+def test_doctor_reports_a_hand_of_another_model(served: str, asked: str, option: str) -> None:
     found = found_in(
         *ends(dialect(served), "hand", hand=True), *ends(dialect(asked), "client", hand=False)
     )

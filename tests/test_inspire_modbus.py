@@ -151,7 +151,7 @@ def answering(answer: bytes | None) -> Iterator[str]:
         (bytes.fromhex("000100000003010302"), HandNotFound),
     ],
 )
-def test_whoever_else_listens_is_not_taken_for_a_hand(
+def test_another_server_is_not_taken_for_a_hand(
     answer: bytes | None, error: type[Exception]
 ) -> None:
     with answering(answer) as place:
@@ -162,7 +162,7 @@ def test_whoever_else_listens_is_not_taken_for_a_hand(
             hand.exchange(HandCommand.brake(N))
 
 
-def test_nobody_listens_and_no_address() -> None:
+def test_refused_connection_and_missing_address() -> None:
     with pytest.raises(HandNotFound, match="where is the hand"):
         InspireModbus(Side.LEFT).open()
     with TcpPort(Rh56TcpHand().port.line) as port:

@@ -128,7 +128,7 @@ def lived(device: Rh56, seconds: float, since: float = 0.0) -> None:
         device.advance_to(since + (i + 1) / 100)
 
 
-def test_device_goes_where_its_register_says_and_1_is_open() -> None:
+def test_device_moves_to_its_register_and_1_is_open() -> None:
     device = Rh56(start=100.0)
     assert angles(device) == (0,) * N
     device.handle(rh56.write(1, Register.ANGLE_SET, [1000, -1, 500, 2000, 0, 250]))
@@ -266,7 +266,7 @@ def test_lost_and_damaged_answers_cost_one_exchange(fault: str) -> None:
         assert hand.statistics.timeouts - before == failed
 
 
-def test_a_port_that_goes_away_is_told_and_found_again(emulated: Rh56Hand) -> None:
+def test_a_port_that_goes_away_is_reported_and_found_again(emulated: Rh56Hand) -> None:
     with driver(emulated) as hand:
         hand.exchange(HandCommand.brake(N))
         emulated.inject("unplug:for=200ms")

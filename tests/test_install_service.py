@@ -62,7 +62,7 @@ def test_one_unit_a_hand_is_written_and_a_dry_run_writes_nothing(tmp_path: Path)
     assert "--wait-for-interface" in left
 
 
-def test_units_of_the_package_are_what_is_written() -> None:
+def test_packaged_units_equal_the_written_ones() -> None:
     for side in Side:
         device = systemd_units.device_link(side)
         command = (
@@ -101,7 +101,7 @@ def test_words_are_quoted_as_systemd_reads_them() -> None:
         (("sim-dex1", "--side", "left", "--set", "a=\n", "--user", "root"), "cannot be in a unit"),
     ],
 )
-def test_what_cannot_be_a_service_is_refused(words: tuple[str, ...], said: str) -> None:
+def test_backends_that_cannot_be_a_service_are_refused(words: tuple[str, ...], said: str) -> None:
     with pytest.raises(Exception, match=said) as raised:
         _install(*words, "--dry-run")
     assert not isinstance(raised.value, OutputError)
@@ -195,7 +195,7 @@ def test_watchdog_reports_three_times_in_its_interval(
     ("variable", "value"),
     [("WATCHDOG_USEC", "x"), ("WATCHDOG_USEC", "0"), ("WATCHDOG_PID", "1"), ("WATCHDOG_USEC", "")],
 )
-def test_nobody_is_told_where_systemd_does_not_watch(variable: str, value: str) -> None:
+def test_no_notification_without_systemd(variable: str, value: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WATCHDOG_USEC", "1000000")
         patch.setenv("WATCHDOG_PID", str(os.getpid()))

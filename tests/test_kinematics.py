@@ -136,7 +136,7 @@ def test_robots_stand_upright() -> None:
         assert poses[:, 2, 3].max() > 0.25
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_contradicting_options_are_refused() -> None:
     with pytest.raises(UsageError, match="before its parent"):
         Skeleton((Segment("a", 0, (0.0, 0.0, 0.0)),), ())
     with pytest.raises(UsageError, match="length 1"):

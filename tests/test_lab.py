@@ -76,7 +76,7 @@ def test_a_record_counts_only_set_points_that_change_and_drive() -> None:
     start = record.now()["t"]
     record.setpoint(0, 1.0)
     record.setpoint(0, 1.0)
-    record.look()
+    record.note_positions()
     place[0] = 0.5
     record.heard(b"AT\r")
     assert record.since(start) == {

@@ -540,7 +540,9 @@ _KNOWN = {
     "dexkit/dds.py": {"Domain", "DomainParticipant"},
     "dexkit/domains.py": {"bind"},  # reserves a port of DDS and reads nothing from it
     "dexkit/doctor/dds.py": {"bind"},
-    "dexkit/view/page.py": {"bind"},  # tries whether a port is free; the page has an address
+    "dexkit/view/browser_page.py": {
+        "bind"
+    },  # tries whether a port is free; the page has an address
     "dexkit/view/foxglove_viewer.py": {"start_server"},  # likewise, by the library
     "emulators/lerobot/ports.py": {"bind"},  # loopback only
     "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address

@@ -45,7 +45,7 @@ MOTOR = st.fixed_dictionaries(
 # ------------------------------------------------------------------------------------ JSON
 
 
-def test_state_has_what_lerobot_reads() -> None:
+def test_state_has_the_fields_that_lerobot_reads() -> None:
     state = LowState_(
         mode_machine=5,
         motor_state=[MotorState_(q=0.5, dq=-1.0, tau_est=2.0, temperature=(30, 41))] * G1.slots,
@@ -67,7 +67,7 @@ def test_state_has_what_lerobot_reads() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(MOTOR, max_size=3), BYTE, BYTE)
-def test_command_is_what_was_written(
+def test_parsed_command_equals_the_written_one(
     motors: list[dict[str, float]], mode_pr: int, machine: int
 ) -> None:
     data = {"mode_pr": mode_pr, "mode_machine": machine, "motor_cmd": motors}
@@ -104,7 +104,7 @@ def test_command_is_what_was_written(
         command_json({}) + b" " * MOST,
     ],
 )
-def test_what_is_no_command_is_refused(payload: bytes) -> None:
+def test_invalid_commands_are_refused(payload: bytes) -> None:
     with pytest.raises(WireError):
         command_from(payload)
 
@@ -129,7 +129,7 @@ def spaced(stream: CommandStream, clock: ManualClock, period: float, count: int)
     found = []
     for _ in range(count):
         clock.advance(period)
-        stream.look()
+        stream.detect_pause()
         found.append(stream.counts())
     return found
 
@@ -137,7 +137,7 @@ def spaced(stream: CommandStream, clock: ManualClock, period: float, count: int)
 def test_commands_count_after_a_second_without_a_gap() -> None:
     clock = ManualClock()
     stream = CommandStream(clock)
-    stream.look()
+    stream.detect_pause()
     stream.connected(7)
     assert spaced(stream, clock, 0.125, 12) == [False] * 9 + [True] * 3
     assert spaced(stream, clock, 0.375, 3) == [False] * 3

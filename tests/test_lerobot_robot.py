@@ -59,7 +59,7 @@ def test_local_hand_obeys_brakes_without_commands_and_at_the_end() -> None:
         hand.state()
 
 
-def test_local_hand_raises_what_is_wrong_and_does_not_obey_what_came_before() -> None:
+def test_local_hand_raises_faults_and_does_not_obey_earlier_commands() -> None:
     device = ScriptedHand(io_rate=200.0)
     with LocalHand(device) as hand:
         for wrong in ([math.nan], [1.0, 2.0]):
@@ -288,7 +288,7 @@ def test_wrong_configurations_are_refused(
         make(config)
 
 
-def test_dex3_observes_what_it_measures_and_a_gripper_without_force_says_so(
+def test_dex3_observes_measured_values_and_gripper_without_force_is_refused(
     package: ModuleType, tmp_path: Path
 ) -> None:
     robot = make(

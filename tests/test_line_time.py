@@ -112,7 +112,7 @@ def _check(baudrate: int, timer: float, delay: int, host: float, phase: float) -
     assert end - begin >= busy + 3 * exchange_period(busy, timer) - ENOUGH, what
 
 
-def test_the_formula_is_what_the_emulated_line_does() -> None:
+def test_the_formula_agrees_with_the_emulated_line() -> None:
     for case in itertools.product(BAUD_RATES, TIMERS, DELAYS, HOST_TIMES):
         _check(*case, phase=0.37e-3)
 

@@ -73,7 +73,7 @@ def test_a_hole_in_a_regular_stream_is_estimated(
     assert losses.dropped_by_topic["rt/a"] <= losses.datagrams + 2
 
 
-def test_an_estimate_never_exceeds_what_was_dropped() -> None:
+def test_estimate_never_exceeds_the_dropped_datagrams() -> None:
     losses = Losses()
     for topic in ("rt/a", "rt/b"):
         for n in (*range(50), *range(150, 160)):
@@ -148,7 +148,7 @@ def test_a_writer_that_catches_up_lacks_nothing_and_an_irregular_one_is_not_judg
     assert losses.gaps == {}
 
 
-def test_what_the_kernel_dropped_is_not_said_twice() -> None:
+def test_kernel_drops_are_not_reported_twice() -> None:
     losses = Losses()
     for n in (*range(100), *range(150, 300)):
         losses.note_sample("rt/a/state", 1, T0 + n * 2 * MS)
@@ -210,7 +210,7 @@ def test_pauses_are_reported_with_their_time() -> None:
 # -- a reader that is full -------------------------------------------------------------------------
 
 
-def test_a_full_reader_counts_what_it_refuses() -> None:
+def test_full_reader_counts_refused_samples() -> None:
     domain = free_domain()
     with DdsNode(domain) as hand, DdsNode(domain) as node:
         writer = hand.writer(CMD, CMD_TYPE)
@@ -225,7 +225,7 @@ def test_a_full_reader_counts_what_it_refuses() -> None:
             assert reader.refused == 15
 
 
-def test_what_a_reader_refused_is_in_the_recording(
+def test_refused_samples_are_noted_in_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dexkit.traces.dds_recording.MOST", 10)
@@ -285,7 +285,7 @@ def recorder(buffer: str, *arguments: object, **options: object) -> Iterator[sub
 
 
 @pytest.mark.parametrize("buffer", ["small", "default"])
-def test_a_recorder_that_was_stopped_says_what_it_lost(tmp_path: Path, buffer: str) -> None:
+def test_stopped_recorder_reports_its_losses(tmp_path: Path, buffer: str) -> None:
     domain = free_domain()
     out = tmp_path / "out.mcap"
     sent = 0

@@ -158,7 +158,7 @@ def test_big_endian_samples() -> None:
     assert verify_payload(HG_CMD, sealed)
 
 
-def test_what_is_refused() -> None:
+def test_invalid_settings_are_refused() -> None:
     with pytest.raises(UsageError, match="HandCmd_ carries no CRC"):
         crc_of(hg.HandCmd_())
     with pytest.raises(UsageError, match="carries no CRC"):

@@ -111,7 +111,7 @@ def test_torque_of_fourteen_point_nine_saturates_where_the_vendors_wraps() -> No
     assert MotorCmd.setpoint(0, tau=-1.0, ratio=1.0).tor_des == -2560  # the vendor's sends 0
 
 
-def test_what_is_beyond_the_wire_saturates() -> None:
+def test_values_beyond_the_wire_range_saturate() -> None:
     big = MotorCmd.setpoint(0, q=1e9, dq=1e9, tau=1e9, kp=1e9, kd=1e9)
     assert (big.pos_des, big.spd_des, big.tor_des) == (2**31 - 1, 0x7FFF, 0x7FFF)
     assert (big.k_pos, big.k_spd) == (0xFFFF, 0xFFFF)

@@ -411,7 +411,7 @@ def test_holding_with_force_heats_it() -> None:
     assert one.winding > one.case > 25.5
 
 
-def test_unplugged_loses_what_was_on_its_way_and_not_the_motor() -> None:
+def test_unplugging_loses_bytes_in_transit_but_not_the_motor_state() -> None:
     one = motor()
     host = Host(one, faults=("unplug@10ms:for=20ms",))
     host.ask(MotorCmd.setpoint(0, q=5.4, kp=5.0, kd=0.05))

@@ -94,7 +94,7 @@ def test_mcap_ros2_reads_our_bytes_with_our_schema(message: Any) -> None:
     _same(mt.layout, message, decode(mt.encode(message)))
 
 
-def test_omgidl_is_what_others_recorded_with() -> None:
+def test_omgidl_equals_recorded_schemas() -> None:
     """The shipped recordings carry schemas that dexkit did not write."""
     seen = set()
     for path in SAMPLES:

@@ -81,7 +81,7 @@ def test_two_hands_fit_a_small_terminal() -> None:
     assert lines[-1].startswith("q quit")
 
 
-def test_what_is_beyond_the_screen_is_said_and_scrolled_to() -> None:
+def test_hidden_lines_are_counted_and_can_be_scrolled_to() -> None:
     collector = closing_hands(1.0)
     narrow = text_of(collector, 0.5, 50, 16)
     assert any("lines below" in line for line in narrow)
@@ -141,7 +141,7 @@ def test_a_hand_in_one_line() -> None:
 # -- events ----------------------------------------------------------------------------------------
 
 
-def test_what_changes_is_told_once() -> None:
+def test_a_change_is_reported_once() -> None:
     collector = closing_hands(4.0, faults=lambda t: {1: OVERCURRENT} if 1.0 < t < 2.0 else {})
     collector.endpoint("k", "rt/dex3/left/cmd", "writer", "xr (pid 7)")
     events = Events(collector)
@@ -171,7 +171,7 @@ def test_what_changes_is_told_once() -> None:
     assert (last.kind, last.text) == ("warn", "rt/dex3/left/cmd: nobody publishes it any more")
 
 
-def test_gaps_and_broken_messages_are_told() -> None:
+def test_gaps_and_broken_messages_are_reported() -> None:
     collector = Collector()
     times = [i * 0.01 for i in range(100)]
     late = [1.5 + i * 0.01 for i in range(10)]

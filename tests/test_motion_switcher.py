@@ -127,7 +127,7 @@ def test_strings_that_are_none(tail: bytes, problem: str) -> None:
         (Request_(RequestHeader_(RequestIdentity_(2**63))), "does not fit int64"),
     ],
 )
-def test_what_cannot_be_sent_is_named(message: Request_, problem: str) -> None:
+def test_unsendable_values_are_named(message: Request_, problem: str) -> None:
     with pytest.raises(EncodeError, match=problem):
         encode(message)
 

@@ -54,7 +54,7 @@ def test_bulk_read_gives_each_its_own_block() -> None:
     assert [(p.id, len(p.data)) for p in packets] == [(3, 2), (1, 1)]
 
 
-def test_group_read_with_missing_servo_stops_or_goes_on() -> None:
+def test_group_read_with_missing_servo_stops_or_continues() -> None:
     params = READ_POSITION + bytes([1, 9, 2])
     assert [p.id for p in three().send(254, Instruction.SYNC_READ, params)] == [1]
     skips = dataclasses.replace(QUIET, missing_id_stalls=False)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dexkit.bridge import Bridge, BridgeEnd
-from dexkit.bridge.core import PATIENCE, Commands, States
+from dexkit.bridge.forwarding import PATIENCE, Commands, States
 from dexkit.clock import ManualClock, RealClock
 from dexkit.command_age import PAUSE
 from dexkit.dds import DdsNode

@@ -138,7 +138,7 @@ def test_commands_are_played_by_default_and_topics_can_be_chosen() -> None:
     assert list(Player(trace, ["dex1/right/cmd"]).topics) == [RIGHT]
 
 
-def test_what_cannot_be_played_is_refused(tmp_path: Path) -> None:
+def test_unplayable_sessions_are_refused(tmp_path: Path) -> None:
     trace = open_trace(trace_of(tmp_path, [0, 10]))
     for bad in ({"speed": 0.0}, {"speed": float("inf")}, {"speed": -1.0}, {"max_gap": 0.0}):
         with pytest.raises(UsageError):

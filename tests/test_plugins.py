@@ -33,7 +33,7 @@ def test_entry_point_of_an_installed_package_is_found(folder: Path) -> None:
     assert [(e.name, e.value) for e in entry_points(GROUP)] == [("acme", "acme:HAND")]
 
 
-def test_group_that_nobody_registers_is_empty(folder: Path) -> None:
+def test_group_without_registered_plugins_is_empty(folder: Path) -> None:
     register(folder, "somebody.else")
     assert entry_points(GROUP) == []
 

@@ -31,7 +31,7 @@ def put_all(recorder: Recorder, count: int) -> int:
     )
 
 
-def test_what_is_recorded_is_what_was_put(tmp_path: Path) -> None:
+def test_recorded_messages_equal_the_written_ones(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path, metadata={"note": "hello"}) as recorder:
         assert put_all(recorder, 2000) == 2000
@@ -80,7 +80,7 @@ def test_any_samples_survive_the_round_trip(
     assert got == sorted(put, key=lambda row: row[2])
 
 
-def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
+def test_an_existing_file_is_kept_without_overwrite(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_text("precious")
     with pytest.raises(UsageError, match="exists"):

@@ -280,7 +280,7 @@ def test_a_file_that_is_deleted_ends_the_recording(tmp_path: Path) -> None:
         recorder.close()
 
 
-def test_a_file_that_is_renamed_is_told(tmp_path: Path) -> None:
+def test_renamed_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path) as recorder:
         put(recorder, 0, 1)
@@ -317,7 +317,9 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return room
 
 
-def test_a_full_disk_leaves_what_it_says(tmp_path: Path, disk: list[int]) -> None:
+def test_after_a_full_disk_the_counted_messages_are_readable(
+    tmp_path: Path, disk: list[int]
+) -> None:
     partly = 0
     for size in [100, 300, *range(2000, 4600, 131)]:  # in the header, and anywhere in a chunk
         disk[0] = size
@@ -445,7 +447,7 @@ def overwrite(path: Path, at: int) -> None:
         lambda path: overwrite(path, path.stat().st_size - 50),
     ],
 )
-def test_a_file_that_another_program_writes_to_is_told(
+def test_write_by_another_program_is_reported(
     tmp_path: Path, change: Callable[[Path], None], more: int
 ) -> None:
     path = tmp_path / "a.mcap"
@@ -488,7 +490,7 @@ def test_a_link_beside_is_not_followed(tmp_path: Path, content: bytes | None) ->
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo])
-def test_what_is_no_file_beside_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_part_path_that_is_no_file_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
     path = tmp_path / "a.mcap"
     before = old(path)
     make(part(path))

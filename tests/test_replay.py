@@ -271,7 +271,7 @@ def test_a_session_of_the_other_hand_is_recognised(tmp_path: Path) -> None:
     assert swapped.plan.sides == (RIGHT,)
 
 
-def test_what_cannot_be_sent_is_refused_or_left_out(tmp_path: Path) -> None:
+def test_unsendable_commands_are_refused_or_left_out(tmp_path: Path) -> None:
     q = slow_wave()
     good = gripper(q)
     nan = list(good)
@@ -619,7 +619,7 @@ def test_no_delay_of_the_program_makes_a_hand_leap(delays: list[float], q: float
     assert all(b - a <= HOLD * 200 + 1 for a, b in itertools.pairwise(order))
 
 
-def test_after_a_pause_the_session_goes_on_where_it_was() -> None:
+def test_after_a_pause_the_session_continues_where_it_was() -> None:
     drive = Drive(plan_of(slow_wave()), q=2.0)
     drive.until(Phase.PLAY)
     for _ in range(100):

@@ -88,7 +88,7 @@ def test_driver_moves_the_emulated_hand_and_holds(emulated: Revo2Hand) -> None:
         hand.exchange(HandCommand.brake(N))
 
 
-def test_the_other_hand_is_refused_and_nobody_is_not_found(emulated: Revo2Hand) -> None:
+def test_wrong_hand_is_refused_and_missing_hand_is_not_found(emulated: Revo2Hand) -> None:
     with pytest.raises(HandRefused, match="is a right one"):
         driver(emulated, Side.LEFT, id=127).open()
     with pytest.raises(HandNotFound, match="no hand with id 126"):

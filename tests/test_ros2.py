@@ -90,7 +90,7 @@ def test_bytes_of_a_ros_2_writer_are_ours(kind: Struct) -> None:
 
 
 @each(("name", "old"), OLD, ids=lambda name: name)
-def test_earlier_layout_is_told_by_its_length_and_by_its_hash(name: str, old: Any) -> None:
+def test_earlier_layout_is_detected_by_its_length_and_by_its_hash(name: str, old: Any) -> None:
     store = store_of(old.struct)
     data = bytes(store.serialize_cdr(made(store, old.struct, [0]), old.struct.ros_name))
     assert layout_of(name, data) is old

@@ -228,7 +228,7 @@ def test_a_complete_run_has_the_score_of_its_kind() -> None:
         ({"known": ()}, "no wrong hands of the model"),
     ],
 )
-def test_any_other_run_has_none_and_says_why(changes: dict[str, Any], why: str) -> None:
+def test_other_runs_have_no_score_and_give_the_reason(changes: dict[str, Any], why: str) -> None:
     score = found(**changes)
     assert score.must_breaking is None
     assert why in score.sentence()
@@ -319,7 +319,7 @@ def digest_with(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> str:
         {"repeat": 9},
     ],
 )
-def test_the_digest_changes_with_what_is_required(
+def test_the_digest_changes_with_the_requirements(
     changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert digest_with(monkeypatch, **changes) != catalogue_digest("dex1-1")
@@ -348,7 +348,7 @@ def test_scores_are_of_the_present_requirements() -> None:
         assert (e.phases, e.rounds) == (plan.phases, plan.rounds), f"{e.model} {run}: {RENEW}"
 
 
-def test_the_file_has_what_the_tool_would_try() -> None:
+def test_score_file_covers_the_trials_of_the_tool() -> None:
     most = {(t.model, t.run, t.setting): t.hands for name in HANDS for t in tasks(name)}
     for e in entries():
         assert e.hands <= most[e.model, RunKind(e.run), Setting(e.setting)]
@@ -364,7 +364,7 @@ def test_counts_and_intervals_of_the_file_agree() -> None:
         assert set(e.requirements) >= {r for ids in e.fewer.values() for r in ids}
 
 
-def test_the_file_is_what_the_tool_would_write() -> None:
+def test_score_file_equals_the_output_of_the_tool() -> None:
     assert scores.FILE.read_text(encoding="utf-8") == as_text(entries())
 
 

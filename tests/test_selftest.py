@@ -124,7 +124,7 @@ def examined(
     hand = Over(inner, change)
     hand.alter = alter
     hand.open()
-    setup = Setup.of(hand.spec, rate=100.0)
+    setup = Setup.from_spec(hand.spec, rate=100.0)
     speed = 1.0 if setup.servo else 0.25
     test = SelfTest(Procedure(setup, joints=joints, speed=speed, touch=touch))
     run(hand, test, clock=clock, turn=turn)
@@ -198,7 +198,7 @@ def check_load(name: str, seed: int, joints: Sequence[int] | None = None) -> Non
 
 
 def test_no_motor_gives_more_than_its_lead_allows() -> None:
-    setup = Setup.of(SimHand().spec)
+    setup = Setup.from_spec(SimHand().spec)
     most = float(setup.kp[0]) * LEAD
     state: HandState | None = None
 
@@ -327,7 +327,7 @@ def test_a_failure_of_the_caller_leaves_the_hand_at_rest() -> None:
     clock = ManualClock(7.0)
     hand = Over(HANDS["dex1"](clock), same)
     hand.open()
-    test = SelfTest(Procedure(Setup.of(hand.spec)))
+    test = SelfTest(Procedure(Setup.from_spec(hand.spec)))
     with pytest.raises(KeyboardInterrupt):
         run(hand, test, clock=clock, turn=fail)
     assert hand.commands[-1].is_brake
@@ -336,7 +336,7 @@ def test_a_failure_of_the_caller_leaves_the_hand_at_rest() -> None:
 # ------------------------------------------------------------------------------------- measuring
 
 
-def test_lost_motion_is_what_friction_does_not_explain() -> None:
+def test_lost_motion_excludes_friction() -> None:
     below, above = [Rest(1.0, 0.1)], [Rest(1.09, -0.1)]
     assert measure.lost_motion(below, above, 5.0, 5.0) == pytest.approx(0.05)
     assert measure.lost_motion(below, above, 5.0, math.nan) == pytest.approx(0.09)
@@ -424,7 +424,7 @@ def test_nothing_measured_is_not_good() -> None:
     assert replace(good(), spoiled=1).verdict is Verdict.INCOMPLETE
 
 
-def test_the_page_says_what_is_worse_and_loads_nothing() -> None:
+def test_page_lists_changes_for_the_worse_and_loads_nothing() -> None:
     result = worn("play=0.05")
     page = render_selftest(result, good())
     assert "Worn" in page
@@ -507,7 +507,7 @@ LEFT = ["--side", "left"]
         (["sim-dex1", *LEFT, "--dialect", "unitree_go"], "without DDS"),
         (["--external", *LEFT, "--dialect", "dex3", "--device", "x"], "for a backend"),
         (["sim-dex1", *LEFT, "--joint", "thumb"], "no joint 'thumb'"),
-        (["sim-dex3", *LEFT], "nobody is at a terminal"),
+        (["sim-dex3", *LEFT], "there is no terminal"),
         (["sim-dex1", *LEFT, "--baseline", "other.json"], "its side is right"),
         (["sim-dex1", *LEFT, "--baseline", "junk.json"], "not a self-test"),
         (["sim-dex1", *LEFT, "--baseline", "mine.json", "--json", "mine.json"], "an input"),

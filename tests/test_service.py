@@ -127,7 +127,7 @@ def test_invalid_commands_are_counted_and_ignored() -> None:
     assert (core.accepted, core.rejected, core.clamped) == (2, 3, 1)
 
 
-def test_a_client_without_gains_is_counted_and_told_the_setting(
+def test_a_client_without_gains_is_counted_and_reported_the_setting(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limp, "PERSISTENCE", 0.0)
@@ -233,7 +233,7 @@ class TestLink:
         service.stop()
         assert not hand.is_open
 
-    def test_service_goes_on_after_any_exception_of_a_backend(
+    def test_service_continues_after_any_exception_of_a_backend(
         self, caplog: pytest.LogCaptureFixture
     ) -> None:
         hand, node = ScriptedHand(), FakeNode()
@@ -364,7 +364,7 @@ class TestStop:
         hand.hang.set()
 
 
-def test_publishing_errors_are_counted_and_the_service_goes_on(
+def test_publishing_errors_are_counted_and_the_service_continues(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     hand, node = ScriptedHand(), FakeNode()

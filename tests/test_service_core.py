@@ -15,7 +15,7 @@ from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
-from dexkit.service.core import Estimation, HandCore
+from dexkit.service.hand_core import Estimation, HandCore
 from tests.each import each
 
 TIMEOUT = DEX1_1.command_timeout
@@ -79,7 +79,7 @@ def test_the_watchdog_brakes_after_a_second_and_not_before(early: float, late: f
     assert bench.exchange().q[0] == 2.5
 
 
-def test_state_goes_on_while_braking() -> None:
+def test_state_continues_while_braking() -> None:
     bench = Bench()
     bench.command(2.0)
     bench.clock.advance(5.0)
@@ -299,7 +299,7 @@ class TestFailedExchanges:
         assert not Bench().core.failed(CommandRejected("it does not like it"))
 
     @each("q", [[math.nan], [math.inf], [0.0, 0.0]])
-    def test_a_state_that_is_none_is_a_failure(self, q: list[float]) -> None:
+    def test_invalid_state_is_a_failure(self, q: list[float]) -> None:
         bench = Bench()
         with pytest.raises(HandError, match="backend returned"):
             bench.core.measured(HandState.from_values(q, stamp=0.0))

@@ -31,9 +31,9 @@ from dexkit.hand import (
 from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import HandService, Publisher
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.finger_state import FingerStateEncoder
+from dexkit.service.hand_core import HandCore
 from tests.each import each
 from tests.service_helpers import FakeNode, deliver_until, wait_until
 
@@ -199,7 +199,7 @@ class TestState:
         assert tuple(m.error) == (0x10, 3)
         assert len(mapping().encode({LEFT: self.VIEW})) == 1428  # docs/sources/unitree-dex.md#a4
 
-    def test_the_message_is_what_is_encoded(self) -> None:
+    def test_the_message_equals_the_encoded_values(self) -> None:
         m = mapping()
         assert m.state({LEFT: self.VIEW}) == STATES.decode(m.encode({LEFT: self.VIEW}))
 

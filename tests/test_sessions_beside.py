@@ -160,7 +160,7 @@ def test_hands_that_stand_still_tell_no_time(tmp_path: Path, pick: Path) -> None
     assert (code, "no joint moves" in output) == (2, True)
 
 
-def test_record_merges_what_was_written_meanwhile(
+def test_record_merges_episodes_written_meanwhile(
     tmp_path: Path, pick: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out.mcap"

@@ -108,7 +108,7 @@ def test_a_phase_is_cut_with_its_record(tmp_path: Path) -> None:
     assert (code, text) == (2, "run.mcap has no phase walk")
 
 
-def test_what_cannot_be_cut_leaves_no_file(tmp_path: Path) -> None:
+def test_failed_cut_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     for arguments in (
         ["--from", 1000],

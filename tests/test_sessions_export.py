@@ -141,7 +141,7 @@ def test_several_recordings_are_exported_and_one_refused(tmp_path: Path, part: P
     assert dexkit("export", bad, "--to", "csv", "--out", tmp_path / "one")[0] == 2
 
 
-def test_values_that_equal_are_told_apart(tmp_path: Path) -> None:
+def test_equal_values_are_distinguished(tmp_path: Path) -> None:
     mt = message_type("unitree_go::msg::dds_::MotorCmds_")
     motor = mt.motor_type.cls
     values = [0.0, -0.0, np.float32(np.nan).item(), float("inf"), 1e-45, 3.4028234e38]

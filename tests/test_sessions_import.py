@@ -142,7 +142,7 @@ def test_a_file_cut_in_a_character_is_read(tmp_path: Path) -> None:
     assert len(streams(open_trace(tmp_path / "e.mcap"))["left_arm", STATE]) == 3
 
 
-def test_what_is_wrong_with_items_is_told_and_the_rest_stays(tmp_path: Path) -> None:
+def test_faulty_items_are_reported_and_the_others_kept(tmp_path: Path) -> None:
     found = document(frames=30, cameras=0)
     data = found["data"]
     data[3]["states"]["left_ee"]["qpos"][2] = float("nan")
@@ -217,7 +217,7 @@ def test_nothing_to_import_is_an_error(tmp_path: Path) -> None:
 # -- sides, models, pictures ---------------------------------------------------------------------
 
 
-def test_swapped_states_are_exchanged_and_told(tmp_path: Path) -> None:
+def test_swapped_states_are_exchanged_and_reported(tmp_path: Path) -> None:
     good = document(hand=6, frames=90, cameras=0, named=True)
     bad = document(hand=6, frames=90, cameras=0, named=True, swapped=True)
     trace = imported(tmp_path, whole(bad))
@@ -309,7 +309,7 @@ def test_picture_headers() -> None:
     assert parse_picture(b"") is None
 
 
-def test_what_no_stream_carries_is_kept_as_json(tmp_path: Path) -> None:
+def test_data_without_a_stream_are_kept_as_json(tmp_path: Path) -> None:
     found = document(frames=4, cameras=0)
     for i, item in enumerate(found["data"]):
         item["tactiles"] = {"left_ee": [i, 2, 3]}
@@ -434,7 +434,7 @@ def test_lerobot_datasets_are_read_by_the_place_of_the_columns(
         assert len(list((tmp_path / "all").glob("*.mcap"))) == 2
 
 
-def test_lerobot_columns_of_other_kinds_are_told(tmp_path: Path) -> None:
+def test_lerobot_columns_of_other_kinds_are_reported(tmp_path: Path) -> None:
     matrix = np.full((5, len(NAMES)), 0.1)
     cases: dict[str, dict[str, Any]] = {
         "strings": {"action": ["a"] * 5},

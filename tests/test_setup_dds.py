@@ -248,7 +248,7 @@ def test_an_interpreter_that_cannot_be_used_is_refused(
         ({"headers": ""}, "python3.12-dev"),
     ],
 )
-def test_what_a_build_needs_is_named(changes: dict[str, object], words: str) -> None:
+def test_missing_build_dependencies_are_named(changes: dict[str, object], words: str) -> None:
     assert words in refusal(with_python(**changes), kind=DdsLibraryMissing)
 
 
@@ -645,7 +645,7 @@ def test_a_step_that_fails_says_why_and_nothing_is_installed(
         (Installed("0.10.5", "", ("/a/libddsc.so.0",), "no interface"), "no interface"),
     ],
 )
-def test_what_does_not_work_is_not_installed(found: Installed, words: str) -> None:
+def test_a_wheel_that_does_not_work_is_not_installed(found: Installed, words: str) -> None:
     script = Script(probes=[found])
     with pytest.raises(DdsBuildFailed, match="nothing was installed") as caught:
         carry_out(script)
@@ -653,7 +653,7 @@ def test_what_does_not_work_is_not_installed(found: Installed, words: str) -> No
     assert not installs(script)
 
 
-def test_a_wheel_is_written_anew_with_a_true_record(tmp_path: Path) -> None:
+def test_wheel_is_rewritten_with_a_correct_record(tmp_path: Path) -> None:
     wheel, target = make_wheel(tmp_path), tmp_path / "new.whl"
     files = {"cyclonedds.libs/libddsc.so.0": b"library", "dist-info/licenses/LICENSE": b"EPL"}
     pinned_wheel.rewrite(wheel, target, pinned_wheel.inside("libddsc.so.0"), files)

@@ -130,7 +130,7 @@ def verify(archive: Path, key: Path, *more: str) -> tuple[int, str, str]:
 # --------------------------------------------------------------------------- round trip
 
 
-def test_what_was_signed_is_verified(signed: Signed) -> None:
+def test_signed_archive_is_verified(signed: Signed) -> None:
     code, out, err = verify(signed.archive, signed.public)
     assert (code, err) == (0, "")
     listed = subprocess.run(
@@ -334,7 +334,7 @@ def test_edited_verdict_is_found_though_well_signed(signed: Signed, tmp_path: Pa
     assert verify(archive, signed.public, "--no-rejudge")[0] == 0  # which says so
 
 
-def test_manifest_that_says_more_than_the_result_is_found(signed: Signed, tmp_path: Path) -> None:
+def test_manifest_with_additional_statements_is_detected(signed: Signed, tmp_path: Path) -> None:
     members = contents(signed.archive)
     archive = resigned(signed, tmp_path / "a.zip", members, overall="pass")
     code, out, _ = verify(archive, signed.public, "--no-rejudge")
@@ -434,7 +434,7 @@ def test_missing_tool_names_the_package(
     assert not (tmp_path / "a.zip").exists()
 
 
-def test_key_that_is_none_is_refused(signed: Signed, tmp_path: Path) -> None:
+def test_invalid_key_is_refused(signed: Signed, tmp_path: Path) -> None:
     bad = tmp_path / "bad"
     for text, why in (
         ("", "holds no public key"),
@@ -584,7 +584,7 @@ def test_two_members_of_one_name_are_refused(tmp_path: Path) -> None:
         read_directory(io.BytesIO(data), "it")
 
 
-def test_what_is_no_ordinary_file_is_refused(tmp_path: Path, public_key: Path) -> None:
+def test_special_files_are_refused(tmp_path: Path, public_key: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path, tmp_path / "pipe", Path("/dev/zero")):
         code, _, err = verify(place, public_key)

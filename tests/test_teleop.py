@@ -583,7 +583,7 @@ def test_stroke_time_equals_the_published_measurement(rate: float, seconds: floa
     from dexkit.clock import ManualClock
     from dexkit.hand import HandCommand
     from dexkit.models import DEX1_1
-    from dexkit.service.core import Estimation, HandCore
+    from dexkit.service.hand_core import Estimation, HandCore
 
     clock = ManualClock()
     gripper = feedback.VirtualGripper(clock)

@@ -104,7 +104,7 @@ def test_info_says_when_a_file_is_unfinished(tmp_path: Path) -> None:
     assert json.loads(run("info", "--json", path).stdout)["truncated"] is True
 
 
-def test_info_refuses_what_is_no_recording(tmp_path: Path) -> None:
+def test_info_refuses_other_files(tmp_path: Path) -> None:
     done = run("info", write(tmp_path / "a.mcap", b"SQLite format 3\0" + bytes(50)))
     assert done.returncode == 2
     assert "not an mcap file" in done.stderr
@@ -175,7 +175,7 @@ def test_record_finds_topics_that_appear_later_and_ends_on_sigterm(tmp_path: Pat
     assert len(trace.samples(STATE)) == 10
 
 
-def test_a_recorder_killed_leaves_what_it_had(tmp_path: Path) -> None:
+def test_killed_recorder_leaves_a_readable_recording(tmp_path: Path) -> None:
     from dexkit.dds import DdsNode
 
     domain = free_domain()

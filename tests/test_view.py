@@ -37,7 +37,7 @@ from tests.watch_helpers import closing_hands, ns
 FEW = settings(max_examples=25, deadline=None)
 
 pytest.importorskip("viser")
-from dexkit.view.page import Page  # noqa: E402
+from dexkit.view.browser_page import Page  # noqa: E402
 
 # -- the time line ---------------------------------------------------------------------------------
 
@@ -209,9 +209,9 @@ def test_page_asks_nobody_for_a_share_link(page: Page) -> None:
 
 def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "dexkit.view.page")
+    monkeypatch.delitem(sys.modules, "dexkit.view.browser_page")
     with pytest.raises(ExtraMissing) as error:
-        import dexkit.view.page  # noqa: F401
+        import dexkit.view.browser_page  # noqa: F401
     assert "dexkit[view]" in error.value.hint
 
 

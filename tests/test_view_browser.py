@@ -37,7 +37,7 @@ class Seen(NamedTuple):
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seen]:
-    from dexkit.view.page import Page
+    from dexkit.view.browser_page import Page
 
     late = int(MotorError.OVERCURRENT)
     hands = closing_hands(30.0, 20.0, faults=lambda t: {1: late} if t > 20.0 else {})
@@ -132,7 +132,7 @@ def test_a_fault_of_a_live_hand_shows_and_goes(tmp_path: Path) -> None:
     pytest.importorskip("cyclonedds")
     from dexkit.dds import DdsNode
     from dexkit.messages import message_type
-    from dexkit.view.page import Page
+    from dexkit.view.browser_page import Page
     from dexkit.view.sources import Live
     from dexkit.watch import Collector
     from dexkit.watch.listener import Listener

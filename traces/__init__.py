@@ -1,4 +1,4 @@
-"""Recordings of DDS traffic: write them, read them, play them.
+"""Write, read and replay recordings of DDS traffic.
 
 A recording is an mcap file whose channels are DDS topics and whose payloads are the samples as
 they were on the wire. See docs/traces.md.
@@ -41,7 +41,7 @@ __all__ = [
     "sample_path",
 ]
 
-# loaded when they are asked for: whoever reads a recording needs neither
+# loaded on first use: reading a recording needs neither
 _LATER = {
     "Player": "player",
     "PlayStats": "player",

@@ -40,7 +40,7 @@ MAX_RATIO = 300
 """Most decompressed bytes for each byte of the file. The states of an idle robot, in which little
 more than the times change, reach about 130."""
 SPARE = 8 * 2**20
-"""Decompressed bytes allowed beyond that, for short recordings."""
+"""Decompressed bytes allowed in addition, for short recordings."""
 
 # Largest schema, channel, metadata or index record that is accepted, bytes.
 _MAX_RECORD = 64 * 2**20
@@ -49,9 +49,9 @@ _RUN = 4 * 2**20
 # A checksum is taken over, and the next record is looked for in, this many bytes at a time.
 _BLOCK = 2**20
 _SCAN = 2**16
-# How often reading resumes after a damaged record.
+# Largest number of times that reading resumes after a damaged record.
 _MAX_RESUMED = 1000
-# Records in one chunk that do not belong there, before the rest of it is left out.
+# Misplaced records in one chunk after which the rest of the chunk is left out.
 _MAX_FOREIGN = 100
 _MAX_MESSAGES = 50
 
@@ -65,7 +65,7 @@ HEADS = np.dtype(
 """A message record up to its payload; ``length`` counts from ``channel`` on."""
 Heads = NDArray[np.void]
 OpenFile = Callable[[], BinaryIO]
-"""Opens a recording that is not a file of this machine; it can be read and sought in."""
+"""Opens a recording that is not a local file; returns a readable, seekable object."""
 
 _IN_SUMMARY = frozenset(
     {
@@ -77,7 +77,7 @@ _IN_SUMMARY = frozenset(
         Opcode.FOOTER,
     }
 )
-# Fits the record to follow: 1 where an opcode may begin a record outside of chunks.
+# By opcode: 1 where it may begin a record outside of chunks.
 _KNOWN = np.zeros(256, dtype=np.uint64)
 for _opcode, _least in LEAST.items():
     _KNOWN[_opcode] = _least
@@ -120,7 +120,7 @@ class _Snapshot:
         self._at = file.tell()
 
     def seek(self, at: int) -> int:
-        self._at = at  # to ask the file for it takes as long as a read
+        self._at = at  # asking the file for its position takes as long as a read
         return self._file.seek(at)
 
     def read(self, count: int = -1) -> bytes:
@@ -155,7 +155,7 @@ class Container:
         self._found = Found(self.segments, self.schemas, self.channels)
         self._summary = Summary()
         self._bodies: dict[tuple[int, int], bytes] = {}
-        self._data_end: tuple[int, int] | None = None  # where, and its CRC
+        self._data_end: tuple[int, int] | None = None  # offset, and its CRC
         self._unpacked = 0
         self._size = 0
         self._complete_definitions = False
@@ -176,7 +176,8 @@ class Container:
         _append_limited(self.damage, text)
         _append_limited(self.warnings, text)
 
-    # -- the walk ------------------------------------------------------------------------------
+    # -- walking the records
+    # ------------------------------------------------------------------------------
 
     def open(self) -> None:
         """Index the file: read short records, note the offsets of chunks and attachments.
@@ -238,7 +239,7 @@ class Container:
         size = self._size
         self._run: Segment | None = None
         finished = False
-        sure = at  # from here on a record may begin that was missed
+        sure = at  # a missed record may begin from here on
         resumed = 0
         found = self._records(file, at)
         while (record := next(found, None)) is not None:
@@ -247,7 +248,7 @@ class Container:
             if odd or end > size:
                 if not odd and opcode == Opcode.CHUNK:
                     cut = self._add_chunk(file, at, end)
-                    if cut > at:  # its own lengths say where it ends
+                    if cut > at:  # its own lengths give its end
                         at = sure = cut
                         found = self._records(file, at)
                         continue
@@ -483,7 +484,7 @@ class Container:
             )
 
     def _read_footer(self, file: BinaryIO, at: int, end: int) -> bool:
-        """Read the last record; False if the file ends before the 8 bytes behind it."""
+        """Read the last record; return False if the file ends before the 8 bytes after it."""
         file.seek(at + HEAD.size)
         self._summary.footer = records.footer(file.read(end - at - HEAD.size))
         self._summary.end = at
@@ -500,7 +501,9 @@ class Container:
     # -- checksums and summary -----------------------------------------------------------------
 
     def _check_sums(self, file: BinaryIO) -> bool:
-        """Verify the checksums of data section and summary; True if the summary's is right."""
+        """Verify the checksums of data section and summary; return True if the summary's is
+        right.
+        """
         summary, footer = self._summary, self._summary.footer
         unsure = []
         if self._data_end is None:
@@ -852,17 +855,17 @@ def _decompress_zstd(packed: bytes, size: int, cut: bool) -> tuple[bytes, bool]:
             pass
         return bytes(out[:size]), False
     if size and zstandard.frame_content_size(packed) == size:
-        try:  # at once, into memory of that size
+        try:  # in one call, into memory of that size
             whole = _of_thread.decompressor.decompress(packed, allow_extra_data=False)
             return whole, False
         except zstandard.ZstdError:
-            pass  # damaged, or with something behind it: what can be had is read below
+            pass  # damaged, or followed by other data: the readable part is read below
     with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
         return reader.read(size), bool(reader.read(1))
 
 
 class _OfThread(threading.local):
-    """What a thread keeps, for making one takes as long as decompressing a chunk."""
+    """A thread's own decompressor; making one takes as long as decompressing a chunk."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor()

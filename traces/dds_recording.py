@@ -35,9 +35,9 @@ _log = logging.getLogger(__name__)
 
 #: Samples that a reader keeps until they are taken; 40 s of a 500 Hz topic.
 MOST = 20_000
-#: Bytes that the system is asked to hold while the recorder does not run; 3 s of ten such topics.
+#: Socket receive buffer requested from the system, bytes: 3 s of ten such topics.
 RECEIVE_BUFFER = 16 * 2**20
-#: Topics that are subscribed because they were seen, those of hands not counted.
+#: Discovered topics that are subscribed at most, hand topics not counted.
 MAX_TOPICS = 256
 # Descriptions of endpoints that are kept.
 _MAX_SEEN = 1000
@@ -49,7 +49,7 @@ _ENDPOINTS_INTERVAL = 0.25
 # Seconds to wait for discovery of the type of a topic asked for by name; on one machine it takes
 # a few tens of milliseconds.
 _DISCOVERY_WAIT = 0.5
-# Seconds after which the thread runs its checks although nothing woke it.
+# Seconds between checks of the thread when no sample wakes it.
 _IDLE = 0.1
 
 
@@ -62,12 +62,12 @@ class DdsRecording:
     :param topics: names in any spelling, or patterns; None for every topic whose type is known.
     :param types: DDS type names by topic, for topics that must be subscribed before discovery
         tells their type.
-    :param max_topics: how many topics are subscribed because somebody announced them.
+    :param max_topics: how many discovered topics are subscribed.
 
-    Endpoints and their QoS, and what was lost, are stored whenever they change, so a killed
-    recording has them too.
+    Endpoints and their QoS, and what was lost, are stored whenever they change, so that a killed
+    recording contains them.
 
-    :ivar losses: what the recording lacks.
+    :ivar losses: samples missing in the recording.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class DdsRecording:
 
     @property
     def subscribed(self) -> list[str]:
-        """Topics that are being recorded, whether or not samples have come."""
+        """Topics that are being recorded, with or without samples so far."""
         return sorted({topic for topic, _ in list(self._readers)})
 
     @property
@@ -121,7 +121,7 @@ class DdsRecording:
         guesses = {t: _model_types(t) for t in self._patterns or () if t not in self._types}
         guesses = {topic: types for topic, types in guesses.items() if types}
 
-        # readers of types that nobody uses look like peers of another dialect to a service
+        # to a service, a reader of an unused type looks like a peer of another dialect
         def unused(endpoints: list[Endpoint]) -> set[str]:
             return guesses.keys() - {e.topic for e in endpoints if not e.own}
 
@@ -243,7 +243,7 @@ class DdsRecording:
             self._readers[topic, type_name] = self.node.reader(
                 topic, kind, qos=Qos.reader_default(), most=MOST, on_data=self._wake.set
             )
-        except DdsError as error:  # a name that DDS does not allow, and a peer has all the same
+        except DdsError as error:  # a name that DDS does not allow, although a peer uses it
             self._unknown[topic] = str(error)
 
     def _read_samples(self) -> None:

@@ -10,8 +10,8 @@ What is counted:
 * samples that are *probably missing* on each topic: when datagrams were dropped, gaps in a writer's
   source timestamps are divided by its period. An estimate.
 * *gaps* of a state topic that comes at a steady rate: by the robot's own clock where the message
-  has one (``tick``), else by the writer's source timestamps. An estimate, whoever is to blame:
-  samples that were lost on the network, or a writer that stood still.
+  has one (``tick``), else by the writer's source timestamps. An estimate that does not tell samples
+  lost on the network from a paused writer.
 
 The readers are best-effort, so that the recorder never slows down the writers.
 """
@@ -26,19 +26,20 @@ __all__ = ["PAUSE", "Gaps", "Losses", "Pause"]
 
 #: Seconds between two iterations of the recorder's loop from which on it counts as a pause.
 PAUSE = 0.5
-# Periods without a sample that are a gap, and intervals after which the period estimate is used.
+# A gap is longer than so many periods; intervals before the period estimate is used.
 _GAP = 2.5
 _MIN_INTERVALS = 8
 # Share of a new interval in the running period.
 _SHARE = 1 / 16
-# Seconds after a drop in which its gap may be detected: the next sample must arrive first.
+# Seconds after a drop within which its gap may be detected, since the next sample must arrive
+# first.
 _GAP_WINDOW = 5.0
 _MAX_PAUSES = 20  # pauses that are kept
 _MAX_WRITERS = 1024  # whose gaps are looked for
 # Intervals from which a writer's period is learnt, and how much those of one period differ.
 _LEARN = 32
 _ALIKE = 0.3
-# Periods from which on an interval is long, and up to which it makes up for a late sample.
+# An interval is long from so many periods on; up to so many it compensates a late sample.
 _LATE, _EARLY = 1.6, 0.6
 
 
@@ -86,10 +87,11 @@ class Gaps:
 
 
 class _Pace:
-    """Finds gaps in the samples of a writer that keeps a schedule.
+    """Finds gaps in the samples of a periodic writer.
 
-    A sample that is written late is followed by one that seems early, and nothing is missing; after
-    a gap the next sample comes a whole period later. The period is that of the shortest common
+    A sample that is written late is followed by an apparently early one, and nothing is missing;
+    after a gap the next sample comes a whole period later. The period is that of the shortest
+    common
     intervals, so that it is right even when half of the samples are missing from the start.
     """
 
@@ -106,7 +108,7 @@ class _Pace:
     def sample(self, at_ns: int) -> None:
         """Note a sample by the time at which it was written."""
         passed, self._last = at_ns - self._last, at_ns
-        if passed <= 0 or passed == at_ns:  # a clock that was set; the first
+        if passed <= 0 or passed == at_ns:  # the first sample, or a clock that was set
             self._length = 0
         elif not self._period:
             self._learn(passed)
@@ -189,7 +191,8 @@ class Losses:
             stream = self._streams[topic, writer] = _Stream(topic)
         before, stream.last = stream.last, source_ns
         passed = source_ns - before
-        if before <= 0 or passed <= 0:  # the first, one without a time, a clock that was set
+        # the first sample, one without a time, or a clock that was set
+        if before <= 0 or passed <= 0:
             return
         stream.intervals += 1
         known = stream.intervals > _MIN_INTERVALS

@@ -1,8 +1,8 @@
-"""Topic and type names: ROS 2 and DDS spellings of the same thing, made one.
+"""Convert ROS 2 topic and type names to their DDS spelling.
 
 A ROS 2 topic ``/dex1/left/cmd`` of type ``unitree_go/msg/MotorCmds`` is the DDS topic
-``rt/dex1/left/cmd`` of type ``unitree_go::msg::dds_::MotorCmds_``. Recordings are written by
-tools of either world; everything behind the reader uses the DDS spelling.
+``rt/dex1/left/cmd`` of type ``unitree_go::msg::dds_::MotorCmds_``. Recordings contain either; all
+code after the reader uses the DDS spelling.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ USB = "usb/"
 """Beginning of the channels that hold USB transfers and no DDS samples."""
 
 SESSION = "rt/session/"
-"""Beginning of the topics that hold what an imported session has and no DDS topic carries."""
+"""Prefix of topics with data of an imported session that no DDS topic carries."""
 
 
 _OTHERS = {kind.ros_name: name for name, kind in ALL.items() if "dds_" not in kind.scope}
@@ -39,7 +39,7 @@ def dds_topic(name: str) -> str:
 def dds_type(name: str) -> str:
     """``unitree_go/msg/MotorCmds`` and its other spellings as the name on the wire.
 
-    A name of no known shape is returned as it is.
+    Other names are returned unchanged.
     """
     for separator in ("::", "/", "."):
         if separator in name:

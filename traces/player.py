@@ -37,13 +37,13 @@ _MAX_ERRORS = 1_000_000
 
 @dataclass(frozen=True)
 class PlayStats:
-    """What a play-back did. Errors are seconds from the deadline to the call of ``publish``.
+    """Counters of a replay. Errors are seconds from the deadline to the call of ``publish``.
 
     :param sent: messages published.
     :param passes: complete passes over the recording.
     :param stopped: it was stopped before its end.
     :param duration: seconds from the first deadline to the end.
-    :param pauses: times that the player itself stood still.
+    :param pauses: times that the player itself was paused.
     """
 
     sent: int
@@ -139,8 +139,8 @@ class Player:
 
         :param stop: ends the play-back when set; nothing is published after it is noticed,
             which takes at most 50 ms.
-        :param paused: told after each pause of the player how long that was. The recording goes
-            on when it returns.
+        :param paused: called after each pause of the player, with its length. The replay continues
+            when it returns.
         """
         clock = clock if clock is not None else RealClock()
         stop = stop if stop is not None else threading.Event()
@@ -203,7 +203,7 @@ class _TimeLine:
             left = self.start + offset - clock.now()
             if stop.is_set():
                 return None
-            if left < -PAUSE:  # nobody stood still, but publishing does not keep up
+            if left < -PAUSE:  # there was no pause, but publishing does not keep up
                 self.start -= left
                 return 0.0
             if left <= 0:
@@ -221,6 +221,6 @@ class _TimeLine:
             self._paused(away)
             self._watch.restart()
         now = self._clock.now()
-        if away:  # not by ``away``: in suspend, the clock of the deadlines stands still as well
+        if away:  # not by ``away``: in suspend, the clock of the deadlines stops as well
             self.start += now - self._seen
         self._seen = now

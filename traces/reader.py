@@ -1,8 +1,8 @@
 """Read recordings: mcap files by dexkit or by others, finished or cut short, in bounded memory.
 
-:func:`open_trace` indexes a file without holding its messages. What it cannot read it says in
-:attr:`Trace.warnings`; what it can read it gives, so that a recording that was killed, or a disk
-that filled up, costs its last moments and not the rest. How the file is checked is in
+:func:`open_trace` indexes a file without holding its messages. Unreadable parts are listed in
+:attr:`Trace.warnings`; everything else is returned, so that a killed recorder or a full disk costs
+only the last moments. How the file is checked is in
 :mod:`dexkit.traces.container`.
 """
 
@@ -44,14 +44,14 @@ __all__ = [
 
 Times = NDArray[np.int64]
 
-# glibc keeps what is freed for the next chunk, up to the largest block that was ever freed; what it
-# gives back to the system costs as much as all the rest of reading, page by page.
+# Let glibc keep freed memory for the next chunk, up to this size. Returning it to the system page
+# by page costs as much time as all the rest of reading.
 _MALLOC_KEEP = 8 * 2**20
 # Bytes of chunks that are held while those that overlap in time are put in order.
 _MAX_HELD = 64 * 2**20
-# Messages that are made at once.
+# Messages created in one step.
 _PIECE = 1024
-# Characters of a text out of the file that a sentence repeats.
+# Characters of a text from the file that are quoted in a message.
 _LONGEST = 500
 
 
@@ -99,7 +99,7 @@ class ChannelInfo:
 
 @dataclass(frozen=True)
 class Definition:
-    """How a channel stands in the file: what a copy of it needs.
+    """A channel's definition in the file, as a copy needs it.
 
     :param topic: as recorded.
     :param schema: name, encoding and text of its schema; None without one.
@@ -159,9 +159,9 @@ class SampleArray:
 
 @dataclass
 class _Sink:
-    """What is collected of one channel, piece by piece.
+    """Collects the data of one channel, piece by piece.
 
-    :param payloads: the payloads of each piece one behind the other; None if they are not wanted.
+    :param payloads: the concatenated payloads of each piece; None if they are not wanted.
     :param columns: what decodes them instead, shared by all channels of the topic.
     :param rows: which numbers they have there.
     """
@@ -228,15 +228,16 @@ class Trace:
     """A recording. Made by :func:`open_trace`; holds an index, not the messages.
 
     :ivar path: the file.
-    :ivar truncated: the file ends before its end record: the recorder was killed, is still
-        running, or the file is a partial copy.
-    :ivar damage: what contradicts itself or could not be read, in sentences with the place; more
-        may be found while messages are read. Empty: all that was read is as it was written, as
-        far as the file has checksums.
-    :ivar warnings: the same, and what else is odd or missing.
+    :ivar truncated: the file ends before its end record: the recorder was killed, is still running,
+        or the file is a partial copy.
+    :ivar damage: contradictions and unreadable parts, as sentences with the place; more may be
+        found while messages are read. Empty: everything read so far agrees with the file's
+        checksums.
+    :ivar warnings: the same, and other irregularities.
     :ivar notes: what cannot be checked.
     :ivar metadata: metadata records by name; of several with one name, later keys win.
-    :ivar library: what wrote the file, as it says itself.
+    :ivar mixed_types: by topic with several types, the warning about it.
+    :ivar library: the writing library, as named in the file.
     :ivar profile: mcap profile, ``"ros2"`` in ROS 2 bags and in dexkit's own recordings.
     """
 
@@ -247,6 +248,7 @@ class Trace:
         self.truncated = self._file.truncated
         self.damage = self._file.damage
         self.warnings = self._file.warnings
+        self.mixed_types: dict[str, str] = {}
         self.notes = self._file.notes
         self.metadata = self._file.metadata
         self.library = self._file.library
@@ -256,7 +258,7 @@ class Trace:
         if self.truncated and not self.message_count:
             self._file.warn("it holds no messages")
 
-    # -- what it holds -------------------------------------------------------------------------
+    # -- contents -------------------------------------------------------------------------
 
     @property
     def channels(self) -> list[ChannelInfo]:
@@ -265,7 +267,7 @@ class Trace:
 
     @property
     def definitions(self) -> dict[tuple[str, str], Definition]:
-        """Each channel as it stands in the file, by topic and type.
+        """The definition of each channel in the file, by topic and type.
 
         :raises TraceUnsupported: two channels of one topic and type differ in their schema or
             encoding, so that their messages cannot be told apart.
@@ -525,7 +527,7 @@ class Trace:
                 message_encoding=channel.message_encoding,
                 problem=problem,
             )
-            # these are there on purpose, for other readers than this one
+            # written on purpose, for other readers than this one
             if problem and count and not channel.topic.startswith((USB, SESSION)):
                 self._file.warn(f"{_shorten(channel.topic)}: {problem}")
         types: dict[str, set[str]] = {}
@@ -534,13 +536,15 @@ class Trace:
         for topic, names in types.items():
             if len(names) > 1:
                 some = ", ".join(sorted(names)[:5]) + ", ..." * (len(names) > 5)
-                self._file.warn(f"{topic} carries {len(names)} types: {some}")
+                text = f"{topic} carries {len(names)} types: {some}"
+                self._file.warn(text)
+                self.mixed_types[topic] = text
 
 
 def open_trace(path: str | os.PathLike[str], open_file: OpenFile | None = None) -> Trace:
     """Open a recording: an mcap file, or the directory of a ROS 2 bag with one in it.
 
-    :param open_file: opens it where it is no file of this machine, again for each pass over it;
+    :param open_file: opens a recording that is not a local file, once for each pass over it;
         ``path`` is only its name then.
     :raises TraceUnreadable: it is missing, not an mcap file, or ends within its header.
     """
@@ -562,7 +566,7 @@ def open_trace(path: str | os.PathLike[str], open_file: OpenFile | None = None) 
 
 @cache
 def _keep_memory() -> None:
-    """Let glibc keep what is freed; once is enough for a process."""
+    """Let glibc keep freed memory; called once in a process."""
     bytearray(_MALLOC_KEEP)
 
 
@@ -621,7 +625,7 @@ def _check_layout(type_name: str, schema: Schema) -> tuple[str, list[str]]:
     if (schema.encoding, schema.name) == ("omgidl", type_name) and (
         schema.data == _schema_text(type_name).encode()
     ):
-        return "", []  # as dexkit itself would write it
+        return "", []  # as dexkit itself writes it
     from dexkit.traces import schemas
 
     try:

@@ -1,12 +1,13 @@
-"""Write recordings: a bounded queue, a thread of its own, and a file that survives its writer.
+"""Write recordings: a bounded queue, a writer thread, and a file that survives a killed process.
 
-Whoever receives samples calls :meth:`Recorder.put`, which only appends to a queue. When the disk
+The receiver of samples calls :meth:`Recorder.put`, which only appends to a queue. When the disk
 is slower than the samples, the queue fills up to its bound and further samples are dropped and
-counted, so recording never slows down what is recorded. Every :data:`FLUSH_INTERVAL` what has
-been received is written as a complete chunk and handed to the operating system: killing the
+counted, so recording never slows down what is recorded. Every :data:`FLUSH_INTERVAL` the received
+samples are written as a complete chunk and handed to the operating system: killing the
 process (SIGKILL included) costs the last moments, not the file, as long as the writer keeps up
-with the queue. A power cut may cost more, since nothing is forced onto the disk. What is said to
-be written is on the disk: :mod:`~dexkit.traces.recording_file` takes whole chunks or nothing.
+with the queue. A power cut may cost more, since nothing is forced onto the disk. A sample that
+counts as written is in the file: :mod:`~dexkit.traces.recording_file` commits whole chunks or
+nothing.
 
 Schemas are ``ros2msg`` and the profile is ``ros2``, because that is what PlotJuggler, Foxglove
 and the readers of ROS 2 bags open; topics keep their DDS names (``rt/...``).
@@ -33,12 +34,12 @@ __all__ = ["FLUSH_INTERVAL", "MAX_CHANNELS", "Recorder"]
 
 #: Seconds between complete chunks in the file; less than half of the half second that may be lost.
 FLUSH_INTERVAL = 0.2
-# Seconds that the writer sleeps when nothing wakes it, and queued messages that do.
+# Longest sleep of the writer, seconds, and queued messages that wake it.
 _POLL = 0.05
 _WAKE_AT = 512
-# Messages written between two looks at the clock.
+# Messages written between two readings of the clock.
 _SLICE = 4096
-# Bytes that are written at once at the latest, whatever the time.
+# Bytes after which a chunk is written before its time.
 _COMMIT_AT = 4 * 2**20
 #: Channels, each a topic with a type, in one file: their ids are 16-bit numbers from 1 on.
 MAX_CHANNELS = 2**16 - 1
@@ -66,7 +67,7 @@ class _Metadata(NamedTuple):
 
 
 class _Foreign(NamedTuple):
-    """A type that is no DDS type of dexkit's."""
+    """A type that is not one of dexkit's DDS types."""
 
     name: str
     ros_name: str
@@ -92,8 +93,8 @@ class Recorder:
 
     :param path: the file to write.
     :param overwrite: replace an existing file, as soon as there is a message to replace it by.
-    :param keep_empty: leave a recording without messages, too; else no file is left, and an
-        existing one stays.
+    :param keep_empty: keep a recording without messages; otherwise no file is left, and an existing
+        one stays.
     :param max_messages: bound of the queue, messages.
     :param max_bytes: bound of the queue, bytes of payload.
     :param compression: ``"zstd"``, ``"lz4"`` or ``"none"``.
@@ -140,7 +141,7 @@ class Recorder:
         self._error: Exception | None = None
         self._written = 0
 
-    # -- what has happened ---------------------------------------------------------------------
+    # -- counters ---------------------------------------------------------------------
 
     @property
     def written(self) -> int:
@@ -151,7 +152,7 @@ class Recorder:
     def dropped(self) -> int:
         """Messages dropped because the queue was full or the disk failed.
 
-        When all is over, what was offered and is not in the file.
+        After :meth:`close`: messages offered that are not in the file.
         """
         with self._lock:
             return sum(c.dropped for c in self._channels.values())
@@ -175,7 +176,8 @@ class Recorder:
         """Why writing has stopped, or None."""
         return self._error
 
-    # -- life ----------------------------------------------------------------------------------
+    # -- opening and closing
+    # ----------------------------------------------------------------------------------
 
     def open(self) -> None:
         """Create the file and start the writer.
@@ -191,7 +193,8 @@ class Recorder:
             cast(BinaryIO, self._file), compression=self._compression, enable_data_crcs=True
         )
         if self._file.readable:
-            # a private name; without it the recording is the same and memory grows
+            # a private attribute of the library; without it memory grows, but the recording is the
+            # same
             vars(self._writer)["_Writer__chunk_indices"] = ChunkIndexes(self._file)
         self._schema_ids: dict[str, int] = {}
         self._thread = Worker("recorder", self._run, failed=self._failed)
@@ -323,7 +326,7 @@ class Recorder:
             self._file.close(keep=self._written > 0 or (whole and self._keep_empty))
 
     def _failed(self, error: Exception) -> None:
-        """A full disk, a vanished mount: close() raises it. What is not in the file is lost."""
+        """Keep an error of the disk or mount for close(). Messages not in the file are lost."""
         with self._lock:
             self._error = error
             self._queue = []
@@ -364,7 +367,7 @@ class Recorder:
                 **{f"dropped {topic}": str(count) for topic, count in sorted(dropped.items())},
             },
         )
-        self._commit()  # the end is made from what is in the file
+        self._commit()  # the summary is made from what is in the file
         self._file.verify()
         writer.finish()  # type: ignore[no-untyped-call]
         self._commit()
@@ -389,7 +392,7 @@ class Recorder:
             self._queued_bytes -= size
 
     def _commit_after(self, committed: float) -> float:
-        """Complete the chunk if it is time; returns when that was last done."""
+        """Complete the chunk if it is due; return the time of the last commit."""
         now = time.monotonic()
         if now - committed < FLUSH_INTERVAL and self._file.waiting < _COMMIT_AT:
             return committed
@@ -397,7 +400,7 @@ class Recorder:
         return now
 
     def _commit(self) -> None:
-        """Complete the chunk and have it on the disk, and see that the file is still there."""
+        """Complete the chunk, commit it, and check that the file still exists."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._file.commit()
         with self._lock:

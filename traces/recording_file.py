@@ -3,8 +3,8 @@
 * Written data stay in memory until :meth:`RecordingFile.commit`, which writes them to the file. If
   that fails part-way, the file is truncated to the last commit, so every message reported as
   written can be read.
-* A recording that replaces another is written beside it, under the same name with ``.part``, and
-  takes its place when it holds a message. Until then the old one is untouched.
+* A recording that replaces another is written to the same name with ``.part``, and renamed when it
+contains a message. Until then the old one is untouched.
 * Changes by other programs are detected: deletion, renaming or truncation at the next commit,
   changed bytes at the end.
 * The file is locked (``flock``) while it is written. A second recorder is refused; readers do
@@ -43,14 +43,14 @@ _OPEN_PART = _CREATE | os.O_NOFOLLOW | os.O_NONBLOCK
 # Records of a recording that ended before its first message
 _BEFORE_MESSAGES = frozenset({Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA})
 _BLOCK = 1 << 20
-_RETRIES = (0.001, 0.01, 0.05)  # seconds; a look at a lock takes microseconds
+_RETRIES = (0.001, 0.01, 0.05)  # seconds; testing a lock takes microseconds
 _EXTRA_RETRIES = (0.1, 0.2)  # seconds, for a lock that another program gives up after _RETRIES
 
 
 class RecordingFile:
     """A file for the mcap library's writer (``write``, ``tell``, ``flush``).
 
-    :param path: what it is called in the end. A link is followed.
+    :param path: its final name. A link is followed.
     :param overwrite: replace what is there.
 
     :ivar displaced: what happened to the file's name while it was written, or empty.
@@ -66,7 +66,7 @@ class RecordingFile:
         self._overwrite = overwrite
         self._fd = -1
         self._regular = True
-        self._is_part = False  # written beside, still
+        self._is_part = False  # still written as ``.part``
         self._buffer: list[bytes] = []
         self._buffered = 0
         self._size = 0
@@ -76,7 +76,8 @@ class RecordingFile:
             False  # it was changed by another one, or the clock of its disk differs
         )
 
-    # -- life ----------------------------------------------------------------------------------
+    # -- opening and closing
+    # ----------------------------------------------------------------------------------
 
     def open(self) -> None:
         """Create it.
@@ -135,8 +136,9 @@ class RecordingFile:
         fd = os.open(self._target, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
             self._lock(fd, fcntl.LOCK_EX)
-            # Who is to replace this file locks its own before it looks at this one's lock. If it
-            # looked too early, it goes on; else it is refused, and gives up within _RETRIES.
+            # A recorder that is to replace this file locks its own ``.part`` before it tests this
+            # lock. If it tested too early, it continues; otherwise it is refused, and gives up
+            # within _RETRIES.
             self._refuse_other_recorder(self._part, (*_RETRIES, *_EXTRA_RETRIES))
         except BaseException:
             if self._is_at(self._target, fd):
@@ -146,7 +148,7 @@ class RecordingFile:
         return fd
 
     def _open_device(self) -> int:
-        """Open what is no file. A pipe that nobody reads is refused, not waited for."""
+        """Open a device or pipe. A pipe without a reader is refused instead of waiting for one."""
         try:
             fd = os.open(self._target, os.O_WRONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         except OSError as error:
@@ -160,7 +162,7 @@ class RecordingFile:
         return fd
 
     def _open_beside(self) -> int:
-        """Open ``.part``. Others may have put something there: a link is not followed."""
+        """Open ``.part``. It may be another program's: a link is not followed."""
         try:
             fd = os.open(self._part, _OPEN_PART, 0o666)
             if stat.S_ISREG(os.fstat(fd).st_mode):
@@ -178,7 +180,7 @@ class RecordingFile:
             except BlockingIOError:
                 if pause is None:
                     raise self._busy_error() from None
-                time.sleep(pause)  # somebody may only be looking
+                time.sleep(pause)  # another recorder may only be testing the lock
             except OSError:
                 return  # a file system without locks
             else:
@@ -200,10 +202,11 @@ class RecordingFile:
         )
 
     def close(self, *, keep: bool) -> None:
-        """Close it; what was not committed is lost.
+        """Close it; uncommitted data are lost.
 
-        :param keep: leave it under its name; else remove it, and leave what it was to replace.
-        :raises TraceError: it cannot get its name.
+        :param keep: keep it under its name; otherwise remove it, and keep the file that it was to
+            replace.
+        :raises TraceError: it cannot be renamed.
         """
         fd, self._fd = self._fd, -1
         if fd < 0:
@@ -221,7 +224,7 @@ class RecordingFile:
             os.close(fd)
 
     def publish(self, fd: int | None = None) -> None:
-        """Give it its name, if it has not got it yet.
+        """Rename it to its final name, unless that is done.
 
         :raises TraceError: another recorder has begun to write there, or it cannot be renamed.
         """
@@ -245,7 +248,7 @@ class RecordingFile:
     # -- for the writer ------------------------------------------------------------------------
 
     def write(self, data: bytes) -> int:
-        """Take bytes; they are on the disk after :meth:`commit`."""
+        """Buffer bytes; :meth:`commit` writes them to the file."""
         if data:
             self._buffer.append(bytes(data))
             self._buffered += len(data)
@@ -264,7 +267,7 @@ class RecordingFile:
         return self._buffered
 
     def commit(self) -> None:
-        """Hand what was written to the operating system, all of it or nothing.
+        """Write the buffered bytes to the file, all of them or none.
 
         :raises OSError: the disk is full, for example.
         """
@@ -293,9 +296,9 @@ class RecordingFile:
             self._changed_by_others = os.fstat(self._fd).st_mtime_ns != self._changed_ns
 
     def check(self) -> None:
-        """See whether it is still there.
+        """Check that it still exists.
 
-        :raises TraceError: it was deleted: what is written goes nowhere. Or it was cut.
+        :raises TraceError: it was deleted or truncated.
         """
         if not self._regular:
             return
@@ -314,10 +317,10 @@ class RecordingFile:
             )
 
     def verify(self) -> None:
-        """See whether it holds what was committed.
+        """Check that it holds what was committed.
 
-        It is read only if it has another time of change than after the last commit: a second
-        look at a long recording would keep its end waiting.
+        It is read only if its modification time has changed since the last commit, because reading
+        a long recording again would delay its end.
 
         :raises TraceError: another program has written into it.
         """
@@ -345,11 +348,11 @@ class RecordingFile:
         there, here = _status(path), os.fstat(fd)
         return there is not None and (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
 
-    # -- what was written ------------------------------------------------------------------------
+    # -- reading back ------------------------------------------------------------------------
 
     @property
     def readable(self) -> bool:
-        """Whether what was committed can be read back."""
+        """Whether committed data can be read back."""
         return self._regular
 
     def chunk_indexes(self) -> Iterator[ChunkIndex]:
@@ -399,10 +402,10 @@ class ChunkIndexes:
         self._file = file
 
     def append(self, index: ChunkIndex) -> None:
-        """Forget it."""
+        """Ignore it."""
 
     def __iter__(self) -> Iterator[ChunkIndex]:
-        """From the file; everything must have been committed."""
+        """Read the indexes from the file; everything must have been committed."""
         return self._file.chunk_indexes()
 
 
@@ -414,7 +417,7 @@ def _status(path: Path) -> os.stat_result | None:
 
 
 def _is_worth_keeping(fd: int) -> bool:
-    """Whether it is anything but a recording that ended before its first message."""
+    """Whether it is not merely a recording that ended before its first message."""
     if not MAGIC.startswith(os.pread(fd, len(MAGIC), 0)):
         return True
     size = os.fstat(fd).st_size

@@ -1,9 +1,9 @@
-"""The records of an mcap file (mcap.dev/spec): go from one to the next, and parse them strictly.
+"""Walk and parse the records of an mcap file (mcap.dev/spec), strictly.
 
-A record is an opcode, a length and a body. :func:`walk` gives where the records lie, in a file or
+A record is an opcode, a length and a body. :func:`walk` yields the offsets of records in a file or
 in the bytes of a chunk. Each of the other functions takes a body and raises :class:`BadRecord`
-where the lengths inside of it do not fit it. Bytes behind the last known field are allowed: the
-format says that later versions may add some.
+where its inner lengths do not fit. Bytes after the last known field are allowed, because later
+versions of the format may add some.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class ChunkHead(NamedTuple):
 
 
 class ChunkIndex(NamedTuple):
-    """What the summary says of a chunk. ``offsets``: each channel's message index in the file."""
+    """A chunk's entry in the summary. ``offsets``: each channel's message index in the file."""
 
     start_ns: int
     end_ns: int
@@ -144,7 +144,7 @@ class ChunkIndex(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """What the summary says of the whole file."""
+    """The summary's statistics of the whole file."""
 
     messages: int
     schemas: int
@@ -158,7 +158,7 @@ class Statistics(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """An attachment, without its data, or what the summary says of it."""
+    """An attachment without its data, or its entry in the summary."""
 
     log_ns: int
     create_ns: int
@@ -176,7 +176,7 @@ class Footer(NamedTuple):
 
 
 class _Fields:
-    """Takes one field after the other from a body."""
+    """Reads the fields of a body in order."""
 
     def __init__(self, body: bytes) -> None:
         self.body = body
@@ -227,17 +227,17 @@ def walk(
     *,
     messages: list[int] | None = None,
 ) -> Iterator[tuple[int, int, int]]:
-    """Go from record to record: opcode, where the record begins, where it ends.
+    """Walk from record to record; yield opcode, begin and end of each.
 
-    Only the heads are read. The walk checks nothing but that a whole head lies before ``stop``. A
-    record that ends behind ``stop`` is cut short or damaged; it is given, and it is the last one.
-    Whoever wants to go on behind damage, or elsewhere, begins another walk there.
+    Only the heads are read. The walk checks only that a whole head lies before ``stop``. A record
+    that ends after ``stop`` is cut short or damaged; it is yielded as the last one. To continue
+    after damage, start another walk there.
 
-    :param source: the bytes, or what reads them from a file: (where, how many) -> bytes.
-    :param at: where the first record begins.
-    :param stop: where the last one ends; needed for a file.
-    :param messages: takes where each whole message begins; these are not given then, which is
-        three times as fast.
+    :param source: the bytes, or a function that reads them from a file: (offset, count) -> bytes.
+    :param at: offset of the first record.
+    :param stop: end of the last one; needed for a file.
+    :param messages: list that takes the offset of each whole message; they are not yielded then,
+        which is three times as fast.
     """
     message, least = (-1 if messages is None else int(Opcode.MESSAGE)), LEAST[Opcode.MESSAGE]
     places: list[int] = [] if messages is None else messages
@@ -320,7 +320,7 @@ def chunk_index(body: bytes) -> ChunkIndex:
 
 
 def attachment_index(body: bytes) -> tuple[int, int, Attachment]:
-    """(offset, length, what it says of the attachment)"""
+    """(offset, length, attachment without its data)"""
     fields = _Fields(body)
     at, length, log, created, size = fields.take(_FIVE)
     return at, length, Attachment(log, created, fields.text(), fields.text(), size)

@@ -1,8 +1,8 @@
-"""Schema texts of recordings, read into one form so that layouts can be compared.
+"""Parse the schema texts of recordings into one form, to compare layouts.
 
 A recording carries the layout its payloads had when they were written. Layouts have changed
-(docs/sources/unitree-dex.md#a3) and plain CDR does not say which one it is, so a payload of an old
-layout decodes to nonsense without any error. Therefore the recorded schema, in whichever of
+(docs/sources/unitree-dex.md#a3), and plain CDR does not identify them, so a payload of an old
+layout decodes to wrong values without an error. Therefore the recorded schema, in whichever of
 ``ros2msg``, ``ros2idl`` and ``omgidl`` it is, is compared with dexkit's own.
 """
 
@@ -23,7 +23,7 @@ ENCODINGS = ("ros2msg", "ros2idl", "omgidl")
 _MAX_TEXT = 1_000_000
 # Longest word or name in one. Scopes are prefixed to names, so long ones would cost their square.
 _MAX_WORD = 256
-# Differences, and names in one of them, that are told.
+# Differences that are reported, and names quoted in one.
 _MAX_DIFFERENCES = 8
 _MAX_DEPTH = 16
 
@@ -69,8 +69,8 @@ _IDL_PRIMITIVES = {
     "wstring": "wstring",
 }
 
-# u8 and i8 (and so on) occupy the same bytes: a difference in sign alone is worth saying, but
-# does not shift what follows. unitree_ros2 has a signed motor temperature, the SDKs an unsigned.
+# u8 and i8 (and so on) occupy the same bytes: a difference in sign alone is reported, but does not
+# shift the following fields. unitree_ros2 has a signed motor temperature, the SDKs an unsigned.
 _SAME_BYTES = str.maketrans({"i": "u"})
 
 
@@ -141,7 +141,7 @@ def differences(recorded: Struct, ours: Struct) -> tuple[list[str], list[str]]:
 
 
 def _first_few(found: list[str]) -> list[str]:
-    """The first of them, and how many more: a schema may differ in a hundred thousand fields."""
+    """The first differences and the number of the others; a schema may differ in 100,000 fields."""
     more = len(found) - _MAX_DIFFERENCES
     return [*found[:_MAX_DIFFERENCES], f"and {more} more"] if more > 0 else found
 
@@ -292,7 +292,7 @@ def _length(digits: str) -> int:
     return int(digits)
 
 
-# One pass, in which no place is looked at twice: what is opened and not closed ends with the text.
+# A single pass without backtracking: an unclosed comment ends with the text.
 _TOKEN = re.compile(
     r"//[^\n]*|/\*.*?(?:\*/|\Z)|^[^\S\n]*#[^\n]*|^=+[^\S\n]*$|^IDL:[^\n]*$"  # left out
     r"|(::|[A-Za-z_]\w*|\d[\w.+-]*|\"(?:\\.|[^\"\\])*(?:\"|\\?\Z)|'[^']*(?:'|\Z)|[^\s])",

@@ -29,9 +29,9 @@ class _Chunk(Protocol):
 
 @dataclass
 class Found:
-    """What the data section holds.
+    """Contents of the data section.
 
-    :param left_out: where chunks lie that are too large to be read.
+    :param left_out: offsets of chunks that are too large to be read.
     """
 
     segments: Sequence[_Chunk]
@@ -44,11 +44,11 @@ class Found:
 
 @dataclass
 class Summary:
-    """The records behind the data section.
+    """The records after the data section.
 
     :ivar begin: where they begin in the file; ``end``: where the footer does.
-    :ivar definitions: schemas and channels: opcode, body, where.
-    :ivar groups: records of one kind that follow each other: opcode, where they begin and end.
+    :ivar definitions: schemas and channels: opcode, body, offset.
+    :ivar groups: runs of records of one kind: opcode, begin and end.
     """
 
     begin: int = 0
@@ -63,7 +63,7 @@ class Summary:
     groups: list[list[int]] = field(default_factory=list)
 
     def add(self, opcode: int, body: bytes, at: int, end: int) -> None:
-        """Take one record.
+        """Add one record.
 
         :raises BadRecord: it cannot be read.
         """

@@ -1,10 +1,9 @@
-"""Write a recording from data that are already there: in order, nothing dropped, whole or not at
-all.
+"""Write a recording from existing data: in order, without drops, atomically.
 
 :class:`~dexkit.traces.recorder.Recorder` serves live samples and drops what its queue cannot hold.
-:class:`RecordingWriter` serves imports and edits: :meth:`RecordingWriter.put` returns when the
-message is taken, and the same messages give the same file. A file appears under its name when it
-is finished; an error before that leaves none, and leaves what it was to replace.
+:class:`RecordingWriter` serves imports and edits: :meth:`RecordingWriter.put` blocks until the
+message is accepted, and the same messages give the same file. The file appears under its name when
+it is finished; after an error there is none, and a file that it was to replace is kept.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from dexkit.traces.recording_file import RecordingFile
 
 __all__ = ["RecordingWriter", "definition"]
 
-# Bytes that are handed to the system at once.
+# Bytes written in one system call.
 _COMMIT_AT = 4 * 2**20
 # Bytes of payload in a chunk.
 _CHUNK = 2**20
@@ -73,11 +72,11 @@ class RecordingWriter:
             self.close()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a metadata record; what UTF-8 cannot hold is escaped."""
+        """Write a metadata record; text that is not valid UTF-8 is escaped."""
         self._writer.add_metadata(_utf8(name), {_utf8(k): _utf8(v) for k, v in values.items()})
 
     def add_channel(self, channel: Definition) -> int:
-        """Write a channel; :meth:`put` takes the number that is returned.
+        """Write a channel; return its number for :meth:`put`.
 
         :raises UsageError: a file holds 65,535 channels at most.
         """
@@ -100,7 +99,7 @@ class RecordingWriter:
     def put(self, channel: int, data: bytes, log_time_ns: int, publish_time_ns: int = 0) -> None:
         """Write one message.
 
-        :raises UsageError: a time is not one.
+        :raises UsageError: a time is out of range.
         :raises TraceError: the disk is full, for example.
         """
         if not (0 <= log_time_ns < _TIMES and 0 <= publish_time_ns < _TIMES):
@@ -113,7 +112,7 @@ class RecordingWriter:
             self._commit()
 
     def close(self) -> None:
-        """Finish the file and give it its name.
+        """Finish the file and rename it to its final name.
 
         :raises TraceError: it cannot be written.
         """

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
 from dexkit.conformance.audit.journal import Entry, Journal
-from dexkit.conformance.audit.page import Summary, render
 from dexkit.conformance.audit.records import FileRecord, State
 from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.tables import write_tables
 from dexkit.conformance.audit.workers import Lost, Pool
 from dexkit.documents import write_file
@@ -19,7 +19,7 @@ from dexkit.documents import write_file
 __all__ = ["FAIL_ON", "Audit", "Limits", "Outcome", "Progress", "Runner", "in_this_process"]
 
 FAIL_ON = ("never", "fail", "unusable", "warn")
-"""What makes the exit code other than 0; each includes those before it."""
+"""Findings that make the exit code non-zero; each level includes those before it."""
 
 Runner = Callable[[Iterable[Task], object], "Iterator[tuple[Task, FileRecord | Lost]]"]
 """Examines files until a stop request is true: in processes, or on a cluster."""
@@ -27,7 +27,7 @@ Runner = Callable[[Iterable[Task], object], "Iterator[tuple[Task, FileRecord | L
 
 @dataclass(frozen=True)
 class Limits:
-    """What one file may take.
+    """Limits for one file.
 
     :param memory: bytes of the process that examines it.
     :param max_size: bytes of an object that are copied; larger ones are read by ranges.
@@ -62,7 +62,7 @@ def in_this_process(tasks: Iterable[Task], stop: object) -> Iterator[tuple[Task,
 
 @dataclass
 class Outcome:
-    """How far an audit is, and what it has found.
+    """Progress and results of an audit.
 
     :param total: files; ``done`` of them have a record, ``reused`` from an audit before.
     :param problems: locations that cannot be looked into.
@@ -192,7 +192,7 @@ class Audit:
     def _tasks(
         self, journal: Journal, sessions: dict[str, Session], outcome: Outcome
     ) -> list[Task]:
-        """What is to be examined, largest files first; counts what need not be."""
+        """The files to be examined, largest first; counts those that need not be."""
         settings = settings_key(self._labels)
         tasks = []
         for name, session in sessions.items():

@@ -50,7 +50,7 @@ class Task:
 
 
 def settings_key(labels: Sequence[str]) -> str:
-    """What the records of two audits must have in common to be taken for each other's."""
+    """Key of the settings; records are reused only if it is equal."""
     return ",".join([__version__, catalogue_digest(), *labels])
 
 

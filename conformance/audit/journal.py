@@ -23,7 +23,7 @@ _FIRST = f'{{"format":"{FORMAT}","version":{VERSION}}}\n'.encode()
 
 
 class Entry(NamedTuple):
-    """Where a record lies in the journal, and what says whether it still holds."""
+    """Position of a record in the journal, and the data that show whether it is still valid."""
 
     at: int
     length: int

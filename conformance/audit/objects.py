@@ -28,7 +28,7 @@ _TAGS = (
     *("ETag", "etag", "md5Hash", "md5", "sha256", "blob_id", "generation", "versionId"),
     *("mtime", "LastModified", "Last-Modified", "last_modified", "updated", "created"),
 )
-"""What file systems of fsspec call that which changes with an object, best first."""
+"""Names, in fsspec's file systems, of attributes that change with an object, best first."""
 
 
 def file_system(url: str) -> tuple[Any, str]:
@@ -49,7 +49,7 @@ def file_system(url: str) -> tuple[Any, str]:
 
 
 def tag_of(about: dict[str, Any]) -> str:
-    """What changes whenever an object does, of what its file system says about it; or empty."""
+    """A tag that changes whenever the object does, from its file system's attributes; or empty."""
     return next((str(about[key]) for key in _TAGS if about.get(key)), "")
 
 
@@ -149,7 +149,7 @@ class RangeFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place."""
+        """Set the position."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._source.size}[whence]
         self._at = max(0, base + offset)
         return self._at

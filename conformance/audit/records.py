@@ -1,4 +1,4 @@
-"""What an audit knows of one file: a row with its facts, and a row for each finding."""
+"""Records of one file: a row with its facts, and a row for each finding."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FINDING: dict[str, type] = {
 
 
 class State(str, Enum):
-    """What became of a file."""
+    """Final state of a file."""
 
     JUDGED = "judged"
     NOT_JUDGED = "nothing judged"

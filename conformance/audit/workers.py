@@ -31,11 +31,11 @@ _ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": str(256 * 2**20),
     "MALLOC_TOP_PAD_": str(16 * 2**20),
 }
-"""Of the processes, unless the user has set it."""
+"""Environment of the processes, unless the user has set it."""
 
 
 class Lost(str):
-    """How the process of a task ended before it had a result, in words."""
+    """Text: how the process of a task ended without a result."""
 
     __slots__ = ()
 

@@ -1,8 +1,8 @@
 """The checks: each judges a recording for one requirement and one side.
 
-A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes on
-missing evidence, and takes every limit from its requirement's tolerances, so that several hand
-models share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
+A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes
+without evidence, and takes every limit from its requirement's tolerances, so that hand models can
+share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.velocity`,
 :mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.firmness`, :mod:`~.safety`,
 :mod:`~.afterwards`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers`,
@@ -56,12 +56,12 @@ CHECK_MODULES: Mapping[str, Sequence[str]] = {
 """The modules that register the checks of each layer."""
 
 ROUNDING = 1e-3
-"""Part of a limit by which a saturated value may be above it: a drive that is clamped at the limit
+"""Relative excess over a limit that is allowed for a saturated value: a drive clamped at the limit
 reports it as float32 and in its own counts, which round (docs/sources/unitree-dex.md#g: 15 N m are
-1536 counts of 0.0098 N m, and come back as 15.000001). Used where a limit is that of the hand's
-own clamp; other limits have a tolerance of their own."""
+1536 counts of 0.0098 N m, and come back as 15.000001). Used for limits at which the hand itself
+clamps; other limits have their own tolerance."""
 STROKE_S = 1.0
-"""Seconds that a hand driven by Unitree's client takes for a stroke."""
+"""Seconds for a full stroke under Unitree's client."""
 
 
 Span = tuple[float, float]
@@ -76,10 +76,9 @@ def rate_measure(
     at_most: bool = False,
     span: Span | None = None,
 ) -> Measure:
-    """A rate, Hz, that was observed for that many seconds.
+    """A measured rate, Hz, over a time of observation, seconds.
 
-    Both ends of that time may be wrong by the kit's error, each of which changes the rate by its
-    part of the time.
+    Each end of that time has the kit's timing error, which changes the rate in proportion.
     """
     per_second = 2 * hertz / seconds if seconds > 0 else 0.0
     return Measure(
@@ -89,14 +88,14 @@ def rate_measure(
 
 @dataclass(frozen=True)
 class Late:
-    """The delay of a conforming hand that would cause the same failure: the failure's size.
+    """Size of a failure: the delay of a conforming hand that would cause the same failure.
 
-    :param seconds: at each of the failure's places, or one for all of them; infinite where no
-        delay causes such a failure. For a missing motion, the seconds that a conforming hand
-        takes for it: :data:`STROKE_S` for a stroke.
-    :param how: ``total``: once, at that place; ``mean``: again and again, as a rate suffers;
-        ``p99``: one time in a hundred.
-    :param best: the same for the best quarter of repeated events; 0 if not known.
+    :param seconds: at each of the failure's places, or one for all of them; infinite where no delay
+        causes such a failure. For a missing motion, the seconds that a conforming hand takes for
+        it: :data:`STROKE_S` for a stroke.
+    :param how: ``total``: a single delay at that place; ``mean``: a repeated delay, as it lowers a
+        rate; ``p99``: in one of a hundred.
+    :param best: the same for the best quarter of repeated events; 0 if unknown.
     """
 
     seconds: tuple[float, ...]
@@ -111,15 +110,14 @@ class Outcome:
     :param met: whether the requirement is met; None when it could not be judged.
     :param cause: the likely cause, where the check can determine it; else the requirement's.
     :param late: the delay of a conforming hand that would cause this failure, where the check can
-        determine it; else the length of the failure's place.
+        determine it; else the duration of the failure.
     :param absent: the hand lacks this unit: a failure if the vendor claims the unit, whatever
         ``met`` is otherwise.
-    :param joints: indices of the joints that it is about, the most important first; empty if it is
-        about no particular joint.
-    :param plots: the plots that show it, where they differ from the requirement's.
+    :param joints: indices of the joints concerned, the most important first; empty if none in
+        particular.
+    :param plots: the plots that show it, if they differ from the requirement's.
     :param retry: another run may give another outcome.
-    :param measures: the figures with a limit that it rests on, one for each place; empty if it
-        rests on none.
+    :param measures: the measured values with limits behind it, one for each place; may be empty.
     """
 
     met: bool | None
@@ -137,7 +135,7 @@ class Outcome:
     measures: tuple[Measure, ...] = ()
 
     def about(self, *joints: int) -> Outcome:
-        """Return a copy that is about these joints (indices)."""
+        """Return a copy with the joints concerned (indices)."""
         return replace(self, joints=tuple(int(joint) for joint in joints))
 
     def shown_by(self, *plots: PlotKind | Plot) -> Outcome:
@@ -146,19 +144,19 @@ class Outcome:
         return replace(self, plots=chosen)
 
     def because(self, cause: str) -> Outcome:
-        """Return a copy with a cause that the check has determined."""
+        """Return a copy with a cause determined by the check."""
         return replace(self, cause=cause)
 
     def resting_on(self, *measures: Measure) -> Outcome:
-        """Return a copy with the figures that it rests on."""
+        """Return a copy with the measures behind it."""
         return replace(self, measures=measures)
 
     def timed(
         self, seconds: float, limit: float, *, at_least: bool = False, span: Span | None = None
     ) -> Outcome:
-        """Return a copy that rests on a time, seconds.
+        """Return a copy with a measured time, seconds.
 
-        :param at_least: the limit is the least that is asked for.
+        :param at_least: the limit is a minimum.
         :param span: begin and end of its place; None for the outcome's first one.
         """
         measure = Measure(float(seconds), float(limit), larger_is_worse=not at_least, span=span)
@@ -167,20 +165,20 @@ class Outcome:
     def rated(
         self, hertz: float, limit: float, seconds: float, *, at_most: bool = False
     ) -> Outcome:
-        """Return a copy that rests on a rate, Hz.
+        """Return a copy with a measured rate, Hz.
 
-        :param seconds: how long it was observed.
-        :param at_most: the limit is the most that is allowed.
+        :param seconds: time of observation.
+        :param at_most: the limit is a maximum.
         """
         return self.resting_on(rate_measure(hertz, limit, seconds, at_most=at_most))
 
     def placed(self, rad: float, limit: float, *, at_least: bool = False) -> Outcome:
-        """Return a copy that rests on a distance, rad."""
+        """Return a copy with a measured distance, rad."""
         measure = Measure(float(rad), float(limit), "rad", Quantity.POSITION, not at_least)
         return self.resting_on(measure)
 
     def pressed(self, torque: float, limit: float, *, at_least: bool = False) -> Outcome:
-        """Return a copy that rests on a torque, N m."""
+        """Return a copy with a measured torque, N m."""
         measure = Measure(float(torque), float(limit), "N m", Quantity.TORQUE, not at_least)
         return self.resting_on(measure)
 
@@ -208,7 +206,7 @@ class BaseContext(Generic[RecordingT, ViewT]):
     """One requirement to be judged for one subject; each layer adds access to its data.
 
     :param recording: the layer's recording, decoded.
-    :param hand: the part of it that is about the subject.
+    :param hand: the data of the subject in it.
     """
 
     recording: RecordingT
@@ -225,23 +223,25 @@ class BaseContext(Generic[RecordingT, ViewT]):
         )
 
     def passed(self, figure: str, observed: str = "", **values: float) -> Outcome:
-        """The requirement is met."""
+        """Return the outcome "met"."""
         return Outcome(True, figure, observed, values=_plain(values))
 
     def failed(self, figure: str, observed: str, *places: Evidence, **values: float) -> Outcome:
-        """It is not met."""
+        """Return the outcome "not met"."""
         return Outcome(False, figure, observed, evidence=places, values=_plain(values))
 
     def skipped(self, reason: str) -> Outcome:
-        """It cannot be judged with this recording."""
+        """Return an outcome that cannot be judged with this recording."""
         return Outcome(None, reason=reason)
 
     def in_unit(self, outcome: Outcome) -> Outcome:
-        """An outcome of a check with the subject's unit of q where the check says rad."""
+        """Replace "rad" in an outcome by the subject's unit of q."""
         return outcome
 
     def absent(self, reason: str) -> Outcome:
-        """Not judged: the hand lacks this unit; a failure only where the vendor claims it."""
+        """Return the outcome of a hand without this unit: not judged, or failed if the vendor
+        claims the unit.
+        """
         return Outcome(None, reason=reason, absent=True)
 
 
@@ -284,7 +284,7 @@ class Context(BaseContext[Recording, SideView]):
         return self.recording.unit
 
     def in_unit(self, outcome: Outcome) -> Outcome:
-        """An outcome of a check with the subject's unit of q where the check says rad."""
+        """Replace "rad" in an outcome by the subject's unit of q."""
         if self.unit == "rad":
             return outcome
         short = self.unit.rpartition(" ")[2]
@@ -297,9 +297,9 @@ class Context(BaseContext[Recording, SideView]):
         )
 
     def once(self, name: object, work_out: Callable[[], T]) -> T:
-        """What another check of this hand has worked out under that name, else do it now.
+        """Return a result cached under a name for this hand, computing it at first use.
 
-        :param name: with all that the result depends on, except for the recording.
+        :param name: must include everything that the result depends on, except for the recording.
         """
         known = self.hand.known
         if name not in known:
@@ -313,7 +313,7 @@ class Context(BaseContext[Recording, SideView]):
         return value * self.joints[joint].stroke if name.endswith("_stroke") else value
 
     def named(self, text: str, joint: int) -> str:
-        """``text`` with the joint's name before it, where the hand has several."""
+        """Prefix ``text`` with the joint's name, if the hand has several joints."""
         return text if len(self.joints) == 1 else f"{self.joints[joint].name}: {text}"
 
     def phases(self, name: str | None = None) -> list[Phase]:
@@ -326,7 +326,7 @@ class Context(BaseContext[Recording, SideView]):
 
     @property
     def object_at(self) -> float | None:
-        """The q at which this side touches its object, or None if not known."""
+        """The q at which this side touches its object, or None if unknown."""
         return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
 
     def at(self, topic: str, seconds: float, end: float | None = None) -> Evidence:
@@ -354,9 +354,10 @@ def check(*requirement_ids: str) -> Callable[[CheckT], CheckT]:
 
 
 def check_of(requirement: Requirement) -> Check:
-    """The check that is registered for a requirement, else for the nearest that it is ``like``.
+    """The check registered for a requirement, else for the nearest requirement in its chain of
+    ``like``.
 
-    Modules of checks are imported one after the other until one registers it.
+    Modules of checks are imported in order until one registers it.
 
     :raises KeyError: there is none.
     """

@@ -1,4 +1,4 @@
-"""What a hand does after something has disturbed it: bad commands, silence, another client."""
+"""Check a hand after disturbances: bad commands, silence, another client."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ __all__: list[str] = []
 
 _AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
 _AT_A_STOP = 0.05
-"""Part of the stroke from its ends in which a gripper may have come to its stop."""
+"""Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
 _FAST_S = 0.05
 """Seconds over which the fastest part of a step is measured: several states of the slowest rate."""
 
 
 @check("DEX1-ABUSE-01", "DEX3-ABUSE-01")
 def unchanged(ctx: Context) -> Outcome:
-    """Duration and speed of good steps after each abuse, and the displacement by a torque, compared
-    with those before any; and the errors of the steps between the phases.
+    """Compare duration and speed of good steps, and the displacement by a torque, after each abuse
+    with those before any; also the errors of the steps between the phases.
     """
     between = [*ctx.phases("center"), *ctx.phases()]
     for phase in (p for p in between if obeyed_before(ctx, p)):
@@ -46,7 +46,7 @@ def _longer(ctx: Context, first: list[Step]) -> Outcome:
             seconds = _duration(step)
             known = [d for d in map(_duration, _like(first, step)) if d is not None]
             if seconds is None or not known:
-                continue  # whether it arrives at all is judged by other requirements
+                continue  # other requirements judge whether it arrives at all
             slack = ctx.tolerance("slack_s" if phase.name == "recover" else "soft_start_s")
             ratio = seconds / (max(known) + slack)
             if worst is None or ratio > worst[0]:
@@ -91,7 +91,8 @@ def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
         for step in steps_of(ctx, phase):
             now = _fastest(step)
             known = [
-                # a hand of constant speed is no faster on a longer way, one like a spring is
+                # a hand of constant speed is not faster over a longer distance, a spring-like one
+                # is
                 fast * min(1.0, abs(step.size / s.size))
                 for s in _like(first, step)
                 if (fast := _fastest(s)) is not None
@@ -148,7 +149,7 @@ def _other_stiffness(ctx: Context) -> Outcome | None:
 
 @check("DEX1-WDOG-05")
 def first_command_counts(ctx: Context) -> Outcome:
-    """How far the first command after a pause moves the hand before the next one comes."""
+    """Motion of the hand by the first command after a pause, until the second command."""
     worst: tuple[float, Step, float] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         for step in steps_of(ctx, phase):
@@ -179,7 +180,7 @@ def first_command_counts(ctx: Context) -> Outcome:
 
 @check("DEX1-WDOG-06")
 def in_force(ctx: Context) -> Outcome:
-    """Force, or speed, shortly before the time-out, as a part of that at the last command."""
+    """Force or speed shortly before the time-out, relative to that at the last command."""
     window, states = ctx.tolerance("window_s"), ctx.states
     good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
     worst: tuple[float, str, float] | None = None

@@ -14,7 +14,7 @@ __all__ = ["of_positions", "of_range", "of_scale", "of_type"]
 
 
 def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec]) -> str:
-    """The likely cause of positions outside their range, or an empty text.
+    """Explain positions outside their range; empty if no cause is known.
 
     :param q: rad, shape (n, n_joints).
     :param other: the joints of the hand's other side.
@@ -49,7 +49,7 @@ def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSp
 
 
 def of_range(q: float) -> str:
-    """The likely cause of a joint at ``q``, far outside its range, or an empty text."""
+    """Explain a joint at ``q``, far outside its range; empty if no cause is known."""
     if abs(q - 100.0) < 5.0:
         unit = "percent"
     elif 120.0 < abs(q) <= 400.0:
@@ -60,7 +60,7 @@ def of_range(q: float) -> str:
 
 
 def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
-    """The likely cause of steps of one joint that miss their targets, or an empty text.
+    """Explain steps of one joint that miss their targets; empty if no cause is known.
 
     :param targets: q that was commanded, rad; ``reached``: where each step ended.
     :param stroke: of a joint whose q counts from 0.
@@ -82,7 +82,7 @@ def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
 
 
 def of_type(found: Iterable[str], wanted: str, dialect: Dialect) -> str:
-    """The likely cause of a topic with other types than the expected one, or an empty text."""
+    """Explain a topic with other types than the expected one; empty if no cause is known."""
     for name in sorted(found):
         if name in (dialect.cmd_type, dialect.state_type) and name != wanted:
             return "The types of state and command are swapped."

@@ -1,7 +1,8 @@
-"""Judge the commands that a client sends to a hand: form, values, rate, motion of q, begin and end.
+"""Check the commands that a client sends to a hand: form, values, rate, motion of q, begin and end.
 
-Intervals are those of the client: source timestamps, where the recording has them. Only commands
-that drive a joint are compared with its range: zero gains stop a hand, whatever q is.
+Intervals are measured by the client's source timestamps, where the recording has them. Only
+commands that drive a joint are compared with its range, because zero gains stop a hand whatever q
+is.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from dexkit.models import ModeByte, model
 
 _MOST_PLACES = 5
 _FEWEST = 20
-"""Commands of a session at least."""
+"""Fewest commands of a session."""
 _SAME = 1e-6
-"""Part by which two equal times may differ after rounding."""
+"""Relative difference of two times that counts as rounding."""
 _MOVES = 0.02
-"""Part of a joint's range by which a target that moves changes."""
+"""Smallest change of a moving target, as a part of the joint's range."""
 _COMES_BACK = 4
-"""Commands within which q is back where it was, if two clients send by turns."""
+"""Number of commands within which q returns, if two clients alternate."""
 _NEAR = 0.25
-"""Part of a jump within which q is back."""
+"""Distance from the old q, as a part of the jump, that counts as returned."""
 
 Mask = NDArray[np.bool_]
 
@@ -35,8 +36,8 @@ Mask = NDArray[np.bool_]
 def sessions(ctx: Context) -> list[slice]:
     """The commands by session: a pause longer than the hand's time-out separates two.
 
-    A run of fewer than :data:`_FEWEST` commands is no session of its own. Otherwise a client that
-    sends less than one command in that time would have no session to be judged.
+    A run of fewer than :data:`_FEWEST` commands does not count as a session. Otherwise a client
+    slower than one command in that time would have no session.
     """
     times = _clock(ctx)
     pause = model(ctx.recording.dialect.model).command_timeout
@@ -68,9 +69,9 @@ def _driven(ctx: Context) -> Mask:
 
 
 def _between_stops(ctx: Context, driven: Mask) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Joints with their commands from the first to the last that drives them, by session.
+    """Each joint's commands from the first to the last that drives it, by session.
 
-    A joint that is never driven, although its q moves, is given with all of its commands.
+    A joint that is never driven although its q moves is included with all of its commands.
     """
     q = ctx.commands.q
     for part in sessions(ctx):
@@ -105,7 +106,7 @@ def length(ctx: Context) -> Outcome:
 
 @check("DEX1-CLIENT-02")
 def finite(ctx: Context) -> Outcome:
-    """Values that are no finite number, in commands that hold all joints."""
+    """NaN and infinite values in commands that contain all joints."""
     commands = ctx.commands
     whole = commands.length >= ctx.recording.dialect.length
     wrong = np.zeros(len(commands), dtype=np.bool_)
@@ -151,7 +152,7 @@ def in_range(ctx: Context) -> Outcome:
 
 
 def _unit(far: float, stroke: float) -> str:
-    """The unit that a value has if it is not in radians; empty if it fits none."""
+    """Guess the unit of a value that is not in radians; empty if none fits."""
     degrees = 1.1 * math.degrees(stroke)
     if abs(far) <= 2 * stroke:
         return ""
@@ -162,10 +163,9 @@ def _unit(far: float, stroke: float) -> str:
 
 @check("DEX1-CLIENT-04")
 def not_normalised(ctx: Context) -> Outcome:
-    """Whether q runs from 0 to exactly 1, and rests there, as a value without unit does.
+    """Whether q runs from 0 to exactly 1 and rests there, like a normalised value.
 
-    It may be larger at first, where the hand is, which the client takes for a value of the same
-    kind.
+    At first it may be larger: the hand's position, which the client takes for a normalised value.
     """
     q = ctx.commands.q[:, 0]
     q = q[np.isfinite(q) & _driven(ctx)[:, 0]]
@@ -240,7 +240,7 @@ def mode(ctx: Context) -> Outcome:
     wrong = whole & (status != JointMode.FOC) & (status != JointMode.BRAKE)
     if kind is ModeByte.RIS:
         wrong |= whole & ((value & 15) != index)
-    if kind is not ModeByte.UNUSED:  # a motor that is on its way is driven
+    if kind is not ModeByte.UNUSED:  # a moving motor is driven
         for joint, rows in _between_stops(ctx, whole & (status == JointMode.FOC)):
             wrong[rows, joint] |= whole[rows, joint] & (status[rows, joint] != JointMode.FOC)
     if not wrong.any():
@@ -266,10 +266,10 @@ def mode(ctx: Context) -> Outcome:
 def slow_stretches(
     t: Floats, rate: float, window: float
 ) -> tuple[float, list[tuple[float, float]]]:
-    """The least rate in windows that slide over the commands, Hz, and where it is below ``rate``.
+    """The lowest rate in sliding windows of the commands, Hz, and where it is below ``rate``.
 
-    It is below it where as many intervals as there are in ``window`` seconds at ``rate`` take
-    longer than that: a steady client of exactly ``rate`` passes.
+    It is below where as many intervals as fit into ``window`` seconds at ``rate`` take longer: a
+    steady client of exactly ``rate`` passes.
 
     :param t: seconds, rising.
     :returns: the rate is infinite for commands of less than ``window`` seconds in all.
@@ -348,10 +348,10 @@ def gap(ctx: Context) -> Outcome:
 
 
 def distance_from_states(ctx: Context, joint: int, memory: float) -> Floats:
-    """Distance of each commanded q from the states that the client may have known, rad.
+    """Distance of each commanded q from the states available to the client, rad.
 
-    These are the states of the last ``memory`` seconds and the one before: a client reads a state
-    some time after the recorder, and smooths several values. NaN where there are none.
+    These are the states of the last ``memory`` seconds and the one before, because a client reads a
+    state later than the recorder and smooths several. NaN without states.
     """
     states, commands = ctx.states, ctx.commands
     distance = np.full(len(commands), np.nan)
@@ -371,7 +371,7 @@ def distance_from_states(ctx: Context, joint: int, memory: float) -> Floats:
 
 @check("DEX1-CLIENT-08")
 def lead(ctx: Context) -> Outcome:
-    """How far a command is ahead of the last states."""
+    """Lead of a command over the last states."""
     limit, driven = ctx.requirement.tolerance("max_lead_stroke"), _driven(ctx)
     if not np.ptp(ctx.states.q, axis=0).any():
         return ctx.skipped("q of the hand never changes: that is no fault of the client")
@@ -402,7 +402,7 @@ def lead(ctx: Context) -> Outcome:
 
 
 def returns(q: Floats, least: float) -> Mask:
-    """Whether each command jumps away by more than ``least``, and one of the next is back.
+    """Whether each command jumps by more than ``least``, and one of the next returns.
 
     :param q: of one joint, shape (n,).
     """
@@ -417,7 +417,7 @@ def returns(q: Floats, least: float) -> Mask:
 
 @check("DEX1-CLIENT-11")
 def one_writer(ctx: Context) -> Outcome:
-    """Commands that alternate between two targets, as those of two clients do."""
+    """Commands that alternate between two targets, as from two clients."""
     window, fewest = ctx.tolerance("window_s"), round(ctx.tolerance("min_returns"))
     t = ctx.commands.t
     most, place, which = 0, 0.0, 0
@@ -480,8 +480,8 @@ def ends_at_rest(ctx: Context) -> Outcome:
                     states.q[states.between(end - look, end), joint],
                 ),
             )
-            # in motion is a target that moves while an object holds the hand, and a hand that
-            # moves to a target that rests
+            # "in motion" includes a moving target while an object holds the hand, and a hand that
+            # moves to a resting target
             if max(speeds) / spec.stroke > fastest:
                 fastest, where, which = max(speeds) / spec.stroke, end, joint
     text = ctx.named(

@@ -1,11 +1,10 @@
 """Check that q, dq and tau_est of the state agree with each other.
 
-A hand that reports anything else than what it measures (the command, a filtered value, another
-joint's) contradicts itself: its q moves while its dq stands, its torque says contact while its q
-goes on into the object. The checks compare the members of the state with each other, in windows,
-so that a fault that is there for half a second shows as well as one that is always there. What is
-legal leaves room: measurements that are up to 20 ms old, prediction between them, coarse encoders,
-a constant factor on dq (DEX1-FIELD-16 tells it), and torque only in contact.
+A hand that does not report measurements (but the command, a filtered value or another joint's)
+contradicts itself: q moves while dq is 0, or tau_est shows contact while q continues into the
+object. The checks compare the members of the state in windows, so that a fault of half a second is
+detected like a permanent one. Allowed are measurements up to 20 ms old, prediction between them,
+coarse encoders, a constant factor on dq (DEX1-FIELD-16 reports it), and torque in contact only.
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ from dexkit.models import model
 __all__ = ["FOUGHT_OVER", "contacts", "filled"]
 
 _FEW = 10
-"""Measurements that are needed to say anything."""
+"""Fewest measurements for a verdict."""
 _FAST = 0.999
-"""Part of the states at which the reported speed is no higher than the one that counts as the
-hand's fastest: a single wrong value does not make it fast."""
+"""Quantile of the reported speeds that counts as the hand's fastest, so that a single wrong value
+does not count."""
 _OWN = 1.2
-"""By how much a hand may exceed that speed."""
+"""Allowed factor over that speed."""
 _LAGS = np.array([1.25, 4.0, 10.0, 25.0])
 """Lengths of the windows in which q is compared with the integral of dq, in lags."""
 
 
 class _Joint:
-    """What a joint reported, without repetitions.
+    """A joint's states without repetitions.
 
     :ivar times: of its measurements.
     :ivar t: seconds; ``q``, rad, and ``dq``, rad/s, have the same length.
@@ -46,7 +45,7 @@ class _Joint:
 
     @classmethod
     def from_context(cls, ctx: Context, joint: int) -> _Joint:
-        """A joint; the same for all checks."""
+        """The joint's data, cached for all checks."""
         return ctx.once(("joint", joint), lambda: cls(ctx, joint))
 
     def __init__(self, ctx: Context, joint: int) -> None:
@@ -81,7 +80,7 @@ class _Joint:
 
     @property
     def path(self) -> Floats:
-        """The integral of the size of dq up to each measurement, rad."""
+        """The integral of abs(dq) up to each measurement, rad."""
         return self._integrals[1]
 
     @cached_property
@@ -89,20 +88,20 @@ class _Joint:
         return self.integrals(self.dq)
 
     def integrals(self, speeds: Floats) -> tuple[Floats, Floats]:
-        """The integrals of speeds and of their size up to each measurement, rad."""
+        """The integrals of speeds and of their absolute values up to each measurement, rad."""
         found = np.zeros(len(speeds), dtype=np.complex128)
         for part, column in ((found.real, speeds), (found.imag, np.abs(speeds))):
             steps = column[1:] + column[:-1]
             steps /= 2
             steps *= self._steps
             part[1:] = steps
-        # complex numbers are added as fast as others, so that both sums take the time of one
+        # complex addition is as fast as real addition, so both sums take the time of one
         np.cumsum(found[1:], out=found[1:])
         return found.real.copy(), found.imag.copy()
 
 
 def _measurements(ctx: Context, joint: int) -> Rows:
-    """The states with a new measurement: those that repeat q and a dq that is not 0 have none."""
+    """The states with a new measurement; a state that repeats q and a non-zero dq has none."""
     states = ctx.states
     q, dq = states.q[:, joint], states.dq[:, joint]
     good = finite_rows(q, dq)
@@ -129,7 +128,7 @@ def _fastest(ctx: Context, joint: int) -> float:
 
 
 def _reported_speed(ctx: Context, joint: int) -> float | None:
-    """The speed that :data:`_FAST` of the states do not exceed; None if dq is not filled."""
+    """The quantile :data:`_FAST` of abs(dq); None if dq is not filled."""
     dq = np.abs(ctx.states.dq[:, joint])
     dq = dq[finite_rows(dq)]
     if not len(dq) or not dq.any():
@@ -140,7 +139,7 @@ def _reported_speed(ctx: Context, joint: int) -> float | None:
 
 @check("DEX1-FIELD-15", "DEX3-FIELD-15")
 def jumps(ctx: Context) -> Outcome:
-    """The largest change of q between two states, as a part of what the speed allows."""
+    """The largest change of q between two states, relative to the speed limit."""
     states = ctx.states
     worst: tuple[float, float, float, int, float, float] | None = None
     for joint in range(len(ctx.joints)):
@@ -150,7 +149,7 @@ def jumps(ctx: Context) -> Outcome:
             continue
         speed = _fastest(ctx, joint)
         change, gaps = np.abs(np.diff(q)), np.maximum(np.diff(t), 0.0)
-        # a gap is judged by RATE-03; what a hand did in a long one is unknown
+        # RATE-03 judges gaps; the motion within a long one is unknown
         near = gaps <= ctx.tolerance("max_gap_s")
         allowed = speed * (gaps + ctx.tolerance("max_hold_s")) + ctx.tolerance("counts_rad")
         part = np.where(near, change / allowed, 0.0)
@@ -185,12 +184,12 @@ FOUGHT_OVER = (
     *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "burst"),
     "two-writers",
 )
-"""Stimuli with bad or contradictory commands: where they are obeyed, a hand may really shake."""
+"""Stimuli with bad or contradictory commands: a hand that obeys them may really oscillate."""
 
 
 @check("DEX1-FRESH-03", "DEX3-FRESH-03")
 def alternates(ctx: Context) -> Outcome:
-    """In how many of the cells of a window q goes forth and back, in the worst window."""
+    """Number of cells with a reversal of q, in the worst window."""
     cell, count = (
         ctx.tolerance("cell_s"),
         round(ctx.tolerance("window_s") / ctx.tolerance("cell_s")),
@@ -237,19 +236,19 @@ def alternates(ctx: Context) -> Outcome:
     outcome = ctx.failed(
         f"{turns} times", text, ctx.at(ctx.states.topic, at, at + window), turns=turns
     )
-    # no delay puts an old state behind a new one
+    # a delay does not reorder states
     return outcome.about(joint).if_late(math.inf)
 
 
 def filled(ctx: Context) -> bool:
-    """Whether any dq is a number other than 0; in the first states of those that fill it."""
+    """Whether any dq is non-zero; usually decided by the first states."""
     dq = ctx.states.dq
     return bool(np.nan_to_num(dq[:_FEW]).any() or np.nan_to_num(dq[_FEW:]).any())
 
 
 @check("DEX1-FIELD-16", "DEX3-FIELD-16")
 def slope(ctx: Context) -> Outcome:
-    """In the worst window, how far dq is from the slope of q, as a part of it (RMS)."""
+    """Relative RMS error between dq and the slope of q, in the worst window."""
     if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float] | None = None
@@ -279,7 +278,7 @@ def slope(ctx: Context) -> Outcome:
 
 
 def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float, float] | None:
-    """Error, ratio and begin of a joint's worst window; None without one in which it moves."""
+    """Error, ratio and begin of a joint's worst window; None if it does not move."""
     step = ctx.tolerance("slope_s")
     count = round(ctx.tolerance("window_s") / step)
     if len(x.t) < _FEW or x.t[-1] - x.t[0] < 2 * count * step:
@@ -310,7 +309,7 @@ def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float,
 
 @check("DEX1-FIELD-17", "DEX3-FIELD-17")
 def keeps_up(ctx: Context) -> Outcome:
-    """How far q moved beyond what dq, up to 40 ms earlier or later, allows, in the worst window."""
+    """Motion of q that dq, up to 40 ms earlier or later, does not explain, in the worst window."""
     if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     joints = [_Joint.from_context(ctx, joint) for joint in range(len(ctx.joints))]
@@ -321,7 +320,7 @@ def keeps_up(ctx: Context) -> Outcome:
         return courses[joint][0].bound(lengths) / ctx.joints[joint].stroke
 
     worst: tuple[float, float, int, float, float, float] | None = None
-    # the worst joint comes first, as far as one can tell: of the others little is looked at then
+    # the presumably worst joint first, so that the others need few windows
     for joint in sorted(courses, key=bound, reverse=True):
         x, (course, factor), stroke = joints[joint], courses[joint], ctx.joints[joint].stroke
         for seconds in lengths:
@@ -355,7 +354,7 @@ def keeps_up(ctx: Context) -> Outcome:
 
 
 def _course(ctx: Context, x: _Joint) -> tuple[Course, float]:
-    """A joint's course, without a constant factor of its dq, and that factor."""
+    """A joint's course with the constant factor of its dq removed, and that factor."""
     lag = ctx.tolerance("max_lag_s")
     factor = _factor(x, x.said, lag)
     course = Course(
@@ -373,8 +372,8 @@ def _course(ctx: Context, x: _Joint) -> tuple[Course, float]:
 
 
 def _unstable(ctx: Context) -> list[tuple[float, float]]:
-    """Begin and end of commands with negative gains, and of those of two clients by turns: where
-    they are put in force, the joint may oscillate faster than the states show.
+    """Begin and end of commands with negative gains, and of two alternating clients: under them the
+    joint may oscillate faster than the states show.
     """
     names = ("negative", "two-writers")
     return [ctx.span(p) for name in names for p in ctx.recording.phases(name, ctx.side)]
@@ -403,10 +402,10 @@ def _factor(x: _Joint, c: Floats, lag: float) -> float:
 class _Pressing:
     """A stretch of states in which a gripper is commanded into its object.
 
-    :param begin: seconds, as ``end``.
-    :param tau: N m, the median of its size.
-    :param q: rad, the median, as ``goal``, which is within the stroke.
-    :param kp: N m/rad, the least that is commanded.
+    :param begin: seconds; likewise ``end``.
+    :param tau: median of abs(tau_est), N m.
+    :param q: median, rad; likewise ``goal``, clamped to the stroke.
+    :param kp: the lowest commanded, N m/rad.
     """
 
     begin: float
@@ -445,7 +444,7 @@ def _stiffness(ctx: Context, rows: Rows) -> Floats:
 
 
 def contacts(ctx: Context, touch: float) -> list[_Pressing]:
-    """Consecutive pieces of all contacts in which a hand presses on an object that it touches."""
+    """Consecutive pieces of all stretches in which a hand presses on an object."""
     states, spec = ctx.states, ctx.joints[0]
     rows, ages = _newest(ctx)
     goals = _goals(ctx, rows)
@@ -484,7 +483,7 @@ def contacts(ctx: Context, touch: float) -> list[_Pressing]:
 
 @check("DEX1-FORCE-06")
 def force_in_every_contact(ctx: Context) -> Outcome:
-    """The least size of tau_est of all pieces of all contacts with the object."""
+    """The smallest abs(tau_est) of all pieces of all contacts with the object."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = contacts(ctx, ctx.object_at)
@@ -507,7 +506,7 @@ def force_in_every_contact(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-18")
 def stops_at_object(ctx: Context) -> Outcome:
-    """How far q goes into the object while tau_est says contact, as a part of the command."""
+    """Motion of q into the object while tau_est shows contact, as a part of the command."""
     touch = ctx.object_at
     if touch is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
@@ -533,7 +532,9 @@ def stops_at_object(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-07")
 def no_force_at_any_rest(ctx: Context) -> Outcome:
-    """The largest tau_est at a rest in the free, beyond what its distance to the goal explains."""
+    """The largest tau_est at rest without contact, beyond what the distance to the goal
+    explains.
+    """
     states, spec = ctx.states, ctx.joints[0]
     if ctx.recording.stimulus is None:
         return ctx.skipped("the recording does not say what was between the fingers")

@@ -1,4 +1,4 @@
-"""Topics, types and quality of service."""
+"""Check topics, types and quality of service."""
 
 from __future__ import annotations
 

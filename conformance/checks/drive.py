@@ -30,7 +30,7 @@ _STEPS = (
 """Phases in which a joint moves freely by a position command."""
 _LEAST_STEP = 0.1  # of the stroke
 _REST_S, _REST_PART = 0.1, 0.01  # before a step: seconds, and part of the stroke that q may vary
-_BEGUN, _WAY = 0.01, 0.5  # parts of a step between which the motor cannot but drive the joint
+_BEGUN, _WAY = 0.01, 0.5  # parts of a step between which the motor must drive the joint
 _STRONG = 0.5  # of the largest tau_est: values that count
 _CLEAR = 0.75  # part of them that must have the same sign
 
@@ -39,7 +39,7 @@ _CLEAR = 0.75  # part of them that must have the same sign
 class _Drive:
     """A stretch in which the motor drives a joint: at the beginning of a step, or into an object.
 
-    :param way: direction in which it drives: 1 or -1.
+    :param way: direction of drive: 1 or -1.
     :param tau: largest tau_est in size, N m.
     :param sign: of tau_est towards ``way``; 0 where it has both signs, or none worth the name.
     :param contact: whether it presses on the object.
@@ -66,13 +66,13 @@ def _drive_of(ctx: Context, step: Step) -> _Drive | None:
     if abs(step.size) < _LEAST_STEP * step.stroke or not len(before):
         return None
     if not float(np.ptp(before)) <= _REST_PART * step.stroke:
-        return None  # it was still under way: its torque may brake it
+        return None  # it was still moving: its torque may brake it
     way = 1 if step.size > 0 else -1
     part = (step.q - step.start) / step.size
     half = np.flatnonzero(part >= _WAY)
     if not len(half):
-        return None  # whether it arrives is judged by other requirements
-    # before it moves, tau_est may be that of the command before
+        return None  # other requirements judge whether it arrives
+    # before it moves, tau_est may still be that of the previous command
     begin = float(step.t[np.argmax(part >= _BEGUN)])
     return _driven(ctx, joint, way, begin, float(step.t[half[0]]))
 
@@ -108,7 +108,7 @@ def _drives(ctx: Context) -> Iterator[_Drive]:
 
 @check("DEX1-FORCE-08", "DEX3-FORCE-04")
 def one_sign(ctx: Context) -> Outcome:
-    """Whether tau_est has one sign towards the motion that the motor causes, in both directions."""
+    """Whether tau_est has a consistent sign relative to the motion that the motor causes."""
     found = list(_drives(ctx))
     if not found:
         return ctx.skipped("no step from rest was made half-way")
@@ -117,7 +117,7 @@ def one_sign(ctx: Context) -> Outcome:
         signs = [d.sign for d in mine if d.sign]
         usual = 1 if sum(signs) >= 0 else -1
         odd = [d for d in mine if d.sign == -usual]
-        # a single one may be what was left of the motion before
+        # a single one may be left over from the previous motion
         if len(odd) >= ctx.tolerance("min_odd"):
             return _turned(ctx, odd, len(signs))
         for way in (1, -1):
@@ -135,14 +135,14 @@ def one_sign(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-16", "DEX3-FORCE-07")
 def sign_of_the_push(ctx: Context) -> Outcome:
-    """Whether tau_est has the sign of the push where the motor drives a joint from rest."""
+    """Whether tau_est has the sign of the motion when the motor drives a joint from rest."""
     clear = [d for d in _drives(ctx) if d.sign]
     if not clear:
         return ctx.skipped("tau_est has no clear sign in any step from rest")
     wrong = [d for d in clear if d.sign < 0]
     for joint in range(len(ctx.joints)):
         mine = [d for d in wrong if d.joint == joint]
-        # a single one may be what was left of the motion before
+        # a single one may be left over from the previous motion
         if len(mine) < ctx.tolerance("min_odd"):
             continue
         among = sum(d.joint == joint for d in clear)
@@ -180,7 +180,7 @@ def _one_way(ctx: Context, drive: _Drive, most: float) -> Outcome:
 
 @check("DEX1-FORCE-09")
 def as_commanded(ctx: Context) -> Outcome:
-    """The least tau_est in contact, as a part of kp times the distance to the goal."""
+    """The smallest tau_est in contact, relative to kp times the distance to the goal."""
     touch = ctx.object_at
     if touch is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
@@ -204,7 +204,7 @@ def as_commanded(ctx: Context) -> Outcome:
 
 @check("DEX3-FORCE-05")
 def joints_as_commanded(ctx: Context) -> Outcome:
-    """The least tau_est of pressing joints, as a part of kp times the distance to the goal."""
+    """The smallest tau_est of pressing joints, relative to kp times the distance to the goal."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     worst: tuple[float, int, float, float, float, float] | None = None
@@ -243,13 +243,13 @@ def joints_as_commanded(ctx: Context) -> Outcome:
 # ----------------------------------------------------------------------- commands: torque, gains
 
 
-_LATE = 0.6  # of a pull: before it, a hand may still obey the command before
+_LATE = 0.6  # of a pull: before it, a hand may still obey the previous command
 
 
 def _pushed(ctx: Context, phase: Phase, *, after: float = 0.0) -> Iterator[tuple[int, float]]:
-    """Joints that a phase pushes, and how far each moves towards its target, rad.
+    """Joints that a phase pushes, and their motion towards the target, rad.
 
-    :param after: part of the phase that is left out.
+    :param after: part of the phase that is skipped.
     """
     for step in steps_of(ctx, phase):
         rows = step.t >= step.begin + after * (step.end - step.begin)
@@ -290,9 +290,10 @@ def torque_drives(ctx: Context) -> Outcome:
 
 @check("DEX3-GAIN-05")
 def grades_of_stiffness(ctx: Context) -> Outcome:
-    """Time to half-way of a step with a third of the client's stiffness, compared with its own.
+    """Time to half of a step with a third of the client's stiffness, compared with the client's
+    stiffness.
 
-    A step that is limited by the joint's own speed does not show gains, and is left out.
+    A step at the joint's own top speed does not depend on gains, and is left out.
     """
     stiff = {s.joint: s for p in ctx.phases("stiff") for s in steps_of(ctx, p)}
     worst: tuple[float, int, float, float] | None = None
@@ -324,12 +325,13 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
     return outcome.timed(took, least, at_least=True)
 
 
-# ---------------------------------------------------------------------------------------- softly
+# ---------------------------------------------------------------------------------------- low
+# stiffness
 
 
 @check("DEX1-GAIN-04")
 def soft_commands(ctx: Context) -> Outcome:
-    """The part of its way that a step with little stiffness makes."""
+    """Progress of a step with low stiffness, as a part of the step."""
     found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * s.stroke]
     if not found:
         return ctx.skipped("no state during a step with little stiffness")

@@ -1,5 +1,5 @@
-"""Checks of each joint and each finger for itself: its range, its part of a command's mode bytes,
-its grip; and the low-rate copy of the state.
+"""Check each joint and finger separately: range, own mode byte, grip; and the low-rate copy of the
+state.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def whole_range(ctx: Context) -> Outcome:
 
 
 def _held(ctx: Context, step: Step) -> bool:
-    """Whether a joint presses on the hand's object as its command says."""
+    """Whether a joint presses on the hand's object with the commanded force."""
     spec = ctx.joints[step.joint]
     if ctx.object_at is None or (step.target - step.start) * spec.closing <= 0:
         return False
@@ -71,18 +71,18 @@ def _mode_at(ctx: Context, begin: float, end: float) -> NDArray[np.intp] | None:
 
 
 def _status(ctx: Context, mode: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """The status in each joint's mode byte, and whether it asks for time-out protection."""
+    """The status in each joint's mode byte, and whether time-out protection is on."""
     if ctx.recording.dialect.mode_byte is ModeByte.RIS:
         return mode >> 4 & _STATUS, np.asarray(mode >> 7 & 1, dtype=np.bool_)
     return mode, np.zeros(len(mode), dtype=np.bool_)
 
 
-_GOING = 0.9  # of the time of a phase; a step may begin with it
+_GOING = 0.9  # of a phase's time; a step may begin with it
 
 
 @check("DEX3-MODE-05")
 def own_mode(ctx: Context) -> Outcome:
-    """How far driven joints go, while others are locked, have tripped or are protected.
+    """Progress of driven joints while others are locked, have tripped or are protected.
 
     Protection that has not tripped changes nothing: in those steps all joints count.
     """
@@ -108,7 +108,7 @@ def own_mode(ctx: Context) -> Outcome:
             size = float(target[joint] - start[joint])
             if not driven or abs(size) < ctx.requirement.tolerance("min_step_stroke") * spec.stroke:
                 continue
-            # a slow joint makes the way that its speed allows, but for the time to get going
+            # a slow joint moves as far as its speed allows, less the time to start
             least = ctx.requirement.tolerance("min_step_stroke")
             speed = own_speed(ctx, joint, least)
             if speed is not None:
@@ -133,9 +133,9 @@ def own_mode(ctx: Context) -> Outcome:
 
 @check("DEX3-MODE-06")
 def lock_stops(ctx: Context) -> Outcome:
-    """How far a joint moves on that is locked under way, and whether it then stands still.
+    """Run-out of a joint that is locked while it moves, and whether it then stands still.
 
-    What the hand takes to begin the step, it may take to obey the lock.
+    It may take as long to obey the lock as it took to begin the step.
     """
     worst: tuple[float, str, int, float, float, float] | None = None
     # of the first one: it begins at rest
@@ -168,7 +168,7 @@ def lock_stops(ctx: Context) -> Outcome:
     outcome = ctx.failed(
         f"{far:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin), motion_rad=far
     )
-    # a lock that came late made it run on
+    # a late lock extends the run-out
     late_by = (far - limit) / speed if speed else STROKE_S * far / ctx.joints[joint].stroke
     return outcome.about(joint).placed(far, limit).if_late(late_by)
 
@@ -210,7 +210,7 @@ _MOVES = 0.01  # of the stroke
 
 @check("DEX3-MODE-07")
 def unknown_status(ctx: Context) -> Outcome:
-    """Commands whose mode bytes have a status without a meaning."""
+    """Commands with an undefined status in their mode bytes."""
     return stays(ctx, "commands with an unknown status in the mode byte")
 
 
@@ -222,9 +222,10 @@ _FORCE_S, _HELD = 0.3, 0.2  # s over which a force is taken, and the part of it 
 
 @check("DEX3-FORCE-06")
 def keeps_gripping(ctx: Context) -> Outcome:
-    """The least tau_est later in a long grip, as a part of that at its beginning.
+    """The smallest tau_est later in a long grip, relative to its beginning.
 
-    What a fifth of the states does not reach is not held: a limit that chatters lets go as often.
+    A value that a fifth of the states do not reach does not count as held, since a chattering limit
+    lets go as often.
     """
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
@@ -267,7 +268,7 @@ def keeps_gripping(ctx: Context) -> Outcome:
 
 @check("DEX3-TOPIC-04")
 def low_rate_is_fresh(ctx: Context) -> Outcome:
-    """Whether each state of the low-rate topic is one that the fast topic had just then."""
+    """Whether each state of the low-rate topic equals a recent one of the fast topic."""
     slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
     if slow is None or not len(slow) or not len(fast):
         return ctx.absent("there is no low-rate topic")
@@ -317,7 +318,7 @@ def low_rate_goes_on(ctx: Context) -> Outcome:
     for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
         if end - begin <= worst[0]:
             continue
-        # a service that is restarted, or a machine that stood still, is silent on both
+        # a restarted service or a paused machine is silent on both
         own = fast.t[(fast.t > begin) & (fast.t < end)]
         quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
         worst = max(worst, (end - begin - quiet, begin))

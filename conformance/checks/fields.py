@@ -1,4 +1,4 @@
-"""Values of the fields in each state."""
+"""Check the values of the fields in each state."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ def in_stroke(ctx: Context) -> Outcome:
 def _stands_far_off(ctx: Context) -> Outcome | None:
     """Fail if an out-of-range command makes a joint stop more than a stroke outside its range.
 
-    No joint has its stop there: such a hand takes commands and publishes states in another
-    unit, of which the kit has used only a small part.
+    No joint has its stop there: such a hand uses another unit for commands and states, of which the
+    kit has used only a small part.
     """
     for phase in ctx.phases("out-of-range"):
         begin, end = ctx.span(phase)
@@ -149,7 +149,7 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
 
 @check("DEX1-FIELD-14")
 def plausible_speed(ctx: Context) -> Outcome:
-    """The fastest motion of q, as a part of the joint's highest speed."""
+    """The fastest motion of q, relative to the joint's top speed."""
     window = ctx.tolerance("window_s")
     t = ctx.states.clock
     ends = np.searchsorted(t, t + window)

@@ -281,7 +281,7 @@ def locked(ctx: Context) -> Outcome:
 
 @check("DEX3-MODE-04")
 def wrong_id(ctx: Context) -> Outcome:
-    """A command with another motor's id at one index: the other motor must not move."""
+    """A command whose mode byte has another motor's id: that motor must not move."""
     first, other = _roles(ctx).crossed
     names = [ctx.joints[i].name for i in (first, other)]
     quiet = [j for j in range(len(ctx.joints)) if j != first]
@@ -330,7 +330,7 @@ def order(ctx: Context) -> Outcome:
 
 
 def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) -> str:
-    """The likely cause of motion in another joint than the commanded one, or an empty text."""
+    """Explain motion of another joint than the commanded one; empty if no cause is known."""
     name = ctx.joints[joint].name
     if still and not wrong:
         return f"{name} is not driven: its commands are lost, it is locked, or it has no power."
@@ -344,16 +344,17 @@ def _order_cause(ctx: Context, joint: int, wrong: Sequence[int], still: bool) ->
     return ""
 
 
-_SMALL = 0.1  # of the range: a step after another soft one, which did not get far
+_SMALL = 0.1  # of the range: a step after another soft one, which moved little
 
 
 @check("DEX3-GAIN-02")
 def stiffness(ctx: Context) -> Outcome:
-    """Time to half-way of a step with low gains, compared with one with the client's gains.
+    """Time to half of a step with low gains, compared with the client's gains.
 
-    In some of them other joints keep their gains: one that obeys theirs is as quick as they are.
+    In some steps other joints keep the client's gains: a joint that uses theirs is as quick as they
+    are.
 
-    A step that is limited by the joint's own speed does not show gains, and is left out.
+    A step at the joint's own top speed does not depend on gains, and is left out.
     """
     stiff = {s.joint: s for p in ctx.recording.phases("stiff", ctx.side) for s in steps_of(ctx, p)}
     worst: tuple[float, int, float, float] | None = None
@@ -364,7 +365,7 @@ def stiffness(ctx: Context) -> Outcome:
         if reference is None or abs(step.size) < _SMALL * step.stroke:
             continue
         progress = (step.final - step.start) / step.size if step.size else 0.0
-        # after another soft step a weight may still move the joint: only the first is from rest
+        # after another soft step gravity may still move the joint: only the first starts from rest
         if joints == len(ctx.joints) and progress < ctx.tolerance("min_progress"):
             return ctx.failed(
                 f"{progress:.0%}",
@@ -459,7 +460,7 @@ def units(ctx: Context) -> Outcome:
 
 
 def _moved(ctx: Context, joints: Sequence[int], begin: float, end: float) -> Floats:
-    """How far each joint moves from begin to end, as parts of its stroke."""
+    """Motion of each joint from begin to end, as a part of its stroke."""
     q = ctx.states.q[ctx.states.between(begin, end)][:, list(joints)]
     if len(q) < 5:
         return np.full(len(joints), np.nan)
@@ -648,11 +649,11 @@ def _holds_in(ctx: Context, silence: _Silence) -> Outcome:
     slow = [j for j in _roles(ctx).slow if not silence.guarded[j]]
     if not target or not slow:
         return ctx.skipped("no joint was on its way when the commands stopped")
-    # in the beginning, and where the silence is long at its end as well
+    # at the beginning and, in a long silence, also at its end
     least = ctx.requirement.tolerance("min_travel_stroke")
     spans = [(late, min(end, late + _AT_LAST), least)]
     if end - late > 2 * _AT_LAST:
-        spans.append((end - _AT_LAST, end, 0.5 * least))  # it is nearer to its goal by then
+        spans.append((end - _AT_LAST, end, 0.5 * least))  # it is closer to its goal by then
     for a, b, least in spans:
         rows = ctx.states.between(a, a + 0.05)
         if not len(ctx.states.q[rows]):

@@ -1,7 +1,7 @@
-"""How firmly a gripper holds and presses: by a torque that pushes at it, and on an object.
+"""Check a gripper's stiffness: displacement by a torque, and force on an object.
 
-A gripper that is held by kp is a spring. How far a torque displaces it in the free tells how stiff
-that spring is; on an object it must press as the same spring does.
+A position-controlled gripper is a spring of stiffness kp. The displacement by a torque without
+contact gives its stiffness; on an object it must press with the same stiffness.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from dexkit.hand import Floats
 __all__ = ["Nudge", "nudges"]
 
 STIFFNESS = "stiffness"
-"""The phase of pushes that are spread over a run."""
+"""The phase of the pushes that are repeated throughout a run."""
 _PEAKS_S, _FEW_PEAKS = 1.05, 3
-"""Seconds of contact in which peaks are counted, and how many are no single wrong value."""
+"""Window of contact in which peaks are counted, seconds, and the fewest peaks of a failure."""
 
 
 @dataclass(frozen=True)
 class Nudge:
-    """A push by a torque at a gripper that is held by kp.
+    """A torque pulse on a position-controlled gripper.
 
-    :param way: rad, by which the torque displaces it; ``asked`` is that torque through kp.
+    :param way: displacement by the torque, rad; ``asked`` is torque / kp.
     """
 
     begin: float
@@ -38,7 +38,7 @@ class Nudge:
 
 
 def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
-    """The pushes of these phases, by default of those that the requirement needs."""
+    """The torque pulses of these phases, by default of the phases that the requirement needs."""
     found = []
     for phase in ctx.phases() if phases is None else phases:
         begin, end = ctx.span(phase)
@@ -56,7 +56,7 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
 
 @check("DEX1-HOLD-01")
 def held(ctx: Context) -> Outcome:
-    """The displacement by a push after a long hold, compared with that by the same push before."""
+    """The displacement by a torque after a long hold, compared with that before it."""
     found = nudges(ctx)
     if len(found) < 2:
         return ctx.skipped("no state during two pushes")
@@ -81,7 +81,7 @@ def held(ctx: Context) -> Outcome:
 
 @check("DEX1-GAIN-05")
 def stiffness(ctx: Context) -> Outcome:
-    """The largest displacement by a torque, as a part of that torque through kp."""
+    """The largest displacement by a torque, relative to torque / kp."""
     found = nudges(ctx, [*ctx.phases(), *ctx.phases(STIFFNESS)])
     if not found:
         return ctx.skipped("no state while it was pushed")
@@ -112,7 +112,7 @@ class _Peak:
 
 
 def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
-    """The failure of a hand that presses too hard again and again, each time for a moment only."""
+    """The failure of a hand with repeated short peaks of force."""
     for i, first in enumerate(peaks):
         near = [p for p in peaks[i:] if p.end - first.begin <= _PEAKS_S]
         count, states = sum(p.count for p in near), sum(p.states for p in near)
@@ -131,7 +131,9 @@ def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
 
 @check("DEX1-FORCE-18")
 def presses_as_it_holds(ctx: Context) -> Outcome:
-    """tau_est of each piece of contact, as a part of what the hand's own stiffness gives there."""
+    """tau_est of each piece of contact, relative to the hand's measured stiffness times the
+    error.
+    """
     touch = ctx.object_at
     if touch is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
@@ -141,7 +143,7 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
         return ctx.skipped("no state while it was pushed")
     if len(shown) < len(found):
         return ctx.absent("a torque does not displace this hand: it has a force of its own")
-    # in parts of kp; one that is stiffer than commanded may press more, and a softer one less
+    # relative to kp; a stiffer hand may press more, and a softer one less
     stiffest = max(1.0, *(n.asked / n.way for n in shown))
     softest = min(1.0, *(n.asked / n.way for n in shown))
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")

@@ -1,4 +1,4 @@
-"""tau_est of a gripper: in contact, at rest, and its sign."""
+"""Check tau_est of a gripper: in contact, at rest, and its sign."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def squeezes(ctx: Context) -> tuple[float, float] | None:
 def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
     """(median tau_est of the last half second, begin, end) of a squeeze.
 
-    The failure's place is the whole phase: a machine that is busy before the last half second
-    delays the contact as well.
+    The failure's place is the whole phase, because an overload before the last half second delays
+    the contact too.
     """
     span = squeezes(ctx)
     if span is None:
@@ -62,16 +62,15 @@ def in_contact(ctx: Context) -> Outcome:
 
 
 _HELD = 0.2
-"""Part of the states that may be below what is called held: a limit that chatters lets go as often
-as it is in force."""
+"""Quantile of tau_est that counts as held: a chattering limit lets go half of the time."""
 
 
 def _felt(
     ctx: Context, begin: float, end: float, window: float
 ) -> list[tuple[float, float, float]]:
-    """(time, median size of tau_est, the size that is held) of consecutive windows.
+    """(time, median abs(tau_est), held abs(tau_est)) of consecutive windows.
 
-    One without states is left out.
+    Windows without states are left out.
     """
     found = []
     for at in np.arange(begin, end - window + 1e-9, window):
@@ -84,7 +83,7 @@ def _felt(
 
 @check("DEX1-FORCE-10")
 def lasts(ctx: Context) -> Outcome:
-    """How far the force of a long grip rises and falls while the command stays the same."""
+    """Rise and fall of the force of a long grip under a constant command."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     window = ctx.tolerance("window_s")
@@ -121,7 +120,7 @@ def lasts(ctx: Context) -> Outcome:
 
 
 def _touched(ctx: Context, begin: float, end: float) -> float | None:
-    """When a gripper came to where it stands at the end, s; None without states."""
+    """Time at which a gripper reached its final position, s; None without states."""
     rows = ctx.states.between(begin, end)
     t, q = ctx.states.t[rows], ctx.states.q[rows, 0]
     good = np.isfinite(q)
@@ -135,7 +134,7 @@ def _touched(ctx: Context, begin: float, end: float) -> float | None:
 
 @check("DEX1-FORCE-17")
 def again(ctx: Context) -> Outcome:
-    """The least force of later grips, as a part of that of the first."""
+    """The smallest force of later grips, relative to the first."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
 
@@ -171,7 +170,7 @@ def again(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-11")
 def soft_grips(ctx: Context) -> Outcome:
-    """The least tau_est of grips with little stiffness."""
+    """The smallest tau_est of grips with low stiffness."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = _soft(ctx)
@@ -210,8 +209,8 @@ def _soft(ctx: Context) -> list[tuple[float, float, float, float, float, float]]
 
 
 def _softer(ctx: Context) -> list[tuple[float, float, float, float, float, float]]:
-    """Those of :func:`_soft` with less stiffness than the client's: with more of it, a coarse goal
-    makes a large difference.
+    """The grips of :func:`_soft` with less stiffness than the client's; with more, a coarse goal
+    has a large effect.
     """
     hand = ctx.recording.model
     assert isinstance(hand, HandModel)  # a robot grips nothing
@@ -219,7 +218,7 @@ def _softer(ctx: Context) -> list[tuple[float, float, float, float, float, float
 
 
 def _usual(ctx: Context) -> float | None:
-    """The force of a grip with the client's stiffness, in parts of what is asked for."""
+    """The force of a grip with the client's stiffness, relative to the commanded one."""
     stiff = []
     for phase in ctx.phases("grip"):
         begin, end = ctx.span(phase)
@@ -236,7 +235,7 @@ def _usual(ctx: Context) -> float | None:
 
 @check("DEX1-FORCE-12")
 def in_proportion(ctx: Context) -> Outcome:
-    """The force of soft grips, compared with that of a stiff one, in parts of what is asked for."""
+    """The force of soft grips compared with a stiff one, each relative to the commanded force."""
     soft = _softer(ctx)
     if not soft:
         return ctx.skipped("no grips with little stiffness")
@@ -258,7 +257,7 @@ def in_proportion(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-14")
 def no_more_than_asked(ctx: Context) -> Outcome:
-    """The greatest force of soft grips, in parts of what is asked for."""
+    """The greatest force of soft grips, relative to the commanded one."""
     soft, usual = _softer(ctx), _usual(ctx)
     if not soft or usual is None:
         return ctx.skipped("no grips to compare, one of them with the client's stiffness")
@@ -275,7 +274,7 @@ def no_more_than_asked(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-15")
 def lets_go(ctx: Context) -> Outcome:
-    """tau_est after zero gains at the q of a grip, in parts of the grip's."""
+    """tau_est after zero gains at the q of a grip, relative to that of the grip."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     worst: tuple[float, float, float, float, float] | None = None
@@ -302,7 +301,7 @@ def lets_go(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-13")
 def zero(ctx: Context) -> Outcome:
-    """The median of tau_est in the free before the first command."""
+    """The median of tau_est without contact, before the first command."""
     if ctx.recording.stimulus is None:
         return ctx.skipped("the recording does not say what was between the fingers")
     states, asked = ctx.states, ctx.commands.t
@@ -407,7 +406,7 @@ def sign(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-04", "DEX3-FORCE-02")
 def unit(ctx: Context) -> Outcome:
-    """The largest tau_est, as a part of the joint's torque limit."""
+    """The largest tau_est, relative to the joint's torque limit."""
     worst: tuple[float, float, int, float] = (0.0, 0.0, 0, 0.0)
     for joint, spec in enumerate(ctx.joints):
         tau = np.abs(ctx.states.tau[:, joint])

@@ -1,4 +1,4 @@
-"""Start-up, late joiners and restarted clients."""
+"""Check start-up, late joiners, restarted clients and services."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def state_first(ctx: Context) -> Outcome:
         f"{abs(lead):.3f} s {'before' if lead > 0 else 'after'} the first command was received",
         ctx.at(ctx.commands.topic, first_command),
         lead_s=lead,
-    )  # no measure: by how little it came too late says nothing, for it had all that time
+    )  # no measure: the margin has no meaning, because the service had plenty of time
 
 
 @check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")
@@ -66,7 +66,7 @@ def late_joiner(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
 def restarted_client(ctx: Context) -> Outcome:
-    """The steps of a restarted client, and of one that a second client has left alone again."""
+    """The steps of a restarted client, and of a client after a second client has ended."""
     alone = [p for p in ctx.phases("recover") if p.params.get("after") == "two-writers"]
     if alone:
         left = arrival(ctx, "after a second client had gone", alone)
@@ -142,10 +142,11 @@ def shutdown(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-05", "DEX3-LIFE-05")
 def last_state(ctx: Context) -> Outcome:
-    """The mode of the last state before the service ended, and where the hand was found after it.
+    """The mode of the last state before the service ended, and the hand's position after the
+    restart.
 
-    A last state that shows it driven may have been measured before the brake. Then it counts
-    whether a hand that was moving went on.
+    A last state with a driven motor may have been measured before the brake. Then the check is
+    whether a moving hand continued to move.
     """
     begin, end = ctx.span(ctx.phases()[-1])
     rows = ctx.states.between(begin - 0.2, end)
@@ -175,8 +176,8 @@ def last_state(ctx: Context) -> Outcome:
 
 
 def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int] | None:
-    """How far a joint that moved when its service was stopped went on until it started again, rad,
-    how far it may have, and the joint; None if none moved, or had room to go on.
+    """Motion of a joint from the stop of its service to the restart, rad, the allowed motion, and
+    the joint; None if no joint moved with room to continue.
     """
     later = ctx.states.between(end - 0.1, end + 1.0)
     after = ctx.states.q[later][ctx.states.t[later] > begin + 0.25]
@@ -203,9 +204,9 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
 
 @check("DEX1-LIFE-06", "DEX3-LIFE-06")
 def no_new_goal(ctx: Context) -> Outcome:
-    """How far a hand was found, after a restart of its service, from where it may have gone.
+    """Distance of the hand, after a restart of its service, from where it may be.
 
-    A motor may go on as its last command says (DEX1-LIFE-05), but no other way.
+    A motor may continue to its last goal (DEX1-LIFE-05), but must not move elsewhere.
     """
     worst: tuple[float, float, float, int, float, float] | None = None
     for phase in ctx.phases():

@@ -1,7 +1,7 @@
-"""Members of a state that clients rarely use: where they are filled, they must be plausible.
+"""Check rarely used members of a state: if they are filled, they must be plausible.
 
-A vendor may leave each of them 0. Otherwise it must hold what its name means: some client may read
-an uninitialised byte, a value in another unit or a counter in a reserved word.
+A vendor may leave each of them 0. Otherwise it must have its documented meaning: a client might
+misread an uninitialised byte, a value in another unit or a counter in a reserved word.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ __all__: list[str] = []
 
 _HG = "HandState_"
 _STEPS = 3.0
-"""Steps of an encoder in a second difference of q from which on it shows an acceleration: three
-rounded positions make up to two of them, with a standard deviation of 0.7."""
+"""Smallest second difference of q, encoder steps, that shows an acceleration: rounding of three
+positions makes up to two steps, with a standard deviation of 0.7."""
 
 
 def _motors(ctx: Context, *names: str) -> list[str]:
@@ -167,7 +167,7 @@ def acceleration(ctx: Context) -> Outcome:
         # integrated twice, so that it can be compared with q over the same window
         dq = _integral(t, states.ddq[:, joint])
         reported, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
-        # what the steps of a coarse encoder look like is no acceleration
+        # the steps of a coarse encoder are not an acceleration
         rounding = _STEPS * encoder_step(ctx, joint) / window**2
         busy = np.abs(seen) > max(ctx.tolerance("min_ddq_rad_s2"), rounding)
         if busy.sum() < 20:
@@ -181,7 +181,7 @@ def acceleration(ctx: Context) -> Outcome:
     text = ctx.named(f"ddq is {ratio:.2f} times what q shows", joint)
     if ctx.tolerance("min_ratio") <= ratio <= ctx.tolerance("max_ratio"):
         return ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
-    # such late timestamps have the effect of the smallest acceleration that is judged
+    # such late timestamps have the effect of the smallest acceleration judged here
     size = 0.1 * window
     outcome = ctx.failed(f"x {ratio:.2f}", text, ratio=ratio).about(joint).if_late(size, how="p99")
     return outcome.because("its sign is wrong") if ratio < 0 else outcome
@@ -216,7 +216,7 @@ def lost(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-10", "DEX3-FIELD-09")
 def reserved(ctx: Context) -> Outcome:
-    """How many values each reserved word takes."""
+    """Number of different values of each reserved word."""
     paths = _motors(ctx, "reserve")
     if ctx.recording.dialect.state_type.endswith(_HG):
         paths += _motors(ctx, "sensor")
@@ -248,7 +248,7 @@ def voltages(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-12", "DEX3-FIELD-08")
 def no_fault(ctx: Context) -> Outcome:
-    """Fault words while a hand moves freely and obeys its commands."""
+    """Fault words while a hand moves without contact and obeys its commands."""
     spans = [ctx.span(p) for p in ctx.phases()]
     paths = [*_motors(ctx, "motorstate"), "error"]
     assert ctx.states.columns is not None

@@ -1,4 +1,4 @@
-"""Steps: direction, arrival, settling, speed, overshoot, independence, zero gains."""
+"""Check steps: direction, arrival, settling, speed, overshoot, independence, zero gains."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ class Step:
         return abs(self.final - self.target)
 
     def arrives_within(self, seconds: float) -> bool:
-        """Whether it moves to its target at the end, fast enough to be there in ``seconds``."""
+        """Whether it still moves to its target at the end, fast enough to arrive within
+        ``seconds``.
+        """
         late = self.t >= self.end - 0.1
         if late.sum() < 2:
             return False
@@ -98,7 +100,7 @@ def steps_of(ctx: Context, phase: Phase) -> list[Step]:
 
 
 def speed_of(step: Step) -> float | None:
-    """Mean speed from 10 to 90 % of a step's way, rad/s; None if it did not get there."""
+    """Mean speed from 10 to 90 % of a step, rad/s; None if 90 % was not reached."""
     part = (step.q - step.start) / step.size
     low, high = np.argmax(part >= 0.1), np.argmax(part >= 0.9)
     if part[high] < 0.9 or high <= low:
@@ -107,14 +109,16 @@ def speed_of(step: Step) -> float | None:
 
 
 _PEAK_S = 0.04
-"""Seconds over which a speed is taken: noise of 0.1 % of a range is 2.5 % of it in a second."""
+"""Window of a speed measurement, seconds: position noise of 0.1 % of a range gives 2.5 % of the
+range per second."""
 _LARGER, _FASTER = 1.5, 1.2
-"""A step that is so much larger would be so much faster, if the joint's own speed did not limit
-it."""
+"""Factor of size, and of speed: a step larger by this factor is faster by it, unless the joint's
+own top speed limits it."""
 _CHANGE, _WATCHED_S = 0.05, 0.25
-"""A change of a goal, as a part of the range, and the seconds of it in which a joint is fastest."""
+"""Smallest change of a goal, as a part of the range, and the seconds after it in which a joint is
+fastest."""
 _FREE = ("joint", "step", "stiff", "ends")
-"""Phases with the client's gains in which a joint may be as fast as it can."""
+"""Phases with the client's gains that allow a joint's top speed."""
 
 
 def peak_speed(step: Step) -> float:
@@ -129,7 +133,7 @@ def peak_speed(step: Step) -> float:
 
 
 def _free_steps(ctx: Context) -> dict[int, list[tuple[Step, float]]]:
-    """The steps of each joint in which it may be as fast as it can, and their peak speeds."""
+    """The steps of each joint that allow its top speed, and their peak speeds."""
 
     def work_out() -> dict[int, list[tuple[Step, float]]]:
         found: dict[int, list[tuple[Step, float]]] = {}
@@ -144,8 +148,8 @@ def _free_steps(ctx: Context) -> dict[int, list[tuple[Step, float]]]:
 def own_speed(ctx: Context, joint: int, least_stroke: float) -> float | None:
     """Top speed of a joint that limits its large steps, in its slower direction, rad/s.
 
-    None without such steps, and where the joint has been faster after larger ones. What a hand is
-    judged with that follows as fast as it can: no source gives a speed, and DEX3-MOVE-04 asks for
+    None without such steps, or if the joint has been faster after larger ones. It is the speed for
+    judging a hand that follows as fast as it can: no source gives a speed, and DEX3-MOVE-04 demands
     little.
 
     :param least_stroke: size of a large step as a part of the joint's range.
@@ -170,11 +174,10 @@ def own_speed(ctx: Context, joint: int, least_stroke: float) -> float | None:
 
 
 def limited_by_speed(ctx: Context, step: Step) -> bool:
-    """Whether a joint's own top speed limits a step: it was no faster after much larger changes of
+    """Whether a joint's own top speed limits a step: it was not faster after much larger changes of
     its goal in the same run, with the same stiffness.
 
-    Then the step's time does not show its gains. Without a larger change this is not known, and
-    False.
+    Then the duration does not depend on gains. Without a larger change it is unknown: False.
     """
     given, states, joint = ctx.commands, ctx.states, step.joint
     spec = ctx.joints[joint]
@@ -206,7 +209,7 @@ def limited_by_speed(ctx: Context, step: Step) -> bool:
 
 
 def half_way(step: Step) -> float | None:
-    """Seconds from the command to half of a step's way; None if it did not get there."""
+    """Seconds from the command to half of a step; None if it was not reached."""
     part = (step.q - step.start) / step.size if step.size else np.zeros(0)
     if not len(part) or not (part >= 0.5).any():
         return None
@@ -214,9 +217,7 @@ def half_way(step: Step) -> float | None:
 
 
 def least_half_way(step: Step) -> float:
-    """The same in seconds, for one that does not get there at least as long as it takes at the mean
-    speed so far.
-    """
+    """The same; if half of the step was not reached, a lower bound by the mean speed so far."""
     half = half_way(step)
     if half is not None:
         return half
@@ -230,13 +231,13 @@ def steps(ctx: Context) -> list[Step]:
 
 
 _PLAIN = ("step", "joint", "recover", "resume", "company", "restart", "service-restart")
-"""Steps with good commands alone, by which a hand shows that it obeys; each has a requirement."""
-_NEWEST = 3  # steps; in a single one it may have been at its target already
+"""Steps with good commands only, which show that a hand obeys; each has its own requirement."""
+_NEWEST = 3  # steps; in a single one the hand may have been at its target already
 _DISOBEYS = 0.1  # of the stroke
 
 
 def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
-    """The failure of a hand that ends a step elsewhere than commanded."""
+    """The failure of a hand that ends a step away from its target."""
     limit = ctx.tolerance("max_error_stroke", step.joint)
     return (
         ctx.failed(
@@ -254,7 +255,7 @@ def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
 def obeyed_before(ctx: Context, phase: Phase) -> bool:
     """Whether the hand obeyed the newest plain steps before a phase.
 
-    What made it disobey there is judged there, and not once more in each later phase.
+    A fault there is judged there, not again in each later phase.
     """
     assert ctx.recording.stimulus is not None  # a phase is of one
     earlier = [
@@ -405,7 +406,7 @@ def speed(ctx: Context) -> Outcome:
 
 @check("DEX1-MOVE-05", "DEX3-MOVE-05")
 def overshoot(ctx: Context) -> Outcome:
-    """How far q goes beyond the target."""
+    """Overshoot of q beyond the target."""
     found = [
         (float(np.max((s.q - s.target) * np.sign(s.size))), s)
         for s in steps(ctx)
@@ -435,7 +436,7 @@ def overshoot(ctx: Context) -> Outcome:
 
 @check("DEX1-MOVE-06", "DEX3-MOVE-06")
 def monotonous(ctx: Context) -> Outcome:
-    """How far q turns back on its way to the target."""
+    """Largest reversal of q on the way to the target."""
     found = []
     for step in steps(ctx):
         if abs(step.size) < 0.1 * step.stroke:
@@ -499,7 +500,7 @@ def settling(ctx: Context) -> Outcome:
 
 @check("DEX1-MOVE-09", "DEX3-MOVE-08")
 def begins(ctx: Context) -> Outcome:
-    """Time from the command until the hand moves, of every step of the run that arrives."""
+    """Time from the command until the hand moves, for every step that arrives."""
     slowest: tuple[float, float, Step] | None = None
     first = [p for name in _AFTER_A_PAUSE for p in ctx.phases(name)[:1]]
     for phase in (p for name in _PROMPT for p in ctx.phases(name)):
@@ -513,7 +514,7 @@ def begins(ctx: Context) -> Outcome:
                 or step.error > _DISOBEYS * step.stroke
                 or not way.any()
             ):
-                continue  # whether it arrives is judged by other requirements
+                continue  # other requirements judge whether it arrives
             after = float(step.t[np.argmax(way)]) - step.begin
             limit = ctx.tolerance("max_first_s" if phase in first else "max_reaction_s")
             if slowest is None or after / limit > slowest[0] / slowest[1]:
@@ -544,20 +545,20 @@ def _range(q: Floats) -> float:
 
 
 _BEGUN = 0.02
-"""Part of the stroke after which a hand counts as moving: a slow one takes 0.1 s for it."""
+"""Part of the stroke after which a hand counts as moving; a slow one takes 0.1 s for it."""
 _AFTER_A_PAUSE = ("restart", "service-restart")
-"""Steps of which the first comes when hand and client have just found each other."""
+"""Steps of which the first follows directly after discovery."""
 _PROMPT = (
     *("step", "joint", "ends", "center", "fingerprint", "recover", "old-stamps"),
     *("company", *_AFTER_A_PAUSE),
 )
-"""Steps that must begin at once; WDOG-03 judges those after a pause, SIDE-02 those beside bad
-commands."""
+"""Steps that must begin at once; WDOG-03 judges those after a pause, SIDE-02 those during bad
+commands to the other hand."""
 
 
 @check("DEX1-MOVE-10")
 def dead_zones(ctx: Context) -> Outcome:
-    """How much of a dead zone lies between where the gripper goes there and its end."""
+    """Size of a dead zone between the gripper's reached position and its end."""
     worst: tuple[float, float, float, float, float] | None = None
     reached = {s.target: s.final for p in ctx.phases("ends") for s in steps_of(ctx, p)}
     for phase in ctx.phases():
@@ -609,7 +610,7 @@ def ends(ctx: Context) -> Outcome:
 
 @check("DEX1-SIDE-01", "DEX3-SIDE-01")
 def independent(ctx: Context) -> Outcome:
-    """Motion of this hand while only the other one's target changes."""
+    """Motion of this hand while only the other hand's target changes."""
     name = ctx.requirement.phase or ""
     others = [p for p in ctx.recording.phases(name) if ctx.side not in p.sides]
     if not others:
@@ -655,7 +656,7 @@ def independent(ctx: Context) -> Outcome:
 
 @check("DEX1-SIDE-03")
 def by_its_own(ctx: Context) -> Outcome:
-    """Steps of this hand while the other one gets other values in the same members."""
+    """Steps of this hand while the other hand gets other values in the same members."""
     worst: tuple[float, Step] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         for step in steps_of(ctx, phase):
@@ -690,16 +691,17 @@ def zero_gains(ctx: Context) -> Outcome:
 
 
 def not_driven(ctx: Context, how: str) -> Outcome:
-    """How far each joint moves towards a q that must have no effect."""
+    """Motion of each joint towards a q that must have no effect."""
     given = steps(ctx)
     if not given:
         return ctx.skipped("no state during this stimulus")
-    # joints that are at q already show nothing
+    # joints already at q prove nothing
     limit = [2 * ctx.tolerance("max_motion_stroke", s.joint) for s in given]
     away = [s for s, least in zip(given, limit, strict=True) if abs(s.size) > least]
     if not away:
         return ctx.skipped("the hand was already at the q that must have no effect")
-    # a weight pulls a joint the same way whatever q is: with q on either side, both must count
+    # gravity pulls a joint the same way whatever q is, so q is commanded on both sides and both
+    # must count
     ways: dict[tuple[int, bool], tuple[float, Step]] = {}
     for s in away:
         towards = float(np.max((s.q - s.start) * np.sign(s.size)))
@@ -732,7 +734,7 @@ def not_driven(ctx: Context, how: str) -> Outcome:
 
 @check("DEX1-CMD-01", "DEX3-CMD-01")
 def every_command(ctx: Context) -> Outcome:
-    """How far the hand goes towards a goal that was commanded once."""
+    """Progress of the hand towards a goal that was commanded once."""
     judged, missed = 0, []
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -765,13 +767,13 @@ def every_command(ctx: Context) -> Outcome:
         *(ctx.at(ctx.states.topic, a, b) for a, b, *_ in missed),
         missed=len(missed),
     )
-    # on a network a single sample may be lost: another run tells
+    # a network may lose a single sample: repeat the run
     return replace(outcome.about(joint).if_late(end - begin), retry=True)
 
 
 def _driven(ctx: Context) -> list[tuple[int, int]]:
-    """The joints that the stimulus drives by a velocity, and in which direction: a gripper opens,
-    fingers close.
+    """The joints that the stimulus drives by velocity, with direction: a gripper opens, fingers
+    close.
     """
     hand = ctx.recording.model
     roles = hand.roles if isinstance(hand, HandModel) else None
@@ -781,7 +783,8 @@ def _driven(ctx: Context) -> list[tuple[int, int]]:
 
 
 def _least_driven(ctx: Context) -> tuple[float, int, Phase] | None:
-    """The least motion with a commanded velocity without a position gain, rad, its joint and phase.
+    """The smallest motion under a commanded velocity without position gain, rad, with joint and
+    phase.
 
     Negative where a joint has moved the other way; None without states.
     """
@@ -792,7 +795,7 @@ def _least_driven(ctx: Context) -> tuple[float, int, Phase] | None:
         given = ctx.commands.dq[(ctx.commands.t >= begin) & (ctx.commands.t <= end)]
         for joint, way in _driven(ctx):
             if len(given) and not given[:, joint].any():
-                continue  # it is driven by a torque this time
+                continue  # driven by torque in this phase
             q = ctx.states.q[rows, joint]
             if len(q) < 2 or not np.isfinite(q).all():
                 continue

@@ -1,4 +1,4 @@
-"""Response to an operator through the model of Unitree's client (phase ``operator``)."""
+"""Check the response to an operator, modelled with Unitree's client (phase ``operator``)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dexkit.teleop import client_for
 from dexkit.teleop.tracking import Step, TrackingFigures, tracking_figures
 
 _PART = 0.75
-"""Part of its rate that the modelled client must have reached; below it the hand is not blamed."""
+"""Part of its nominal rate that the modelled client must reach; below it the hand is not judged."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def stroke(ctx: Context) -> Outcome:
 
 @check("DEX1-OPER-02", "DEX3-OPER-02")
 def lag(ctx: Context) -> Outcome:
-    """Seconds by which the joint lags behind a slowly moving operator."""
+    """Lag of the joint behind a slowly moving operator, seconds."""
     return _judge(
         ctx,
         "lag_s",
@@ -148,7 +148,7 @@ def lag(ctx: Context) -> Outcome:
 
 @check("DEX1-OPER-03", "DEX3-OPER-03")
 def overshoot(ctx: Context) -> Outcome:
-    """How far the joint goes past the operator's target."""
+    """Overshoot of the joint beyond the operator's target."""
     return _judge(
         ctx,
         "overshoot_rad",

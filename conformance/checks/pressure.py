@@ -1,5 +1,5 @@
-"""Checks of what the fingers feel while they press on an object: pressure sensors in a state, or
-tactile areas on a topic of their own.
+"""Check the fingers' pressure readings in contact: sensors in the state, or tactile areas on their
+own topic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__: list[str] = []
 _BEFORE_S = 0.1  # s before a phase or at its end in which a pressure is taken
 
 
-_STANDS = 0.02  # of the stroke, by which a finger may move at the end of a phase and yet stand
+_STANDS = 0.02  # of the stroke: motion at the end of a phase that still counts as standing
 
 
 def _pressures(
@@ -74,7 +74,9 @@ def _fingers(ctx: Context) -> tuple[str, ...]:
 
 
 def _touches(ctx: Context) -> Iterator[tuple[Phase, str, Floats, Floats]]:
-    """Each phase in which a finger presses, the finger, and the pressures before and during it."""
+    """Phases in which a finger presses, with the finger and the pressures before and during the
+    phase.
+    """
     for phase in ctx.phases("touch"):
         begin, end = ctx.span(phase)
         free = _pressures(ctx, begin - _BEFORE_S, begin)
@@ -84,7 +86,7 @@ def _touches(ctx: Context) -> Iterator[tuple[Phase, str, Floats, Floats]]:
 
 
 def _presses(ctx: Context, phase: Phase) -> bool:
-    """Whether the object holds the finger back, by the course of q: it stands before its goal."""
+    """Whether the object stops the finger: by q, it stands still before its goal."""
     return any(
         s.error > ctx.requirement.tolerance("min_held_stroke") * s.stroke
         and float(np.ptp(s.q[s.t >= s.end - _BEFORE_S])) < _STANDS * s.stroke
@@ -157,7 +159,7 @@ def saturates(ctx: Context) -> Outcome:
 
 @check("DEX3-SENS-08")
 def releases(ctx: Context) -> Outcome:
-    """What is left of each element's pressure some time after the object was let go."""
+    """Remaining pressure of each element some time after the object was released."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     rest = [ctx.span(p)[0] for p in (ctx.phases("touch") or ctx.phases("squeeze"))[:1]]
@@ -173,7 +175,7 @@ def releases(ctx: Context) -> Outcome:
         return ctx.absent("the states hold no sensor packets")
     rise, left = most - free, later - free
     rise, left = np.nan_to_num(rise), np.nan_to_num(left)
-    # the noise of an element that hardly touches is no pressure of the grip
+    # noise of an element with hardly any contact does not count
     touched = rise > ctx.tolerance("min_rise_part") * rise.max(initial=0.0)
     if not touched.any():
         return ctx.skipped("no pressure rose at the object")
@@ -190,14 +192,14 @@ def releases(ctx: Context) -> Outcome:
 
 
 def _untouched(ctx: Context, begin: float) -> float:
-    """When the hand began to touch the object that it grips at ``begin``, s."""
+    """Time at which the hand touched the object that it grips at ``begin``, s."""
     before = [ctx.span(p)[0] for name in ("touch", "firmer") for p in ctx.phases(name)]
     return min((b for b in before if b < begin), default=begin)
 
 
 @check("DEX3-SENS-09")
 def pressure_lasts(ctx: Context) -> Outcome:
-    """The least part of an element's pressure that is left at the end of a grip."""
+    """The smallest remaining part of an element's pressure at the end of a grip."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     worst: tuple[float, int, int, float, float] | None = None
@@ -235,10 +237,10 @@ def pressure_lasts(ctx: Context) -> Outcome:
 
 @check("DEX3-SENS-10")
 def follows_the_force(ctx: Context) -> Outcome:
-    """How much of a change of a finger's torque its pressure shows, while it holds the object.
+    """Change of a finger's pressure relative to that of its torque, while it holds the object.
 
-    A gearing with friction keeps what it has pressed. So a rise counts beyond the most torque of
-    the grip so far, and a fall where the finger gives way by a part of what it had gone forward.
+    Gear friction keeps the pressure, so a rise counts only above the largest torque of the grip so
+    far, and a fall only where the finger gives way by a part of its former advance.
     """
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
@@ -274,8 +276,8 @@ def follows_the_force(ctx: Context) -> Outcome:
 def _share(
     ctx: Context, finger: str, free: Floats | None, begin: float, end: float
 ) -> float | None:
-    """The change of a finger's pressure from before ``begin`` to ``end``, in parts of what the
-    change of its torque makes of it; None where that hardly changes.
+    """The change of a finger's pressure from before ``begin`` to ``end``, relative to the change
+    that its torque predicts; None where the torque hardly changes.
     """
     joints = [i for i, j in enumerate(ctx.joints) if j.closing and j.name.startswith(finger)]
     before, then = (
@@ -307,15 +309,17 @@ def _share(
 
 
 def _most_torque(ctx: Context, joints: list[int], begin: float) -> Floats:
-    """The most torque of each joint in the grip that goes on at ``begin``, N m, shape (joints,)."""
+    """The largest torque of each joint in the grip in progress at ``begin``, N m, shape
+    (joints,).
+    """
     tau = np.abs(ctx.states.tau[ctx.states.between(0.0, begin)][:, joints])
     free = np.flatnonzero((tau < ctx.tolerance("min_tau_nm")).all(axis=1))
     return np.asarray(tau[free[-1] + 1 if len(free) else 0 :].max(axis=0))
 
 
 def _gives_way(ctx: Context, finger: str, begin: float, end: float, later: float) -> bool:
-    """Whether a joint that went into the object from ``begin`` to ``end`` comes back until
-    ``later``, by a part of that.
+    """Whether a joint that advanced into the object from ``begin`` to ``end`` returns by a part of
+    that until ``later``.
     """
     joints = [i for i, j in enumerate(ctx.joints) if j.closing and j.name.startswith(finger)]
     way = np.array([ctx.joints[i].closing / ctx.joints[i].stroke for i in joints])
@@ -331,7 +335,9 @@ def _gives_way(ctx: Context, finger: str, begin: float, end: float, later: float
 
 @check("DEX3-SENS-11")
 def feels_nothing(ctx: Context) -> Outcome:
-    """The rise of pressures in a free hand that stands, while the other one squeezes an object."""
+    """The rise of pressures in a standing hand without contact, while the other hand squeezes an
+    object.
+    """
     if ctx.object_at is not None:
         return ctx.skipped("this hand has an object itself")
     other = [s for s in ctx.recording.judged if s != ctx.side]

@@ -1,4 +1,4 @@
-"""Checks for robots; requirements that hands have as well use the hands' checks."""
+"""Checks for robots; requirements shared with hands use the hands' checks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dexkit.messages import Columns
 __all__ = ["RobotContext"]
 
 _SOME = 20  # states before a phase or at its end that are averaged
-_END = 0.06  # s after a phase in which its last command may still have an effect
+_END = 0.06  # s after a phase during which its last command may still act
 _LATE = 1.0  # s by which a state may be late on a busy machine
 _STICKS = struct.Struct("<4x5f")  # in wireless_remote, after head and keys
 
@@ -86,7 +86,7 @@ def state_crc(ctx: RobotContext) -> Outcome:
 
 @check("H1-CLIENT-01")
 def client_crc(ctx: RobotContext) -> Outcome:
-    """The CRC of the commands that the kit has not damaged on purpose."""
+    """The CRC of commands, except for those that the kit has damaged on purpose."""
     intact, t = ctx.recording.commands_intact, ctx.commands.t
     counts = np.ones(len(t), dtype=np.bool_)
     for phase in ctx.phases("wrong-crc"):
@@ -118,7 +118,7 @@ def client_rate(ctx: RobotContext) -> Outcome:
 
 @check("H1-TICK-01")
 def tick_goes_on(ctx: RobotContext) -> Outcome:
-    """Steps of tick, and the longest time without a change."""
+    """Increments of tick, and the longest time without a change."""
     tick, clock = ctx.low["tick"], ctx.states.clock
     if len(tick) < 2:
         return ctx.skipped("fewer than two states")
@@ -142,7 +142,7 @@ def tick_goes_on(ctx: RobotContext) -> Outcome:
 
 @check("H1-TICK-02")
 def tick_rate(ctx: RobotContext) -> Outcome:
-    """How fast tick counts."""
+    """Rate of tick."""
     tick, clock = ctx.low["tick"], ctx.states.clock
     seconds = float(clock[-1] - clock[0]) if len(clock) else 0.0
     if seconds < ctx.tolerance("min_observed_s"):
@@ -374,7 +374,7 @@ def reported_machine(ctx: RobotContext) -> Outcome:
 
 @check("H1-MODE-01")
 def reported_mode(ctx: RobotContext) -> Outcome:
-    """Mode bytes of motors that are held, and of one that was turned off."""
+    """Mode bytes of held motors, and of a motor that was turned off."""
     robot = ctx.recording.robot
     for phase in (*ctx.phases("hold"), *ctx.phases()):
         begin, end = ctx.span(phase)
@@ -401,7 +401,7 @@ def reported_mode(ctx: RobotContext) -> Outcome:
 
 
 def _index(ctx: RobotContext, phase: Phase) -> int:
-    """The joint that a phase is about."""
+    """The joint that a phase moves."""
     return ctx.recording.robot.used.index(int(phase.params["slot"]))
 
 
@@ -421,7 +421,7 @@ def _q(ctx: RobotContext, begin: float, end: float) -> Floats:
 
 @check("H1-MOVE-01", "H1-SAFE-04", "H1-LIFE-02")
 def follows(ctx: RobotContext) -> Outcome:
-    """Where each step of a joint ends."""
+    """Final position of each step of a joint."""
     worst, where, which = -1.0, None, 0
     for phase in ctx.phases():
         if not phase.targets:
@@ -446,7 +446,7 @@ def follows(ctx: RobotContext) -> Outcome:
 
 @check("H1-MOVE-02")
 def independent(ctx: RobotContext) -> Outcome:
-    """How far other joints move while one is commanded."""
+    """Motion of other joints while one is commanded."""
     worst, text, where = -1.0, "", (0.0, 0.0)
     about: tuple[int, ...] = ()
     for phase in ctx.phases():
@@ -469,7 +469,7 @@ def independent(ctx: RobotContext) -> Outcome:
 @check("H1-CRC-02", "H1-MODE-02", "H1-GAIN-04")
 @check("H1-SAFE-01", "H1-SAFE-02", "H1-SAFE-03", "G1-SAFE-05")
 def stays(ctx: RobotContext) -> Outcome:
-    """How far joints move during commands that must have no effect."""
+    """Motion of joints during commands that must have no effect."""
     worst, text, where, which = -1.0, "", (0.0, 0.0), 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -534,7 +534,7 @@ def velocity(ctx: RobotContext) -> Outcome:
 
 @check("H1-GAIN-03")
 def torque(ctx: RobotContext) -> Outcome:
-    """How far a torque turns a joint."""
+    """Motion of a joint under a torque."""
     (phase,) = ctx.phases()
     begin, end = ctx.span(phase)
     q = _q(ctx, begin, end + 0.05)[:, _index(ctx, phase)]
@@ -605,7 +605,7 @@ def state_in_silence(ctx: RobotContext) -> Outcome:
 
 @check("H1-WDOG-03")
 def resumes(ctx: RobotContext) -> Outcome:
-    """The jump when commands arrive again, and the step after it."""
+    """The jump when commands resume, and the step after it."""
     hold = next(p for p in ctx.phases() if not p.targets)
     begin, end = ctx.span(hold)
     q = _q(ctx, begin - 0.02, end)

@@ -1,4 +1,4 @@
-"""Invalid commands, missing commands, several clients and load."""
+"""Check invalid commands, missing commands, several clients and load."""
 
 from __future__ import annotations
 
@@ -84,10 +84,10 @@ def unharmed(ctx: Context, what: str) -> Outcome:
 def moves(
     ctx: Context, what: str, joints: Sequence[int] | None = None, sags: Floats | None = None
 ) -> Outcome:
-    """Failed if a joint moves during the phase; otherwise passed, with how far.
+    """Fail if a joint moves during the phase; otherwise pass, with the motion.
 
     :param joints: those that must not move; None for all.
-    :param sags: how far each joint may move by its weight, rad; None for not at all.
+    :param sags: allowed motion of each joint by gravity, rad; None for none.
     """
     far: tuple[float, float, int] = (0.0, 0.0, 0)
     for phase in ctx.phases():
@@ -198,11 +198,11 @@ def out_of_range(ctx: Context) -> Outcome:
     ).resting_on(*outcome.measures)
 
 
-_TURNS_S = 0.25  # s that a moving hand is given to turn round, with a delay that it may have
+_TURNS_S = 0.25  # s for a moving hand to reverse, with its allowed delay
 
 
 def _other_way(ctx: Context, phase: Phase, joint: int) -> Outcome | None:
-    """The failure of a joint that moves away from the end beyond which it is commanded."""
+    """The failure of a joint that moves away from the end beyond which its goal lies."""
     begin, end = ctx.span(phase)
     spec = ctx.joints[joint]
     rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
@@ -249,7 +249,7 @@ def empty(ctx: Context) -> Outcome:
 def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
     """(last command, end) of each phase without commands: the requirement's, and ``names``.
 
-    A command that is empty or not finite is none: it must not keep the hand driven.
+    An empty or non-finite command does not count: it must not keep the hand driven.
     """
     found = []
     good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
@@ -263,11 +263,11 @@ def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
 
 @check("DEX1-WDOG-01", "DEX1-WDOG-04")
 def brakes(ctx: Context) -> Outcome:
-    """Motion and force after the time-out, of a hand that moved or pressed when silence began.
+    """Motion and force after the time-out of a hand that moved or pressed when silence began.
 
-    A hand that rests at its target shows no difference between braking and holding. So commands
-    end while it is driven by a velocity, or presses on an object. If it does neither, its
-    ``mode`` counts: it must change from driven to 0.
+    At rest at its target, braking and holding look alike, so commands end while the hand is driven
+    by a velocity or presses on an object. If it does neither, ``mode`` must change from driven to
+    0.
     """
     timeout = ctx.tolerance("timeout_s")
     states = ctx.states
@@ -305,7 +305,7 @@ def brakes(ctx: Context) -> Outcome:
                 motion_rad=jump,
             ).placed(jump, allowed)
             return outcome.if_late(STROKE_S * (jump - allowed) / ctx.joints[0].stroke)
-        # at its stop it stands still without a brake as well
+        # at its stop it stands still even without a brake
         stroke = ctx.joints[0].stroke
         at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
         if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
@@ -352,13 +352,15 @@ def brakes(ctx: Context) -> Outcome:
 
 
 def _presses(ctx: Context, since: float, end: float) -> float:
-    """The largest size of tau_est in any piece of a braked stretch: torque must not come back."""
+    """The largest abs(tau_est) in any piece of a braked stretch: torque must not return."""
     begin = min(since + ctx.tolerance("release_s"), end - 0.1)
     return max((size for _, size in _pieces(ctx, begin, end)), key=abs, default=0.0)
 
 
 def _opposes(ctx: Context, since: float, end: float, before: float) -> tuple[float, float] | None:
-    """When, and with which torque, a hand that pressed drives the other way while it brakes."""
+    """Time and torque at which a hand that pressed drives in the opposite direction while
+    braking.
+    """
     for at, _ in _pieces(ctx, since, end):
         tau = ctx.states.tau[ctx.states.between(at, at + _PIECE_S), 0]
         back = -float(np.median(tau)) * (1 if before > 0 else -1)
@@ -371,7 +373,7 @@ _PIECE_S = 0.1
 
 
 def _pieces(ctx: Context, begin: float, end: float) -> list[tuple[float, float]]:
-    """(time, median size of tau_est) of the consecutive pieces of a stretch."""
+    """(time, median abs(tau_est)) of the consecutive pieces of a stretch."""
     found = []
     for at in np.arange(begin, end - 0.99 * _PIECE_S, _PIECE_S):
         tau = ctx.states.tau[ctx.states.between(float(at), float(at) + _PIECE_S), 0]
@@ -381,12 +383,12 @@ def _pieces(ctx: Context, begin: float, end: float) -> list[tuple[float, float]]
 
 
 def stopped(t: Floats, q: Floats, last: float, still: float, limit: float) -> Measure:
-    """When a joint stopped after the last command, s, against the latest time that is allowed.
+    """Time at which a joint stopped after the last command, s, and the limit.
 
     :param t: of the states since then, s.
     :param q: of the joint, rad.
-    :param last: when the last command came, s.
-    :param still: rad; a joint that does not move further than that any more has stopped.
+    :param last: time of the last command, s.
+    :param still: remaining motion that counts as stopped, rad.
     :param limit: s after the last command.
     """
     t, q = t[np.isfinite(q)], q[np.isfinite(q)]
@@ -398,10 +400,9 @@ def stopped(t: Floats, q: Floats, last: float, still: float, limit: float) -> Me
 
 
 def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
-    """Distance that the hand moved while it braked, and the distance that is allowed, rad.
+    """Motion of the hand while it braked, and the allowed motion, rad.
 
-    The allowed distance is the run-out at its last speed, and the motion when a squeezed object
-    pushes it back.
+    Allowed are the run-out at its last speed and the relaxation of a squeezed object.
     """
     states = ctx.states
     before = states.between(at - 0.15, at - 0.05)
@@ -418,7 +419,7 @@ def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
 def state_in_silence(ctx: Context) -> Outcome:
     """Gaps in the state while no command is sent."""
     limit = ctx.tolerance("max_gap_s")
-    # a tripped hand must go on publishing as well
+    # a tripped hand must continue to publish
     silences = _silences(ctx, "guard")
     spans = [(a, b) for a, b in silences if b - a >= ctx.tolerance("min_silence_s")]
     if not spans:
@@ -480,15 +481,13 @@ def resumes(ctx: Context) -> Outcome:
 
 
 def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
-    """The failure of a hand that first goes away from the first goal after a pause, or pulls away
-    from it.
-    """
+    """The failure of a hand that first moves or pulls away from the first goal after a pause."""
     for step in steps_of(ctx, phase):
         limit = ctx.tolerance("max_away_stroke", step.joint)
         if abs(step.size) < limit:
             continue
         way = 1 if step.size > 0 else -1
-        # before it obeys; what it does near its goal is for other requirements
+        # before it obeys; other requirements judge its motion near the goal
         near = np.flatnonzero((step.q - step.target) * way > -0.5 * abs(step.size))
         course = step.q[: int(near[0]) + 1] if len(near) else step.q
         away = float(np.max((step.start - course) * way))
@@ -500,7 +499,7 @@ def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
     return None
 
 
-_SOON_S = 0.25  # s from the end of a step in which a hand that is under way arrives
+_SOON_S = 0.25  # s after the end of a step within which a moving hand must arrive
 
 
 def arrival(
@@ -529,10 +528,10 @@ def arrival(
 
 @check("DEX1-SIDE-02", "DEX3-SIDE-02")
 def beside(ctx: Context) -> Outcome:
-    """The steps of this hand while the other one gets bad commands, or none.
+    """The steps of this hand while the other hand gets bad commands or none.
 
-    They last as long as those commands, whatever way this hand has to go: one that is slow, but
-    about to arrive, obeys.
+    They last as long as those commands, whatever the distance, so a slow hand that is about to
+    arrive passes.
     """
     return arrival(ctx, "while the other hand got bad commands, or none", soon_s=_SOON_S)
 
@@ -552,13 +551,13 @@ def negative_gains(ctx: Context) -> Outcome:
     return stays(ctx, "commands with negative gains", sags=_sags(ctx))
 
 
-_SAGS_AGAIN = 1.5  # times the way that a limp joint sagged, for another pose
+_SAGS_AGAIN = 1.5  # factor on the sag of a limp joint, for other poses
 
 
 def _sags(ctx: Context) -> Floats | None:
-    """How far each joint may sag while it is limp, rad: it did so with zero gains, whatever q was.
+    """Allowed sag of each limp joint, rad, measured with zero gains, whatever q was.
 
-    None where the stimulus does not tell that from motion towards q.
+    None if the stimulus cannot tell sag from motion towards q.
     """
     moved = []
     for phase in ctx.phases("limp"):
@@ -569,7 +568,7 @@ def _sags(ctx: Context) -> Floats | None:
             moved.append(q[-1] - np.median(before, axis=0))
     if len(moved) < 2:
         return None
-    # towards one q and then towards one on the other side
+    # first a q on one side, then one on the other
     low, high = np.min(moved, axis=0), np.max(moved, axis=0)
     slack = np.array([ctx.tolerance("max_motion_stroke", j) for j in range(len(ctx.joints))])
     one_way = (low > -slack) | (high < slack)
@@ -584,7 +583,7 @@ def foreign_type(ctx: Context) -> Outcome:
 
 @check("DEX1-SAFE-07", "DEX3-SAFE-08")
 def burst(ctx: Context) -> Outcome:
-    """Distance from the last command's position after a burst of hundreds of commands."""
+    """Distance from the last command's goal after a burst of hundreds of commands."""
     topic = ctx.states.topic
     wait = ctx.tolerance("settle_s")
     far: tuple[float, float, int] = (0.0, 0.0, 0)
@@ -629,7 +628,7 @@ def burst(ctx: Context) -> Outcome:
 
 @check("DEX1-SAFE-08", "DEX3-SAFE-09")
 def two_writers(ctx: Context) -> Outcome:
-    """The course of q while two clients command two positions, and after one has ended."""
+    """Motion while two clients command two positions, and after one of them has ended."""
     margin = ctx.tolerance
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -664,13 +663,15 @@ def two_writers(ctx: Context) -> Outcome:
 
 @check("DEX1-SAFE-09", "DEX3-SAFE-10")
 def company(ctx: Context) -> Outcome:
-    """The steps of this hand while a second client sends the same, or commands the other hand."""
+    """The steps of this hand while a second client sends the same commands, or commands the other
+    hand.
+    """
     return arrival(ctx, "while a second client commanded the same")
 
 
 @check("DEX1-ORDER-02", "DEX3-ORDER-02")
 def old_stamps(ctx: Context) -> Outcome:
-    """The step of a client whose clock is wrong."""
+    """The step of a client with a wrong clock."""
     return arrival(ctx, "commanded by a client whose clock is an hour behind")
 
 

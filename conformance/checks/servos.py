@@ -1,7 +1,7 @@
-"""Check hands of position servos: speed, grip, rest and silence, by their positions alone.
+"""Check hands of position servos by their positions alone: speed, grip, rest and silence.
 
-Such a hand has no gains, and no source says what force its currents are. So a grip shows by where
-the joints stand: at the object, while they are commanded to go on.
+Such a hand has no gains, and the force of its currents is not documented. So a grip is recognised
+by position: the joints stand at the object while their goals lie beyond it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _STANDS_S = 0.4  # s within which a joint that stands has come to its goal
 
 @check("BRAINCO-SPEED-01")
 def slow_command(ctx: Context) -> Outcome:
-    """The fastest that a joint moves while it is commanded to move slowly."""
+    """The top speed of a joint that is commanded to move slowly."""
     worst: tuple[float, int, tuple[float, float]] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -43,7 +43,7 @@ def slow_command(ctx: Context) -> Outcome:
 
 @check("BRAINCO-GRIP-01")
 def keeps_grip(ctx: Context) -> Outcome:
-    """How far a joint that presses on the object opens, while it is commanded to close."""
+    """Opening of a joint that presses on the object while it is commanded to close."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     worst: tuple[float, int, float] | None = None
@@ -82,7 +82,7 @@ def _gives_way(
         spec = ctx.joints[joint]
         closed = q[:, joint] * spec.closing
         if target * spec.closing - float(closed[0]) < ctx.tolerance("min_held_stroke", joint):
-            continue  # it got there, or nearly
+            continue  # it arrived, or nearly
         opened = np.maximum.accumulate(closed) - closed
         i = int(np.argmax(opened))
         found.append((joint, float(opened[i]), float(t[i])))
@@ -91,7 +91,7 @@ def _gives_way(
 
 @check("BRAINCO-STILL-02")
 def vibrates(ctx: Context) -> Outcome:
-    """The most turns of q a second of a joint whose goal has stayed the same."""
+    """The most reversals of q per second of a joint with a constant goal."""
     worst: tuple[float, int, tuple[float, float], float] | None = None
     for begin, end in _rests(ctx):
         rows = ctx.states.between(begin, end)
@@ -116,9 +116,9 @@ def vibrates(ctx: Context) -> Outcome:
 
 
 def _rests(ctx: Context) -> list[tuple[float, float]]:
-    """Stretches in which the goal of every joint stays the same, and is reached or blocked."""
+    """Stretches with constant goals that are reached or blocked."""
     found = [ctx.span(p) for p in ctx.phases("listen")]
-    # one side grips, and the other holds its pose beside it
+    # one side grips while the other holds its pose
     found += [
         (begin + _CONTACT_S, end) for begin, end in map(ctx.span, ctx.recording.phases("squeeze"))
     ]
@@ -130,7 +130,7 @@ def _rests(ctx: Context) -> list[tuple[float, float]]:
 
 
 def _turns(q: Floats, least: float) -> int:
-    """How often q turns round by at least so much."""
+    """Number of reversals of q of at least this size."""
     turns, way, extreme = 0, 0, float(q[0]) if len(q) else 0.0
     for value in q.tolist():
         if way >= 0 and value < extreme - least:
@@ -144,7 +144,7 @@ def _turns(q: Floats, least: float) -> int:
 
 @check("BRAINCO-WDOG-01")
 def goes_nowhere_else(ctx: Context) -> Outcome:
-    """How far a joint leaves the way to its last goal, while there are no commands."""
+    """Deviation of a joint from the way to its last goal while there are no commands."""
     worst: tuple[float, int, float] | None = None
     for begin, end, goal in _silences(ctx):
         rows = ctx.states.between(begin, end)
@@ -177,7 +177,7 @@ def goes_nowhere_else(ctx: Context) -> Outcome:
 
 @check("BRAINCO-WDOG-04")
 def stops_in_silence(ctx: Context) -> Outcome:
-    """Whether a joint that was on its way stands still after the time-out."""
+    """Whether a moving joint stands still after the time-out."""
     least = ctx.requirement.tolerance("min_left_stroke")
     seen = False
     for begin, end, goal in _silences(ctx):

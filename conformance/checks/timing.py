@@ -1,9 +1,9 @@
-"""Rates, gaps, order and freshness of the state.
+"""Check rate, gaps, order and freshness of the state.
 
-Rates, jitter and freshness are judged in sliding windows: a fault that lasts for a part of the
-recording counts as one that lasts for all of it. Source timestamps are used where the recording has
-them, so that a late reception does not count as a late hand. In a run of the kit, gaps and jitter
-are judged by the times of reception as well: there the kit's own lateness is known and excuses.
+Rates, jitter and freshness are judged in sliding windows, so a temporary fault counts like a
+permanent one. Source timestamps are used where the recording has them, so that late reception does
+not count against the hand. In a run of the kit, gaps and jitter are also judged by reception times,
+because there the kit's own lateness is known and taken into account.
 """
 
 from __future__ import annotations
@@ -30,26 +30,24 @@ OWN_GAP_RULE = (
     *("foreign", "burst", "load"),
 )
 OWN_RATE_RULE = ("load", "burst", "shutdown")
-"""Stimuli during which the state's rate is judged by another requirement, or there is no service.
-"""
+"""Stimuli during which another requirement judges the state rate, or there is no service."""
 _GAP = 0.1  # s; longer intervals are gaps, which RATE-03 judges
 _STRIDE = 0.1  # s from one window to the next
 COARSEST = 0.02
-"""Part of a joint's range: the coarsest encoder that good hands have."""
+"""Coarsest encoder step of a good hand, as a part of the joint's range."""
 _FEW_CHANGES = 10
-"""Changes of q from which on they show an encoder's step."""
+"""Fewest changes of q that show an encoder's step."""
 _ON_LATTICE = 0.9
 """Part of the changes that must be multiples of an encoder's step: noise makes others."""
 _OFF_LATTICE = 0.05
-"""Parts of an encoder's step by which a multiple of it may be off, as published values are
-rounded."""
-_IN_A_ROW = 5  # held positions, in the median of which one outlier does not count
+"""Tolerance of a multiple of the encoder's step, as a part of the step, for rounded values."""
+_IN_A_ROW = 5  # held positions, whose median ignores one outlier
 
 
 def _times(ctx: Context) -> Iterator[Floats]:
-    """The times of the states by which gaps and jitter are judged.
+    """The times of the states for gaps and jitter.
 
-    Source timestamps, and those of reception where the recording says how late the kit was.
+    Source timestamps, and reception times if the recording says how late the kit was.
     """
     yield ctx.states.clock
     if ctx.recording.stimulus is not None:
@@ -79,7 +77,7 @@ def longest_gap(ctx: Context, limit: float, begin: float, end: float) -> Measure
 
 
 def gap_measures(found: Iterable[tuple[float, float]], limit: float) -> list[Measure]:
-    """The gaps (begin, end) as measures against the longest one that is allowed, s."""
+    """The gaps (begin, end) as measures against the longest allowed one, s."""
     return [Measure(b - a, limit, span=(a, b)) for a, b in found]
 
 
@@ -89,10 +87,10 @@ def _spans(ctx: Context, names: tuple[str, ...]) -> list[tuple[float, float]]:
 
 
 def _slow_stretches(ctx: Context) -> list[tuple[float, float, Floats]]:
-    """Begin, end and intervals of each stretch in which the rate is too low in every window.
+    """Begin, end and intervals of each stretch with too low a rate in every window.
 
-    The longest interval of a window is left out: a single late state is judged by RATE-03 and
-    RATE-04.
+    The longest interval of a window is left out, because RATE-03 and RATE-04 judge a single late
+    state.
     """
     clock = ctx.states.clock
     lengths, starts = np.diff(clock), clock[:-1]
@@ -106,7 +104,7 @@ def _slow_stretches(ctx: Context) -> list[tuple[float, float, Floats]]:
     starting = np.arange(0.0, float(passed[-1]) - window, _STRIDE)
     if (lengths >= 0).all():
         rows = np.searchsorted(passed, (starting, starting + window)).T
-    else:  # unsorted: what is found for a time depends on which others are looked for with it
+    else:  # unsorted: the result for one time would depend on the others in the query
         each = [np.searchsorted(passed, (at, at + window)) for at in starting]
         rows = np.array(each, dtype=np.intp).reshape(-1, 2)
     rows = rows[rows[:, 1] - rows[:, 0] >= 2]
@@ -160,14 +158,14 @@ def slow(ctx: Context, rate: float) -> bool:
 
 
 def least_rate(ctx: Context) -> float:
-    """The least rate that is measured of a hand that meets the limit, Hz."""
+    """The lowest measured rate of a hand that meets the limit, Hz."""
     return (1 - ctx.tolerance("slack_part")) * ctx.tolerance("min_rate_hz")
 
 
 def too_slow(ctx: Context, outcome: Outcome, rate: float, intervals: Floats) -> Outcome:
-    """The outcome with its size: how much later than allowed each state comes.
+    """The outcome with its size: the delay of each state beyond the limit.
 
-    :param intervals: those that the rate is of, seconds.
+    :param intervals: the intervals of the rate, seconds.
     """
     period = 1 / ctx.tolerance("min_rate_hz")
     size = 1 / rate - period if rate > 0 else math.inf
@@ -251,7 +249,7 @@ def no_gap(ctx: Context) -> Outcome:
     clock = ctx.states.clock
     if len(clock) < 2:
         return ctx.skipped("fewer than two states")
-    # up to the end of the recording: a state that never comes back is a gap as well
+    # to the end of the recording: a state that never resumes is a gap too
     end = max(float(clock[-1]), ctx.recording.duration)
     found = gaps(ctx, limit, max(float(clock[0]), float(ctx.states.t[0])), end)
     excluded = _spans(ctx, OWN_GAP_RULE)
@@ -308,7 +306,7 @@ def regular(ctx: Context) -> Outcome:
 
 @check("DEX1-RATE-05", "DEX3-RATE-05")
 def spread(ctx: Context) -> Outcome:
-    """Long intervals between states that follow each other, as published and as received."""
+    """Consecutive long intervals between states, as published and as received."""
     limit, window = ctx.tolerance("max_interval_s"), ctx.tolerance("window_s")
     allowed = int(ctx.tolerance("max_count"))
     excluded = _spans(ctx, OWN_RATE_RULE)
@@ -358,8 +356,8 @@ def _worst_p99(ctx: Context, clock: Floats) -> tuple[float, float, float]:
     def p99(i: int, j: int) -> tuple[float, float, float]:
         return percentile(intervals[i:j], 99), float(clock[i]), float(clock[j])
 
-    # A window with fewer intervals as long as the worst 99th percentile so far than lie above its
-    # own is not worse. What the first one is found by only decides how soon it is a high one.
+    # A window cannot be worse if it has fewer intervals above the worst 99th percentile so far than
+    # lie above its own. The choice of the first window affects only how soon a high value is found.
     worst = p99(*rows[:, np.argmax(_count(intervals >= percentile(intervals, 99), rows))].tolist())
     above = ((rows[1] - rows[0] - 1) * 0.01).astype(np.intp)
     left = rows[:, _count(intervals >= worst[0], rows) >= above]
@@ -367,14 +365,14 @@ def _worst_p99(ctx: Context, clock: Floats) -> tuple[float, float, float]:
 
 
 def _count(which: NDArray[np.bool_], rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """How many are true from each row in ``rows[0]`` to before the one in ``rows[1]``."""
+    """Number of true values from each row in ``rows[0]`` to before that in ``rows[1]``."""
     passed = np.concatenate(([0], np.cumsum(which)))
     return np.asarray(passed[rows[1]] - passed[rows[0]])
 
 
 @check("DEX1-ORDER-01", "DEX3-ORDER-01", "H1-ORDER-01")
 def order(ctx: Context) -> Outcome:
-    """Source timestamps rise from sample to sample."""
+    """Source timestamps increase from sample to sample."""
     sent = ctx.states.sent
     if len(sent) < 2 or not np.isfinite(sent).all():
         return ctx.skipped("the recording has no source timestamps")
@@ -412,7 +410,7 @@ class _Course:
 
     @classmethod
     def from_context(cls, ctx: Context, joint: int) -> _Course:
-        """A joint's; the same for all checks."""
+        """A joint's data, cached for all checks."""
         return ctx.once(("course", joint), lambda: cls._from_states(ctx, joint))
 
     @classmethod
@@ -421,15 +419,15 @@ class _Course:
         good = finite_rows(q)
         t, q = t[good], q[good]
         steps = np.diff(q)
-        rows = np.flatnonzero(steps != 0)  # of bits: several times as fast
+        rows = np.flatnonzero(steps != 0)  # comparing bits is several times as fast
         return cls(t, q, rows + 1, steps[rows])
 
     def encoder_step(self, coarsest: float) -> float:
         """The step of the encoder that these positions come from, rad; 0 where they show none.
 
-        With an encoder, changes are multiples of its step, and the positions lie on a lattice: on
-        two, where it is homed again when the service restarts. Old values of a finer encoder may
-        change by equal amounts while the joint has a constant speed, but they lie anywhere.
+        With an encoder, changes are multiples of its step, and the positions lie on a grid: on two,
+        if it is homed again at a restart of the service. Old values of a finer encoder may change
+        by equal amounts at constant speed, but do not lie on a grid.
 
         :param coarsest: the largest step that counts as an encoder's, rad.
         """
@@ -451,7 +449,7 @@ class _Course:
         return step if bins[-4:].sum() >= _ON_LATTICE * len(phases) else 0.0
 
     def held(self, samples: float, which: NDArray[np.bool_]) -> bool:
-        """Whether one of these changes comes after so many states of the same position."""
+        """Whether one of these changes follows this many states of one position."""
         chosen = np.flatnonzero(which)
         before = np.where(chosen > 0, self.changes[chosen - 1], 0)
         return bool((self.changes[chosen] - before >= samples).any())
@@ -459,7 +457,7 @@ class _Course:
 
 @check("DEX1-FRESH-02", "DEX3-FRESH-02")
 def not_frozen(ctx: Context) -> Outcome:
-    """The longest interval of equal positions that ends in a jump that no joint can make."""
+    """The longest interval of equal positions that ends in an impossible jump."""
     limit = ctx.tolerance("max_frozen_s")
     worst = 0.0
     for joint in range(len(ctx.joints)):
@@ -484,7 +482,7 @@ def not_frozen(ctx: Context) -> Outcome:
         frozen &= sent >= ctx.tolerance("min_samples")
         held = np.zeros(len(begin))
         for i in np.flatnonzero(frozen):
-            # a hand that starts fast may be far away when the next measurement comes
+            # a fast hand may be far away at the next measurement
             if jump[i] <= _speed_after(t, q, int(changes[i + 1])) * ctx.tolerance("max_age_s"):
                 frozen[i] = False
                 continue
@@ -511,7 +509,7 @@ def not_frozen(ctx: Context) -> Outcome:
                 .timed(float(held[i]), limit)
                 .if_late(float(held[i]) - limit)
             )
-    # the first second is enough of a hand that moves in it
+    # the first second suffices for a hand that moves in it
     if not any(len(np.unique(c)) > 3 for q in (ctx.states.q[:500], ctx.states.q) for c in q.T):
         return ctx.skipped("the hand does not move in this recording")
     return ctx.passed(
@@ -522,7 +520,7 @@ def not_frozen(ctx: Context) -> Outcome:
 
 
 def _speed_after(t: Floats, q: Floats, row: int) -> float:
-    """How fast q changes within 30 ms from a row on, rad/s."""
+    """Speed of q within 30 ms from a row on, rad/s."""
     last = min(int(np.searchsorted(t, t[row] + 0.03)), len(t) - 1)
     span = float(t[last] - t[row])
     return abs(float(q[last] - q[row])) / span if span > 0.0 else 0.0
@@ -531,7 +529,7 @@ def _speed_after(t: Floats, q: Floats, row: int) -> float:
 def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float) -> float:
     """The last time in [begin, end] at which the commanded position was q.
 
-    A hand that rests at its commanded position repeats that position correctly. ``begin`` where no
+    A hand at rest at its commanded position correctly repeats that position. ``begin`` if no
     command is known.
     """
     t, commanded = ctx.commands.t, ctx.commands.q[:, joint]
@@ -549,7 +547,7 @@ def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float)
 
 
 def _medians(rows: Floats) -> Floats:
-    """The median of each row; of rows of five by comparing columns, as it is needed mostly."""
+    """The median of each row; for the usual rows of five by comparing columns."""
     if rows.shape[1] != 5:
         return np.asarray(np.median(rows, axis=1))
     a, b, c, d, e = rows.T
@@ -561,7 +559,7 @@ def _medians(rows: Floats) -> Floats:
 
 @check("DEX1-FRESH-01", "DEX3-FRESH-01", "DEX1-FRESH-04")
 def fresh(ctx: Context) -> Outcome:
-    """How long a position stays the same while the hand moves."""
+    """Time without a new position while the hand moves."""
     worst: Outcome | None = None
     for joint in range(len(ctx.joints)):
         outcome = _fresh(ctx, joint)

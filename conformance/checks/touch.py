@@ -1,5 +1,5 @@
-"""Checks of a hand's topic for its tactile areas; what they feel is in
-:mod:`~dexkit.conformance.checks.pressure`.
+"""Check the topic of a hand's tactile areas; :mod:`~dexkit.conformance.checks.pressure` checks the
+values.
 """
 
 from __future__ import annotations
@@ -83,13 +83,13 @@ def touch_goes_on(ctx: Context) -> Outcome:
 
 
 def _longest_gap(touch: Floats, states: Floats) -> tuple[float, float]:
-    """The longest time without ``touch``, and when it began; less what the states paused."""
+    """The longest time without ``touch`` beyond pauses of the state, and its begin."""
     times = np.concatenate((touch, states[-1:]))
     worst = (0.0, float(times[0]))
     for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
         if end - begin <= worst[0]:
             continue
-        # a service that is restarted, or a machine that stood still, is silent on both
+        # a restarted service or a paused machine is silent on both
         own = states[(states > begin) & (states < end)]
         quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
         worst = max(worst, (end - begin - quiet, begin))

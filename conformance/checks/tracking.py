@@ -1,4 +1,4 @@
-"""Error and delay between command and position over a session."""
+"""Check error and delay between command and position over a session."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _TOLERANCES = (
     *("min_session_s", "min_travel_stroke", "blocked_tau_nm", "blocked_speed_rad_s"),
     *("min_speed_rad_s", "min_step_stroke"),
 )
-"""Tolerances that the figures depend on."""
+"""Tolerances that the error figures depend on."""
 _SAME = 1e-12
-"""Part of a sum of squares by which sums in another order differ at most."""
+"""Largest relative difference between sums of squares in different order."""
 _ROUNDING = 1e-11
-"""Part of the sums of squares by which a sum is off at most."""
+"""Largest relative error of a sum of squares."""
 _STEPS = (16, 4)
-"""Every so many delays are tried, before each of those that are left."""
+"""Step of the coarse search over delays, before the fine search."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def _session(ctx: Context) -> tuple[float, float] | str:
 
 
 def measure(ctx: Context, search: float) -> list[Tracking] | str:
-    """Error figures of the joints that the session moves, or why there are none."""
+    """Error figures of the joints that the session moves, or the reason why there are none."""
     tolerances = ctx.requirement.tolerances
     used = tuple(tolerances.get(name) for name in _TOLERANCES)
     return ctx.once(("tracking", search, *used), lambda: _measured(ctx, search))
@@ -137,7 +137,7 @@ def _measure(
     n = len(grid)
     late = sliding_window_view(asked, n)[::-1]  # by delay
     best = _best_delay(seen, asked, free)
-    # a hand that is faster at times than it showed lies between what it reaches and the command
+    # a hand that is sometimes faster than assumed lies between the reachable goal and the command
     error = seen[at_work] - late[best][at_work]
     if top_speed is not None:
         reached, wanted = late[best][at_work], commanded[most - best : most - best + n][at_work]
@@ -180,9 +180,9 @@ def _best_delay(seen: Floats, asked: Floats, free: NDArray[np.bool_]) -> int:
         wanted = squares[of] if some is None else np.einsum("ki,i->k", late2[of], some)
         return np.asarray(own + wanted - 2.0 * np.einsum("ki,i->k", late[of], seen))
 
-    same = _SAME * own  # sums of two machines differ by less
+    same = _SAME * own  # differences between machines are smaller
     off = _ROUNDING * (own + float(np.einsum("i,i", asked, asked)))
-    # from one delay to the next the root of the sum changes no more than the command does
+    # between neighbouring delays the root of the sum changes by no more than the command
     change = math.sqrt(float(np.einsum("i,i", *[np.diff(asked)] * 2))) * (1 + _ROUNDING)
     first, last = 0, delays - 1
     for step in _STEPS:
@@ -201,11 +201,11 @@ def _best_delay(seen: Floats, asked: Floats, free: NDArray[np.bool_]) -> int:
 
 
 def _top_speed(ctx: Context, joint: int) -> float | None:
-    """Speed that a joint is judged with, rad/s: a gripper's slowest in large steps of the run, the
-    one that limits a joint of several, and no less than the least that is required.
+    """Speed limit assumed for a joint, rad/s: a gripper's slowest in large steps of the run, or a
+    finger joint's limiting speed; at least the required minimum.
 
-    None where the requirement does not allow for it, where none limits it, or without such steps: a
-    session from outside was commanded by a client that knew the state.
+    None if the requirement does not allow for it, without a limit, or without such steps: the
+    client of an external session knew the state.
     """
     if "min_speed_rad_s" not in ctx.requirement.tolerances:
         return None
@@ -223,7 +223,7 @@ def _top_speed(ctx: Context, joint: int) -> float | None:
 
 
 def _within_reach(goal: Floats, most: float) -> Floats:
-    """The goal that a hand of limited speed can follow.
+    """The goal that a hand of limited speed can reach.
 
     :param goal: rad, at equal intervals.
     :param most: largest change in one interval, rad.
@@ -238,8 +238,8 @@ def _within_reach(goal: Floats, most: float) -> Floats:
 def _free(ctx: Context, joint: int, at: NDArray[np.intp], goal: Floats) -> NDArray[np.bool_]:
     """Rows in which no object blocks a joint.
 
-    For a gripper the object's position is known from the run's settings. Otherwise a joint that
-    presses and does not move is blocked.
+    A gripper's object is known from the run's settings. Otherwise a joint that presses and does not
+    move counts as blocked.
     """
     states = ctx.states
     if ctx.recording.stimulus is not None:

@@ -1,7 +1,7 @@
-"""Motion that no command explains: of a hand at rest, and outside of where it is commanded to.
+"""Check for motion without a command: of a hand at rest, and outside of the commanded range.
 
-Both checks look at the whole run, not at the ends of steps. Stretches that other requirements are
-about (bad commands, missing commands, commands without a position gain) are left out.
+Both checks use the whole run, not only the ends of steps. Stretches that other requirements judge
+(bad commands, missing commands, commands without a position gain) are left out.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ OWN_RULE = (
     ),
     *("guard-drive", "guard", "guard-latch", "guard-clear"),
 )
-"""Stimuli during which other requirements say what may move."""
+"""Stimuli during which other requirements judge motion."""
 _STOPPED = ("silence", "rejected")
-"""Those at whose end a hand has stopped: its next motion starts from there."""
+"""The ones at whose end a hand has stopped; its next motion starts there."""
 _GRID = 0.01  # s, of the cells in which extremes of q and of goals are compared
 _AT_REST_S = 0.3  # s without motion after which a joint is at rest
-_UNDRIVEN_S = 0.1  # the same before a command: nothing has been asked to move
+_UNDRIVEN_S = 0.1  # the same before the first command
 _AT_REST_PART = 0.01  # of the stroke by which q may vary meanwhile
 
 
@@ -45,7 +45,7 @@ _AT_REST_PART = 0.01  # of the stroke by which q may vary meanwhile
 class _Goals:
     """The position commands to one joint, rad.
 
-    :param t: when each was received, s; only those at which ``low`` or ``high`` changes.
+    :param t: times of reception, s; only commands that change ``low`` or ``high``.
     :param low: the goal; -inf for a command that drives the joint by anything else than a
         position, inf for one that does not drive it.
     :param high: likewise, with the other sign.
@@ -57,7 +57,7 @@ class _Goals:
 
 
 def _goals(ctx: Context, joint: int, *, timeout: float = np.inf) -> _Goals:
-    """The goals of one joint; a command that is not finite is none.
+    """The goals of one joint; non-finite commands are ignored.
 
     :param timeout: s after which a command is no goal any more.
     """
@@ -85,13 +85,13 @@ def _goals(ctx: Context, joint: int, *, timeout: float = np.inf) -> _Goals:
 
 
 def _excluded(ctx: Context) -> list[tuple[float, float]]:
-    """Begin and end of the stretches with rules of their own."""
+    """Begin and end of the excluded stretches."""
     return [ctx.span(p) for name in OWN_RULE for p in ctx.recording.phases(name, ctx.side)]
 
 
 @check("DEX1-STILL-01", "DEX3-STILL-01")
 def still(ctx: Context) -> Outcome:
-    """The largest motion of a joint that had come to rest, while its goal stayed the same."""
+    """The largest motion of a joint at rest with a constant goal."""
     if not len(ctx.commands):
         return ctx.skipped("no commands to this hand in the recording")
     excluded = _excluded(ctx)
@@ -160,9 +160,10 @@ def _stretches(
 def _leaves(
     ctx: Context, joint: int, begin: float, end: float, goal: float | None
 ) -> tuple[float, float] | None:
-    """How far a joint leaves the place where it came to rest, rad, and when.
+    """Motion of a joint away from its rest position, rad, and the time.
 
-    Motion from there to the goal is none: a slow joint may still arrive. None if it does not come
+    Motion from there towards the goal does not count: a slow joint may still arrive. None if it
+    does not come
     to rest in [begin, end].
     """
     rows = ctx.states.between(begin, end)
@@ -187,10 +188,10 @@ def _leaves(
 
 @check("DEX1-PATH-01", "DEX3-PATH-01")
 def path(ctx: Context) -> Outcome:
-    """How far q goes beyond where the joint was and where it was commanded to go.
+    """Excess of q over the range between earlier position and commanded goals.
 
-    At each time q must lie between the position of ``before_s`` ago and the goals that were in
-    force since then, or up to ``max_delay_s`` before.
+    At each time q must lie between the position ``before_s`` earlier and the goals in force since
+    then or up to ``max_delay_s`` before.
     """
     worst: tuple[float, float, int, float] = (-1.0, 0.0, 0, 0.0)
     for joint, spec in enumerate(ctx.joints):
@@ -224,7 +225,7 @@ def path(ctx: Context) -> Outcome:
 
 
 def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
-    """How far q is outside of the hull of its earlier position and its goals, rad, and when."""
+    """Excess of q over the hull of its earlier position and its goals, rad, and the time."""
     good = np.isfinite(ctx.states.q[:, joint])
     t, q = ctx.states.t[good], ctx.states.q[good, joint]
     goals = _goals(ctx, joint, timeout=ctx.recording.model.command_timeout)
@@ -262,12 +263,12 @@ def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
 
 
 def _in_force(goals: _Goals, origin: float, cells: int) -> tuple[Floats, Floats]:
-    """The least and the largest goal in each cell; what was in force at its begin counts."""
+    """The lowest and highest goal in each cell, including the one in force at its begin."""
     at: NDArray[np.intp] = ((goals.t - origin) / _GRID).astype(np.intp)
     known = at < cells
     begins = origin + _GRID * np.arange(cells)
     newest = np.searchsorted(goals.t, begins, "right") - 1
-    # before the first command nothing may move: the hull is where the hand is
+    # before the first command nothing may move: the hull is the hand's position
     low = np.where(newest >= 0, goals.low[np.maximum(newest, 0)], np.inf)
     high = np.where(newest >= 0, goals.high[np.maximum(newest, 0)], -np.inf)
     np.minimum.at(low, at[known], goals.low[known])
@@ -291,7 +292,7 @@ def starts_idle(ctx: Context) -> Outcome:
             continue
         away = np.abs(q - q[0])
         worst = max(worst, (float(away.max()), float(t[int(np.argmax(away))])))
-        # what a motor lets go of, it may still have had in its hand at first
+        # a motor that releases a grip may still show its force at first
         for x in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1):
             at = float(x)
             piece = np.abs(tau[(t >= at) & (t < at + 0.1)])

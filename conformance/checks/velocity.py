@@ -1,8 +1,7 @@
 """Check dq against q from one state to the next, and at rest.
 
-The windows of :mod:`~dexkit.conformance.checks.consistency` compare integrals: a dq that is twice
-the speed and 0 by turns has the right one, and one that is stuck while the joint stands is in no
-window with motion.
+:mod:`~dexkit.conformance.checks.consistency` compares integrals in windows with motion. It misses a
+dq that alternates between twice the speed and 0, and one that is stuck while the joint stands.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from dexkit.hand import Floats
 __all__: list[str] = []
 
 _FEW = 10
-"""States that are needed to say anything."""
+"""Fewest states for a verdict."""
 _CALMS_S = 0.2
-"""Seconds that a hand shakes on after contradictory commands: with a late command, and its mass."""
+"""Seconds for which a hand may still oscillate after contradictory commands."""
 
 
 def _series(ctx: Context, joint: int) -> tuple[Floats, Floats, Floats]:
@@ -40,7 +39,7 @@ def _outside(ctx: Context, t: Floats) -> Floats:
 
 @check("DEX1-FIELD-19", "DEX3-FIELD-18")
 def one_course(ctx: Context) -> Outcome:
-    """In how many cells of a window dq goes forth and back by the speed itself, in the worst."""
+    """Number of cells in which dq alternates by the speed itself, in the worst window."""
     if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     cell = ctx.tolerance("cell_s")
@@ -85,7 +84,7 @@ def one_course(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-20", "DEX3-FIELD-19")
 def at_rest(ctx: Context) -> Outcome:
-    """The largest mean of dq of a joint whose q stands."""
+    """The largest mean of dq of a joint at rest."""
     if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     cell = ctx.tolerance("cell_s")
@@ -117,8 +116,8 @@ def at_rest(ctx: Context) -> Outcome:
         rests += int(rest.sum())
         if not rest.any():
             continue
-        # without the first cell, which it may take to stand; a tremor in the play of a gear has no
-        # mean
+        # without the first cell, in which it may come to rest; a tremor in the play of a gear has
+        # zero mean
         last = np.where(rest, np.abs(means[:, 1:].mean(axis=1)), 0.0)
         i = int(np.argmax(last))
         found = (float(last[i]) / spec.stroke, float(last[i]), joint, float(edges[i + count - 1]))

@@ -51,7 +51,7 @@ Precondition = Callable[[Judgement, ContextT], "Result | None"]
 
 @dataclass(frozen=True)
 class Layer(Generic[RecordingT, ViewT, ContextT]):
-    """How one layer is judged.
+    """The data by which one layer is judged.
 
     :param name: one of :data:`~dexkit.conformance.requirements.LAYERS`; it selects the catalogue
         and, in :data:`~dexkit.conformance.checks.CHECK_MODULES`, the checks.

@@ -26,7 +26,7 @@ _REMEDY = {
     "shutdown": _NOT_OURS,
     "service-restart": _NOT_OURS,
 }
-"""What to do, or why not, where a stimulus was not applied."""
+"""Advice or reason if a stimulus was not applied."""
 
 
 def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
@@ -61,7 +61,7 @@ def recorded(judgement: Judgement, context: Context) -> Result | None:
 
 
 def _missing(context: Context) -> str:
-    """What the recording lacks for this requirement, as text; empty if nothing."""
+    """Text that names what the recording lacks for this requirement; empty if nothing."""
     requirement, recording = context.requirement, context.recording
     if requirement.phase:
         if recording.stimulus is None:

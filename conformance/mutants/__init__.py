@@ -27,7 +27,7 @@ from dexkit.models import model_plugins
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
 MODULES = (any_model, gripper, fingers, servos, touch, operator, clients, robot, usb)
-"""Where wrong hands are declared."""
+"""Modules that declare wrong hands."""
 
 
 @cache

@@ -309,7 +309,7 @@ class SwapsBuffers(Service):
 # of a Dex5-1, the first requirement that finds that nothing moves is about the mode byte
 @wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01"))
 class Frozen(Service):
-    """Publishes its first measurement for ever, at full rate."""
+    """Publishes its first measurement forever, at full rate."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]

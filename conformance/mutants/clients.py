@@ -70,7 +70,7 @@ class SendsDegrees(ReferenceClient):
 
 @wrong_hand("DEX1-CLIENT-04")
 class SendsNormalised(ReferenceClient):
-    """Sends q from 0 to 1, and takes states for the same."""
+    """Sends q from 0 to 1, and interprets states in the same way."""
 
     course = ((0, 0.0), (2.0, 1.0), (3.2, 0.0), (4.4, 1.0), (5.9, 1.0))
 
@@ -174,7 +174,7 @@ class JumpsToTheTarget(ReferenceClient):
 
 @wrong_hand("DEX1-CLIENT-11")
 class TwoClients(ReferenceClient):
-    """A second client commands the same hands to another pose, by turns with the first."""
+    """A second client commands the same hands to another pose, alternating with the first."""
 
     def messages(self, now: float) -> list[tuple[str, bytes]]:
         first = super().messages(now)

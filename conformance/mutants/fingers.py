@@ -146,7 +146,7 @@ class TurnedVelocity(FingerService):
 
 
 class _Timed(FingerService):
-    """Has a fault at a certain time: its messages are made anew at rest, too."""
+    """Has a fault at a certain time; its messages are rebuilt at rest, too."""
 
     def live(self, dt: float) -> None:
         super().live(dt)
@@ -180,7 +180,7 @@ class ShakenVelocity(_Timed):
 
 @wrong_hand("DEX3-FIELD-18")
 class VelocityByTurns(_Timed):
-    """Publishes twice the speed as dq and 0 by turns."""
+    """Publishes alternately twice the speed and 0 as dq."""
 
     turns = 0
 
@@ -403,7 +403,7 @@ class SlowFoam(FingerService):
 
 @wrong_hand("DEX3-SENS-10", sides=BOTH)
 class FeelsMotionOnly(Dex3Service):
-    """Reads its sensors in the task that moves the joints: at rest the pressures stand."""
+    """Reads its sensors in the task that moves the joints: at rest the pressures are constant."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -442,7 +442,7 @@ class OneSensorBuffer(FingerService):
 
 @wrong_hand("DEX3-SENS-09", sides=BOTH)
 class TaresInAGrip(FingerService):
-    """Takes what each pressure has been for the last second as its zero, as drift."""
+    """Treats a pressure that is constant for a second as drift, and takes it as the new zero."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -792,7 +792,7 @@ class _Graded(FingerHand):
 
 @wrong_hand("DEX3-GAIN-05")
 class TwoGrades(FingerService):
-    """Knows a soft grip and a firm one: from a quarter of the client's stiffness on, all of it."""
+    """Has only a soft and a firm stiffness: from a quarter of the client's on, the full one."""
 
     hand_fault = _Graded
 
@@ -830,7 +830,7 @@ class _OneStatus(FingerHand):
 
 @wrong_hand("DEX3-MODE-05")
 class StatusOfOneJoint(FingerService):
-    """Takes the status of one joint for that of all."""
+    """Applies the status of one joint to all."""
 
     hand_fault = _OneStatus
 
@@ -857,7 +857,7 @@ class _AnyStatus(FingerHand):
 
 @wrong_hand("DEX3-MODE-07")
 class OneBitOfStatus(Dex3Service):
-    """Looks at one bit of the status: 3, 5 and 7 drive as 1 does."""
+    """Evaluates one bit of the status: 3, 5 and 7 drive like 1."""
 
     hand_fault = _AnyStatus
 
@@ -1242,7 +1242,7 @@ class _OneGuard(FingerHand):
 
 @wrong_hand("DEX3-GUARD-02", also=("DEX3-GUARD-03", "DEX3-HOLD-01", "DEX3-MODE-05"))
 class GuardOfTheLast(Dex3Service):
-    """Takes the last motor's time-out bit for that of all."""
+    """Applies the last motor's time-out bit to all."""
 
     hand_fault = _OneGuard
 

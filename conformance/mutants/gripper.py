@@ -206,7 +206,7 @@ class RepeatsItsStates(_Fields):
 
 @wrong_hand("DEX1-FIELD-19")
 class VelocityByTurns(_Fields):
-    """Measures every second state, and takes dq over one period: twice the speed and 0 by turns."""
+    """Measures every second state, with dq over one period: alternately twice the speed and 0."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -255,7 +255,7 @@ class ShiftsForAWhile(_Fields):
     whole=True,
 )
 class GoesThroughTheObject(_Fields):
-    """In contact lets the published q, and dq with it, go on to the command."""
+    """In contact the published q, and dq with it, continues to the command."""
 
     speed = 0.4  # rad/s
 
@@ -572,7 +572,7 @@ class _KeepsGains(ReferenceHand):
 
 @wrong_hand("DEX1-FORCE-15", also=("DEX1-GAIN-02",), sides=BOTH, whole=True)
 class KeepsGainsAtTheSamePlace(ReferenceService):
-    """Takes gains of 0 for those before where q has not changed."""
+    """Ignores gains of 0 if q has not changed."""
 
     hand = _KeepsGains
 
@@ -592,7 +592,7 @@ class _HardReflex(ReferenceHand):
 
 @wrong_hand("DEX1-FORCE-14", also=("DEX1-FORCE-12",), sides=BOTH)
 class GripsHarderWhenSoft(ReferenceService):
-    """Takes a softer grip for slip, and doubles its force until it lets go."""
+    """Mistakes a softer grip for slip, and doubles its force until it lets go."""
 
     hand = _HardReflex
 
@@ -1063,7 +1063,7 @@ class _SoftInTheFree(ReferenceHand):
 
 @wrong_hand("DEX1-GAIN-05")
 class StiffnessSaturatesInTheFree(ReferenceService):
-    """Has a kp of 2.5 N m/rad at most where nothing is between the jaws."""
+    """Has a kp of 2.5 N m/rad at most without an object between the jaws."""
 
     hand = _SoftInTheFree
 
@@ -1077,7 +1077,7 @@ class _LeastStiffness(ReferenceHand):
 
 @wrong_hand("DEX1-GAIN-04")
 class SoftIsLimp(ReferenceService):
-    """Takes a kp below 1 N m/rad for none, where nothing is between the jaws."""
+    """Treats a kp below 1 N m/rad as 0 without an object between the jaws."""
 
     hand = _LeastStiffness
 
@@ -1121,7 +1121,7 @@ class OffsetOfTheForce(_Fields):
 
 @wrong_hand("DEX1-START-03")
 class KeepsItsGoal(ReferenceService):
-    """Puts the last command of the service before it in force when it starts."""
+    """Applies the last command of the previous service when it starts."""
 
     kept: dict[Side, Motor]
 
@@ -1252,7 +1252,7 @@ class GainsOfTheOtherSide(ReferenceService):
 
 @wrong_hand("DEX1-STILL-01")
 class TakesTheOtherSides(ReferenceService):
-    """Of commands that come at once it now and then gives the left hand the right one's."""
+    """When commands arrive together, the left hand sometimes gets the right hand's command."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)

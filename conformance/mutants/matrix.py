@@ -28,7 +28,7 @@ __all__ = ["Outcome", "Score", "chosen", "cost", "essential", "print_list", "try
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the trial of a wrong hand showed.
+    """Result of the trial of a wrong hand.
 
     :param missed: requirements that should have failed or warned, and did not.
     :param wrongly: requirements that failed or warned, and should not have.

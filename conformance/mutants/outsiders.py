@@ -50,8 +50,7 @@ __all__ = [
 ]
 
 GRADES = ("must-breaking", "lesser", "good")
-"""What a hand is: it breaks what clients rely on, it has a fault that they can live with, or it is
-good."""
+"""Class of a hand: it breaks something that clients rely on, has a tolerable fault, or is good."""
 
 C = TypeVar("C", bound=type[Any])
 _MARK = "_dexkit_hand"
@@ -82,7 +81,7 @@ class Outsider:
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What the checks say of a hand.
+    """Verdicts of the checks on a hand.
 
     :param failed: ids of MUSTs that fail; ``warned`` of other requirements that fail or warn;
         ``errors`` of those that could not be judged for a fault of the kit.
@@ -236,7 +235,7 @@ class Blame(NamedTuple):
 
 
 def blame(result: RunResult) -> Blame:
-    """What a hand is blamed for in a result."""
+    """The requirements that a hand fails in a result."""
     found: dict[str, set[str]] = {"failed": set(), "warned": set(), "errors": set()}
     for r in result.results:
         if r.verdict is Verdict.ERROR:

@@ -65,13 +65,13 @@ class Mutant:
 
     @property
     def summary(self) -> str:
-        """What it does wrong: the first line of its class's docstring."""
+        """Its fault: the first line of its class's docstring."""
         return (self.made.__doc__ or "").strip().splitlines()[0]
 
 
 @dataclass(frozen=True)
 class _Declaration:
-    """What one decorator declares."""
+    """The declaration of one decorator."""
 
     made: type[Any]
     kills: tuple[str, ...]

@@ -194,7 +194,7 @@ class _Overshoots(ServoHand):
 
 @wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08", "DFX-WDOG-01", "FTP-WDOG-01"))
 class Overshoots(ServoService):
-    """Goes 8 % of the travel too far in a large step, and comes back after 0.4 s."""
+    """Overshoots a large step by 8 % of the travel, and returns after 0.4 s."""
 
     hand_fault = _Overshoots
 
@@ -238,7 +238,7 @@ class _LetsGo(ServoHand):
     whole=True,
 )
 class LetsGo(ServoService):
-    """Opens after a second of full current, as a protection does that gives up."""
+    """Opens after a second of full current, like a protection that trips."""
 
     hand_fault = _LetsGo
 
@@ -285,7 +285,7 @@ class _GoesOn(ServoHand):
 
 @wrong_hand("BRAINCO-WDOG-04")
 class GoesOnForEver(ServoService):
-    """Goes on to its last goal without commands."""
+    """Continues to its last goal without commands."""
 
     hand_fault = _GoesOn
 

@@ -38,7 +38,7 @@ _BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
 
 
 class Trial(Protocol):
-    """How the wrong hands of a layer are run and judged."""
+    """Functions that run and judge the wrong hands of a layer."""
 
     def cost(self, mutant: Mutant) -> float:
         """Roughly how long a run takes, in units of the shortest on DDS."""

@@ -34,7 +34,7 @@ STYLE = (
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What is drawn of a recording.
+    """Data of a recording for drawing.
 
     :param name: for people.
     :param begin_ns: log time of second 0.

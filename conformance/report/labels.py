@@ -33,7 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Word:
-    """How a verdict is written.
+    """Text of a verdict.
 
     :param css: class of the page that colours it.
     :param mark: one sign, for tables in Markdown.
@@ -93,7 +93,7 @@ class Tally:
 
 
 def answer_of(grade: Grade) -> Word:
-    """How a grade is written; *not judged* where the run tested nothing of its kind."""
+    """Text of a grade; *not judged* if the run tested nothing of its kind."""
     return ANSWERS[grade.overall] if grade.judged else _NOT_JUDGED
 
 

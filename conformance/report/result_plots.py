@@ -175,7 +175,7 @@ def _busy(view: Recording, span: tuple[float, float]) -> list[Band]:
 
 
 def wish(view: Recording, hand: SideView, joint: int) -> Line | None:
-    """Where the modelled operator wanted a joint, or None without such a phase."""
+    """The modelled operator's target for a joint, or None without such a phase."""
     side = hand.side
     phases = view.phases(OPERATOR, side)
     if not phases or not isinstance(side, Side):

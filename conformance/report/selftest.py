@@ -56,7 +56,7 @@ class Finding:
 
 
 def findings(result: SelfTestResult) -> list[Finding]:
-    """What is wrong with a hand, and what has become worse; nothing twice."""
+    """Faults of a hand and changes for the worse, without duplicates."""
     profile = model(result.hand["model"])
     found: list[Finding] = []
     for joint in result.joints:

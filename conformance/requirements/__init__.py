@@ -62,8 +62,8 @@ _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
 LAYERS = ("dds", "usb", "robot", "client")
-"""What a requirement is about: a hand's topics, its USB device, a robot's topics, or the commands
-of the client that drives a hand."""
+"""Layers of requirements: a hand's topics, its USB device, a robot's topics, or the commands of the
+client that drives a hand."""
 _PLOTS: Mapping[str, tuple[Plot, ...]] = {
     "dds": (Plot(PlotKind.POSITION),),
     "robot": (Plot(PlotKind.POSITION),),
@@ -136,7 +136,7 @@ _TYPE_NAMES: Mapping[type, str] = {
 
 
 class Level(str, Enum):
-    """How binding a requirement is; only a MUST can fail a hand."""
+    """Level of a requirement; only a MUST can fail a hand."""
 
     MUST = "MUST"
     SHOULD = "SHOULD"
@@ -147,7 +147,7 @@ class Level(str, Enum):
 
 
 class Kind(str, Enum):
-    """What a requirement is for; each kind has a grade of its own in every report."""
+    """Purpose of a requirement; each kind has its own grade in every report."""
 
     DROP_IN = "drop-in"
     """A client that was built for the original relies on it, and the original meets it."""

@@ -46,7 +46,7 @@ _PATIENCE = 6
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known of a hand before it is tested.
+    """Properties of a hand that are known before the test.
 
     :param kp: per joint; ``kd`` likewise: those of the model's client.
     :param full: speed of each joint toward smaller and larger q, shape (n, 2).
@@ -65,7 +65,7 @@ class Setup:
     lead: float = LEAD
 
     @classmethod
-    def of(
+    def from_spec(
         cls,
         spec: HandSpec,
         *,
@@ -121,7 +121,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Moved:
-    """What came of a way.
+    """Result of a motion.
 
     :param arrived: it reached its goal, as far as the command goes.
     :param against: it moved against its command.
@@ -181,7 +181,7 @@ class Bench:
 
     @property
     def there(self) -> Floats:
-        """Where the hand is when a command reaches it: one period after its last state."""
+        """Expected position when a command reaches the hand: one period after its last state."""
         assert self.state is not None
         if len(self.t) < 2 or self.t[-1] - self.t[-2] > 4 * self.setup.period:
             return self.state.q
@@ -345,7 +345,7 @@ class Bench:
         return Series(np.array(self.t[begin:end]), table[:, 0], table[:, 1], table[:, 2])
 
     def moved(self, begin: int) -> Floats:
-        """By how much each joint is elsewhere since a place, shape (n,)."""
+        """Displacement of each joint since a given position, shape (n,)."""
         if begin >= len(self._rows):
             return np.zeros(len(self.x))
         return np.asarray(self._rows[-1][1] - self._rows[begin][1])

@@ -1,4 +1,4 @@
-"""What figures of a self-test mean: limits by the model, and what counts as wear."""
+"""Meaning of a self-test's figures: limits by the model, and limits of wear."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["BY_NAME", "KINDS", "Figure", "Kind", "Unit", "Wear", "judged"]
 
 
 class Unit(str, Enum):
-    """What a figure is measured in; limits are parts of the scale."""
+    """Unit of a figure; limits are parts of the scale."""
 
     Q = "q"
     TORQUE = "torque"
@@ -56,7 +56,7 @@ class Kind:
     help: str
 
     def scale(self, setup: Setup, joint: int, asked: float) -> float:
-        """What limits are parts of: the stroke, the torque bound, the speed that was asked for."""
+        """The scale of limits: the stroke, the torque bound, or the commanded speed."""
         if self.unit is Unit.Q:
             return float(setup.stroke[joint])
         if self.unit is Unit.TORQUE:

@@ -22,7 +22,7 @@ _NONSENSE = 20
 
 
 class End(str, Enum):
-    """How a self-test has ended."""
+    """Reason for the end of a self-test."""
 
     DONE = "done"
     STOPPED = "stopped"

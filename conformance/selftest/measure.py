@@ -30,7 +30,7 @@ _OBEYS = 0.2
 
 @dataclass(frozen=True)
 class Rest:
-    """Where a joint came to rest.
+    """Rest position of a joint.
 
     :param q: median of the samples; ``tau`` likewise.
     """
@@ -56,7 +56,7 @@ class Start:
 
 
 def rest(q: Floats, tau: Floats) -> Rest:
-    """Where it rests, from samples of nothing else."""
+    """Rest position from samples at rest."""
     return Rest(float(np.median(q)), float(np.median(tau)))
 
 
@@ -99,7 +99,7 @@ def spread(rests: Sequence[Rest]) -> float:
 
 
 def lost_motion(below: Sequence[Rest], above: Sequence[Rest], kp: float, stiffness: float) -> float:
-    """How far apart a joint rests at one command that it reaches from below and from above.
+    """Distance between a joint's rest positions at one command, reached from below and from above.
 
     A motor that follows ``tau = kp (q - q_now)`` rests beside its command by its torque at rest
     over kp: friction, not play. That part is taken away where the stiffness that was measured says

@@ -49,7 +49,7 @@ _TOUCH_PATIENCE = 60.0  # seconds without a new element
 
 @dataclass(eq=False)
 class JointFound:
-    """What was found of a joint; NaN where it was not measured.
+    """Findings about a joint; NaN where it was not measured.
 
     :ivar figures: by name (:data:`dexkit.conformance.selftest.figures.KINDS`).
     :ivar moves: names of the joints that move when it is commanded.
@@ -69,7 +69,7 @@ class JointFound:
 
 @dataclass(eq=False)
 class ElementFound:
-    """What was found of a tactile element.
+    """Findings about a tactile element.
 
     :ivar rest: Pa while nothing was touched; ``noise`` its standard deviation; NaN: no value.
     :ivar peak: most while it was pressed; NaN if it was not tested.
@@ -86,7 +86,7 @@ class ElementFound:
 
 @dataclass(eq=False)
 class Found:
-    """What a self-test has found so far.
+    """Findings of a self-test so far.
 
     :ivar touched: the elements were tried.
     """
@@ -128,7 +128,7 @@ class Procedure:
         self._skipped = False
 
     def skip(self) -> None:
-        """Go on without what :attr:`question` asks for."""
+        """Continue without the action that :attr:`question` requests."""
         self._skipped = True
 
     def run(self) -> Generator[HandCommand, HandState, None]:
@@ -137,7 +137,7 @@ class Procedure:
         self._at_rest(still)
         everything = set(range(self.setup.spec.n_joints))
         for j in self.chosen:
-            self._tell(f"{self._joint(j).name}: which joint moves, and which way", 0.0)
+            self._report_progress(f"{self._joint(j).name}: which joint moves, and which way", 0.0)
             # the others brake: one that turns the wrong way would run off while it is held
             self.bench.limp = everything - {j}
             yield from self._nudge(j)
@@ -148,10 +148,10 @@ class Procedure:
             yield from self._thoroughly(j, k, len(live))
         if self.touch:
             yield from self._feel()
-        self._tell("at rest", 1.0)
+        self._report_progress("at rest", 1.0)
         self._temperatures(still, (yield from self.bench.watch(0.3)))
 
-    def _tell(self, doing: str, part: float) -> None:
+    def _report_progress(self, doing: str, part: float) -> None:
         self.doing, self.part = doing, part
 
     def _usable(self, j: int) -> bool:
@@ -162,7 +162,7 @@ class Procedure:
         return self.setup.spec.joints[j]
 
     def _open_q(self, j: int) -> float:
-        """Where a joint waits: open, or amid its range where neither end is open."""
+        """Waiting position of a joint: open, or mid-range if neither end is open."""
         spec = self._joint(j)
         return spec.straight if spec.closing else (spec.q_min + spec.q_max) / 2
 
@@ -197,7 +197,7 @@ class Procedure:
 
     def _open(self) -> Turns[None]:
         """Open the hand slowly, finger by finger, so that no joint is in another's way."""
-        self._tell("opening the hand", 0.0)
+        self._report_progress("opening the hand", 0.0)
         for j in range(self.setup.spec.n_joints):
             if self._usable(j):
                 yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
@@ -245,7 +245,7 @@ class Procedure:
             ("speed", self._speeds),
         )
         for n, (title, test) in enumerate(tests):
-            self._tell(f"{joint.name}: {title}", (k + n / len(tests)) / of)
+            self._report_progress(f"{joint.name}: {title}", (k + n / len(tests)) / of)
             yield from test(j)
         yield from self.bench.move(j, self._open_q(j), float(self.bench.slow[j]))
 
@@ -263,7 +263,7 @@ class Procedure:
         joint.figures["zero"] = (low - spec.q_min) + (high - spec.q_max)
 
     def _rest(self, j: int) -> Rest:
-        """Where a joint has just come to rest."""
+        """Rest position that a joint has just reached."""
         s = self.bench.series(j, -max(3, int(SETTLE / self.setup.period)))
         return measure.rest(s.q, s.tau)
 
@@ -306,7 +306,7 @@ class Procedure:
         figures["play"] = measure.lost_motion(rests[1], rests[-1], kp, stiffness)
 
     def _return(self, j: int, direction: int) -> Turns[Rest | None]:
-        """Where a joint rests amid its range, coming in ``direction``."""
+        """Rest position of a joint at mid-range, approached in ``direction``."""
         bench, stroke = self.bench, float(self.setup.stroke[j])
         goal, slow = self._at(j, 0.5), float(bench.slow[j])
         yield from bench.move(j, goal - direction * 0.1 * stroke, slow, settle=True)
@@ -411,7 +411,7 @@ class Procedure:
             missing = [str(e.slot) for e in elements if not e.answered]
             if not missing:
                 break
-            self._tell(f"touch: {place}", 1.0)
+            self._report_progress(f"touch: {place}", 1.0)
             self.question = f"press each element of the {place} (missing: {', '.join(missing)})"
             (state,) = (yield from bench.watch(0.0))[-1:]
             if state.pressure is None:
@@ -427,7 +427,7 @@ class Procedure:
 
 
 def _hottest(state: HandState) -> Floats:
-    """Of case and winding, per joint."""
+    """The higher temperature of case and winding, per joint."""
     if state.winding_temperature is None:
         return state.temperature
     return np.fmax(state.temperature, state.winding_temperature)

@@ -43,7 +43,7 @@ SCHEMA = "selftest.schema.json"
 _POINTS = 160
 """Points of a curve in the file."""
 _ALSO = ("low", "high", "stiffness", "temperature")
-"""What is kept of a joint without being judged."""
+"""Data of a joint that are stored but not judged."""
 _NOISIER = (2.0, 100.0)
 """Times and Pa by which an element's noise is worse than before."""
 
@@ -61,7 +61,7 @@ class Verdict(str, Enum):
 
 
 class Condition(str, Enum):
-    """What a joint did when it was commanded a little."""
+    """Response of a joint to a small command."""
 
     MOVES = "moves"
     DEAD = "dead"
@@ -74,7 +74,7 @@ class Condition(str, Enum):
 
 
 class Touch(str, Enum):
-    """What a tactile element did."""
+    """Response of a tactile element."""
 
     ANSWERS = "answers"
     DEAD = "dead"
@@ -105,13 +105,13 @@ class JointResult:
 
     @property
     def faulty(self) -> list[str]:
-        """What is wrong by the model: ``condition``, or names of figures."""
+        """Faults by the model's limits: ``condition``, or names of figures."""
         bad = self.condition not in (Condition.MOVES, Condition.UNTESTED)
         return ["condition"] * bad + [f.name for f in self.figures if not f.good]
 
     @property
     def worn(self) -> list[str]:
-        """What has become worse since the earlier run."""
+        """Figures that have become worse since the earlier run."""
         bad = self.before is Condition.MOVES and self.condition is not Condition.UNTESTED
         lost = bad and self.condition is not Condition.MOVES
         return ["condition"] * lost + [f.name for f in self.figures if f.wear is Wear.WORN]
@@ -169,7 +169,7 @@ class SelfTestResult:
 
     @property
     def verdict(self) -> Verdict:
-        """What is said of the hand; never good where something that was asked for is missing."""
+        """Verdict on the hand; never good if a requested measurement is missing."""
         wrong = any(j.faulty for j in self.joints) or any(e.faulty for e in self.elements)
         if wrong or self.ended is End.FAULT:
             return Verdict.FAULTY
@@ -349,7 +349,7 @@ def result_of(
     baseline_name: str = "",
     now: datetime | None = None,
 ) -> SelfTestResult:
-    """What a self-test that has ended has found.
+    """Build the result of a finished self-test.
 
     :param about: backend, device and name of the hand; model, side and dialect are added.
     :param baseline: an earlier run of the same hand.

@@ -72,7 +72,7 @@ class File:
 
 @dataclass(frozen=True)
 class Judged:
-    """What was judged, as the result says.
+    """The judged subject, as stated in the result.
 
     :param about: model, dialect, sides, hand, backend, device; ``nature``: emulated, simulated,
         recorded or empty; ``requirements``: how many of how many; recorded_at; ``dexkit``: the
@@ -87,7 +87,7 @@ class Judged:
 
     @classmethod
     def from_result(cls, result: RunResult) -> Judged:
-        """What a result says; long texts are cut."""
+        """Read it from a result; long texts are cut."""
         count = sum(result.counts().values())
         known = {
             **result.subject,

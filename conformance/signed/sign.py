@@ -36,7 +36,7 @@ RECORDING_DIGEST = "recording_sha256"
 
 @dataclass(frozen=True)
 class Signed:
-    """What was signed.
+    """Result of signing.
 
     :param key: the key that signed: kind and fingerprint.
     :param recording: how the recording was found to be the one that was judged.
@@ -111,7 +111,7 @@ def _check_names(paths: dict[str, Path]) -> None:
 
 
 def _match_recording(found: RunResult, recording: Path, digest: Digest) -> str:
-    """How the recording is known to be the one that was judged.
+    """Describe the evidence that the recording is the judged one.
 
     :raises ConformanceError: it is another one.
     """
@@ -139,7 +139,7 @@ def _match_recording(found: RunResult, recording: Path, digest: Digest) -> str:
 
 
 def _match_page(found: RunResult, page: Path) -> str:
-    """How the page is known to be about the same recording.
+    """Describe the evidence that the page is about the same recording.
 
     :raises ConformanceError: it is not.
     """

@@ -42,7 +42,7 @@ _LARGEST_SIGNATURE = 16 * 1024
 
 @dataclass
 class Verified:
-    """What was found.
+    """Result of a verification.
 
     :param differences: one line each; none: the archive is verified.
     :param notes: what was verified, and how, one line each.
@@ -233,7 +233,7 @@ class _Verification:
 
 
 def _manifest_differences(said: Judged, real: Judged) -> list[str]:
-    """What the manifest says of the result, where that says otherwise."""
+    """Statements of the manifest that the result contradicts."""
     there, here = (
         {**judged.about, "overall": judged.overall, **judged.grades} for judged in (said, real)
     )

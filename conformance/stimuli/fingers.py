@@ -107,7 +107,7 @@ _TOUCH_SECONDS = 0.26
 _TOUCH_STANDS, _TOUCH_MORE = 0.1, 12
 """Seconds in which it stands then, and how often it is waited for that."""
 _STATUSES = range(2, 8)
-"""What fits into the three bits of the status and has no meaning in a command to a hand. A status
+"""Values of the three status bits without a meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
 (docs/sources/unitree-dex.md#g)."""
 _STAYS = 4.1
@@ -143,9 +143,9 @@ class FingerScript(HandScript):
     _beside_s = 0.75
 
     _turn_of_splits = 0
-    """How often joints have been treated differently."""
+    """Number of times that joints got different treatment."""
     _drives = 0
-    """How often joints have been set in motion."""
+    """Number of times that joints have been set in motion."""
 
     def _provoke(self) -> Steps:
         sides, phases = self.plan.sides, self.plan.phases

@@ -152,7 +152,7 @@ class GripperScript(HandScript):
         self._mode = 0
         """The mode byte of position commands, in dialects that do not use it."""
         self._grip: dict[Side, Motors] = {}
-        """What a side gets instead of its goal; nothing at all if empty."""
+        """Commands to a side instead of its goal; no commands if empty."""
 
     def _provoke(self) -> Steps:
         sides = self.plan.sides
@@ -258,7 +258,7 @@ class GripperScript(HandScript):
         yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _at_first(self) -> Steps:
-        """How firmly the hand grips and holds before anything has disturbed it."""
+        """Grip and hold stiffness before any disturbance."""
         sides = self.plan.sides
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]

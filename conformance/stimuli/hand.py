@@ -1,5 +1,5 @@
-"""What scripts for hands share: holding poses, waiting until a hand has settled, and the phases
-that are the same for every hand.
+"""Base of the scripts for hands: holding poses, waiting until a hand has settled, and phases common
+to all hands.
 """
 
 from __future__ import annotations
@@ -132,20 +132,20 @@ class HandScript(Script[Side]):
         """Missing commands once more, after a restart of the service."""
 
     def _before_shutdown(self) -> Steps:
-        """What the hand does when its service is stopped."""
+        """Commands to the hand before its service is stopped."""
         yield from ()
 
     def _not_restarted(self) -> Steps:
-        """What follows where the kit cannot restart the service."""
+        """Steps if the kit cannot restart the service."""
         yield from ()
 
     def _after_shutdown(self) -> dict[Side, Pose]:
-        """Where the hand is commanded to after a restart of its service."""
+        """Goal of the hand after a restart of its service."""
         return self._other_place()
 
     @abstractmethod
     def _home(self, side: Side) -> Pose:
-        """Where the hand is brought at first: clear of stops and of the object."""
+        """First pose of the hand: clear of stops and of the object."""
 
     @abstractmethod
     def _other_place(self) -> dict[Side, Pose]:
@@ -229,7 +229,7 @@ class HandScript(Script[Side]):
             self._end(phase)
 
     def _left(self, side: Side, here: Pose) -> float:
-        """How far a hand is from its goal, in parts of its joints' ranges."""
+        """Distance of a hand from its goal, as parts of its joints' ranges."""
         strokes = self._strokes[side]
         return sum(abs(a - b) / s for a, b, s in zip(here, self._goal[side], strokes, strict=True))
 

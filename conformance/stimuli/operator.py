@@ -35,7 +35,7 @@ _POLL = 0.001  # s between two reads while the client waits for a state
 
 
 def _most(plan: Plan[Side], side: Side) -> float:
-    """How far a side may close, 0 to 1, as :class:`~dexkit.teleop.Operator` takes it."""
+    """Largest closing of a side, 0 to 1, for :class:`~dexkit.teleop.Operator`."""
     touch = plan.objects.get(side)
     if touch is None:
         return 1.0

@@ -60,7 +60,7 @@ class Role(Enum):
 
 @dataclass(frozen=True)
 class Observation:
-    """What a player has observed after an action.
+    """Observations of the player after an action.
 
     :param now_ns: the recording's clock.
     :param q: newest pose of each side that has published one; dq likewise.
@@ -132,7 +132,7 @@ S_co = TypeVar("S_co", bound=Subject, covariant=True)
 
 @dataclass(frozen=True)
 class Plan(Generic[S_co]):
-    """What to do to which hands, or to a robot.
+    """The hands or robot of a run, and its phases.
 
     :param objects: where a side touches an object: in the dialect's radians for a hand of one
         joint, percent of closing for others.

@@ -86,7 +86,7 @@ _LONGEST = 4096  # room for an answer, bytes; BUF_SIZE of the manual
 
 @dataclass(frozen=True)
 class Observation:
-    """What the script's runner observed after an action.
+    """Observations of the runner after an action.
 
     :param status: of the transfer: 0, or a negative errno.
     :param data: bytes from the device.
@@ -141,7 +141,7 @@ Steps = Generator[Action, Observation, None]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do.
+    """The phases and parameters of a run.
 
     :param burst: commands of each phase ``burst``.
     :param period: s between the commands of the other phases.

@@ -300,5 +300,5 @@ class UsbRecording:
         return None if late is None else late[1]
 
     def lost(self, begin: float, end: float) -> Lost | None:
-        """By how much the kit was late in [begin, end] beyond an idle machine; None if unknown."""
+        """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
         return self.beats.lost(self.log_time(begin), self.log_time(end))

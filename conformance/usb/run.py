@@ -166,7 +166,7 @@ class _Player:
         return Observation(self._now_ns(), status, data)
 
     def end_turn(self) -> None:
-        """Let the run of the other hand continue."""
+        """Hand over to the run of the other hand."""
         if self._has_turn:
             self._has_turn = False
             self._turn.release()

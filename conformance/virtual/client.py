@@ -44,7 +44,7 @@ class ReferenceClient:
         (3.6, 0.9),
         (5, 0.1),
     )
-    """What the operator does: from each time on, seconds, to that part of closing."""
+    """Motion of the operator: (time in seconds, part of closing from then on)."""
     right_up_s = 0.0
     """Seconds until the right hand's service publishes."""
 
@@ -61,7 +61,7 @@ class ReferenceClient:
         """The newest state of each hand."""
 
     def _closing(self, t: float) -> Pose:
-        """How far the operator has closed, 0 to 1: smoothly from goal to goal."""
+        """The operator's closing, 0 to 1, smooth from goal to goal."""
         at = max(i for i, (begin, _) in enumerate(self.course) if begin <= t)
         (begin, goal), before = self.course[at], self.course[max(at - 1, 0)][1]
         part = min((t - begin) / _MOVE_S, 1.0)
@@ -96,7 +96,7 @@ class ReferenceClient:
         return motors
 
     def messages(self, now: float) -> list[tuple[str, bytes]]:
-        """What is published in this turn: (topic, payload).
+        """Messages of this cycle: (topic, payload).
 
         :param now: seconds since the client's start.
         """

@@ -148,7 +148,7 @@ class FingerHand:
         self.version += 1
 
     def step(self, dt: float) -> None:
-        """Let time pass."""
+        """Advance by one step."""
         self.now += dt
         if self.now - self.heard > self.timeout:
             self.heard = math.inf
@@ -303,7 +303,7 @@ class FingerService(Service):
             hand.release()
 
     def live(self, dt: float) -> None:
-        """Let time pass for the hands."""
+        """Advance the hands."""
         for hand in self.hands.values():
             hand.step(dt)
 

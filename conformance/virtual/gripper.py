@@ -72,7 +72,7 @@ class ReferenceHand:
         return min(max(tau, -self.tau_max), self.tau_max)
 
     def step(self, dt: float) -> None:
-        """Let time pass."""
+        """Advance by one step."""
         self.now += dt
         self.tau = self.motor_torque()
         braking = self.braking
@@ -155,7 +155,7 @@ class ReferenceService(Service):
         return (self.hands[side].q,)
 
     def live(self, dt: float) -> None:
-        """Let time pass for the grippers."""
+        """Advance the grippers."""
         for hand in self.hands.values():
             hand.step(dt)
 

@@ -94,7 +94,7 @@ class FtpService(ServoService):
         return super().endpoints() + touch
 
     def touch_topic(self, side: Side) -> str:
-        """Where a side's tactile areas are published."""
+        """Topic of a side's tactile areas."""
         return self.dialect.touch_topic_of(side)
 
     def publish(self) -> list[Sample]:
@@ -106,12 +106,12 @@ class FtpService(ServoService):
         return samples + self.touch()
 
     def touch(self) -> list[Sample]:
-        """What the areas of every hand feel."""
+        """Messages with the readings of every hand's areas."""
         kind = self.dialect.touch_type
         return [Sample(self.touch_topic(s), kind, self.touched(s), self.now) for s in self.sides]
 
     def touched(self, side: Side) -> bytes:
-        """What the areas of a hand feel, on the wire."""
+        """A hand's tactile readings as a message."""
         hand = self.hands[side]
         if self._touched.get(side, (-1, b""))[0] != hand.version:
             felt = self.pressures(hand)

@@ -91,7 +91,7 @@ class OriginalHand(ReferenceHand):
         return min(max(tau, -most), most)
 
     def step(self, dt: float) -> None:
-        """Let time pass."""
+        """Advance by one step."""
         for _ in range(self.substeps):
             super().step(dt / self.substeps)
 

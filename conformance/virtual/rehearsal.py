@@ -29,7 +29,7 @@ _SATURATED = 0.98
 
 @dataclass(frozen=True)
 class JointFigures:
-    """What a joint did while the session was played.
+    """Figures of a joint during the replay.
 
     :param moved: rad that it was commanded over, and that it moved over.
     :param rms: of the distance from its command, rad; ``worst`` the largest, ``at`` when.
@@ -105,7 +105,7 @@ def _ripple(t: Floats, tau: Floats) -> float:
 
 @dataclass(eq=False)
 class Rehearsal:
-    """What would happen.
+    """Result of a rehearsal.
 
     :param machine: at its end: why it ended, and what it sent.
     :param phases: (phase, begin, end) in seconds from the start.
@@ -123,12 +123,12 @@ class Rehearsal:
 
     @property
     def units(self) -> tuple[str, str]:
-        """Of q and of tau_est."""
+        """Units of q and of tau_est."""
         hand = model(self.plan.dialect.model)
         return hand.unit, hand.torque_unit
 
     def figures(self) -> Mapping[Side, list[JointFigures]]:
-        """By side, of each joint."""
+        """Figures of each joint, by side."""
         return {s: h.figures(joint_limits(self.plan.dialect, s).tau) for s, h in self.hands.items()}
 
 

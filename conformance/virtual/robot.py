@@ -118,7 +118,7 @@ class ReferenceRobot(TopicDevice):
         return orders.mode == self.enable
 
     def live(self, dt: float) -> None:
-        """Let time pass: kp (q_des - q) + kd (dq_des - dq) + tau = friction * dq, solved."""
+        """Advance by one step: kp (q_des - q) + kd (dq_des - dq) + tau = friction * dq, solved."""
         before = self.q
         if self.driven and self.orders is not None:
             self.move(self.orders, dt)
@@ -139,7 +139,9 @@ class ReferenceRobot(TopicDevice):
         self.q = there
 
     def law(self, orders: Orders, dt: float) -> tuple[Floats, Floats, Floats]:
-        """Where springs pull to, by which part of the way in ``dt``, and how far joints drift."""
+        """Equilibrium of the springs, the part of the way there in ``dt``, and the drift of the
+        joints.
+        """
         on = self.follows(orders)
         kp, kd = orders.kp * on, orders.kd * on
         push = kd * orders.dq * on + orders.tau * on

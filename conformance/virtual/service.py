@@ -117,7 +117,7 @@ class TopicDevice(ABC):
         return self.publish()
 
     def advance(self, dt: float) -> list[Sample]:
-        """Let time pass; the states that were published meanwhile."""
+        """Advance the time; return the states published meanwhile."""
         self.now += dt
         self.live(dt)
         if self.now + 1e-9 < self._due:
@@ -126,7 +126,7 @@ class TopicDevice(ABC):
         return self.publish()
 
     def live(self, dt: float) -> None:
-        """Let time pass in the mechanics."""
+        """Advance the mechanics."""
         return
 
     @abstractmethod

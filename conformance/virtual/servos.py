@@ -77,7 +77,7 @@ class ServoHand(FingerHand):
         self.law_q = list(self.place)
 
     def step(self, dt: float) -> None:
-        """Let time pass."""
+        """Advance by one step."""
         if self.driven.any():
             here = self.place
             self.place = [

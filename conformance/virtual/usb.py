@@ -198,7 +198,7 @@ class ReferenceDevice:
     # -- time and mechanics ---------------------------------------------------------------------
 
     def advance(self, seconds: float) -> None:
-        """Let time pass: mechanics and time-out protection."""
+        """Advance mechanics and time-out protection."""
         if seconds <= 0:
             return
         begin, self.now = self.now, self.now + seconds

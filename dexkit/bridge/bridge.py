@@ -1,4 +1,4 @@
-"""Run the bridge: DDS endpoints and threads around :mod:`dexkit.bridge.core`.
+"""Run the bridge: DDS endpoints and threads around :mod:`dexkit.bridge.forwarding`.
 
 One thread for each direction, so that a client that reads slowly holds up no command.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dexkit.bridge.core import Commands, Direction, Outgoing, States
+from dexkit.bridge.forwarding import Commands, Direction, Outgoing, States
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE, PauseWatch, SampleAges
 from dexkit.dds import DdsNode, Endpoint, Reader, Sample, Writer

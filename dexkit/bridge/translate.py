@@ -27,8 +27,8 @@ themselves. :class:`Reachable` chooses between both.
 
 **Without a gain.** unitree_hg knows no gains, so a command that does not pull towards its q
 (kp <= 0: limp, or driven by velocity or torque) cannot be expressed in it; obeyed as it is, q = 0
-of a client that lets go would close the gripper. :class:`~dexkit.bridge.core.Commands` puts the
-gripper's own position there instead.
+of a client that lets go would close the gripper. :class:`~dexkit.bridge.forwarding.Commands` puts
+the gripper's own position there instead.
 
 **Why gains shrink and torques do not.** Torques of both dialects are those of the joint that
 runs from 0 to 5.4 rad (``dexkit serve`` publishes one tau_est in both). A radian of unitree_hg is

@@ -1,4 +1,4 @@
-"""What a driver provides for a bring-up: its motors by address, and the joints that they may be."""
+"""The interface of a driver for a bring-up: motors by address, and the joints to be assigned."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Drive:
 
 
 class Zero(str, Enum):
-    """What the travel between the stops says of a joint's zero."""
+    """How a joint's zero follows from the travel between its stops."""
 
     MIDDLE = "middle"
     """The range of q lies in the middle of the travel; the limits keep off the stops."""
@@ -105,7 +105,7 @@ class JointChoice:
 
 @dataclass(frozen=True)
 class Plan:
-    """What there is to find on a hand, and how gently.
+    """The properties to be found on a hand, and the limits of torque and speed.
 
     :param joints: in the order in which their travel is measured.
     :param reference: gear ratio in whose radians motors are read and driven.
@@ -147,7 +147,7 @@ class Bench(Protocol):
 
     @property
     def plan(self) -> Plan:
-        """What there is to find."""
+        """The plan of the bring-up."""
         ...
 
     @property
@@ -192,11 +192,11 @@ class Bench(Protocol):
 
     @property
     def where(self) -> str:
-        """Where the settings are stored, for messages."""
+        """Path of the settings file, for messages."""
         ...
 
     def load(self) -> Findings:
-        """What an earlier bring-up of this hand has found; empty if there was none.
+        """Load the findings of an earlier bring-up of this hand; empty if there was none.
 
         :raises UsageError: the file cannot be read.
         """

@@ -1,4 +1,4 @@
-"""What a bring-up has found so far, so that it can be resumed, replayed and stored."""
+"""The findings of a bring-up so far, so that it can be resumed, replayed and stored."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class MotorFound:
 
 @dataclass(frozen=True)
 class TravelFound:
-    """What the stops of a joint say.
+    """Properties of a joint derived from its stops.
 
     :param ratio: its gear ratio.
     :param offset: the motor's position where q = 0, rad at the joint.

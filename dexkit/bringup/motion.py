@@ -20,7 +20,7 @@ __all__ = ["Effort", "End", "Go", "Mover", "check_motors"]
 
 @dataclass(frozen=True)
 class Effort:
-    """How strongly and how fast joints are moved.
+    """Limits of torque and speed for the motions.
 
     :param torque: N·m at the joint, at most. Motion starts with a quarter of it.
     :param speed: rad/s.
@@ -38,8 +38,10 @@ class Effort:
             raise UsageError(f"speed is 0.02 to 2 rad/s, not {self.speed:g}")
 
     @classmethod
-    def of(cls, plan: Plan, torque: float | None = None, speed: float | None = None) -> Effort:
-        """What is asked for, or else what the plan has.
+    def from_plan(
+        cls, plan: Plan, torque: float | None = None, speed: float | None = None
+    ) -> Effort:
+        """Use the given limits, or else those of the plan.
 
         :raises UsageError: it is more than the plan allows.
         """
@@ -71,7 +73,7 @@ _LONGEST_STEP = 0.05  # s
 
 
 class End(str, Enum):
-    """How a motion ended."""
+    """Reason for the end of a motion."""
 
     ARRIVED = "arrived"
     STALLED = "stalled"
@@ -130,7 +132,8 @@ class Mover:
         self._resting = snapshot.motors
 
     def step(self, now: float, snapshot: Snapshot, held: bool) -> Drive | End | None:
-        """What to send now; how the motion has ended; or None to lock every motor.
+        """Return the command to send now, the reason for the end of the motion, or None to lock
+        every motor.
 
         :param held: the dead-man key; whenever it was not, motion starts gently again.
         :raises HandFault: a fault, a silent motor, one that moves against its command, ahead of

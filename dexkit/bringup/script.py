@@ -31,7 +31,7 @@ _SAME_RATIO = 0.01
 
 @dataclass(frozen=True)
 class Question:
-    """What the person is asked.
+    """A question to the person.
 
     :param key: names it in files of answers.
     :param choices: the answers that are possible.

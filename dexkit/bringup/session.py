@@ -45,7 +45,7 @@ class Session:
         self.doing = ""
         self.moves = False
         self.done = False
-        self._effort = effort or Effort.of(plan)
+        self._effort = effort or Effort.from_plan(plan)
         self._fault: HandFault | None = None
         self._widest = plan.widest
         self._script = script(plan, motors, findings)
@@ -103,7 +103,7 @@ class Session:
             self.doing = f"press and hold the {self._touch.action.place} now"
 
     def step(self, now: float, snapshot: Snapshot, held: bool) -> Drive | None:
-        """What to send next: one motor's command, or None to lock every motor.
+        """Return the next command to one motor, or None to lock every motor.
 
         :param now: monotonic seconds, of the snapshot.
         :param held: the dead-man key.

@@ -84,7 +84,7 @@ class SettingsFile:
         documents.update_file(self.path, change)
 
     def load(self, key: str) -> Findings:
-        """What a bring-up has found of a hand; empty if there was none.
+        """Load the findings of a bring-up of a hand; empty if there was none.
 
         :raises UsageError: the file cannot be read.
         """

@@ -106,7 +106,9 @@ class _LazyGroup(click.Group):
 @click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="dexkit")
 def cli() -> None:
-    """Put any gripper or hand on Unitree's Dex topics and prove that it is a drop-in."""
+    """Serve any gripper or hand on Unitree's Dex topics, and test that it is a drop-in
+    replacement.
+    """
 
 
 def main(argv: list[str] | None = None) -> int:

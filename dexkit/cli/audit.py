@@ -31,8 +31,7 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     default=Path("audit-out"),
     show_default=True,
     metavar="DIR",
-    help="Where the journal, the tables and the page are kept. What it has of unchanged files is "
-    "used again.",
+    help="Folder for journal, tables and page. Results of unchanged files are reused.",
 )
 @click.option("--fresh", is_flag=True, help="Judge all files again.")
 @click.option(
@@ -40,7 +39,7 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     type=click.Choice(_FAIL_ON),
     default="unusable",
     show_default=True,
-    help="What the exit code shows; each includes those before it.",
+    help="Which findings make the exit code non-zero; each level includes those before it.",
 )
 @click.option(
     "--format",
@@ -55,8 +54,8 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     "labels",
     multiple=True,
     metavar="KEY",
-    help="Group sessions also by this key of their metadata, besides robot, operator, task and "
-    "site; may be repeated.",
+    help="Group sessions also by this key of their metadata, in addition to robot, operator, task "
+    "and site; may be repeated.",
 )
 @click.option(
     "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
@@ -66,8 +65,8 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     is_flag=False,
     flag_value="auto",
     metavar="[ADDRESS]",
-    help="Judge on a Ray cluster (extra [ray]): at HOST:PORT, at the one of this machine (auto, "
-    "which is meant without ADDRESS), or at one that is started for this audit (local).",
+    help="Judge on a Ray cluster (extra [ray]): at HOST:PORT, the running one of this machine "
+    "(auto, the default without ADDRESS), or a new one for this audit only (local).",
 )
 @click.option(
     "--timeout",
@@ -91,8 +90,8 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     default=8192,
     show_default=True,
     metavar="MIB",
-    help="Largest object of a URL that is copied to the temporary folder; larger ones are read "
-    "where they are, by ranges, several times.",
+    help="Largest object of a URL that is copied to the temporary folder; larger ones are read in "
+    "place by range requests, several times.",
 )
 @quiet_option()
 def command(
@@ -112,8 +111,8 @@ def command(
     """Judge every recorded session (mcap file) in folders or behind URLs, as 'dexkit check' does.
 
     Writes a row for each file, and for each requirement and side, as Parquet or JSON lines, and a
-    summary page. Whatever is wrong with a file is a row, and no end. An audit that was stopped
-    goes on when it is called again (docs/audit.md).
+    summary page. A faulty file becomes a row and does not stop the audit. Run the same command
+    again to continue a stopped audit (docs/audit.md).
 
     Exit code: 0 every MUST that could be judged is met in every file, 1 one is not, 2 a file is
     not usable, damaged or inconclusive, or there is none; see --fail-on. 130 interrupted.

@@ -16,7 +16,7 @@ _WIDEST = 100  # columns; longer lines are hard to read
 
 @click.command("backends")
 def command() -> None:
-    """List the hands that can be served: name, model, origin, what each needs, its settings."""
+    """List the backends that can be served: name, model, origin, device and settings."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     console = Console()
     for row in list_backends():

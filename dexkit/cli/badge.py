@@ -23,14 +23,14 @@ from dexkit.documents import check_output_paths
     help="Where to write it; - prints it.",
 )
 @grade_option(
-    "Draw only the badge of this grade. That of drop-in is never drawn alone where safety failed.  "
+    "Draw only the badge of this grade. The drop-in badge is never drawn alone if safety failed.  "
     "[default: both, side by side]"
 )
 def command(result: Path, output: Path, grade: str | None) -> None:
-    """Draw the badges of a result: what it is a drop-in for, and how safe it is beside that.
+    """Draw the badges of a result: drop-in and safety.
 
-    A badge shows when the hand was emulated, simulated or only recorded, and how many
-    requirements could not be judged.
+    A badge says if the hand was emulated, simulated or only recorded, and how many requirements
+    could not be judged.
     """
     from dexkit.conformance.report.badge import badge_text, badges, render_badge
     from dexkit.conformance.requirements import Kind

@@ -73,7 +73,7 @@ def command(
     real_time: bool,
     quiet: bool,
 ) -> int:
-    """Translate between Dex1 dialects: commands of a client to a Dex1-1, and its states back.
+    """Translate between Dex1 dialects: commands from a client to a Dex1-1, and states back.
 
     \b
     client xr_teleoperate v1.1 (--sim), gripper with today's service:

@@ -48,7 +48,7 @@ _LOST_ANSWERS = 3
     "--torque",
     type=Number(0.01, 3.0),
     metavar="NM",
-    help="Torque at a joint, at most; motion begins with a quarter of it.  [default: the "
+    help="Largest torque at a joint; motion begins with a quarter of it.  [default: the "
     "backend's, shown by --dry-run]",
 )
 @click.option(
@@ -57,14 +57,14 @@ _LOST_ANSWERS = 3
     metavar="RAD/S",
     help="Speed of every motion.  [default: the backend's]",
 )
-@click.option("--dry-run", is_flag=True, help="Only print the plan: nothing is opened, or moves.")
+@click.option("--dry-run", is_flag=True, help="Only print the plan; open and move nothing.")
 @click.option("--restart", is_flag=True, help="Forget what an earlier bring-up has found.")
 @click.option(
     "--answers",
     "answers_path",
     type=FILE,
     metavar="FILE",
-    help="Take answers from a file that --save-answers wrote; what it lacks is asked.",
+    help="Take answers from a file written by --save-answers; missing ones are asked.",
 )
 @click.option(
     "--save-answers", type=FILE, metavar="FILE", help="Write the answers of this session."
@@ -72,8 +72,8 @@ _LOST_ANSWERS = 3
 @click.option(
     "--unattended",
     is_flag=True,
-    help="Move without the dead-man key: only a hand on a USB/IP server of this machine or a "
-    "pseudo-terminal, as emulated ones are, and only with --answers.",
+    help="Move without the dead-man key: only emulated hands (on a USB/IP server of this machine "
+    "or a pseudo-terminal), and only with --answers.",
 )
 def command(
     backend_name: str,
@@ -89,11 +89,11 @@ def command(
     save_answers: Path | None,
     unattended: bool,
 ) -> None:
-    """Find out how a hand is wired, and store it as its settings.
+    """Find out how a hand is wired, and store the result as its settings.
 
-    The hand MOVES, one joint at a time, slowly, and only while you hold the space bar; every other
-    key, or none, stops it. After each motion you are asked what you saw. Run the same command again
-    to go on after a stop. Read docs/first-contact.md before the first real hand.
+    The hand MOVES, one joint at a time, slowly, and only while you hold the space bar. Releasing
+    it, or any other key, stops the hand. After each motion you are asked what you saw. Run the same
+    command again to continue after a stop. Read docs/first-contact.md before the first real hand.
     """
     if len(sides) != 1:
         raise UsageError("one hand at a time", hint="--side left or --side right")
@@ -110,7 +110,7 @@ def command(
     options = BackendOptions(sides[0], device, texts)
     options.refuse_unknown(kind.settings)
     bench: Bench = kind.bringup.load()(options)
-    effort = Effort.of(bench.plan, torque, speed)
+    effort = Effort.from_plan(bench.plan, torque, speed)
     if dry_run:
         _print_plan(bench, effort, (), attended=not unattended)
         return

@@ -70,8 +70,8 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--side",
     type=click.Choice(["left", "right"]),
-    help="Whose motor, needed for dex1-serial; of an EZGripper, to take the adapter that the "
-    "file names for that side.",
+    help="Side of the gripper. Required for dex1-serial; for an EZGripper it selects the adapter "
+    "that the file names for this side.",
 )
 @click.option(
     "--id",
@@ -93,14 +93,14 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
     type=_NumberOrAuto(12_000_000),
     default=1_000_000,
     show_default=True,
-    help="Bits a second, or auto to try those known.",
+    help="Bits per second, or auto to try the known rates.",
 )
 @click.option(
     "--effort",
     type=Number(5, 60),
     default=calibration.EFFORT,
     show_default=True,
-    help="Percent of force while looking for the closed position.",
+    help="Effort while searching the closed position, percent.",
 )
 @click.option("--speed", is_flag=True, help="Also measure the speed, at full effort.")
 @click.option(
@@ -115,15 +115,15 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
     is_flag=True,
     help="With --speed: also time moves of several distances, and print the overhead of a move.",
 )
-@click.option("--force", is_flag=True, help="Instead, measure the force table with a gauge.")
+@click.option("--force", is_flag=True, help="Measure the force table with a gauge instead.")
 @click.option(
     "--up-to",
     type=Number(10, 100),
     default=ControlSettings().effort,
     show_default=True,
     metavar="PCT",
-    help="With --force: the largest effort; that of 'serve --set effort=PCT'. The more, the warmer "
-    "the motor while the gauge is read.",
+    help="With --force: the largest effort, as in 'serve --set effort=PCT'. A higher effort heats "
+    "the motor more while the gauge is read.",
 )
 @click.option(
     "--set-baudrate",
@@ -166,12 +166,11 @@ def command(
     """Measure and store a gripper's zero and, with --speed, its speed.
 
     The gripper MOVES: it closes until it is stopped, then opens. It must be empty and free. The
-    result is stored under the adapter's USB serial number (or the path, where there is none), so
-    that it is found again whatever port it is plugged into.
+    result is stored under the adapter's USB serial number (without one, under its path), so that it
+    does not depend on the port.
 
-    With GRIPPER dex1-serial nothing moves: you hold the jaws closed, and the motor itself stores
-    that position as its zero. Of the options only --device, --side, --dry-run and --yes
-    apply.
+    With dex1-serial nothing moves: you hold the jaws closed, and the motor itself stores that
+    position as its zero. Only the options --device, --side, --dry-run and --yes apply.
     """
     if gripper == "dex1-serial":
         from dexkit.cli.calibrate_dex1 import calibrate_dex1

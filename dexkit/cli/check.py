@@ -32,7 +32,7 @@ from dexkit.robots import ROBOTS
 @click.option(
     "--side",
     type=click.Choice(["left", "right", "both"]),
-    help="Hands to judge. Default: those of the run, else all that are in the recording.",
+    help="Hands to judge. Default: those of the run, else all hands in the recording.",
 )
 @click.option(
     "--dialect",
@@ -48,7 +48,7 @@ from dexkit.robots import ROBOTS
     help="Only requirements at least this binding.",
 )
 @grade_option(
-    "Which grade decides the exit code. Default: both. All requirements are judged and shown."
+    "Grade that decides the exit code. Default: both. All requirements are judged and shown."
 )
 @click.option(
     "--capabilities",
@@ -80,9 +80,9 @@ def command(
 ) -> None:
     """Judge a recording against the requirements of its hand.
 
-    Judges what the recording holds: any session recorded with 'dexkit record', a ROS 2 bag, or
-    the recording of a conformance run with all its stimuli. In a session the client's commands
-    are judged as well; what the client does wrong fails no hand.
+    IN.mcap is a session recorded with 'dexkit record', a ROS 2 bag, or the recording of a
+    conformance run with all its stimuli. In a session the client's commands are judged too; errors
+    of the client do not fail the hand.
 
     Exit code, about the hands: 0 every MUST that could be judged is met, 1 one is not, 2 the
     recording is not usable or damaged (what is left is judged all the same), nothing in it could

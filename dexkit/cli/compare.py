@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 @html_option()
 @markdown_option(default="print it")
 def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Path | None) -> None:
-    """Put results of several hands, or of several versions of one, side by side.
+    """Compare results of several hands, or of several versions of one.
 
-    Runs of the same hand (its name in capabilities.toml, else the backend) are taken in the order
-    of their time; what became worse from one to the next is named as a regression. The page also
-    shows the curves of their recordings beside each other, where these lie beside the results.
+    Runs of the same hand (its name in capabilities.toml, else the backend) are compared in order of
+    time; a worse verdict is listed as a regression. The page also shows the curves of their
+    recordings side by side, if these are in the folders of the results.
 
     Exit code: 0 no regression, 1 there is one, 2 the results cannot be compared.
     """

@@ -52,11 +52,11 @@ def command(
 ) -> int:
     """Write a part of the recording FILE to OUT.
 
-    Times count from the first message; negative ones from the last. Payloads, times, schemas and
-    metadata stay as they are; OUT says what it is a part of.
+    Times count from the first message; negative times from the last. Payloads, times, schemas and
+    metadata are unchanged; OUT names the recording that it was cut from.
 
-    Exit code: 0 written, 1 the recording is damaged (what can be read of it is cut), 2 wrong
-    usage, nothing left, or an unusable file.
+    Exit code: 0 written, 1 the recording is damaged (its readable part is cut), 2 wrong usage,
+    nothing left, or an unusable file.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.edit import cut

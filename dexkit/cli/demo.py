@@ -39,12 +39,12 @@ _INTRO = (
     "--backend",
     default="ezgripper",
     show_default=True,
-    help="Hand to show; its device is emulated.",
+    help="Backend to demonstrate, with an emulated device.",
 )
 @click.option("--domain", type=DOMAIN, help="DDS domain.  [default: a free one]")
 @view_option()
 def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
-    """Run the conformance suite on two emulated EZGrippers, in some 90 seconds.
+    """Run the conformance suite on two emulated EZGrippers; takes about 90 seconds.
 
     Traffic stays on this machine, on a DDS domain of its own. Exit code: 0 the hands passed,
     1 they did not, 2 they could not be judged.

@@ -37,7 +37,7 @@ __all__ = ["command"]
     default=0.05,
     show_default=True,
     metavar="RAD",
-    help="Positions that are closer are the same.",
+    help="Positions count as equal within this difference.",
 )
 @topic_option("Compare", "all")
 @json_option("Print JSON.")
@@ -46,7 +46,7 @@ __all__ = ["command"]
     "html_path",
     type=FILE,
     metavar="FILE",
-    help="Write a page with the curves of both over each other, those that differ most first.",
+    help="Write a page with the curves of both overlaid, the most different joints first.",
 )
 def command(
     a: Path,
@@ -59,11 +59,11 @@ def command(
 ) -> int:
     """Compare two runs of one session: topics, rates, gaps, and the position of every joint.
 
-    B is put on A's clock by the correlation of the commands (of the states, where there are no
-    commands), and each joint is compared at A's times where both have values.
+    B is aligned to A by the correlation of the commands (without commands, of the states), and each
+    joint is compared at A's times where both have values.
 
-    Exit code: 0 the same topics and positions, 1 they differ or a recording is damaged, 2 they
-    cannot be compared.
+    Exit code: 0 equal topics and positions, 1 they differ or a recording is damaged, 2 they cannot
+    be compared.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.compare import compare

@@ -100,7 +100,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     type=Number(0.2, 600),
     default=2.0,
     show_default=True,
-    help="Seconds during which samples are counted.",
+    help="Seconds of observation.",
 )
 def command(
     domain: int | None,
@@ -118,8 +118,8 @@ def command(
 
     Use it when a client hangs at "Waiting to subscribe dds...". It observes DDS domains without
     publishing any topic and without CycloneDDS, checks this Python environment, and checks the
-    device if one is named. Traffic stays on this machine unless --interface names a network. A
-    servo on a named serial port is only asked for its id and model.
+    device if one is named. Traffic stays on this machine unless --interface names a network. On a
+    named serial port only ids and models of servos are read.
 
     Exit codes: 0 healthy, 1 problems found, 2 the examination failed, 130 interrupted. Ctrl-C ends
     --watch with the code of the last complete examination.

@@ -35,7 +35,7 @@ __all__ = ["command"]
     "--fps",
     type=click.IntRange(1, 1000),
     metavar="N",
-    help="Frames a second of lerobot and episodes.  [default: measured]",
+    help="Frames per second, for lerobot and episodes.  [default: measured]",
 )
 @click.option("--task", metavar="TEXT", help="Task of all episodes.  [default: the recording's]")
 def command(
@@ -48,10 +48,10 @@ def command(
 ) -> int:
     """Write the recordings SESSION... to the folder DIR in another format.
 
-    lerobot makes one dataset (v3.0) and episodes one task folder of them; of the others, several
-    recordings get a folder of their name each.
+    lerobot writes one dataset (v3.0), and episodes one task folder, for all recordings. The other
+    formats write one folder for each recording.
 
-    Exit code: 0 all is exported, 1 a recording is damaged or was refused (the others are
+    Exit code: 0 everything is exported, 1 a recording is damaged or was refused (the others are
     exported), 2 wrong usage, or nothing could be exported.
     """
     from dexkit.traces import open_trace

@@ -50,8 +50,8 @@ def command(
     dataset (v2.0, v2.1, v3.0), a ROS 2 bag (sqlite3 or mcap), or tables of dexkit export. OUT is
     an mcap file for one session, and a folder for several.
 
-    Exit code: 0 all is imported, 1 something is left out (it is listed, and in the recording), 2
-    wrong usage, or nothing can be imported.
+    Exit code: 0 everything is imported, 1 something is left out (it is listed, also in the
+    recording), 2 wrong usage, or nothing can be imported.
     """
     from dexkit.models import model
     from dexkit.traces.sessions.episodes import Options

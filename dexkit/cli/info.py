@@ -88,10 +88,10 @@ def command(files: tuple[Path, ...], as_json: bool, plot: bool, html_path: Path 
     """Show the topics, types, rates, gaps and damage of recordings.
 
     FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
-    read as far as it goes.
+    read up to its end.
 
-    Exit code: 0 the files agree with their checksums and counts, 1 one is damaged (what can be
-    read is shown, what is lost is named), 2 one is not a recording.
+    Exit code: 0 the files agree with their checksums and counts, 1 one is damaged (the readable
+    part is shown, losses are listed), 2 one is not a recording.
     """
     from dexkit.traces import open_trace
 

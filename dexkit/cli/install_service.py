@@ -22,7 +22,7 @@ from dexkit.cli.options import (
 from dexkit.documents import write_file
 from dexkit.errors import OutputError, UsageError
 from dexkit.hand import Side
-from dexkit.systemd_units import device_link, serial_rule, unit, unit_name, usb_rules
+from dexkit.systemd_units import device_link, serial_rule, unit, unit_name
 
 __all__ = ["command"]
 
@@ -41,7 +41,7 @@ _UNITS, _RULES = Path("/etc/systemd/system"), Path("/etc/udev/rules.d")
     "gives it the name /dev/dexkit-SIDE.",
 )
 @set_option("Setting of the backend, as of 'dexkit serve'.")
-@click.option("--dialect", type=DIALECT, help="As of 'dexkit serve'.")
+@click.option("--dialect", type=DIALECT, help="As for 'dexkit serve'.")
 @click.option("--domain", type=DOMAIN, default=0, show_default=True, help="DDS domain.")
 @click.option(
     "--interface",
@@ -58,7 +58,9 @@ _UNITS, _RULES = Path("/etc/systemd/system"), Path("/etc/udev/rules.d")
     metavar="S",
     help="How long a start waits for the interface.",
 )
-@click.option("--user", metavar="NAME", help="Who runs the service.  [default: who installs it]")
+@click.option(
+    "--user", metavar="NAME", help="User that runs the service.  [default: the installing user]"
+)
 @click.option("--no-udev", is_flag=True, help="Write no udev rules; use device paths as given.")
 @click.option(
     "--directory",
@@ -83,9 +85,9 @@ def command(
 ) -> int:
     """Write systemd units that serve BACKEND from boot on, one for each hand.
 
-    A unit restarts its service when it ends or when its state loop stands still, gives it
-    real-time priority, and waits for network and device. Nothing is started: the commands that do
-    it are printed. docs/install-service.md describes the files.
+    A unit restarts its service when it ends or its state loop hangs, gives it real-time priority,
+    and waits for network and device. Nothing is started; the commands for it are printed.
+    docs/install-service.md describes the files.
     """
     kind = backend(backend_name)
     paths = devices_by_side(devices, sides)
@@ -114,8 +116,8 @@ def command(
         files[(directory or _UNITS) / unit_name(side)] = unit(
             side, words, user=name, what=backend_name
         )
-    if backend_name == "dex3-usb" and not no_udev:
-        rules += usb_rules()
+    if kind.udev_rules is not None and not no_udev:
+        rules += kind.udev_rules.load()()
     if rules:
         files[(directory or _RULES) / "71-dexkit.rules"] = rules
     for path, text in files.items():

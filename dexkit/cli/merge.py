@@ -39,11 +39,11 @@ def command(
 ) -> int:
     """Write several recordings to OUT as one, in order of time.
 
-    Messages that several files have are written once. Of metadata that differ, those of later
-    files get the file's name.
+    Messages that occur in several files are written once. If metadata differ, those of later files
+    are stored under the file's name.
 
-    Exit code: 0 written, 1 a recording is damaged (what can be read of it is merged), 2 wrong
-    usage, or an unusable file.
+    Exit code: 0 written, 1 a recording is damaged (its readable part is merged), 2 wrong usage, or
+    an unusable file.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.edit import clock_offset, merge

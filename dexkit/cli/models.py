@@ -24,10 +24,10 @@ _SIDES = ("left", "right")
 
 @click.command("models")
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--all", "every", is_flag=True, help="All of every model.")
-@json_option("Print JSON, always with everything.")
+@click.option("--all", "every", is_flag=True, help="Print every detail of every model.")
+@json_option("Print JSON, always with every detail.")
 def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
-    """Print the models: joints, limits, topics, types, rates, gains, who implements them.
+    """Print the models: joints, limits, topics, types, rates, gains, and backends.
 
     Without a NAME, an overview. docs/models.md has the same with drawings; the shape of the
     JSON is in dexkit/model_facts.py: one object with a list "models".

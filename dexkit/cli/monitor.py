@@ -47,7 +47,7 @@ _PAGE = 10  # lines
     "--period",
     type=Number(min=0.05, max=3600),
     metavar="S",
-    help="Seconds between two pictures.  [default: 0.2 on a terminal, 1 with --json, else 10]",
+    help="Seconds between updates.  [default: 0.2 on a terminal, 1 with --json, else 10]",
 )
 @click.option(
     "--log",
@@ -67,13 +67,13 @@ def command(
 ) -> int:
     """Show hands, robots and topics in the terminal: joints, rates, ages, gaps, faults, events.
 
-    For a robot that is reached by ssh: it needs no display and no browser. It only listens, and
-    publishes nothing. Keys: q ends it, space holds the picture, r begins and ends a recording
-    (mcap), c clears the events, arrows and page keys scroll.
+    Use it over ssh: it needs no display and no browser. It only listens, and publishes nothing.
+    Keys: q quits, space freezes the display, r starts and stops a recording (mcap), c clears the
+    events, arrows and page keys scroll.
 
     Without a terminal it prints events as lines, and every ten seconds a line for each hand.
 
-    Exit code: 0; 1 a recording lacks something; 2 wrong usage.
+    Exit code: 0; 1 a recording is incomplete; 2 wrong usage.
     """
     if log is not None and log.exists():
         raise UsageError(f"{log} exists", hint="choose another name for the recording")

@@ -81,7 +81,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     "--generated",
     type=click.IntRange(1, 1_000_000),
     metavar="N",
-    help="Try N hands that are put together from faults, places and conditions.",
+    help="Try N hands generated from faults, places and conditions.",
 )
 @click.option(
     "--good", is_flag=True, help="With --generated: good hands, which must not be blamed."
@@ -90,7 +90,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     "--seed",
     type=click.IntRange(0, 2**31),
     default=1,
-    help="With --generated: which of them.  [default: 1]",
+    help="With --generated: seed of the random choice.  [default: 1]",
 )
 @click.option("--quick", is_flag=True, help="With --generated: judge them in quick runs.")
 @click.option(
@@ -98,13 +98,13 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     is_flag=True,
     help="With --generated: in thorough runs, which take ten times as long.",
 )
-@click.option("--dialect", help="With --generated: only hands that speak it.")
+@click.option("--dialect", help="With --generated: only hands with this dialect.")
 @click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
 @click.option(
     "--resume",
     type=FILE,
     metavar="FILE",
-    help="With --generated: keep what is done in this file, and do not do it again.",
+    help="With --generated: store results in this file, and skip hands that have one.",
 )
 @click.option(
     "--from", "source", metavar="FILE_OR_MODULE", help="Try the hands of a Python file or module."
@@ -113,13 +113,13 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     "--list",
     "listed",
     is_flag=True,
-    help="Print the hands, with model, requirement and sides, and try none.",
+    help="Only list the hands, with model, requirement and sides.",
 )
 @click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the score as JSON.")
 @click.option(
     "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
 )
-@verbose_option("Print what every wrong hand does wrong.")
+@verbose_option("Print the fault of every wrong hand.")
 def command(
     model: str | None,
     require: tuple[str, ...],
@@ -137,18 +137,19 @@ def command(
     jobs: int | None,
     verbose: bool,
 ) -> None:
-    """Try the conformance checks on hands that are known to be wrong.
+    """Test the conformance checks with hands that are known to be wrong.
 
-    Each wrong hand (a mutant) changes one thing of a hand that does everything right. The checks
-    must catch it by the requirement that it breaks, and find no other fault with it. It runs on a
-    virtual clock: no device, no DDS.
+    Each wrong hand (a mutant) is a correct hand with one fault. The checks must detect it by the
+    requirement that it breaks, and report no other. Runs use a virtual clock, without device and
+    DDS.
 
-    With --generated the hands are put together from faults, places and conditions that the checks'
-    authors have not seen together, and judged in default, quick or thorough runs, as the
-    conformance suite does them; with --from they are yours (docs/mutants.md).
+    With --generated, hands are combined from faults, places and conditions, and judged in default,
+    quick or thorough runs like those of the conformance suite. With --from, the hands are your own
+    (docs/mutants.md).
 
-    Exit code: 0 every requirement is proven by a wrong hand, 1 one is missed, wrongly blamed or
-    has no wrong hand, 2 there is nothing to try. With --generated and --from: 0 every wrong hand is
+    Exit code: 0 every requirement detects its wrong hand, 1 a wrong hand is missed or wrongly
+    blamed, or a requirement has none, 2 no hand is selected. With --generated and --from: 0 every
+    wrong hand is
     caught and no good one is blamed, 1 otherwise.
     """
     if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:

@@ -254,7 +254,7 @@ def session_options() -> Callable[[F], F]:
             "--from",
             "form",
             type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
-            help="The format of SOURCE.  [default: told by its files]",
+            help="The format of SOURCE.  [default: detected by its files]",
         ),
         click.option(
             "--episode",
@@ -267,12 +267,13 @@ def session_options() -> Callable[[F], F]:
             "--rate",
             type=Number(min=0.1, max=2000),
             metavar="HZ",
-            help="Frames a second, where the source has no times.  [default: what it says]",
+            help="Frames per second, if the source has no times.  [default: the source's]",
         ),
         click.option(
             "--hand",
             metavar="MODEL",
-            help="Model of the hands, e.g. dex3-1, or none.  [default: told by joints and limits]",
+            help="Model of the hands, e.g. dex3-1, or none.  [default: detected by joints and "
+            "limits]",
         ),
         click.option("--keep-sides", is_flag=True, help="Do not exchange hands that look swapped."),
     )
@@ -490,7 +491,7 @@ def line_time_option() -> Callable[[F], F]:
     return click.option(
         "--line-time/--no-line-time",
         default=True,
-        help="Let each byte take its time on the line.",
+        help="Simulate the transmission time of each byte.",
     )
 
 

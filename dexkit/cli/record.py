@@ -32,7 +32,7 @@ __all__ = ["command"]
 @topic_option("Record", "every topic of a known type, also those that appear later")
 @dds_options()
 @duration_option()
-@click.option("--force", is_flag=True, help="Overwrite OUT, once there is something to write.")
+@click.option("--force", is_flag=True, help="Overwrite OUT, when the first message arrives.")
 @click.option(
     "--beside-episodes",
     "episodes",
@@ -59,18 +59,16 @@ def command(
 ) -> int:
     """Record DDS topics to OUT, an mcap file, until Ctrl-C.
 
-    Payloads are written as they were on the wire, with the time of reception and the source
-    timestamp, and with ros2msg schemas, as PlotJuggler, Foxglove and readers of ROS 2 bags want
-    them. Killing the recorder costs at most half a second.
+    Payloads are written unchanged, with reception time and source timestamp, and with ros2msg
+    schemas for PlotJuggler, Foxglove and readers of ROS 2 bags. A killed recorder loses at most
+    half a second.
 
-    With --beside-episodes, each episode that was written to DIR meanwhile is merged with the
-    recording into OUT_NAME.mcap: hands as they were on the wire, arms and pictures at the true time
-    of their frames.
+    With --beside-episodes, each episode written to DIR during the recording is merged with it into
+    OUT_NAME.mcap: hands from the wire, arms and pictures at the true times of their frames.
 
-    Exit codes: 0 a complete recording, as far as this machine can know; 1 nothing was received,
-    or something is missing (it is reported), or OUT was renamed meanwhile, or an episode
-    could not be merged; 2 wrong usage, or OUT
-    cannot be written (any more).
+    Exit codes: 0 no loss was detected; 1 nothing was received, something is missing (it is
+    reported), OUT was renamed meanwhile, or an episode could not be merged; 2 wrong usage, or OUT
+    cannot be written.
     """
     from dexkit.dds import DdsNode
     from dexkit.traces import Recorder

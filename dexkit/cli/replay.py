@@ -73,8 +73,8 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
 @click.option(
     "--rehearse",
     is_flag=True,
-    help="Only play it on the model's emulated hand, in virtual time, and write a page of what "
-    "would happen.",
+    help="Only play it on the model's emulated hand, in virtual time, and write a page with the "
+    "result.",
 )
 @html_option()
 @side_option("Hands to drive.  [default: all that the session commands]")
@@ -112,21 +112,21 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     "--resample",
     type=Number(min=1.0, max=1000.0),
     metavar="HZ",
-    help="Commands a second, interpolated.  [default: the recorded ones]",
+    help="Commands per second, interpolated.  [default: the recorded ones]",
 )
 @click.option(
     "--limit",
     type=click.Choice(["refuse", "clamp"]),
     default="refuse",
     show_default=True,
-    help="Commands outside the joints' limits: refuse the session, or move them to the limit.",
+    help="Commands outside the joints' limits: refuse the session, or clamp them.",
 )
 @click.option(
     "--jumps",
     type=click.Choice(["refuse", "stretch"]),
     default="refuse",
     show_default=True,
-    help="Where joints would have to turn too fast: refuse, or give them the time that they need.",
+    help="Commands that demand too high a joint speed: refuse the session, or stretch time.",
 )
 @click.option(
     "--invalid",
@@ -141,7 +141,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     type=click.Choice(["commands", "states"]),
     default="commands",
     show_default=True,
-    help="The commands, or the hands' recorded positions as commands.",
+    help="Play the commands, or the recorded positions as commands.",
 )
 @click.option("--swap-sides", is_flag=True, help="Play each hand's commands on the other hand.")
 @click.option(
@@ -154,13 +154,13 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     "--accept",
     multiple=True,
     type=click.Choice(_ACCEPTABLE),
-    help="Play in spite of this finding; may be repeated.",
+    help="Play despite this finding; may be repeated.",
 )
 @click.option(
     "--max-distance",
     type=Number(min=0, min_open=True),
     metavar="RAD",
-    help="Stop if a joint is further away from its command ...  [default: a quarter of its stroke]",
+    help="Stop if a joint is further from its command ...  [default: a quarter of its stroke]",
 )
 @click.option(
     "--distance-time",
@@ -176,7 +176,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     default=PAUSE,
     show_default=True,
     metavar="S",
-    help="Stop if no state of a hand comes for longer.",
+    help="Stop if a hand publishes no state for longer.",
 )
 @click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
 @session_options()
@@ -201,12 +201,13 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
 )
 @click.pass_context
 def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
-    """Play a session on hands, with care.
+    """Replay a session on hands, checked and supervised.
 
     SOURCE is a recording, or a session of any format that 'dexkit import' reads. It is checked
-    first; what is found is printed, and refused unless an option cures it. The hands are led from
-    where they are to the first pose, the session is played, and they are left at rest: at its end,
-    on a fault, without states, too far from the commands, on Ctrl-C, space or q.
+    first; findings are printed, and the session is refused unless an option cures them. The hands
+    move slowly from their present pose to the first one, then the session is played. The hands are
+    brought to rest at its end, on a fault, without states, too far from the commands, and on
+    Ctrl-C, space or q.
 
     The default domain is 1, the simulation's: --domain 0 with a robot's interface moves real hands.
 

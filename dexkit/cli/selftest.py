@@ -43,7 +43,7 @@ whose client asks for all of it, are tried at it."""
 
 @click.command("selftest")
 @click.argument("backend_name", metavar="[BACKEND]", required=False)
-@click.option("--external", is_flag=True, help="A hand that is served already, on DDS.")
+@click.option("--external", is_flag=True, help="Test a hand that is already served on DDS.")
 @click.option(
     "--side", type=click.Choice([str(s) for s in Side]), required=True, help="Hand to test."
 )
@@ -66,7 +66,7 @@ whose client asks for all of it, are tried at it."""
     "--speed",
     type=Number(0.05, 1.0),
     metavar="PART",
-    help="Part of the full speed that is tried at most.  [default: 0.25; 1 for position servos]",
+    help="Largest test speed, as a part of the full speed.  [default: 0.25; 1 for position servos]",
 )
 @click.option(
     "--lead",
@@ -108,13 +108,13 @@ def command(backend_name: str | None, **given: Any) -> int:
     """Test one hand: its joints one by one, and its tactile elements.
 
     BACKEND is a name from 'dexkit backends' or package.module:Class; the hand is driven directly.
-    Every joint is moved over its whole range, slowly first: nothing may be in its way. Space, q or
-    Ctrl-C stops and leaves the hand at rest.
+    Every joint MOVES over its whole range, slowly at first: keep the hand free. Space, q or Ctrl-C
+    stops and leaves the hand at rest.
 
-    Writes a page and a JSON file. With --baseline it says what has become worse since.
+    Writes a page and a JSON file. With --baseline it reports what has become worse since.
 
-    Exit code: 0 nothing is wrong, 1 something is, is worse than before, or could not be measured,
-    2 it cannot begin, 130 stopped.
+    Exit code: 0 no fault found, 1 a fault, a change for the worse, or a failed measurement, 2 the
+    test cannot begin, 130 stopped.
     """
     if (backend_name is None) == (not given["external"]):
         raise UsageError(
@@ -158,7 +158,7 @@ def command(backend_name: str | None, **given: Any) -> int:
                 return 130
             raise
         stack.callback(hand.close)
-        setup = Setup.of(
+        setup = Setup.from_spec(
             hand.spec,  # opening may have refined its rate
             dialect=spoken,
             joint_speeds=getattr(hand, "joint_speeds", None),
@@ -229,21 +229,21 @@ def _joints(names: list[str], chosen: tuple[str, ...]) -> list[int] | None:
 def _touch(name: str, wanted: bool) -> bool:
     """Whether elements are to be pressed.
 
-    :raises UsageError: nobody is at a terminal to be asked.
+    :raises UsageError: there is no terminal to ask at.
     """
     if not wanted or not model_by_name(name).sensors:
         return False
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise UsageError(
-            f"a {model_by_name(name).title} has tactile elements, and nobody is at a terminal to "
-            "press them",
+            f"a {model_by_name(name).title} has tactile elements, and there is no terminal to ask "
+            "an operator to press them",
             hint="--no-touch tests the joints alone",
         )
     return True
 
 
 def _outputs(given: dict[str, Any], model: str) -> tuple[Path, Path]:
-    """Where the result and the page go; never over an earlier run unless a name is given."""
+    """Paths of result and page; an earlier run is overwritten only if a name is given."""
     stem = f"selftest-{model}-{given['side']}-{datetime.now():%Y%m%d-%H%M%S}"
     json_path, page = given["json_path"], given["html_path"]
     if json_path is None:

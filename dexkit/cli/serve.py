@@ -75,7 +75,7 @@ _LONELY = 10.0  # seconds without a client before a hint
     "--dialect",
     type=DIALECT,
     help="Topics, types and units.  [default: the model's first: "
-    + ", ".join(f"{m.dialects[0].name} for a {m.name}" for m in MODELS.values())
+    + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())
     + "]",
 )
 @dds_options(default_domain=None, domain_default_text="0 for a device, else 1")
@@ -83,8 +83,8 @@ _LONELY = 10.0  # seconds without a client before a hint
     "--state-rate",
     type=Number(1, 1000),
     metavar="HZ",
-    help="States published a second.  [default: the model's, "
-    + ", ".join(f"{m.state_rate:g} for a {m.name}" for m in MODELS.values())
+    help="States published per second.  [default: the model's, "
+    + ", ".join(f"{m.state_rate:g} ({m.name})" for m in MODELS.values())
     + "]",
 )
 @click.option(

@@ -39,17 +39,17 @@ __all__ = ["command"]
     metavar="DIR",
     help="Keep the wheel here, for other environments and machines.",
 )
-@click.option("--no-install", is_flag=True, help="Only make the wheel that --wheel keeps.")
+@click.option("--no-install", is_flag=True, help="Only build the wheel for --wheel.")
 @click.option(
     "--replace", is_flag=True, help="Replace an installed cyclonedds that works, or is not 0.10.x."
 )
-@click.option("--dry-run", is_flag=True, help="Say what would be done, and do nothing.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
 @click.option(
     "--log",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Where commands and their output are written.  "
-    "[default: dexkit/setup-dds.log in the user's folder for logs]",
+    help="Log file of commands and their output.  [default: dexkit/setup-dds.log in the user's "
+    "folder for logs]",
 )
 def command(
     source: Path | None,
@@ -65,11 +65,11 @@ def command(
     CycloneDDS library 0.10.x to build the Python binding against (CYCLONEDDS_HOME, /opt/ros,
     a build in your home, the distribution's package). If there is none, says what to install.
 
-    Installs into the environment that dexkit is in, after a message went to another process and
-    back. Needs no root, and refuses the system's own Python. If it fails or is interrupted, the
-    environment is as it was.
+    Installs into dexkit's own environment, after a test message to another process and back. Needs
+    no root, and refuses the system's own Python. A failure or interruption leaves the environment
+    unchanged.
 
-    Exit code: 0 DDS works, 1 a step failed, 2 it cannot be done here, 130 interrupted.
+    Exit code: 0 DDS works, 1 a step failed, 2 not possible on this machine, 130 interrupted.
     """
     from dexkit.setup_dds.execute import carry_out
     from dexkit.setup_dds.plan import Options, make_plan

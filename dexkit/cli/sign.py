@@ -24,7 +24,7 @@ from dexkit.escaping import one_line
     "--page",
     type=click.Path(exists=True, path_type=Path),
     metavar="PAGE.html",
-    help="The report page of the result, to be signed as well.",
+    help="Also sign this report page of the result.",
 )
 @click.option(
     "--key",
@@ -39,7 +39,7 @@ from dexkit.escaping import one_line
     type=click.Choice(["ssh-keygen", "minisign"]),
     default="ssh-keygen",
     show_default=True,
-    help="Program that makes the signature; it must be installed.",
+    help="Signing program; it must be installed.",
 )
 @click.option(
     "-o",
@@ -56,14 +56,14 @@ def command(
     tool: str,
     output: Path | None,
 ) -> None:
-    """Sign a result with its recording, as one archive.
+    """Sign a result together with its recording, as one archive.
 
     The archive is a zip of the result, the recording, the page if one is given, a manifest with
     their SHA-256 digests, and a signature of the manifest. The same files and key give the same
     bytes. 'dexkit verify' checks it.
 
-    A recording that the result was not judged from is refused: by the digest in the result, or,
-    where that has none, by judging the recording again.
+    A recording that does not belong to the result is refused: by the digest in the result or,
+    without one, by judging the recording again.
 
     Exit code: 0 the archive is written, 2 a file, the key or the tool cannot be used, or the
     recording is another one.

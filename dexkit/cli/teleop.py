@@ -61,7 +61,7 @@ _MS = 1e3
     default="unitree_go",
     show_default=True,
     help="Dialect of the hands: "
-    + "; ".join(f"{', '.join(d.name for d in m.dialects)} for a {m.name}" for m in MODELS.values())
+    + "; ".join(f"{', '.join(d.name for d in m.dialects)} ({m.name})" for m in MODELS.values())
     + ".",
 )
 @dds_options()
@@ -74,7 +74,7 @@ _MS = 1e3
     "patience",
     type=Number(min=0),
     metavar="S",
-    help="Wait up to S seconds for states.  [default: for ever, as the genuine client]",
+    help="Wait up to S seconds for states.  [default: no limit, as the genuine client]",
 )
 @click.option(
     "--release",
@@ -93,7 +93,7 @@ _MS = 1e3
     "record_path",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="F.mcap",
-    help="Record the hands' topics meanwhile; 'dexkit check' judges them.",
+    help="Also record the hands' topics, for 'dexkit check'.",
 )
 @force_option()
 @json_option("Print the measurements as JSON (docs/teleop.md).")
@@ -114,8 +114,8 @@ def command(
 ) -> int:
     """Drive a hand as xr_teleoperate does, and measure its response: delay, lag, overshoot.
 
-    PROFILE is what the operator does ('dexkit teleop --list'), or a recording: FILE.mcap, whose
-    commands are then what the operator wants. The client waits for the state of both hands,
+    PROFILE names a motion of the operator ('dexkit teleop --list'), or is a recording FILE.mcap
+    whose commands are the operator's targets. The client waits for the state of both hands,
     clips each Dex1-1 command to 0.18 rad of the last state and smooths it, as the genuine one
     does. The default domain is 1, the simulation's:
     --domain 0 with a robot's interface moves real hands.

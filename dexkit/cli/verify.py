@@ -16,8 +16,8 @@ from dexkit.escaping import REMARK, one_line
     type=click.Path(exists=True, path_type=Path),
     required=True,
     metavar="FILE",
-    help="Whose signature is accepted: an ssh public key, an allowed_signers file, or a public key "
-    "of minisign.",
+    help="Accepted signer: an ssh public key, an allowed_signers file, or a public key of "
+    "minisign.",
 )
 @click.option(
     "--rejudge/--no-rejudge",
@@ -31,10 +31,10 @@ def command(archive: Path, public_key: Path, rejudge: bool) -> None:
     Checks the signature, the digest of every file, and that none is missing or added; then judges
     the recording as 'dexkit check' does and compares all verdicts with those of the result.
 
-    A signature says who vouches for the result, not that the hand is good.
+    A signature says who vouches for the result, not that the hand conforms.
 
-    Exit code: 0 all of that is right, whatever the verdict on the hand; 1 something differs, one
-    line each; 2 the archive, the key or the tool cannot be used.
+    Exit code: 0 everything agrees, whatever the verdict on the hand; 1 something differs, one line
+    each; 2 the archive, the key or the tool cannot be used.
     """
     from dexkit.conformance.signed.verify import verify_archive
     from dexkit.signatures import PublicKey

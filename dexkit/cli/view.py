@@ -40,7 +40,7 @@ __all__ = ["command", "recorded"]
     default="127.0.0.1",
     show_default=True,
     metavar="ADDRESS",
-    help="Bind the page to this address. It has no password: others on the network could see it.",
+    help="Bind the page to this address. It has no password: anyone on the network could see it.",
 )
 @click.option(
     "--port",
@@ -96,13 +96,13 @@ def command(
     out: str | None,
     duration: float | None,
 ) -> None:
-    """Show hands and robots on a page in the browser: how they move, what is wrong, and when.
+    """Show hands and robots on a page in the browser: motion, faults and events.
 
-    Without RECORDING: what is on the wire now. The viewer only listens and publishes nothing. A
-    RECORDING has a time line to go along, with the phases of a conformance run and the
-    requirements that failed; two are shown side by side. Until Ctrl-C.
+    Without RECORDING it shows the live DDS domain; it only listens and publishes nothing. For a
+    RECORDING there is a time line with the phases of a conformance run and the failed requirements;
+    two recordings are shown side by side. Ctrl-C ends it.
 
-    Needs the extra 'view': pip install 'dexkit[view]'. The page loads nothing from elsewhere.
+    Needs the extra 'view': pip install 'dexkit[view]'. The page loads nothing from the network.
     --to rerun and --to foxglove need the extra of that name instead.
 
     Exit code: 0; 2 wrong usage, an unusable recording, or a missing package.
@@ -115,7 +115,7 @@ def command(
 
     # names the extra before anything else is done
     if to is None:
-        from dexkit.view.page import Page
+        from dexkit.view.browser_page import Page
     elif to == "rerun":
         from dexkit.view.rerun_viewer import RerunViewer
     else:
@@ -155,7 +155,7 @@ def command(
 
 
 class _Written:
-    """How much of a recording is written, on the status line."""
+    """Show the progress of writing a recording on the status line."""
 
     def __init__(self) -> None:
         self._line = StatusLine(quiet=False)

@@ -31,7 +31,7 @@ from dexkit.topics import roles
 __all__ = ["DISCOVERY_SECONDS", "observe_domains"]
 
 DISCOVERY_SECONDS = 0.7
-"""How long an empty domain is waited on; a participant on this machine answers within 10 ms."""
+"""Seconds to wait on an empty domain; a participant on this machine answers within 10 ms."""
 
 _GROUP = "239.255.0.1"  # of discovery (RTPS 9.6.2.3)
 _INDICES = 61  # participants on one machine and domain that are called by port, as dexkit.dds

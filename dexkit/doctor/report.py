@@ -22,7 +22,7 @@ from dexkit.topics import roles
 __all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
 
 SCHEMA_VERSION = 1
-"""Of the JSON report; raised when a field changes its meaning or goes."""
+"""Version of the JSON report; incremented when a field changes its meaning or is removed."""
 
 _BODY_TOPICS = {
     topic

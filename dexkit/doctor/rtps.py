@@ -58,7 +58,8 @@ SEDP_SUBSCRIPTIONS = bytes.fromhex("000004c2")
 _PARTICIPANT = bytes.fromhex("000001c1")
 
 BUILTIN_ENDPOINTS = 0b111011
-"""What an observer has (PID_BUILTIN_ENDPOINT_SET): it announces its participant (bit 0) and its
+"""Built-in endpoints of an observer (PID_BUILTIN_ENDPOINT_SET): it announces its participant (bit
+0) and its
 subscriptions (4), and detects participants (1), publications (3) and subscriptions (5). It
 publishes nothing."""
 

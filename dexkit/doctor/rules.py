@@ -33,7 +33,7 @@ from dexkit.wire import dex3_usb, mx64
 __all__ = ["ROBOT_NETWORK", "Readiness", "Scope", "Verdict", "diagnose", "readiness", "verdict"]
 
 ROBOT_NETWORK = "192.168.123."
-"""Where Unitree's robots are (docs/sources/unitree-dex.md#a6)."""
+"""Network of Unitree's robots (docs/sources/unitree-dex.md#a6)."""
 
 _FROZEN_COMMANDS = 0.1  # rad that commands move while a measured state must change
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
@@ -706,7 +706,7 @@ def _place(one: Awaited) -> str:
 
 
 def _remedy(one: Awaited, view: DomainView, readers: Iterable[Endpoint]) -> str:
-    """What to do when no process publishes what clients wait for."""
+    """Advice if no process publishes the state that clients wait for."""
     if one.simulation:
         return "start the simulator on this domain, or the client without --sim"
     parts = []

@@ -1,4 +1,4 @@
-"""How CycloneDDS 0.10 describes Unitree's types, to tell who describes them otherwise.
+"""Hashes of Unitree's types as described by CycloneDDS 0.10, to detect other descriptions.
 
 A participant announces a hash of each type. A 0.10.x peer that does not know the hash asks for the
 type, and what the Python binding sends from 2023 on crashes it (docs/sources/unitree-dex.md#f).

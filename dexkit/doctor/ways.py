@@ -12,8 +12,8 @@ _NEAR = 0.15  # of it within which a joint is where something says
 
 
 class Course(NamedTuple):
-    """Where a hand was and where it was commanded to, at the first sample and at the last: q of
-    each joint in the dialect's unit.
+    """Position and goal of a hand at the first and the last sample: q of each joint in the
+    dialect's unit.
     """
 
     began: Sequence[float]
@@ -23,10 +23,10 @@ class Course(NamedTuple):
 
 
 def moves_against(course: Course, ranges: Sequence[tuple[float, float]]) -> int:
-    """How many joints moved against their commands; 0 if that is half or less of those that moved.
+    """Number of joints that moved against their commands; 0 if it is half or less of the moving
+    joints.
 
-    Such a joint stands where a scale that is turned round would have it: one that is merely late
-    does not.
+    Such a joint stands at the position of an inverted scale; a merely late joint does not.
     """
     moved = against = 0
     for began, now, first, asked, (low, high) in zip(*course, ranges, strict=True):

@@ -303,7 +303,7 @@ class RowReader:
 
 
 class _Plan:
-    """Where the numbers are in samples of one shape."""
+    """Offsets of the numbers in samples of one shape."""
 
     def __init__(self, kind: Struct, paths: Sequence[_Steps], data: bytes, big: bool) -> None:
         counts = _counts(kind, data, big)
@@ -374,7 +374,7 @@ def encode_columns(
 
 
 class _Layout:
-    """Where the members of a sample of one shape are."""
+    """Offsets of the members in samples of one shape."""
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
         self._dtype = dtype

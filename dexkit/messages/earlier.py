@@ -31,7 +31,9 @@ class Layout:
     packages: str
 
 
-def _of(type_name: str, names: Sequence[str], inner: Mapping[str, Struct] | None = None) -> Struct:
+def _struct(
+    type_name: str, names: Sequence[str], inner: Mapping[str, Struct] | None = None
+) -> Struct:
     """The present type with these members only, in this order."""
     present = STRUCTS[type_name]
     members = {member.name: member for member in present.fields}
@@ -42,7 +44,7 @@ def _of(type_name: str, names: Sequence[str], inner: Mapping[str, Struct] | None
 
 
 _HG = "unitree_hg::msg::dds_::"
-_SENSOR = {"press_sensor_state": _of(_HG + "PressSensorState_", ("pressure", "temperature"))}
+_SENSOR = {"press_sensor_state": _struct(_HG + "PressSensorState_", ("pressure", "temperature"))}
 _FIRST = (
     "unitree_sdk2 before 2024-12-18, unitree_sdk2_python before 2024-10-23, unitree_ros2 before "
     "v0.3.0"
@@ -54,7 +56,7 @@ EARLIER: dict[str, tuple[Layout, ...]] = {
     _HG + "HandCmd_": (
         Layout(
             "2024-08",
-            _of(_HG + "HandCmd_", ("motor_cmd",)),
+            _struct(_HG + "HandCmd_", ("motor_cmd",)),
             "99a6748ede49d3451404fb82339a",
             _FIRST,
         ),
@@ -62,7 +64,7 @@ EARLIER: dict[str, tuple[Layout, ...]] = {
     _HG + "HandState_": (
         Layout(
             "2024-08",
-            _of(
+            _struct(
                 _HG + "HandState_",
                 ("motor_state", "imu_state", "press_sensor_state", *_POWER, "reserve"),
                 _SENSOR,
@@ -72,7 +74,7 @@ EARLIER: dict[str, tuple[Layout, ...]] = {
         ),
         Layout(
             "2024-12",
-            _of(
+            _struct(
                 _HG + "HandState_",
                 (*_BEGIN, *_POWER, "system_v", "device_v", "error", "reserve"),
                 _SENSOR,

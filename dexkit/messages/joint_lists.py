@@ -17,7 +17,7 @@ _GO = "unitree_go::msg::dds_::"
 
 @dataclass(frozen=True)
 class JointLists:
-    """Where the values of motors are in such a message.
+    """Location of the motors' values in such a message.
 
     :param motor: DDS name of the type that a motor is shown as.
     :param lists: for a member of it, the list that holds it and how many there are one.
@@ -89,4 +89,4 @@ JOINT_LISTS: Mapping[str, JointLists] = {
         errors="err",
     ),
 }
-"""By DDS name (docs/sources/unitree-dex.md#j3)."""
+"""Messages with joint lists by DDS name (docs/sources/unitree-dex.md#j3)."""

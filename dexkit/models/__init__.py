@@ -174,8 +174,8 @@ T = TypeVar("T")
 
 
 class _Known(Mapping[str, T]):
-    """By name: the built-in ones first, then those of other packages, which are loaded when a name
-    is asked for that is not built in, or all names are.
+    """Models by name: built-in ones first, then those of other packages. The latter are loaded when
+    a name is not built in, or when all names are requested.
     """
 
     def __init__(self, own: dict[str, T]) -> None:

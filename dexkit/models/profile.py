@@ -107,14 +107,14 @@ class Dialect:
 
     def topics(self, side: Subject) -> tuple[str, str]:
         """(command topic, state topic) of a side or a robot."""
-        return self._of(self.cmd_topic, side), self._of(self.state_topic, side)
+        return self._topic(self.cmd_topic, side), self._topic(self.state_topic, side)
 
     def touch_topic_of(self, side: Subject) -> str:
         """The topic of a side's tactile areas; empty where the dialect has none."""
-        return self._of(self.touch_topic, side)
+        return self._topic(self.touch_topic, side)
 
     @staticmethod
-    def _of(topic: str, side: Subject) -> str:
+    def _topic(topic: str, side: Subject) -> str:
         return topic.format(side=side, s=str(side)[0])
 
     @property
@@ -186,7 +186,7 @@ class TouchArea:
 
     @property
     def elements(self) -> int:
-        """How many elements it has."""
+        """Number of elements."""
         return self.rows * self.columns
 
 
@@ -231,7 +231,7 @@ class Finger:
 
     @property
     def end(self) -> tuple[float, float]:
-        """Where it ends."""
+        """Position of its tip."""
         return self.along(len(self.joints) - 1 + self.tip)
 
 

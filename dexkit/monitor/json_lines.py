@@ -1,4 +1,4 @@
-"""What the monitor knows as JSON, a line each time; sans IO."""
+"""Format the monitor's data as JSON lines, without I/O."""
 
 from __future__ import annotations
 

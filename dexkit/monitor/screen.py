@@ -28,9 +28,9 @@ _KEYS = "q quit  space pause  r record  c clear events  up/down scroll"
 
 @dataclass(frozen=True)
 class Shown:
-    """What is shown, besides the picture.
+    """Contents of the screen besides the picture.
 
-    :param title: what is listened to.
+    :param title: domain and interface.
     :param clock: the time of day.
     :param recording: what the recorder says, or empty.
     :param scroll: lines of the hands that are above the screen.

@@ -101,7 +101,7 @@ class FtpMap(DialectMap):
         )
 
     def encode_touch(self, views: Mapping[Side, StateView]) -> bytes | None:
-        """What the tactile areas feel, in the device's counts; None where it is not measured."""
+        """Readings of the tactile areas, device counts; None if they are not measured."""
         (view,) = views.values()
         if view.state.pressure is None:
             return None

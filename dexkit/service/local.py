@@ -4,8 +4,8 @@
         hand.move_to(goal)
         print(hand.state().q)
 
-Commands go through the same :class:`~dexkit.service.core.HandCore` as those of a client on DDS:
-limits, time-out, slow first motion of a real hand, brake after a pause, a fault or a
+Commands go through the same :class:`~dexkit.service.hand_core.HandCore` as those of a client on
+DDS: limits, time-out, slow first motion of a real hand, brake after a pause, a fault or a
 reconnection.
 """
 
@@ -22,7 +22,7 @@ from dexkit.clock import Clock
 from dexkit.errors import DexkitError, HandFault, HandLost, HandTimeout
 from dexkit.hand import CommandGate, Floats, Hand, HandCommand, HandState, MotorError
 from dexkit.models import HandModel, model
-from dexkit.service.core import HandCore
+from dexkit.service.hand_core import HandCore
 from dexkit.service.publisher import Publisher
 from dexkit.service.service import HandService
 

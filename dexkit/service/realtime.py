@@ -46,9 +46,9 @@ def real_time() -> Iterator[bool]:
 
 
 def go_first() -> None:
-    """Let this thread run before the process's other threads, if they have real-time priority.
+    """Raise this thread above the process's other threads, if they have real-time priority.
 
-    For the one that has deadlines: the others work when it sleeps.
+    Use it for the thread with deadlines: the others run while it sleeps.
     """
     if sys.platform == "linux" and os.sched_getscheduler(0) == os.SCHED_RR:
         with suppress(OSError):
@@ -56,7 +56,7 @@ def go_first() -> None:
 
 
 def precise_timers() -> None:
-    """Let the calling thread's sleeps end on time.
+    """Reduce the calling thread's timer slack, so that its sleeps end on time.
 
     Linux may delay a wake-up by the thread's timer slack, 50 us by default, to save power.
     """

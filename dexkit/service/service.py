@@ -1,4 +1,4 @@
-"""Serve a hand on DDS: threads and endpoints around :class:`~dexkit.service.core.HandCore`.
+"""Serve a hand on DDS: threads and endpoints around :class:`~dexkit.service.hand_core.HandCore`.
 
 Three activities, each with its own clock:
 
@@ -42,9 +42,9 @@ from dexkit.hand import Hand, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, HandModel, model
 from dexkit.models import dialect as dialect_by_name
-from dexkit.service.core import Estimation, HandCore
 from dexkit.service.counters import TopicCounters
 from dexkit.service.dialects import Fill, StateView, dialect_map
+from dexkit.service.hand_core import Estimation, HandCore
 from dexkit.service.limp import LimpCommands
 from dexkit.service.publisher import Publisher, align
 from dexkit.single_publisher import NodeTopics, SolePublisher
@@ -113,7 +113,7 @@ class HandService:
     :param state_rate: Hz; by default that of the model.
     :param publisher: publishes the state, at its own rate, also for other services.
     :param phase: when in a period the hand is exchanged with, 0 to 1; state is published at 0.
-    :param estimation: when q is predicted, see :class:`~dexkit.service.core.Estimation`.
+    :param estimation: when q is predicted, see :class:`~dexkit.service.hand_core.Estimation`.
     :param stall_tau: N·m of tau_est that a joint whose prediction is stalled has at least.
     :param wait_for_device: do not fail when the hand is missing at the start, wait for it.
     :param force: start, and go on, even if another program publishes the state topic.
@@ -675,7 +675,7 @@ class HandService:
         return payload
 
     def _compose_touch(self) -> bytes | None:
-        """What the hands' tactile areas feel now; None without a state, or where they do not."""
+        """Message of the hands' tactile areas; None without a state, or without such areas."""
         views = tuple(unit.core.view() for unit in self._units)
         encoded_views, payload = self._touch
         if len(views) == len(encoded_views) and all(

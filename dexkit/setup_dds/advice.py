@@ -19,7 +19,7 @@ _ROS = {"22.04": "humble", "24.04": "jazzy"}
 
 
 def how_to_get_library(distribution: Distribution) -> str:
-    """What to type, one command a line, to have a CycloneDDS library 0.10.x."""
+    """Commands, one a line, that install a CycloneDDS library 0.10.x."""
     known = _PACKAGED.get(distribution.id)
     lines = []
     if known is not None and _release(distribution) >= known:

@@ -1,4 +1,4 @@
-"""What ``dexkit setup-dds`` knows of a machine before it decides anything."""
+"""Facts about a machine on which ``dexkit setup-dds`` bases its plan."""
 
 from __future__ import annotations
 

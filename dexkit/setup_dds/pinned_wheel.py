@@ -19,7 +19,7 @@ from dexkit.errors import DdsBuildFailed
 __all__ = ["LIBRARY_FOLDER", "inside", "outside", "rewrite"]
 
 LIBRARY_FOLDER = "cyclonedds.libs"
-"""Where wheels have their libraries, beside the package."""
+"""Suffix of the folder with a wheel's libraries, beside the package."""
 
 _MODULE = "cyclonedds/__library__.py"
 

@@ -25,7 +25,7 @@ _NEEDED = {"binding": 150 * _MB, "library": 300 * _MB, "install": 30 * _MB}
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asks for.
+    """The user's options.
 
     :ivar source: checkout of the C library that is to be built.
     :ivar source_version: its version; empty if the folder is no such checkout.
@@ -86,7 +86,7 @@ class BuildSource:
 
 @dataclass(frozen=True)
 class Plan:
-    """What will be done.
+    """The steps to be done.
 
     :ivar examined: what was found on the way, one line each, with the reason why it is not used.
     :ivar notes: what the user should know, such as a library that must not be moved.
@@ -289,7 +289,7 @@ def _library_problem(library: Library, interpreter: Interpreter) -> str:
 
 
 def _endurance(library: Library, machine: Machine) -> tuple[str, ...]:
-    """What becomes of an environment that uses a library where it is."""
+    """Explain how long an environment that uses a library in place will work."""
     folder = PurePosixPath(library.folder)
     safe = ("/usr", "/lib", "/opt", machine.interpreter.prefix)
     if any(folder.is_relative_to(place) for place in safe):

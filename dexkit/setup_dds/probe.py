@@ -49,7 +49,7 @@ def _start(python: str, folder: str, call: str) -> list[str]:
 
 
 def result_of(code: int, output: str) -> Installed:
-    """What the child has found.
+    """Parse the child's result.
 
     :param code: its exit code; negative: of which signal it died.
     """
@@ -65,10 +65,10 @@ def result_of(code: int, output: str) -> Installed:
 
 def main(send: bool) -> None:
     """Find out, and print it."""
-    print(json.dumps(dataclasses.asdict(_look(send))))
+    print(json.dumps(dataclasses.asdict(_probe(send))))
 
 
-def _look(send: bool) -> Installed:
+def _probe(send: bool) -> Installed:
     try:
         version = metadata.version("cyclonedds")
     except metadata.PackageNotFoundError:

@@ -61,15 +61,15 @@ LEAD_SIMULATED_1_1 = 1.0
 """The same in simulation, release 1.1; later ones do not clip there
 (docs/sources/unitree-dex.md#b3)."""
 WEIGHTS = (0.5, 0.3, 0.2)
-"""Of the three last values, newest first (docs/sources/unitree-dex.md#b3)."""
+"""Weights of the three last values, newest first (docs/sources/unitree-dex.md#b3)."""
 PINCH_MIN, PINCH_MAX = 5.0, 7.0
 """Pinch distance or trigger that means closed, and open (docs/sources/unitree-dex.md#b3)."""
 
 Pose: TypeAlias = tuple[float, ...]
 """q of every joint of a hand, rad."""
 Inputs: TypeAlias = Mapping[Side, Pose | None]
-"""What hand tracking gives: the pinch value of a Dex1-1, the joint targets of other hands; None, or
-no entry, while it has nothing."""
+"""Output of hand tracking: the pinch value of a Dex1-1, the joint targets of other hands; None, or
+no entry, without data."""
 
 
 class JointCommand(NamedTuple):
@@ -149,7 +149,7 @@ class StateReceiver:
         self.advance(now)
 
     def advance(self, now: float) -> None:
-        """Let the thread run up to ``now``."""
+        """Simulate the thread up to ``now``."""
         while self._time <= now:
             found = self._kept.pop(self._reads[self._at], None)
             if found is None:

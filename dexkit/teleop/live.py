@@ -172,9 +172,9 @@ class LiveClient:
         stop: threading.Event,
         progress: Callable[[float, Session], object] = lambda seconds, session: None,
     ) -> Session:
-        """Let the operator perform for so many seconds, or until stopped.
+        """Run the operator's motion for some seconds, or until stopped.
 
-        After a pause of this program the operator goes on where he was.
+        After a pause of this program it continues where it was.
 
         :param progress: called about twice a second.
         """

@@ -1,4 +1,4 @@
-"""What is drawn of a hand or robot at a moment, for any library: frames and colours."""
+"""Compute the drawing of a hand or robot at one time, for any library: frames and colours."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Drawing:
 
     @property
     def pin_sizes(self) -> Floats:
-        """Of the joints' axes, m, shape (n, 3)."""
+        """Sizes of the joints' axes, m, shape (n, 3)."""
         thick = 0.045 if self.robot else 0.0105
         rows = [(p.length, thick, thick) for p in self.skeleton.pins]
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
@@ -76,7 +76,7 @@ class Drawing:
         return frame
 
     def at(self, view: SubjectView) -> Drawn:
-        """What is drawn of this state."""
+        """The drawing of this state."""
         poses = self.skeleton.poses(_drawn_q(view, view.q))
         driven, ghost = np.isfinite(view.target), None
         if driven.any():
@@ -142,7 +142,7 @@ def _torque_colors(view: SubjectView) -> Colors:
 
 
 def places(count: int, robots: Mapping[int, bool]) -> list[tuple[float, float, float]]:
-    """Where figures stand: hands in a row, robots behind them.
+    """Positions of the figures: hands in a row, robots behind them.
 
     :param robots: whether each is a robot.
     """

@@ -43,7 +43,7 @@ class Moment:
         return np.asarray(self.root @ frames)
 
     def numbers(self) -> dict[str, dict[str, float]]:
-        """By field and joint, in the dialect's units; NaN is left out."""
+        """Values by field and joint, in the dialect's units, without NaN."""
         view = self.view
         fields = {"q": view.q, "target": view.target, "dq": view.dq, "tau_est": view.tau}
         return {

@@ -57,7 +57,7 @@ class FoxgloveViewer:
 
     @property
     def url(self) -> str:
-        """Where Foxglove finds it."""
+        """URL for Foxglove."""
         return f"ws://{self.host}:{self.port}"
 
     def close(self) -> None:

@@ -129,13 +129,13 @@ class Figure:
         if self._elements is not None:
             self._set(self._elements, "batched_positions", "elements", drawn.elements)
             self._color(self._elements, "element colors", drawn.element_colors)
-        self._tell(view)
+        self._show_problems(view)
 
     def remove(self) -> None:
         """Take it off the scene."""
         self._root.remove()
 
-    def _tell(self, view: SubjectView) -> None:
+    def _show_problems(self, view: SubjectView) -> None:
         faults = view.faults
         text = ""
         if view.stale:

@@ -1,4 +1,4 @@
-"""What a page shows: a live domain, or a recording with its marks."""
+"""Data sources of a page: a live domain, or a recording with its marks."""
 
 from __future__ import annotations
 

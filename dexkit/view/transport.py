@@ -33,7 +33,7 @@ class Transport:
         return self.live and not self.paused
 
     def advance(self, now: float, begin: float, end: float) -> float:
-        """Go on with the clock; returns the moment to show.
+        """Advance with the clock; return the time to show.
 
         :param begin: of the line, ``end`` its end: of a live one what the history reaches back to,
             and now.
@@ -52,11 +52,11 @@ class Transport:
         return self.at
 
     def hold(self) -> None:
-        """Let the time until the next :meth:`advance` not count."""
+        """Ignore the time until the next :meth:`advance`."""
         self._last = None
 
     def seek(self, at: float) -> None:
-        """Go to a moment; a live line stands there."""
+        """Jump to a time; a live line pauses there."""
         self.at = min(max(at, self.begin), self.end)
         if self.live:
             self.paused = True

@@ -1,4 +1,4 @@
-"""What is on the wire, for those that show it: rates, ages, gaps, and each hand's values.
+"""Observe DDS topics for viewers: rates, ages, gaps, and each hand's values.
 
 :class:`~dexkit.watch.collector.Collector` takes samples and answers for any moment, without input
 or output of its own. :class:`~dexkit.watch.listener.Listener` feeds it from a DDS domain,

@@ -166,7 +166,7 @@ class SubjectView:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What is known of a moment.
+    """The data of one time.
 
     :param at: seconds since the first sample.
     :param topics: by name; ``subjects`` by dialect, left before right.
@@ -288,7 +288,7 @@ class _Topic:
         return len(np.unique(self._writers.rows[some, 0]))
 
     def place(self, part: Part) -> int:
-        """Where the fields of a part begin."""
+        """Index of a part's first field."""
         first = 0
         for each in self.parts:
             if each is part:
@@ -298,7 +298,7 @@ class _Topic:
 
 
 class Collector:
-    """What was seen of a domain, or in a recording.
+    """Collects the samples of a domain or a recording.
 
     :param most: samples of each topic whose values are kept, as far as they are not older than two
         minutes; None keeps all, for a recording.
@@ -377,7 +377,7 @@ class Collector:
                    default=0.0)  # fmt: skip
 
     def picture(self, at: float) -> Picture:
-        """What is known of the moment ``at``, seconds since the first sample."""
+        """The data at the time ``at``, seconds since the first sample."""
         views = [self._topic_view(t, at) for _, t in sorted(self._topics.items())]
         silent = self._announced() - {t.name for t in self._topics.values()}
         views += [self._silent_view(name) for name in sorted(silent)]

@@ -1,4 +1,4 @@
-"""What has changed from one picture to the next, for people and logs; sans IO."""
+"""Find changes from one picture to the next, for people and logs, without I/O."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Event:
 
 @dataclass
 class _Known:
-    """What was last said of a hand or robot."""
+    """The last reported condition of a hand or robot."""
 
     faults: frozenset[str] = frozenset()
     stale: bool = True

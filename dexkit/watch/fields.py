@@ -75,7 +75,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Part:
-    """What a topic says of one hand, or of a robot.
+    """The part of a topic for one hand or robot.
 
     :param kind: ``"cmd"``, ``"state"``, ``"low"`` or ``"touch"``.
     :param joints: in the units of the topic's dialect.
@@ -102,7 +102,7 @@ class Part:
 
 
 def parts_of(topic: str, type_name: str) -> list[Part]:
-    """What a topic of a type says, of which hands or robot; empty for other topics."""
+    """The parts of a topic, by its name and type; empty for other topics."""
     found = [
         _hand_part(role.dialect, role.kind, side, type_name)
         for role in roles(topic, type_name)

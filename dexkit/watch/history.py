@@ -81,7 +81,7 @@ class History:
         self._count = kept
 
     def until(self, at: float) -> int:
-        """How many rows are not later than ``at``."""
+        """Number of rows up to the time ``at``."""
         return int(np.searchsorted(self.t, at, "right"))
 
     def between(self, begin: float, end: float) -> slice:

@@ -2,7 +2,7 @@
 
 Polynomial 0x04C11DB7, initial value 0xFFFFFFFF, not reflected, no final xor. The vendor's function
 takes the data as 32-bit little-endian words and feeds each of them most significant byte first,
-which is CRC-32/MPEG-2 over the data with the bytes of every word turned round
+which is CRC-32/MPEG-2 over the data with the bytes of every word reversed
 (docs/sources/unitree-dex.md#c8, docs/sources/unitree-dex.md#a7; the Dex3-1 manual "CRC32 Function
 Calculation Method").
 """

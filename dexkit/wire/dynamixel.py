@@ -1,7 +1,7 @@
 """Encode and decode DYNAMIXEL Protocol 2.0 packets (instruction and status), without I/O.
 
 A frame is ``FF FF FD 00, ID, length (2, little-endian), instruction, parameters, CRC (2)``;
-the length counts everything behind itself. A status packet has instruction 0x55 and an error
+the length counts everything after itself. A status packet has instruction 0x55 and an error
 byte before its data. (docs/sources/mx64-ezgripper.md#a.)
 """
 
@@ -151,7 +151,7 @@ class Packet:
 
     @property
     def data(self) -> bytes:
-        """The data of a status packet, behind the error byte."""
+        """The data of a status packet, after the error byte."""
         self._expect_status()
         return self.params[1:]
 

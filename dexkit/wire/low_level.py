@@ -86,7 +86,7 @@ class _Image:
         self._back[source[~gap]] = np.flatnonzero(~gap)
         self._header_and_gaps = np.setdiff1d(np.arange(wire), source[~gap])
         self._source, self._gaps = source, np.flatnonzero(gap)
-        # all words but the last, the CRC itself, each turned round as the CRC wants them
+        # all words but the last (the CRC itself), byte-swapped for the CRC
         turned = np.arange(self.size - 4).reshape(-1, 4)[:, ::-1].reshape(-1)
         self._turned, self._turned_gaps = source[turned], np.flatnonzero(gap[turned])
 
@@ -112,7 +112,7 @@ class _Image:
         return sample.tobytes()
 
     def crc(self, payload: Buffer) -> int:
-        """The CRC that belongs into its last member."""
+        """The CRC that its last member should hold."""
         words = np.frombuffer(payload, dtype=np.uint8)[self._turned]
         words[self._turned_gaps] = 0
         return crc32_swapped(words.data)
@@ -141,7 +141,8 @@ def struct_of_payload(name: str, payload: Buffer) -> bytes:
 
 
 def payload_of_struct(name: str, struct: Buffer) -> bytes:
-    """The CDR sample of a C struct, whatever its gaps hold; the way back from the above.
+    """The CDR sample of a C struct, whatever its gaps hold; the inverse of
+    :func:`struct_of_payload`.
 
     :param name: DDS type name, one of :data:`LOW_LEVEL_TYPES`.
     :raises UsageError: another type, or a struct of another size.
@@ -153,7 +154,7 @@ def payload_of_struct(name: str, struct: Buffer) -> bytes:
 
 
 def crc_of_payload(name: str, payload: Buffer) -> int:
-    """The CRC that a CDR sample should carry, whatever it does carry.
+    """The CRC that a CDR sample should carry, computed without its present one.
 
     :param name: DDS type name, one of :data:`LOW_LEVEL_TYPES`.
     :raises UsageError: another type.

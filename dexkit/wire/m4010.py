@@ -8,9 +8,9 @@ addresses all of them, and none answers.
 :class:`MotorCmd`, :class:`MotorData` and :class:`Calibration` are frames as raw integers with ways
 from and to SI units at the *joint*; :class:`FrameParser` finds frames in a stream.
 
-What the vendor's library does differently, and why it is not copied: it sends every negative
-feed-forward torque as 0, lets velocities and gains beyond the wire's range wrap round (they
-saturate here), and checks neither head nor id of an answer.
+Defects of the vendor's library that are not copied: it sends every negative feed-forward torque as
+0, velocities and gains beyond the wire's range wrap around (here they saturate), and neither head
+nor id of an answer is checked.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class MotorCmd:
     ) -> MotorCmd:
         """Drive the joint: ``tau_motor = kp (q - q_now) + kd (dq - dq_now) + tau``.
 
-        SI units at the joint; toward zero (as the vendor's library), saturated.
+        SI units at the joint; rounded toward zero as in the vendor's library, and saturated.
 
         :param number: id of the motor.
         :raises EncodeError: NaN or infinity.
@@ -277,7 +277,7 @@ class MotorCmd:
         )
 
     def joint(self, ratio: float = GEAR_RATIO) -> Setpoint:
-        """What it asks of the joint, SI units."""
+        """The setpoint in SI units at the joint."""
         return Setpoint(
             POSITION.decode(self.pos_des, ratio),
             VELOCITY.decode(self.spd_des, ratio),
@@ -365,7 +365,7 @@ class MotorData:
         )
 
     def joint(self, ratio: float = GEAR_RATIO) -> Feedback:
-        """What it measured, at the joint, SI units."""
+        """The measured values in SI units at the joint."""
         return Feedback(
             POSITION.decode(self.pos, ratio),
             VELOCITY.decode(self.speed, ratio),
@@ -400,11 +400,11 @@ class MotorData:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The command frame that makes a motor take its present place for a position.
+    """The command frame that declares the motor's present position.
 
     :param position: what the joint is at now, rad, 0 to 4 pi. The vendor's library also takes
         negative ones, and then spoils the user id.
-    :param range: stroke of the joint, rad, likewise; unlike all else not of the rotor.
+    :param range: stroke of the joint, rad, likewise; at the joint, unlike all other fields.
     :param time: Unix time, seconds.
     """
 
@@ -438,7 +438,7 @@ class Calibration:
 
     @classmethod
     def from_command(cls, command: MotorCmd) -> Calibration | None:
-        """The calibration that a command with status 6 is, or None."""
+        """The calibration in a command with status 6, or None."""
         if command.status != Status.CALIBRATE or command.tor_des != _CALIBRATION_TORQUE:
             return None
         position = command.pos_des & 0xFFFF
@@ -466,10 +466,10 @@ class Calibration:
 
 
 def calibration_outcome(data: MotorData) -> str:
-    """What an answer to a calibration says: empty when it succeeded, else why it did not.
+    """Explain an answer to a calibration: empty when it succeeded, else the reason of the failure.
 
-    The vendor's library takes everything that is not the answer to a calibration, silence
-    included, for success (docs/sources/unitree-dex.md#g).
+    The vendor's library takes anything else than an answer to a calibration, even silence, for
+    success (docs/sources/unitree-dex.md#g).
     """
     if data.status != Status.CALIBRATE or data.torque != _CALIBRATION_TORQUE:
         return "the motor does not know the command (firmware without calibration?)"
@@ -536,13 +536,13 @@ class FrameParser:
         """Take ``data`` and return the frames that are now complete."""
         buffer = self._buffer
         frames: list[Frame] = []
-        if not buffer and len(data) == self.kinds[0].size:  # a whole frame, as nearly always
+        if not buffer and len(data) == self.kinds[0].size:  # a whole frame: the usual case
             try:
                 frames.append(_KINDS[self.kinds[0].name].parse(data))
                 self.frames += 1
                 return frames
             except WireError:
-                pass  # or something else, or damaged: look closely
+                pass  # other data, or damaged: search byte by byte
         buffer += data
         start = 0  # of what is not yet consumed
         while len(buffer) - start >= 2:

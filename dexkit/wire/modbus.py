@@ -1,11 +1,11 @@
 """Encode and decode Modbus, sans I/O: registers only, on TCP and on serial lines (RTU).
 
-The four functions that the hands know (docs/sources/unitree-dex.md#j1, #j2): read holding or input
-registers, write one or several holding registers. Registers are 16 bits, high byte first; which of
-them are signed is the caller's.
+Four functions, as the hands use them (docs/sources/unitree-dex.md#j1, #j2): read holding or input
+registers, write one or several holding registers. Registers are 16 bits, high byte first; the
+caller knows which of them are signed.
 
-An RTU frame has no length. A real line ends it by silence; here the length follows from the
-function code and the byte count, as a pseudo-terminal keeps no silence.
+An RTU frame has no length. On a real line silence ends it; here the length follows from the
+function code and the byte count, because a pseudo-terminal does not preserve silence.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
 
 MOST_READ, MOST_WRITTEN = 125, 123
 """Registers in one request."""
-_FAILED = 0x80  # added to the function of an answer that refuses
+_FAILED = 0x80  # added to the function code of a refusal
 _MBAP = struct.Struct(">HHH")  # transaction, protocol (0), bytes that follow
 _LARGEST = 254  # bytes that may follow in a TCP frame: unit and 253 of the PDU
 _CRC = 2
@@ -120,8 +120,8 @@ class Request:
 def parse_request(pdu: bytes) -> Request:
     """Read the PDU of a request.
 
-    :raises Refusal: a device refuses it: another function, or a number that cannot be.
-    :raises WireError: shorter or longer than its function has it.
+    :raises Refusal: a device refuses it: unsupported function, or a number out of range.
+    :raises WireError: wrong length for its function.
     """
     if not pdu:
         raise TruncatedError("an empty Modbus request")
@@ -247,10 +247,10 @@ class Adu:
 class TcpParser:
     """Finds frames in the bytes of a TCP connection, which may arrive in any pieces.
 
-    TCP loses nothing within a connection, so a head that cannot be is not searched around: from
-    then on ``broken`` is true, and the connection is of no use.
+    TCP loses nothing within a connection, so there is no resynchronisation: after an invalid head
+    ``broken`` is true, and the connection is unusable.
 
-    :ivar skipped: bytes that belonged to no frame; ``damaged`` heads that could not be.
+    :ivar skipped: bytes that belonged to no frame; ``damaged``: invalid heads.
     """
 
     def __init__(self) -> None:
@@ -265,7 +265,7 @@ class TcpParser:
         return len(self._buffer)
 
     def reset(self) -> None:
-        """Forget what is held, for another connection."""
+        """Discard buffered bytes, for a new connection."""
         self.skipped += len(self._buffer)
         self._buffer.clear()
         self.broken = False
@@ -295,8 +295,8 @@ class TcpParser:
 class RtuParser:
     """Finds frames in the bytes of a serial line, which may arrive in any pieces, among garbage.
 
-    After bytes that are no frame the search goes on at the next one, so that frames among them are
-    still found.
+    After bytes that are no frame the search continues at the next byte, so that frames among them
+    are still found.
 
     :param answers: look for answers, and not for requests: they have other lengths.
     :ivar skipped: bytes that belonged to no frame.

@@ -27,7 +27,7 @@ class Mounting:
     :param signs: +1 where the motor turns as its joint does, else -1.
     :param offsets: the motor's position where the joint is at 0, rad at the joint.
     :param ratios: turns of the rotor for one of the joint.
-    :raises UsageError: another sign, an offset or a ratio that cannot be, or unequal lengths.
+    :raises UsageError: a sign, offset or ratio is invalid, or the lengths differ.
     """
 
     signs: tuple[int, ...]
@@ -52,8 +52,8 @@ class Mounting:
                 raise UsageError(f"a ratio is {_RATIOS[0]:g} to {_RATIOS[1]:g}, not {ratio:g}")
 
     @classmethod
-    def of(cls, joints: Sequence[JointSpec]) -> Mounting:
-        """The assumed one: motors turn as their joints do, from the same zero."""
+    def default(cls, joints: Sequence[JointSpec]) -> Mounting:
+        """The default mounting: motors turn as their joints do, from the same zero."""
         n = len(joints)
         return cls((1,) * n, (0.0,) * n, tuple(joint.gear_ratio for joint in joints))
 

@@ -1,7 +1,7 @@
 """The MX-64(2.0) servo as data: control table, units, modes, error bits.
 
 Addresses, sizes, access, initial values, ranges and units are those of
-docs/sources/mx64-ezgripper.md#b2; where a value is contested there it says so here. Driver and
+docs/sources/mx64-ezgripper.md#b2; values that are contested there are marked here. Driver and
 emulator take them all from this module.
 
 ``mx64.PRESENT_POSITION`` is an :class:`Item`; ``mx64.TABLE`` holds all of them by address.
@@ -41,7 +41,7 @@ WATCHDOG_UNIT = 20e-3
 WATCHDOG_TRIPPED = -1
 
 POSITION_SPAN = 1_048_575
-"""Goal and present position reach this many ticks either way in modes 4 and 5 (256 turns)."""
+"""Range of goal and present position in modes 4 and 5, ticks in either direction (256 turns)."""
 
 PROFILE_TIME_MAX = 32737
 """Largest Profile Velocity and Acceleration in ms, with Drive Mode's time-based profile."""
@@ -162,7 +162,7 @@ class Item:
 
     @property
     def end(self) -> int:
-        """First address behind the item."""
+        """First address after the item."""
         return self.address + self.size
 
     @property

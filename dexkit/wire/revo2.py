@@ -1,8 +1,8 @@
 """Registers of BrainCo's Revo2 on its serial line, Modbus RTU (docs/sources/unitree-dex.md#j1).
 
-Positions, speeds and currents are in thousandths of their full values where the unit mode is
-:attr:`UnitMode.NORMALISED`, and of the joints in their order: thumb, thumb_aux, index, middle,
-ring, pinky. 0 is open.
+With unit mode :attr:`UnitMode.NORMALISED`, positions, speeds and currents are thousandths of their
+full values. The joints are in the order thumb, thumb_aux, index, middle, ring, pinky; position 0 is
+open.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Holding(IntEnum):
     UNIT_MODE = 937
     ID = 1000
     POSITION_AND_SPEED = 1022
-    """Six pairs: where to, and how fast at most; a speed of 0 means the highest."""
+    """Six pairs: goal position and largest speed; a speed of 0 means full speed."""
 
 
 class Input(IntEnum):
@@ -61,14 +61,14 @@ TEXT = 10
 
 
 class UnitMode(IntEnum):
-    """What positions, speeds and currents are in."""
+    """Unit of positions, speeds and currents."""
 
     NORMALISED = 0
     PHYSICAL = 1
 
 
 class MotorStatus(IntEnum):
-    """What a motor does."""
+    """State of a motor."""
 
     IDLE = 0
     RUNNING = 1
@@ -77,7 +77,7 @@ class MotorStatus(IntEnum):
 
 
 SIDES = {1: Side.RIGHT, 2: Side.LEFT}
-"""What :attr:`Holding.SIDE` says."""
+"""Values of :attr:`Holding.SIDE`."""
 
 
 def position_and_speed(positions: Sequence[int], speeds: Sequence[int]) -> list[int]:

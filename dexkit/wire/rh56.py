@@ -2,8 +2,8 @@
 
 A frame is two bytes of head, the device's id, the number of bytes that follow before the checksum,
 an operation (read or write), the address of a register, data, and a checksum: the sum of all bytes
-after the head. A request to read holds how many bytes are wanted, its answer those bytes; a request
-to write holds them, its answer one byte. Numbers are little endian.
+after the head. A read request holds the number of bytes wanted, its answer those bytes; a write
+request holds the bytes, its answer one byte. Numbers are little endian.
 
 Registers are addressed by byte. Those of the joints hold six 16-bit numbers, or six bytes, in the
 order of the joints: pinky, ring, middle, index, thumb bend, thumb rotation.
@@ -41,7 +41,7 @@ __all__ = [
 BAUD_RATE = 115200
 JOINTS = 6
 FULL = 1000
-"""Full travel, speed or force in the registers; an angle of 0 is closed, of this open."""
+"""Full travel, speed or force in the registers; angle 0 is closed, this value is open."""
 UNCHANGED = -1
 """A goal that leaves a joint as it is."""
 IDS = range(1, 255)
@@ -52,7 +52,7 @@ _LEAST = 3  # operation and address
 
 
 class Operation(IntEnum):
-    """What a frame asks for, or answers."""
+    """Operation of a request or answer."""
 
     READ = 0x11
     WRITE = 0x12
@@ -93,7 +93,7 @@ FAULTS: Mapping[Error, MotorError] = {
     Error.MOTOR: MotorError.ABNORMAL_RESET,
     Error.COMMUNICATION: MotorError.COMMUNICATION_CHECK,
 }
-"""What each of them is in a :class:`~dexkit.hand.HandState`."""
+"""The bits as they appear in a :class:`~dexkit.hand.HandState`."""
 
 
 class Status(IntEnum):
@@ -165,7 +165,7 @@ class Frame:
 
 
 def read(device: int, register: int, count: int) -> Frame:
-    """A request to read so many bytes."""
+    """A request to read ``count`` bytes."""
     return Frame(device, Operation.READ, register, bytes([count]))
 
 
@@ -197,7 +197,7 @@ class FrameParser:
     After a frame that cannot be read the search continues at the next byte, so that frames within
     it are still found. Less than one frame is buffered.
 
-    :param answers: look for answers, and not for requests.
+    :param answers: look for answers instead of requests.
     :ivar skipped: bytes that belonged to no frame.
     :ivar damaged: heads whose frame could not be read.
     """

@@ -102,7 +102,7 @@ class Structure:
     """A packed little-endian structure.
 
     :param head: its first bytes, empty where they are not fixed.
-    :param covered: first byte under the CRC and the byte behind the last one.
+    :param covered: first byte covered by the CRC, and the byte after the last one.
     """
 
     name: str
@@ -208,7 +208,7 @@ class Scale:
         return self.counts * ratio**self.power
 
     def encode(self, value: float, ratio: float = 1.0) -> int:
-        """Counts of ``value``: toward zero (as the vendor's library,
+        """Counts of ``value``: rounded toward zero (as in the vendor's library,
         docs/sources/unitree-dex.md#c9), saturated.
 
         :raises EncodeError: ``value`` is NaN or infinite.
@@ -227,8 +227,8 @@ class Scale:
 
 
 NUDGE = 1 + 2**-50
-"""Makes up for the rounding of a division and a multiplication, so that a decoded count encodes
-to itself and not to its neighbour; far below one count otherwise."""
+"""Compensates the rounding of a division and a multiplication, so that a decoded count encodes to
+itself; far below one count."""
 
 POSITION = Scale(
     "position", ("pos_des", "pos"), "rad", 32768 / (2 * math.pi), -(2**31), 2**31 - 1, 1

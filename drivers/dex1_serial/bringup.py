@@ -1,4 +1,4 @@
-"""Bring up a Dex1-1: what ``dexkit bringup dex1-serial`` drives, finds and stores."""
+"""Bring up a Dex1-1: motors, measurements and stored settings of ``dexkit bringup dex1-serial``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Dex1Bench", "Exchange", "bench", "plan_of"]
 log = logging.getLogger(__name__)
 
 _RATIOS = (15.0, 40.0)
-"""Ratios that are believed: the vendor's library has 25, and no document says that every motor has
+"""Plausible gear ratios. The vendor's library uses 25; no document says that every motor has it
 (docs/sources/unitree-dex.md#g)."""
 _SCAN_TIMEOUT = 0.1
 """Seconds to wait for an id: a busy machine must not hide a motor."""
@@ -38,7 +38,7 @@ Exchange = Callable[[MotorCmd], MotorData]
 
 
 def plan_of(side: Side) -> Plan:
-    """What there is to find on a Dex1-1: of the motors on the line, the one of this side."""
+    """Plan the bring-up of a Dex1-1: which motor on the line belongs to this side."""
     return Plan(
         tuple(_choice(each, wanted=each is side) for each in Side),
         GEAR_RATIO,
@@ -222,7 +222,7 @@ class Dex1Bench:
     # --- results
 
     def settings(self, findings: Findings) -> dict[str, str]:
-        """Settings that follow; those of the mounting only once the travel is known."""
+        """Settings that follow from the findings; the mounting only once the travel is known."""
         name = str(self.side)
         texts: dict[str, str] = {}
         adapter = None if self._line is None else find_device(self._line.path).serial_number
@@ -238,7 +238,7 @@ class Dex1Bench:
         return {}
 
     def load(self) -> Findings:
-        """What the file has of this side's gripper."""
+        """Load the stored findings of this side's gripper."""
         return self._file.load(str(self.side))
 
     def store(self, findings: Findings) -> None:

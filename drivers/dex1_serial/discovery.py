@@ -95,7 +95,7 @@ def _probe(
 def _describe_answering_motor(
     line: MotorLine, number: int, timeout: float, sleep: Callable[[float], None]
 ) -> str:
-    """Say what answers on a port on which the wanted motor does not."""
+    """Describe the other motors that answer on a port without the wanted motor."""
     if not is_shared(line):  # the probe is a brake: do not brake a motor that is in use
         for other, side in SIDES.items():
             if other != number and _probe(line, other, timeout, 1, sleep) is not None:

@@ -107,9 +107,9 @@ class Dex1Serial:
         self._mounting = settings.mounting
 
     def _load_stored(self) -> None:
-        """Take what a bring-up has found of this side's gripper.
+        """Apply the settings that a bring-up has stored for this side's gripper.
 
-        :raises UsageError: the file cannot be read, or holds a setting that cannot be.
+        :raises UsageError: the file cannot be read, or holds an invalid setting.
         """
         if self.configuration.config is None:
             return
@@ -126,7 +126,7 @@ class Dex1Serial:
             log.info("settings of the %s gripper: %s", self._side, store.path)
 
     def _check_adapter(self, path: str) -> None:
-        """Refuse a gripper on another adapter than that of the settings.
+        """Refuse a gripper that is on another adapter than the stored settings.
 
         :raises HandRefused: it is on another one.
         """
@@ -240,7 +240,7 @@ class Dex1Serial:
         return _decode_state(data, self._joint(data), stamp)
 
     def _joint(self, data: MotorData) -> Feedback:
-        """What the motor measured, at the joint and in its direction."""
+        """Joint state in the motor's answer."""
         q, dq, tau = data.joint(self._mounting.ratios[0])
         sign = self._mounting.signs[0]
         return Feedback(self._mounting.joint(0, q), sign * dq, sign * tau)

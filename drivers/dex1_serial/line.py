@@ -6,9 +6,9 @@ The two motors of a robot may share a line. Two hands of one process then share 
 Unlike the vendor's library (docs/sources/unitree-dex.md#g "Receive behaviour"), this module finds
 frames by head and CRC, checks the id, discards received bytes before each command, and waits for a
 late answer before it sends the next command. A stray byte or a late answer costs at most one
-exchange. An answer does not say which command it belongs to, so that one that is later still is
-taken for that of the next command; the line is quiet for :data:`LATE` before two commands in a row
-until it counts as in step again.
+exchange. An answer does not name its command, so an even later one is taken for the answer to the
+next command. After a time-out the line must therefore be quiet for :data:`LATE` before each of the
+next two commands.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 LATE = 0.01
 """Seconds to wait for a late answer before the next command is sent."""
 _QUIET = 2
-"""Commands after a missing answer before which the line must have been quiet: a late answer may
-have been taken for that of the first, whose own is then found before the second."""
+"""Commands after a time-out that wait for a quiet line. Two, because a late answer may be taken for
+the answer to the first command, whose own answer then arrives before the second."""
 _CHUNK = 4096
 _MAX_STRAY_CHUNKS = 64
 """Chunks discarded at most before a command: more than an adapter and the kernel buffer."""

@@ -124,7 +124,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 OF_THE_HAND = ("id", "sign", "offset", "ratio", "adapter")
-"""Settings that describe a gripper, which the settings file holds for each side."""
+"""Settings of one gripper that the settings file stores by side."""
 
 
 def from_options(options: BackendOptions) -> Dex1Settings:
@@ -138,11 +138,11 @@ def from_options(options: BackendOptions) -> Dex1Settings:
 
 
 def with_stored(settings: Dex1Settings, texts: Mapping[str, str]) -> Dex1Settings:
-    """Return the settings with those of a file, which do not replace the given ones.
+    """Merge the settings of a file into these; the given ones take precedence.
 
-    Without a device, the adapter of the file is looked for.
+    Without a device, the adapter named in the file is used.
 
-    :raises UsageError: one is no property of a gripper, or cannot be parsed.
+    :raises UsageError: a setting is unknown, or cannot be parsed.
     """
     for name in texts:
         if name not in OF_THE_HAND:

@@ -1,4 +1,4 @@
-"""Bring up a Dex3-1: what ``dexkit bringup dex3-usb`` drives, finds and stores."""
+"""Bring up a Dex3-1: motors, measurements and stored settings of ``dexkit bringup dex3-usb``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Dex3Bench", "bench", "plan_of"]
 log = logging.getLogger(__name__)
 
 _REFERENCE = 108.0
-"""Ratio in whose joint radians motors are driven before their own is known."""
+"""Gear ratio assumed for a motor until its own is known."""
 _RATIOS = (108.0, 189.0, 214.0)
 """The actuators' 108 and 214, and 108 x 1.75, which torque and speed of thumb_0 allow
 (docs/sources/unitree-dex.md#b4)."""
@@ -36,7 +36,7 @@ _TRIPPED = int(MotorError.MOTOR_SAW_HOST_TIMEOUT)
 
 
 def plan_of(side: Side) -> Plan:
-    """What there is to find on a Dex3-1."""
+    """Plan the bring-up of a Dex3-1."""
     specs = {spec.name: spec for spec in DEX3_1.joints[side]}
     return Plan(
         tuple(_choice(specs[name]) for name in _ORDER),
@@ -214,7 +214,9 @@ class Dex3Bench:
     # --- results
 
     def settings(self, findings: Findings) -> dict[str, str]:
-        """Settings that follow; those of all joints only once every joint is known."""
+        """Settings that follow from the findings; lists over joints only once every joint is
+        known.
+        """
         found = self._found
         texts: dict[str, str] = {}
         if found is not None:
@@ -239,7 +241,7 @@ class Dex3Bench:
         return texts
 
     def load(self) -> Findings:
-        """What the file has of this hand."""
+        """Load the stored findings of this hand."""
         return self._store.load(self._key)
 
     def store(self, findings: Findings) -> None:

@@ -183,11 +183,11 @@ def _list_on_usb(seen: list[str], hints: list[str]) -> list[Candidate]:
 
 
 def _renew(backend: Backend) -> Backend:
-    """Libusb with a new list of devices.
+    """Return a libusb backend with a fresh device list.
 
     libusb drops a device whose transfer failed, and lists it again only when udev announces it.
     udev does not when a kernel driver was unbound and bound again, nor where no udev runs. The old
-    list stays in memory, for it may be in use.
+    list stays in memory, because it may be in use.
     """
     log.debug("libusb does not list a hand that the system has; asking it anew")
     _replaced.append(backend)

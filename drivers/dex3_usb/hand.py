@@ -411,4 +411,5 @@ backend = Backend(
     needs="--device serial number or usbip://HOST:PORT, if there is more than one hand",
     settings=SETTINGS,
     bringup=Lazy("dexkit.drivers.dex3_usb.bringup:bench"),
+    udev_rules=Lazy("dexkit.systemd_units:usb_rules"),
 )

@@ -1,8 +1,8 @@
-"""Find out which reading of the manual a Dex3-1 answers, without motion.
+"""Find out which command frame a Dex3-1 accepts, without motion.
 
-Frames here lock motors, or make one limp: without gains nothing is driven. Sizes and heads of the
-command frame are tried in turn until one is not only answered but obeyed, which a motor shows by
-the status in its next state.
+The frames lock motors or leave one limp; with zero gains nothing is driven. Frame sizes and heads
+that the manual allows are tried in turn until one is both answered and obeyed. A motor shows that
+it obeys by the status in its next state.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _TRIES = 3
 _IDS_AT_ONCE = 7
 """Packets of 20 bytes that fit the smaller bus buffer."""
 _POLLED_IDS = range(4)
-"""Sensors of a bus in the reading "3+4" of the manual."""
+"""Sensors of a bus, if the manual's "3+4" means three motors and four sensors."""
 
 
 @dataclass
 class Found:
-    """What answers.
+    """Result of the probe.
 
     :ivar obeyed: a motor took the status that it was sent.
     :ivar model_code: ``mode[0]`` of the state frame.
@@ -124,7 +124,7 @@ def probe(wire: Wire) -> Found:
 
 
 def _exchange(wire: Wire, frame: bytes) -> StateFrame | None:
-    """The answer to a frame, sent again where it was lost or damaged.
+    """Send a frame and return its answer; repeat if it was lost or damaged.
 
     :raises HandTimeout: there is none.
     """
@@ -167,7 +167,7 @@ def _obeys(wire: Wire, found: Found) -> bool:
 
 
 def _find_sensors(wire: Wire, found: Found) -> None:
-    """Which sensors answer, first by themselves, then where they are addressed."""
+    """Find the sensors that answer: first unasked, then when they are addressed."""
     locked = {(bus, number): lock(number) for bus, number in found.motors}
     every = [(bus, number) for bus in range(N_BUSES) for number in _POLLED_IDS]
     for polled, asked in ((False, []), (True, every)):

@@ -278,7 +278,7 @@ OF_THE_HAND = (
     *("frame", "head", "motors", "sensors", "signs", "offsets", "ratios", "limits"),
     "poll_sensors",
 )
-"""Settings that describe a hand, which the settings file holds for each."""
+"""Settings of one hand that the settings file stores by serial number."""
 SETTINGS: dict[str, str] = {"usb": _USB} | {
     name: meaning for name, (_, meaning) in _PARSERS.items()
 }
@@ -296,9 +296,9 @@ def from_options(options: BackendOptions) -> Dex3Settings:
 
 
 def with_stored(settings: Dex3Settings, texts: Mapping[str, str]) -> Dex3Settings:
-    """Return the settings with those of a file, which do not replace the given ones.
+    """Merge the settings of a file into these; the given ones take precedence.
 
-    :raises UsageError: one is no property of a hand, or cannot be parsed.
+    :raises UsageError: a setting is unknown, or cannot be parsed.
     """
     for name in texts:
         if name not in OF_THE_HAND:

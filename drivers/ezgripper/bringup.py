@@ -1,4 +1,6 @@
-"""Bring up an EZGripper: what ``dexkit bringup ezgripper`` drives, finds and stores."""
+"""Bring up an EZGripper: servos, measurements and stored settings of ``dexkit bringup
+ezgripper``.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,11 @@ _TORQUE_OF_AMPERE = 6.0 / 4.1
 _JOINT_TORQUE = _TORQUE_OF_AMPERE * mx64.CURRENT_UNIT * mx64.TICK / JOINT_PER_TICK
 """N·m at the joint of one unit of current."""
 _WIDEST = 1.2
-"""Parts of SAKE's stroke that a gripper is opened at most."""
+"""Largest opening, as a multiple of SAKE's stroke."""
 
 
 def plan_of(side: Side) -> Plan:
-    """What there is to find: which servos move this side's gripper, and where it is closed."""
+    """Plan the bring-up: which servos move this side's gripper, and where it is closed."""
     return Plan(
         tuple(_choice(each, wanted=each is side) for each in Side),
         1.0,
@@ -224,7 +226,7 @@ class EZGripperBench:
     # --- results
 
     def records(self, findings: Findings) -> dict[int, GripperRecord]:
-        """What follows for each servo of this side's gripper, once all of them are known."""
+        """Calibration records of this side's servos, once all of them are known."""
         joint = next(j for j in self.plan.joints if j.wanted)
         found: dict[int, GripperRecord] = {}
         for motor in findings.motors_of(joint.name):
@@ -241,7 +243,9 @@ class EZGripperBench:
         return found
 
     def settings(self, findings: Findings) -> dict[str, str]:
-        """Settings that follow; of two servos only the ids, as the file holds the others."""
+        """Settings that follow from the findings; for two servos only the ids, the file holds the
+        rest.
+        """
         records = self.records(findings)
         if not records:
             return {}
@@ -260,11 +264,13 @@ class EZGripperBench:
         return f"{self.side}_bringup"
 
     def load(self) -> Findings:
-        """What the file has of this side's gripper."""
+        """Load the stored findings of this side's gripper."""
         return self._file.load(self._findings_key)
 
     def store(self, findings: Findings) -> None:
-        """Write findings and answers; once all is known, zeros and ids as SAKE's file has them."""
+        """Write findings and answers; once complete, also zeros and ids in the format of SAKE's
+        file.
+        """
         self._file.store(self._findings_key, self.settings(findings), self._facts, findings)
         records = self.records(findings)
         for number, record in records.items():

@@ -115,7 +115,7 @@ class SpeedResult:
 
 @dataclass(frozen=True)
 class DistanceResult:
-    """How long moves of several distances take, one way.
+    """Durations of moves over several distances in one direction.
 
     :param speed: of the moves, percent of stroke a second.
     :param overhead: seconds that each move takes besides its distance over the speed: answer,
@@ -313,7 +313,7 @@ def measure_distances(
     progress: Progress = _ignore_progress,
     cancelled: Cancelled = _never_cancelled,
 ) -> tuple[DistanceResult, DistanceResult]:
-    """Time moves of several distances; return what opening and what closing takes.
+    """Time moves over several distances; return the results for opening and for closing.
 
     The overhead is where the straight line through times over distances meets distance 0 (the
     note on predictive state, "fixed overhead"). A move lasts from its command until the fingers

@@ -75,7 +75,7 @@ _TURNAROUND = 0.5e-3
 processor time (benchmarks/bench_serial.py); the rest is for other load on the processor."""
 
 _BEYOND = 0.1
-"""Part of the stroke beyond its ends at which a servo's zero is not believed."""
+"""Distance beyond the stroke, as a part of it, at which a servo's zero is rejected."""
 _CLIENT_GAINS = DEX1_1.client_gains
 
 
@@ -195,7 +195,9 @@ class EZGripper:
         return ((opening * per_percent, closing * per_percent),)
 
     def adapt_command(self, command: HandCommand) -> HandCommand:
-        """Give a command without gains those of Unitree's client, if ``zero_gains`` is POSITION."""
+        """Add the gains of Unitree's client to a command without gains, if ``zero_gains`` is
+        POSITION.
+        """
         if self.configuration.zero_gains is ZeroGains.LIMP or not command.is_limp:
             return command
         kp, kd = _CLIENT_GAINS

@@ -57,7 +57,7 @@ class _Phase(Enum):
 
 
 class Restart:
-    """Faults of one gripper, and its way back.
+    """Fault handling and restart of one gripper.
 
     :ivar units: the servos, while the gripper is connected.
     """
@@ -173,7 +173,7 @@ class Restart:
             self._group.switch_off()
 
     def lost_servo(self, command: HandCommand, error: ServoSilent) -> None:
-        """Stop the gripper, of which a servo does not answer any more.
+        """Stop the gripper because one of its servos no longer answers.
 
         :raises HandLost: the port has gone away.
         """

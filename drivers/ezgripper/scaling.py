@@ -31,7 +31,7 @@ __all__ = [
 
 STROKE = mx64.EZGRIPPER_STROKE
 STROKES = (1000, 3600)
-"""Strokes that a gripper may have, ticks: below one turn by as much as tells open from closed."""
+"""Allowed strokes, ticks: less than one turn, so that open and closed can be told apart."""
 TICKS_PER_PERCENT = STROKE / 100
 
 _JOINT = DEX1_1.joints[Side.LEFT][0]

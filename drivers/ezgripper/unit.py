@@ -1,4 +1,4 @@
-"""One servo of a gripper with what is known of it: calibration, control, newest sample."""
+"""One servo of a gripper with its calibration, control and newest sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Emulated Dex3-1 hands, ready to be attached: in a thread or in a process of their own."""
+"""Run emulated Dex3-1 hands in a thread or in a child process."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Dex3Hands:
     :param wiring: of every hand; by default as dexkit assumes.
     :param log: file that gets a line of JSON for each command that drives a motor, and when the
         motor stops being driven.
-    :raises EmulatorError: the port cannot be had.
+    :raises EmulatorError: the port cannot be opened.
     :raises OutputError: the log cannot be written.
-    :raises UsageError: an option that cannot be.
+    :raises UsageError: an option is invalid.
 
-    Looking into a device while a client talks to it gives a snapshot of a moving thing.
+    Reading a device while a client talks to it gives a snapshot only.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Dex3Hands:
 
     @property
     def ready_lines(self) -> list[str]:
-        """A line for each hand: where it is, and what it is called there."""
+        """One line for each hand: URL and serial number."""
         return [
             f"ready: {self.url} {side} {VENDOR_ID:04x}:{PRODUCT_ID[side]:04x} "
             f"serial={usb.serial} busid={usb.device.busid}"
@@ -123,7 +123,7 @@ class Dex3Hands:
 
     @property
     def error(self) -> BaseException | None:
-        """What ended the server, or None."""
+        """The error that ended the server, or None."""
         return self._server.error
 
     @property
@@ -136,13 +136,13 @@ class Dex3Hands:
         return self._usb[side].mcu
 
     def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now)."""
+        """Inject a fault now (or at its ``@TIME`` from now)."""
         fault = parse_fault(spec, DEX3_FAULTS)
         for usb in self._usb.values():
             self._server.call(partial(usb.mcu.inject, fault))
 
     def close(self) -> None:
-        """Cut clients off and free the port."""
+        """Disconnect clients and free the port."""
         self._server.close()
         if self._log is not None:
             self._log.close()
@@ -223,7 +223,7 @@ def emulated_dex3(
     The other parameters are those of :class:`Dex3Hands`.
 
     :raises EmulatorError: it did not become ready.
-    :raises UsageError: an option that cannot be.
+    :raises UsageError: an option is invalid.
     """
     hands: Dex3Hands | Dex3Process
     if process:

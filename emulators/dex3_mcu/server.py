@@ -2,10 +2,11 @@
 
 The ``usbip`` package provides descriptors, control requests, endpoint halts, parked IN transfers
 and the bytes of the protocol. Its own listener is not used: it never closes an accepted connection,
-so nothing can be unplugged; it does not tell which free port it took; and its devices advance only
-while a client sends requests.
+so nothing can be unplugged; it does not report which free port it took; and its devices advance
+only while a client sends requests.
 
-One client at a time can import a device, as on a real host: a second import is refused as busy.
+Only one client at a time can import a device, as on a real host: a second import is refused as
+busy.
 
 A client's use of memory and connections is bounded:
 
@@ -73,7 +74,7 @@ _REQUEST = 8  # bytes: version, code, status
 _BUSID = 32
 _COMMAND = 48
 _FIELDS = struct.Struct(">I8xI8xI")  # of a command: its code, direction, length of the data
-_ST_DEV_BUSY = 2  # of the kernel's usbip_common.h
+_ST_DEV_BUSY = 2  # of Linux' usbip_common.h
 _RETURN = struct.Struct(">IIIIIi24x")
 _SET_CONFIGURATION = b"\x00\x09"
 _ACCEPT_PAUSE = 0.1  # seconds without accepting after the system ran out of file descriptors

@@ -1,6 +1,6 @@
-"""What can be set about an emulated Dex3-1: the points on which the manual is silent or unclear.
+"""Settings of an emulated Dex3-1: points on which the manual is silent or unclear.
 
-The default of each is the reading that is best supported (docs/sources/unitree-dex.md#c), and
+The default of each is the best supported interpretation (docs/sources/unitree-dex.md#c);
 docs/emulators.md lists them.
 """
 
@@ -20,7 +20,7 @@ class Firmware:
 
     :param answer_bad_frame: a frame of a wrong size or CRC is answered with the state, and
         nothing of it is applied: the manual says that each command returns the state. Otherwise
-        it is met with silence.
+        there is no answer.
     :param queue: answers that wait until the host reads them. The manual's one send, one receive
         needs one; when a frame comes while the queue is full the oldest answer is lost, so that
         a host that missed an answer reads a fresh one next.
@@ -40,8 +40,8 @@ class Firmware:
         are frames of a wrong size.
     :param head: the only first two bytes of a command frame that are taken; None for any. Others
         are frames with a wrong CRC.
-    :param answer_time: seconds from a command to its answer. Unknown, below 1 ms at the 1000 Hz
-        of the manual; 0 shows what the host's side costs.
+    :param answer_time: seconds from a command to its answer. Unknown, below 1 ms at the 1000 Hz of
+        the manual; with 0 a measurement shows the cost of the host's side.
     """
 
     answer_bad_frame: bool = True

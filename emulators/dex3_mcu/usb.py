@@ -36,11 +36,11 @@ class Dex3Usb:
     :class:`~dexkit.emulators.dex3_mcu.server.Server`.
 
     :param clock: the processor's.
-    :raises UsageError: an endpoint number that cannot be.
+    :raises UsageError: an endpoint number is invalid.
 
     A transfer to the hand ends with a packet shorter than 512 bytes, as USB has it: two writes
-    of 512 and 210 bytes are one frame of 722. An answer that is held back is handed over when its
-    time has come; a newer frame does not wait for it.
+    of 512 and 210 bytes are one frame of 722. A delayed answer is delivered when it is due; a newer
+    frame does not wait for it.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Dex3Usb:
 
     def _received(self, endpoint: Any, data: bytes) -> None:
         transfer = self._transfer
-        if len(transfer) <= _MAX_TRANSFER:  # what is longer is no frame, however it goes on
+        if len(transfer) <= _MAX_TRANSFER:  # longer data are no frame, whatever follows
             transfer += data
         if data and len(data) % MAX_PACKET == 0:
             return

@@ -1,6 +1,6 @@
-"""Where the motors and sensors of an emulated Dex3-1 are on its buses, and how they are mounted.
+"""Bus addresses and mounting of the motors and sensors of an emulated Dex3-1.
 
-The manual leaves this open (docs/dex3-protocol.md), so an emulated hand can have any.
+The manual does not give them (docs/dex3-protocol.md), so an emulated hand can have any.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ class Wiring:
 
     @classmethod
     def assumed(cls, side: Side) -> Wiring:
-        """What dexkit assumes of a real hand."""
-        return cls(DEFAULT_BUS_MAP, Mounting.of(DEX3_1.joints[side]))
+        """The wiring that dexkit assumes for a real hand."""
+        return cls(DEFAULT_BUS_MAP, Mounting.default(DEX3_1.joints[side]))
 
     @classmethod
     def random(cls, seed: int) -> Wiring:
-        """Permuted, mirrored and offset at random, with any one joint geared; the same for a seed.
+        """A random wiring, reproducible by its seed.
 
-        Ids start at 0 on every bus, as the manual says, and what is on a bus fits its buffer.
+        Motors are permuted, mirrored and offset, and one joint has another gear ratio. Ids start at
+        0 on every bus, as the manual says, and the packets of a bus fit its buffer.
         """
         rng = random.Random(seed)
         n, sensors = len(DEX3_1.joints[Side.LEFT]), len(DEX3_1.sensors)
@@ -67,7 +68,7 @@ class Wiring:
         )
 
     def describe(self, side: Side) -> dict[str, Any]:
-        """What a person who looks at the hand would find, for a file."""
+        """Describe the wiring for a JSON file, as a person would find it on the hand."""
         return {
             "motors": {
                 f"{bus}.{number}": {"joint": joint.name, "sign": sign, "offset": o, "ratio": r}

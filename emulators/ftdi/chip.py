@@ -96,7 +96,7 @@ class FtdiChip:
     :ivar baudrate: bits a second on the line.
     :ivar latency: milliseconds of the latency timer.
     :ivar breaking: whether the host holds the line in break.
-    :ivar overruns: bytes from the line that found no room.
+    :ivar overruns: bytes from the line lost because the buffer was full.
     :ivar requests: vendor requests that were obeyed.
     """
 
@@ -113,7 +113,7 @@ class FtdiChip:
     # --- the host's requests
 
     def control(self, request: int, value: int, index: int, now: float) -> bytes | None:
-        """Obey a vendor request: the data to return (empty for none), None to stall it."""
+        """Handle a vendor request; return its data (empty for none), or None to stall it."""
         answer = b""
         if request == Request.RESET:
             if value == 0:
@@ -154,7 +154,7 @@ class FtdiChip:
     # --- the line and the host's reads
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; what finds no room is lost and counted."""
+        """Take bytes from the line; bytes beyond the buffer are lost and counted."""
         room = self.model.fifo - len(self._waiting)
         self._waiting += data[:room]
         if len(data) > room:
@@ -164,7 +164,7 @@ class FtdiChip:
     def packet(self, now: float) -> bytes | None:
         """The next packet to the host, if one is due: full, or at the end of the timer.
 
-        Call it only while the host reads: what nobody reads stays in the chip.
+        Call it only while the host reads: unread bytes stay in the chip.
         """
         payload = self.model.packet - STATUS_BYTES
         if len(self._waiting) < payload and now < self._tick:

@@ -20,11 +20,11 @@ class FtdiPort:
     :param adapters: the first is at bus id 1-1, the second at 1-2.
     :param host: address to bind.
     :param port: 0 takes any free one.
-    :raises EmulatorError: the port cannot be had.
+    :raises EmulatorError: the port cannot be opened.
 
     ``start`` serves in a thread. Also a context manager.
 
-    :ivar overruns: 0; what a host does not read is counted by each adapter's chip.
+    :ivar overruns: always 0; each adapter's chip counts the bytes that its host did not read.
     """
 
     overruns = 0
@@ -46,7 +46,7 @@ class FtdiPort:
 
     @property
     def path(self) -> str:
-        """Where clients find it: ``usbip://HOST:PORT``."""
+        """URL for clients: ``usbip://HOST:PORT``."""
         return self._server.url
 
     @property
@@ -56,13 +56,13 @@ class FtdiPort:
 
     @property
     def place(self) -> str:
-        """What a ready line says of it."""
+        """Description for the ready line."""
         one = self.adapters[0]
         return f"busid={one.device.busid} adapter={one.chip.model.name} serial={one.serial}"
 
     @property
     def error(self) -> BaseException | None:
-        """What ended the server, or None."""
+        """The error that ended the server, or None."""
         return self._server.error
 
     @property
@@ -71,12 +71,12 @@ class FtdiPort:
         return self._server.failure
 
     def inject(self, fault: Fault) -> None:
-        """Have a fault on every line, its time counted from now; from any thread."""
+        """Inject a fault into every line, its time counted from now; from any thread."""
         for adapter in self.adapters:
             self._server.call(partial(_add, adapter, fault))
 
     def close(self) -> None:
-        """Cut clients off and free the port. May be called twice."""
+        """Disconnect clients and free the port. May be called twice."""
         self._server.close()
 
     def __enter__(self) -> FtdiPort:

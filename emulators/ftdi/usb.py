@@ -17,9 +17,9 @@ _VENDOR_ID = 0x0403
 _IN_ENDPOINT, _OUT_ENDPOINT = 0x81, 0x02
 _VENDOR_CLASS = 0xFF
 _NOMINAL = (9600, 19200, 38400, 57600, 115_200, 230_400, 460_800, 921_600)
-"""Rates of which a divisor makes 0.2 % more or less: 57692 baud are 57600 for any receiver."""
+"""Nominal rates. A divisor misses them by up to 0.2 %: a receiver takes 57692 baud for 57600."""
 _TOLERANCE = 0.02
-_BUSY_TICK = 4e-3  # seconds between looks at devices that move
+_BUSY_TICK = 4e-3  # seconds between updates of moving devices
 
 
 class FtdiUsb:
@@ -28,10 +28,10 @@ class FtdiUsb:
 
     :param line: with its devices. Its own latency timer is switched off: the chip has one.
     :param serial: serial number of the adapter.
-    :param check_baudrate: devices at another baud rate than the host's do not understand it.
+    :param check_baudrate: devices ignore a host that uses another baud rate.
 
     A transfer to the host ends with a packet that is not full, as USB has it. Not modelled: the
-    chip's transmit FIFO, which would make a host wait that sends faster than the line.
+    chip's transmit FIFO, which throttles a host that sends faster than the line.
     """
 
     def __init__(
@@ -85,13 +85,13 @@ class FtdiUsb:
         return min((time for time in times if time is not None), default=None)
 
     def attached(self) -> None:
-        """Reset the bus: the chip forgets what the last host had not read."""
+        """Reset the bus: the chip discards bytes that the last host had not read."""
         self._transfer.clear()
         self.chip = FtdiChip(self.chip.model, self._clock.now())
         self.device.reset_io()
 
     def _answer_reads(self, now: float) -> None:
-        pending = self._in._pending  # the package has no question for it
+        pending = self._in._pending  # the package has no query for it
         size = self.chip.model.packet
         while pending:
             packet = self.chip.packet(now)
@@ -119,5 +119,5 @@ class FtdiUsb:
 
 
 def _nominal(rate: int) -> int:
-    """The rate that devices on the line take it for."""
+    """The nominal rate that devices on the line assume."""
     return next((r for r in _NOMINAL if abs(rate - r) < _TOLERANCE * r), rate)

@@ -17,7 +17,7 @@ from dexkit.robots import G1
 __all__ = ["MOST", "command_from", "state_json"]
 
 MOST = 1 << 16
-"""Bytes of the longest command that is read; one of LeRobot has some 4000."""
+"""Longest accepted command, bytes; LeRobot's have about 4000."""
 _LARGEST = float.fromhex("0x1.fffffep127")
 _NUMBERS = ("q", "dq", "kp", "kd", "tau")
 
@@ -49,9 +49,9 @@ def state_json(state: LowState_) -> bytes:
 
 
 def command_from(payload: bytes) -> LowCmd_:
-    """A command as LeRobot's client writes it; what it leaves out is 0, as LeRobot's server has it.
+    """Parse a command of LeRobot's client; missing values are 0, as in LeRobot's server.
 
-    :raises WireError: it is no such command, or has a number that is not finite or does not fit.
+    :raises WireError: it is not such a command, or a number is not finite or out of range.
     """
     if len(payload) > MOST:
         raise OversizeError(f"a command of {len(payload)} bytes, at most {MOST} are read")

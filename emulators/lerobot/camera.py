@@ -1,7 +1,7 @@
 """Pictures as LeRobot's camera server sends them: a test card that moves.
 
-The emulated robot sees nothing. What a client needs is that pictures of the right size come at the
-right rate and that one differs from the next.
+The emulated robot has no camera. A client needs pictures of the right size at the right rate, each
+different from the last.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _COUNT = 10  # different pictures
 
 
 def moving_cards() -> Iterator[str]:
-    """Pictures for ever: JPEG in base64, colour bars with a white column that moves across.
+    """Yield pictures without end: JPEG in base64, colour bars with a white column that moves
+    across.
 
     :raises ExtraMissing: Pillow is not installed.
     """

@@ -1,9 +1,9 @@
-"""Decide which of a client's commands count when nothing in them says when they were made.
+"""Decide which commands of a client are fresh, although they have no timestamp.
 
-LeRobot's commands bear no time. Its socket keeps the newest command and sends it again to a server
-that comes back, however old it is then; what it sent while the network or this program stood still
-waits in buffers. So nothing counts that may have waited: after a connection, a pause of this
-program or a gap between commands, one has to come after the other for a while.
+LeRobot's commands have no timestamp. Its socket keeps the newest command and sends it again to a
+restarted server, however old it is; commands sent during a network outage or a pause of this
+program wait in buffers. So a command that may have waited does not count: after a connection, a
+pause of this program or a gap between commands, commands must arrive steadily for a while first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["CommandStream"]
 
 
 class CommandStream:
-    """The commands of whoever is connected. For one thread.
+    """The command stream of the connected client. For one thread.
 
     A command counts if commands have come for more than
     :data:`~dexkit.command_age.QUIET` seconds without a gap of more than
@@ -33,8 +33,8 @@ class CommandStream:
         self._last = 0.0
         self.clients: set[int] = set()
 
-    def look(self) -> float:
-        """To be called again and again, and before :meth:`counts`.
+    def detect_pause(self) -> float:
+        """Detect a pause of this program. Call it periodically, and before :meth:`counts`.
 
         :returns: seconds that this program was paused until now, or 0.
         """
@@ -44,17 +44,17 @@ class CommandStream:
         return away
 
     def connected(self, client: int) -> None:
-        """A client has connected; it may send what it has kept."""
+        """A client has connected; it may first send an old command."""
         self.clients.add(client)
         self._began = None
 
     def disconnected(self, client: int) -> None:
-        """A client has gone."""
+        """A client has disconnected."""
         self.clients.discard(client)
         self._began = None
 
     def counts(self) -> bool:
-        """A command came: whether it counts."""
+        """Note a command; return whether it counts."""
         now = self._clock.since_boot()
         last, self._last = self._last, now
         if self._began is None or now - last > PAUSE:

@@ -1,7 +1,7 @@
 """The ports on ZeroMQ in front of an emulated G1 on DDS: sockets and threads.
 
-Each socket belongs to one thread. Stop and restart of the robot behind it need no care here: states
-come when there are some, and commands are written whether or not somebody reads them.
+Each socket belongs to one thread. A restart of the robot on DDS needs no handling here: states are
+forwarded when they arrive, and commands are written whether or not they are read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["PORTS", "Counters", "LerobotPorts", "Ports"]
 
 log = logging.getLogger("dexkit.lerobot")
 
-_TICK = 50  # ms after which a thread looks whether it is to stop
+_TICK = 50  # ms between checks whether a thread is to stop
 _JOIN = 5.0
 
 
@@ -45,12 +45,12 @@ class Ports:
 
 
 PORTS = Ports()
-"""Those that LeRobot's client has in its source."""
+"""The ports hard-coded in LeRobot's client."""
 
 
 @dataclass
 class Counters:
-    """What happened.
+    """Counters of the ports.
 
     :ivar states: sent.
     :ivar commands: received.
@@ -71,8 +71,8 @@ class Counters:
 class LerobotPorts:
     """LeRobot's ports for the G1 on a DDS domain; a context manager.
 
-    :param node: where the emulated G1 is. Commands are written there, so it must not be the
-        network of a real one.
+    :param node: where the emulated G1 is. Commands are written there, so it must not be the network
+        of a real robot.
     :param address: which of this machine's addresses to listen on.
     :param camera: also send pictures.
     :raises ExtraMissing: pyzmq or Pillow is not installed.
@@ -102,7 +102,7 @@ class LerobotPorts:
             self._commands = self._socket(self._zmq.PULL)
             self._commands.setsockopt(self._zmq.CONFLATE, 1)
             self._commands.setsockopt(self._zmq.MAXMSGSIZE, MOST)
-            # connections are told of before their first message can be received
+            # connections are reported before their first message can be received
             self._monitor = self._commands.get_monitor_socket()
             self._states = self._socket(self._zmq.PUB)
             self._pictures = self._socket(self._zmq.PUB)
@@ -166,7 +166,7 @@ class LerobotPorts:
     def _record_failure(self, error: Exception) -> None:
         self.failure = self.failure or error
 
-    def _tell(self, kind: str, text: str) -> None:
+    def _warn_once(self, kind: str, text: str) -> None:
         if kind not in self._told:
             self._told.add(kind)
             log.warning("%s (counted, logged once)", text)
@@ -187,11 +187,11 @@ class LerobotPorts:
                     payload = self._commands.recv(zmq.NOBLOCK)
                 except zmq.Again:
                     pass
-                # after it was received: whoever sent it has been told of by now
+                # after the receive: its sender's connection has been reported by now
                 self._look_at_connections()
-                if self._stream.look():
+                if self._stream.detect_pause():
                     self.counters.pauses += 1
-                    self._tell("pause", "this program was paused: commands count again in 1 s")
+                    self._warn_once("pause", "this program was paused: commands count again in 1 s")
                 if payload is None:
                     continue
                 data = self._admit(payload)
@@ -206,11 +206,13 @@ class LerobotPorts:
             data = low_level.encode_with_crc(command_from(payload))
         except WireError as error:
             self.counters.refused += 1
-            self._tell("refused", f"a command was refused: {error}")
+            self._warn_once("refused", f"a command was refused: {error}")
             return None
         counts = self._stream.counts()
         if len(self._stream.clients) > 1:
-            self._tell("clients", "two clients are connected: no command counts until one leaves")
+            self._warn_once(
+                "clients", "two clients are connected: no command counts until one leaves"
+            )
         return data if counts else None
 
     def _look_at_connections(self) -> None:
@@ -234,7 +236,7 @@ class LerobotPorts:
                     try:
                         payload = state_json(sample.message)
                     except WireError as error:
-                        self._tell("state", f"a state cannot be read: {error}")
+                        self._warn_once("state", f"a state cannot be read: {error}")
                         continue
                     self._states.send(payload)  # to clients that keep up; it never waits
                     self.counters.states += 1

@@ -36,7 +36,7 @@ class Bus(SerialLine):
 
     :param motors: on the line; ids must differ.
     :param latency_timer: seconds; the product's adapter (CH343) is not known to have one.
-    :raises UsageError: two motors have one id, or none is there.
+    :raises UsageError: two motors have one id, or there is no motor.
 
     Other parameters as :class:`~dexkit.emulators.serial_line.SerialLine`.
     """
@@ -99,7 +99,7 @@ class Bus(SerialLine):
         rate = self.host_baudrate
         hearing = [m for m in self.motors if rate is None or m.firmware.baudrate == rate]
         if not hearing:
-            # the wrong speed makes other bytes of them, and no frame
+            # at the wrong baud rate they become other bytes, and no frame
             counters.garbled += len(data)
             return
         line_rate = hearing[0].firmware.baudrate

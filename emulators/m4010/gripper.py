@@ -1,4 +1,4 @@
-"""Emulated Dex1-1 motors, ready to be opened: in threads or in a process of their own."""
+"""Run emulated Dex1-1 motors in threads or in a child process."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class Dex1Motors:
         every line.
     :param check_baudrate: a client at another baud rate is not understood.
     :raises EmulatorError: a link cannot be made.
-    :raises UsageError: a fault or a figure that cannot be.
+    :raises UsageError: a fault or a value is invalid.
 
-    Reading ``motors`` while a client talks to them is a snapshot of a moving thing.
+    Reading ``motors`` while a client talks to them gives a snapshot only.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class Dex1Motors:
         return line
 
     def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now), on every line."""
+        """Inject a fault into every line, now (or at its ``@TIME`` from now)."""
         fault = parse_fault(spec, M4010_FAULTS)
         for port in self._lines:
             port.inject(fault)
@@ -213,7 +213,7 @@ class Dex1Process(EmulatorProcess):
             raise
 
     def close(self) -> None:
-        """Stop it; ``output`` and ``errors`` then hold what it printed behind the ready line."""
+        """Stop it; ``output`` and ``errors`` then hold what it printed after the ready line."""
         super().close()
         self._cleanup()
 
@@ -238,10 +238,10 @@ def emulated_dex1(
     :param side: ``left``, ``right`` or ``both``.
     :param process: run it as ``dexkit emulate dex1-motor`` in a process of its own. A client in
         the same process competes with the thread for the interpreter, so rates are measured
-        against a process; a thread's motors can be looked into (``.motor``).
+        against a process; the motors of a thread can be inspected (``.motor``).
     :param firmware: only in a thread.
     :raises EmulatorError: it did not become ready.
-    :raises UsageError: an option that cannot be.
+    :raises UsageError: an option is invalid.
     """
     found: Dex1Motors | Dex1Process
     if process:

@@ -30,7 +30,7 @@ __all__ = ["LOCKING", "Motor"]
 
 LOCKING = 1.0
 """Self-locking: the jaws hold an object without motor torque."""
-_MAX_CATCH_UP = 10.0  # seconds; a longer pause of the caller is not lived through
+_MAX_CATCH_UP = 10.0  # seconds; of a longer pause of the caller only the end is simulated
 _HEAT_STEPS = 20  # heat is stepped once in so many steps
 _OVERHEATED = MotorError.WINDING_OVERTEMPERATURE | MotorError.CASE_TEMPERATURE
 
@@ -181,7 +181,8 @@ class Motor:
     # --- the line
 
     def handle(self, command: MotorCmd) -> MotorData | None:
-        """Execute a command; return the data frame, or None if the motor is silent or not meant.
+        """Execute a command; return the data frame, or None if the motor is silent or not
+        addressed.
 
         Call it after :meth:`advance_to`.
         """

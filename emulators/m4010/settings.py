@@ -1,7 +1,7 @@
 """Settings of an emulated M4010: points that no source documents, and its thermal model.
 
 Only the vendor's library was measured (docs/sources/unitree-dex.md#g), no motor. The default of
-each point is the reading that is best supported; docs/emulators.md lists them.
+each point is the best supported interpretation; docs/emulators.md lists them.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Firmware:
         otherwise such a command is ignored.
     :param calibration_enabled: otherwise it answers that calibrating is not enabled.
     :param flash_works: otherwise a calibration cannot be stored.
-    :param answer_time: seconds from a command to its answer. Unknown; 0 shows what the host's side
-        costs.
+    :param answer_time: seconds from a command to its answer. Unknown; with 0 a measurement shows
+        the cost of the host's side.
     :param byte_gap: seconds between bytes after which a frame begun is dropped.
     """
 

@@ -1,7 +1,7 @@
-"""How the motors of an emulated pair of Dex1-1 grippers are numbered and mounted.
+"""Ids and mounting of the motors of an emulated pair of Dex1-1 grippers.
 
-No document says which id is which side but the vendor's service, and none says more of the
-mounting than its library's gear ratio, so that emulated grippers can have any.
+Only the vendor's service says which id is which side, and only the gear ratio of its library is
+known of the mounting. So an emulated gripper can have any.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Wiring:
 
     @classmethod
     def assumed(cls) -> Wiring:
-        """What dexkit assumes of real grippers."""
+        """The wiring that dexkit assumes for real grippers."""
         straight = Mounting((1,), (0.0,), (GEAR_RATIO,))
         return cls(DEX1_1.vendor_ids, dict.fromkeys(Side, straight))
 
     @classmethod
     def random(cls, seed: int) -> Wiring:
-        """Ids at random, motors mirrored, offset and geared at random; the same for a seed."""
+        """Random ids, directions, offsets and gear ratios, reproducible by the seed."""
         rng = random.Random(seed)
         ids = rng.sample(range(BROADCAST_ID), len(Side))
         mountings = {

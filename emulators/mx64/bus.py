@@ -49,9 +49,9 @@ class Bus(SerialLine):
     :param latency_timer: seconds; 0 for an adapter without one.
     :param faults: to come, times counted from ``start``.
     :param start: time on the caller's clock.
-    :param seed: of the faults' chance.
+    :param seed: of the faults' random numbers.
     :param protocol_1: servos whose firmware speaks Protocol 1.0 only.
-    :raises UsageError: two servos have one id, or none is there.
+    :raises UsageError: two servos have one id, or there is no servo.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Bus(SerialLine):
         rate = self.host_baudrate
         hearing = [s for s in self.servos if rate is None or s.baudrate == rate]
         if rate is not None and not hearing and all(s.baudrate != rate for s in self.protocol_1):
-            # the wrong speed makes other bytes of them, and no packet
+            # at the wrong baud rate they become other bytes, and no packet
             self.counters.garbled += len(data)
             return
         begin = max(now, self._line_free) if self.line_time else now

@@ -1,4 +1,4 @@
-"""An emulated EZGripper, ready to be opened: in a thread or in a process of its own."""
+"""Run an emulated EZGripper in a thread or in a child process."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["EmulatedProcess", "EmulatedThread", "emulated_ezgripper"]
 
 
 class EmulatedThread:
-    """A gripper in a thread of this process, whose servos can be looked into.
+    """A gripper in a thread of this process, whose servos can be inspected.
 
-    Reading ``servos`` while a client talks to them is a snapshot of a moving thing.
+    Reading ``servos`` while a client talks to them gives a snapshot only.
 
     :ivar bus: the line.
     """
@@ -35,7 +35,7 @@ class EmulatedThread:
 
     @property
     def path(self) -> str:
-        """What a client opens."""
+        """Path that a client opens."""
         return self.port.path
 
     @property
@@ -49,7 +49,7 @@ class EmulatedThread:
         return self.bus.servos[0]
 
     def inject(self, spec: str) -> None:
-        """Have a fault now (or at its ``@TIME`` from now)."""
+        """Inject a fault now (or at its ``@TIME`` from now)."""
         self.port.inject(parse_fault(spec))
 
     def close(self) -> None:
@@ -80,7 +80,7 @@ class EmulatedProcess(EmulatorProcess):
         super().__init__("mx64", ["--link", self.path, *arguments], MX64_FAULTS, timeout=timeout)
 
     def close(self) -> None:
-        """Stop it; ``output`` and ``errors`` then hold what it printed behind the ready line."""
+        """Stop it; ``output`` and ``errors`` then hold what it printed after the ready line."""
         super().close()
         if self._directory is not None:
             self._directory.close()
@@ -112,8 +112,8 @@ def emulated_ezgripper(
     :param object_pct: opening at which an object is touched, percent; None for none.
     :param process: run it as ``dexkit emulate mx64`` in a process of its own instead of a
         thread of this one. A client in the same process competes with the thread for the
-        interpreter, so rates are measured against a process; a thread's servos can be looked
-        into (``.servo``).
+        interpreter, so rates are measured against a process; the servos of a thread can be
+        inspected (``.servo``).
     :param servo_ids: of several servos on the line, each with fingers of its own, instead of one.
     :param latency_timer: of the USB-serial adapter, seconds.
     :param faults: specifications, see :mod:`dexkit.emulators.faults`.
@@ -122,7 +122,7 @@ def emulated_ezgripper(
     :param firmware: and ``physics``: only in a thread.
     :param extra: more arguments of the command: only for a process.
     :raises EmulatorError: it did not become ready.
-    :raises UsageError: an option that cannot be.
+    :raises UsageError: an option is invalid.
     """
     gripper: EmulatedThread | EmulatedProcess
     ids = tuple(servo_ids) or (servo_id,)

@@ -1,9 +1,9 @@
-"""What an MX-64 with Protocol 1.0 firmware answers: just enough to be recognised.
+"""Emulate the answers of an MX-64 with Protocol 1.0 firmware that identify it.
 
 Ping and reads of its first registers (model number 310, firmware, id, baud rate); a driver for
-Protocol 2.0 should find out and say that the firmware must be upgraded. Frame: ``FF FF, ID,
-length, instruction or error, parameters, checksum`` with the checksum the inverted sum of all
-bytes behind the header.
+Protocol 2.0 should detect it and report that the firmware must be upgraded. Frame: ``FF FF, ID,
+length, instruction or error, parameters, checksum`` with the checksum the inverted sum of all bytes
+after the header.
 """
 
 from __future__ import annotations

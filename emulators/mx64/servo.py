@@ -476,7 +476,7 @@ class Servo:
         return values
 
     def _check_value(self, item: Item, value: int, *, clamp: bool) -> tuple[int, int]:
-        """(error number, value) for a value that shall go into ``item``."""
+        """(error number, value) for a value to be written to ``item``."""
         if item in _GOALS and self._get(mx64.BUS_WATCHDOG) == mx64.WATCHDOG_TRIPPED:
             return ErrorNumber.DATA_RANGE, value
         low, high = item.minimum, item.maximum

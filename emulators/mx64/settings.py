@@ -1,7 +1,7 @@
 """Settings of an emulated MX-64: undocumented points of its firmware, and its mechanics.
 
 Each field of :class:`Firmware` is a point on which the manual is silent or sources disagree
-(docs/sources/mx64-ezgripper.md#f); the default is the reading that is best supported, and
+(docs/sources/mx64-ezgripper.md#f); the default is the best supported interpretation, and
 docs/emulators.md lists them. :class:`Physics` holds the figures of motor, supply, heat and gripper.
 """
 
@@ -86,7 +86,8 @@ class GripperMechanics:
     """Mechanics of the EZGripper at the servo's shaft; 0 % is closed, 100 % open.
 
     Stroke and closing direction are facts (docs/sources/mx64-ezgripper.md#d1,
-    docs/sources/mx64-ezgripper.md#d2). Nobody publishes stiffness or friction of the whole gripper:
+    docs/sources/mx64-ezgripper.md#d2). Stiffness and friction of the whole gripper are not
+    published:
     free motion at some 50 to 90 current units is what the logs of docs/sources/mx64-ezgripper.md#d4
     and docs/sources/mx64-ezgripper.md#b7 show, and the contact stiffness gives a few percent of
     travel at full grip.

@@ -1,4 +1,4 @@
-"""How the servos of emulated EZGrippers on one line are numbered and mounted."""
+"""Ids and mounting of the servos of emulated EZGrippers on one line."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Wiring:
 
     @classmethod
     def random(cls, seed: int) -> Wiring:
-        """One gripper or two, dual or quad, mirrored, offset and with another stroke at random.
+        """A random wiring: one gripper or two, dual or quad, mirrored, offset, with another stroke.
 
-        The same for a seed.
+        The same seed gives the same wiring.
         """
         rng = random.Random(seed)
         sides = [Side.LEFT, Side.RIGHT]

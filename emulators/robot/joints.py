@@ -1,6 +1,6 @@
 """Simulate all joints of a robot as numpy arrays.
 
-A robot has up to 29 joints and lives 500 steps a second, so they are numpy arrays here, where
+A robot has up to 29 joints and 500 steps a second, so they are numpy arrays here, while
 :class:`~dexkit.emulators.joint_mechanics.Joint` is one joint with a richer mechanism. Each is an
 inertia with Coulomb and viscous friction between two hard stops. Joints do not act upon
 each other, and there is no gravity: the robot hangs in a rig, and its links weigh nothing.
@@ -38,11 +38,11 @@ class Law:
 
     @classmethod
     def damping(cls, kd: Array) -> Law:
-        """No torque but against motion."""
+        """Damping only: torque against motion."""
         return cls(np.zeros_like(kd), np.zeros_like(kd), kd)
 
     def blend(self, other: Law, weight: Array) -> Law:
-        """``other`` by ``weight`` (shape (n,), 0 to 1), and this one by the rest."""
+        """Weighted mean of ``other`` (``weight``, shape (n,), 0 to 1) and this law."""
         rest = 1.0 - weight
         return Law(
             rest * self.bias + weight * other.bias,
@@ -78,7 +78,7 @@ class Joints:
         self._drag = 1.0 + self._rate * self.viscous
 
     def step(self, law: Law) -> None:
-        """Live one step of :data:`~dexkit.emulators.robot.settings.STEP` seconds.
+        """Advance by one step of :data:`~dexkit.emulators.robot.settings.STEP` seconds.
 
         Position and speed are taken at the end of the step in the motors' law, so that no gain is
         too high for it. A motor gives up to ``tau_max``; a joint turns at up to ``dq_max``, where
@@ -92,7 +92,7 @@ class Joints:
         most = self.tau_max
         if (np.abs(tau) > most).any():
             clipped = np.minimum(np.maximum(tau, -most), most)
-            # as much as it can, whatever the speed: nothing of its damping is left
+            # full torque, whatever the speed: no damping is left
             dq = np.where(tau == clipped, dq, self._speed_after_step(clipped, self._drag))
             tau = clipped
         fast = np.abs(dq) > self.dq_max

@@ -42,14 +42,14 @@ _REMOTE = struct.Struct("<2xH5f16x")  # head, keys, lx rx ry L2 ly, idle
 
 @dataclass
 class Counters:
-    """What a robot has seen and done.
+    """Counters of an emulated robot.
 
     :ivar commands: obeyed.
     :ivar arm_commands: obeyed, on the arm topic.
     :ivar bad_crc: commands ignored because their CRC is wrong.
     :ivar bad_number: commands ignored because a number is NaN or infinite.
     :ivar bad_machine: commands ignored because their ``mode_machine`` is another robot's.
-    :ivar malformed: samples that are no such message at all.
+    :ivar malformed: samples that cannot be decoded.
     :ivar wrong_mode: commands obeyed that hold a mode byte which its motor does not know.
     :ivar stale: commands ignored because they were old, or may have been sent before a pause ended.
     :ivar pauses: times that the program stood still; the robot damps then until a new command.
@@ -70,7 +70,7 @@ class Counters:
     states: int = 0
 
     def summary(self) -> str:
-        """Those that are not 0, in words."""
+        """The counters that are not 0, as text."""
         pairs = dataclasses.asdict(self).items()
         return ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in pairs if n)
 
@@ -97,7 +97,7 @@ class RobotMechanics:
     """An emulated H1 or G1: see docs/robots.md for what is and what is not emulated.
 
     :param now: seconds of any monotonic clock, the same as in the other calls.
-    :param report: told, in a sentence, of each kind of trouble once.
+    :param report: called with a sentence for each kind of problem, once.
 
     :ivar remote: the wireless remote; assign another to press keys.
     """
@@ -236,7 +236,8 @@ class RobotMechanics:
 
     def _read_setpoints(self, topic: str) -> Array | None:
         """q, dq, tau, kp, kd of the used motors, shape (5, n); None if one is no number."""
-        with np.errstate(invalid="ignore"):  # what is not finite is found below, and said
+        # values that are not finite are found and reported below
+        with np.errstate(invalid="ignore"):
             numbers: Array = self._orders[self._used].astype(np.float64).T
             # in double precision a sum of some singles cannot overflow
             total = float(numbers.sum())
@@ -326,7 +327,7 @@ class RobotMechanics:
     # states
 
     def _prepare_state(self) -> None:
-        """What never changes in a state, and where the rest stands."""
+        """Fill in the constant members of the state, and note where the others are."""
         message = self._state.message
         imu = message["imu_state"][0]
         imu["quaternion"] = 1.0, 0.0, 0.0, 0.0
@@ -360,7 +361,7 @@ class RobotMechanics:
             motors["vol"][self._used] = supply.voltage
 
     def state(self, now: float) -> bytes:
-        """The state as it is, as a sample with its CRC."""
+        """The present state, as a sample with its CRC."""
         message, joints, used = self._state.message, self.joints, self._used
         motors = message["motor_state"][0]
         mode = self._active_command.mode if self._active_command is not None else self._all_off
@@ -383,7 +384,7 @@ class RobotMechanics:
         return self._state.seal()
 
     def remote_message(self) -> WirelessController_:
-        """What the wireless remote says on its own topic."""
+        """The sample of the wireless remote's own topic."""
         sticks = {name: self.remote.sticks.get(name, 0.0) for name in Remote.STICKS}
         return WirelessController_(**sticks, keys=self.remote.bits)
 

@@ -1,7 +1,7 @@
-"""Answer Unitree's MotionSwitcher service, which its low-level examples ask before they move.
+"""Implement Unitree's MotionSwitcher service, which its low-level examples call before they move.
 
-On a robot the service starts and stops the programs that walk. The emulated one has none: it
-remembers the name that a client selected, and gives it back until the client releases it. No DDS:
+On a robot the service starts and stops the walking programs. The emulated robot has none: it stores
+the name that a client selected, and returns it until the client releases it. No DDS:
 :mod:`dexkit.emulators.robot.run` connects it to the topics.
 """
 
@@ -42,7 +42,7 @@ class MotionSwitcher:
         self._silent = False
 
     def answer(self, request: Request_) -> Response_ | None:
-        """Do what a request asks; return the response, or None if the client wants none."""
+        """Execute a request; return the response, or None if the client wants none."""
         self.requests += 1
         identity = request.header.identity
         code, data = self._serve(identity.api_id, request.parameter)

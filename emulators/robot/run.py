@@ -1,4 +1,4 @@
-"""A robot on Unitree's topics: state at a fixed rate, commands as they come.
+"""Run an emulated robot on Unitree's topics: state at a fixed rate, commands as they arrive.
 
 with EmulatedRobot(G1, domain=1) as robot:   # a thread of this process
     ...
@@ -31,24 +31,25 @@ __all__ = ["EmulatedRobot", "run_robot"]
 
 log = logging.getLogger("dexkit.robot")
 
-_DEPTH = 4  # commands of each client kept from one state to the next; only the newest counts
+_DEPTH = 4  # commands of each client that are kept between two states; only the newest counts
 _REQUESTS = 16  # of each client kept from one state to the next
 _RESPONSE_WAIT = 10.0  # seconds that a response waits for its client's reader to be discovered
-_LIVENESS_PERIOD = 0.2  # seconds between looks whether it still lives
+_LIVENESS_PERIOD = 0.2  # seconds between checks that the thread is alive
 
 
 class EmulatedRobot:
-    """A robot that lives in a thread of this process, on one domain.
+    """A robot in a thread of this process, on one domain.
 
     :param node: where its topics are; without one, it makes one on ``domain`` and ``interface``.
-    :param publisher: whose thread it lives in, at the model's state rate; without one, its own.
-    :param force: start even if somebody else publishes the state.
+    :param publisher: runs the robot in its thread, at the model's state rate; without one, a thread
+        of its own.
+    :param force: start even if another program publishes the state.
 
     :ivar robot: the robot itself. It belongs to that thread: read it, and assign ``robot.remote``.
     :ivar switcher: its MotionSwitcher service, of that thread, too.
 
-    Troubles of clients are logged once each, as warnings of the logger ``dexkit.robot``, and
-    counted in ``robot.counters``.
+    Errors of clients are logged once each, as warnings of the logger ``dexkit.robot``, and counted
+    in ``robot.counters``.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class EmulatedRobot:
 
     @property
     def failure(self) -> Exception | None:
-        """What ended it, or a thread that it needs."""
+        """The error that ended it, or a thread that it needs; None while it runs."""
         node = self._node or self._own_node
         return self._failure or self._publisher.failure or (node.failure if node else None)
 
@@ -185,7 +186,9 @@ class EmulatedRobot:
             self._own_node = None
 
     def _refuse_other_publisher(self, node: DdsNode, sole: SolePublisher) -> None:
-        """States must arrive: some clients have a writer for them, which they never use."""
+        """Count only writers whose states arrive: some clients have a state writer that they never
+        use.
+        """
         model = self.model
         with node.reader(model.state_topic, model.state_type) as reader:
             sole.search()
@@ -193,7 +196,7 @@ class EmulatedRobot:
                 return
         self._heard = True
         sole.check()
-        raise TopicConflict(  # it has gone meanwhile, or cannot be seen
+        raise TopicConflict(  # it has gone meanwhile, or is not discovered
             f"somebody already publishes {model.state_topic} on domain {self.domain}",
             hint="stop the other robot, choose another --domain, or add --force",
         )
@@ -278,7 +281,7 @@ def run_robot(
     settings: Settings | None = None,
     force: bool = False,
 ) -> None:
-    """Be a robot until ``stop`` is set.
+    """Run a robot until ``stop`` is set.
 
     :param ready: set when its topics are up.
     :raises TopicConflict: somebody else publishes the state (unless ``force``).

@@ -15,8 +15,8 @@ STEP = 0.002  # seconds of a step of the mechanics: one state
 class Settings:
     """Parameters of an emulated robot.
 
-    The joints of Unitree's robots range from 5 to 300 N·m. Inertia and friction are taken in
-    proportion to that, so that all of them accelerate alike.
+    The joints of Unitree's robots range from 5 to 300 N·m. Inertia and friction are proportional to
+    that, so all joints accelerate alike.
 
     :param acceleration: of a joint under its full torque, rad/s².
     :param coulomb: friction torque, part of the joint's full torque.
@@ -29,7 +29,7 @@ class Settings:
         (0.005 rad/s, 0.05 m/s²), 0 none.
     :param seed: of that noise.
     :param ambient: temperature of all motors at first, degrees Celsius.
-    :param heating: by which a motor is warmer than that after a long time at full torque, K.
+    :param heating: temperature rise of a motor after a long time at full torque, K.
     :param warm_up: time constant of warming up, seconds.
     :param idle_power: W that the computers draw.
     :param capacity: of the battery, W·h.
@@ -72,7 +72,7 @@ class Remote:
     :param sticks: of :attr:`STICKS`, each -1 to 1; those not named are at 0.
     :raises UsageError: there is no such key or stick.
 
-    Names and bits: "Remote Control Data" in Unitree's G1 developer pages.
+    Names and bits are from "Remote Control Data" in Unitree's G1 developer pages.
     """
 
     keys: frozenset[str] = frozenset()
@@ -102,7 +102,7 @@ class Remote:
     def parse(cls, text: str) -> Remote:
         """A remote from ``"A,R1,lx=0.5"``: keys, and sticks with their positions; empty: let go.
 
-        :raises UsageError: it is not that.
+        :raises UsageError: the text has another form.
         """
         keys, sticks = set(), {}
         for word in filter(None, (part.strip() for part in text.split(","))):

@@ -14,7 +14,7 @@ __all__ = ["Supply"]
 Array = NDArray[np.float64]
 
 PERIOD = 0.1
-"""Seconds between two looks."""
+"""Seconds between two updates."""
 _CELL_FULL, _CELL_EMPTY = 4.15, 3.3  # V
 _COPPER_LOSS = 60.0  # W that a motor turns into heat at full torque
 
@@ -25,7 +25,7 @@ class Supply:
     :ivar cells: of the battery, in series.
     :ivar temperature: shape (n,), degrees Celsius.
     :ivar charge: percent.
-    :ivar power: W drawn at the last look.
+    :ivar power: W drawn at the last update.
     """
 
     def __init__(self, model: RobotModel, joints: Joints, settings: Settings) -> None:
@@ -37,7 +37,7 @@ class Supply:
         self.power = settings.idle_power
 
     def step(self) -> None:
-        """Live :data:`PERIOD` seconds with the torques of now."""
+        """Advance by :data:`PERIOD` seconds with the present torques."""
         joints, s = self._joints, self._settings
         load = np.square(joints.tau / joints.tau_max)
         goal = s.ambient + s.heating * load

@@ -28,7 +28,7 @@ from dexkit.hand import Side
 from dexkit.messages import encode, unitree_go, unitree_hg
 from dexkit.models import dialect
 from dexkit.service import HandService
-from dexkit.service.core import HandCore
+from dexkit.service.hand_core import HandCore
 from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.rig import LocalNode, WaitTimeout, open_files, until
 

@@ -90,7 +90,7 @@ class _Messages:
         kind = message_type(chosen.cmd_type)
         good = [kind.encode(filled(chosen.cmd_type, rng)) for _ in range(3)]
         good.append(kind.encode(kind.cls()))
-        if spoken == "unitree_go":
+        if kind.cls is unitree_go.MotorCmds_:
             nan = unitree_go.MotorCmd_(q=float("nan"), kp=5.0)
             good.append(encode(unitree_go.MotorCmds_([nan])))
             good.append(encode(unitree_go.MotorCmds_([nan] * 1000)))

@@ -61,12 +61,12 @@ def _session(out: Path, options: argparse.Namespace) -> int:
     if why_not:
         print(f"no C program: {why_not}")
 
-    def told(case: Case) -> None:
+    def report_case(case: Case) -> None:
         cases.append(case)
         print(f"{case.status:8}{case.group:10} {case.name}: {case.said}", flush=True)
 
     devices = Devices()
-    control = Control(devices, told)
+    control = Control(devices, report_case)
     try:
         initramfs = out / "initramfs.gz"
         python = Path(sys.prefix) / "bin/python"
@@ -89,9 +89,11 @@ def _session(out: Path, options: argparse.Namespace) -> int:
         devices.close()
     if not (ended and control.finished):
         why = "the session did not end" if ended else f"it did not end in {options.patience:.0f} s"
-        told(Case("lab", "the guest's session", "failed", f"{why}; see {out / 'console.log'}"))
+        report_case(
+            Case("lab", "the guest's session", "failed", f"{why}; see {out / 'console.log'}")
+        )
     if devices.failure is not None:
-        told(Case("lab", "the emulators", "failed", repr(devices.failure)))
+        report_case(Case("lab", "the emulators", "failed", repr(devices.failure)))
     facts = {
         "kernel": f"{kernel.release} ({kernel.version})",
         "packages": ", ".join(kernel.packages),

@@ -18,16 +18,16 @@ class Control:
     """Listens on the loopback address, which is 10.0.2.2 for the guest.
 
     :param devices: whose records the guest may read.
-    :param told: called with each case that the guest has finished.
+    :param on_case: called with each case that the guest has finished.
 
     :ivar port: the port taken.
     :ivar facts: what the guest has said about itself.
     :ivar finished: whether the guest has said that it has done everything.
     """
 
-    def __init__(self, devices: Devices, told: Callable[[Case], object]) -> None:
+    def __init__(self, devices: Devices, on_case: Callable[[Case], object]) -> None:
         self._devices = devices
-        self._told = told
+        self._on_case = on_case
         self.facts: dict[str, Any] = {}
         self.finished = False
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -48,7 +48,7 @@ class Control:
     def _answer(self, message: dict[str, Any]) -> dict[str, Any]:
         kind = message["do"]
         if kind == "case":
-            self._told(Case(**message["case"]))
+            self._on_case(Case(**message["case"]))
         elif kind == "fact":
             self.facts.update(message["facts"])
         elif kind == "finished":

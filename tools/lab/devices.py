@@ -50,7 +50,7 @@ class Record:
         self._clock = RealClock()
         self._lock = threading.Lock()
 
-    def look(self) -> None:
+    def note_positions(self) -> None:
         """Note where the joints are."""
         place = [float(q) for q in self._positions()]
         with self._lock:
@@ -80,7 +80,7 @@ class Record:
         """What happened since ``start``: extremes of the joints, how many set-points came,
         and what the serial line heard of late.
         """
-        self.look()
+        self.note_positions()
         with self._lock:
             places = [place for t, place in self._places if t >= start]
             setpoints = [values for t, values in self._setpoints if t >= start]
@@ -131,7 +131,7 @@ class Devices:
     def _watch(self) -> None:
         while not self._stopping.wait(_PERIOD):
             for record in self.records.values():
-                record.look()
+                record.note_positions()
 
     @property
     def failure(self) -> BaseException | None:
@@ -212,7 +212,7 @@ def _record_motor(motor: Any) -> Record:
         # an overshoot is shorter than what a busy machine leaves between two looks
         for first in range(0, n, _LOOK_STEPS):
             step(min(_LOOK_STEPS, n - first))
-            record.look()
+            record.note_positions()
 
     step = mechanics.step
     mechanics.drive, mechanics.brake, mechanics.step = driven, braked, stepped

@@ -29,7 +29,7 @@ from dexkit.emulators.wear import parse_wear
 from dexkit.hand import Side
 from dexkit.threads import Worker
 from dexkit.traces import open_trace, sample_path
-from dexkit.view.page import Page
+from dexkit.view.browser_page import Page
 from tools.browser import Browser, chromium
 from tools.pictures.terminal import monitor_picture
 
@@ -130,7 +130,7 @@ def worn_page() -> str:
         hand = SimHand(Side.LEFT, clock=clock)
         hand.wear(parse_wear(wear, hand.spec))
         hand.open()
-        test = SelfTest(Procedure(Setup.of(hand.spec), speed=0.25))
+        test = SelfTest(Procedure(Setup.from_spec(hand.spec), speed=0.25))
         run(hand, test, clock=clock)
         about = {"backend": "sim-dex1", "name": "A7"}
         baseline = results[0] if results else None

@@ -1,4 +1,4 @@
-"""The commands to hands in a session of any format, as tables over time."""
+"""Read the commands to hands from a session of any format, as tables over time."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class HandCommands:
-    """What one hand was commanded, in order of time.
+    """The commands to one hand, in order of time.
 
     :param t: seconds from the session's first command, ascending, shape (n,).
     :param q: rad; ``dq`` rad/s, ``tau`` N·m, ``kp`` N·m/rad, ``kd`` N·m·s/rad; shape (n, joints).
-        NaN where a message lacks a joint, or says so.
+        NaN where a message lacks a joint or contains NaN.
     :param driven: whether the mode byte drives the joint, shape (n, joints).
     :param counts: motors in each message, shape (n,).
     :param late: seconds by which a command was received later than its writer's usually are, shape
@@ -65,14 +65,14 @@ class HandCommands:
 class RecordedCommands:
     """A session's commands, and positions, of the hands of one model.
 
-    :param name: what to call it.
+    :param name: for messages.
     :param form: of the source: ``recording``, or the format it was imported from.
     :param nominal_rate: frames a second that were asked for, where the source has no times; else 0.
     :param first_ns: time of the first command, ns since the epoch; 0 where it is unknown.
     :param states: (t, q) of each hand, in the same seconds.
-    :param others: what it has besides, and is not played.
-    :param corrections: what an import has changed; ``problems``: what it could not take over.
-    :param damage: what is wrong with the file.
+    :param others: other contents, which are not played.
+    :param corrections: what an import has changed; ``problems``: what it could not import.
+    :param damage: of the file.
     """
 
     name: str
@@ -136,9 +136,7 @@ def read_session(
 
 
 def _is_recording(source: Path) -> bool:
-    """Whether it is to be read as a recording; what is no session of another format is, too, so
-    that the error is about that.
-    """
+    """Whether to read it as a recording; so are unknown formats, for the error message."""
     return source.is_file() and not (
         source.suffix in (".jsonl", ".ndjson", ".db3") or source.name == DATA
     )
@@ -204,7 +202,7 @@ def _number(text: str) -> float:
 
 
 def _others(trace: Trace, streams: Sequence[Stream], mine: Sequence[Stream]) -> tuple[str, ...]:
-    """What else is commanded, in words."""
+    """Describe what else is commanded."""
     played = {s.topic for s in mine}
     found = [
         f"{s.part} ({len(s.joints)} joints)"
@@ -230,7 +228,7 @@ def _commands(stream: Stream, first_ns: int) -> HandCommands:
     first = role.dialect.index[_side(stream)]
     shape = stream.q.shape
     hand = model(role.dialect.model)
-    # what a source does not have is what the model's own client sends
+    # fields missing in the source get the values of the model's own client
     missing = {
         "dq": np.zeros(shape),
         "tau": np.zeros(shape),
@@ -277,6 +275,6 @@ def _ages(samples: SampleArray) -> tuple[Floats, Flags]:
 
 
 def counted(counts: NDArray[np.intp]) -> str:
-    """Numbers of motors with how often, in words."""
+    """Describe numbers of motors and how often each occurs."""
     found = Counter(counts.tolist())
     return ", ".join(f"{n} motors in {k} messages" for n, k in sorted(found.items()))

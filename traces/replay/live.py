@@ -1,4 +1,4 @@
-"""A replay on DDS: endpoints and the loop around a :class:`ReplayMachine`."""
+"""Run a :class:`ReplayMachine` on DDS: endpoints and loop."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ _NAP = 0.05
 class LiveReplay:
     """A machine's endpoints on a node, and its loop.
 
-    :param force: command beside others. By default this gives way to any other client of the hands.
+    :param force: command although other clients do. By default the replay stops if another client
+        commands the hands.
     :raises TopicConflict: another program commands one of the hands. So does :meth:`play`, when one
         starts to.
     """
@@ -73,7 +74,7 @@ class LiveReplay:
         return [topic for topic, writer in self._writers.items() if not writer.matched]
 
     def advice(self) -> str:
-        """What may be wrong where no hand is found."""
+        """Advice if no hand is found."""
         seen = {(e.topic, e.type_name) for e in self.node.endpoints() if e.kind == "writer"}
         spoken = self.machine.plan.dialect
         for d in DIALECTS.values():
@@ -93,7 +94,7 @@ class LiveReplay:
     def wait_ready(
         self, stop: threading.Event, waiting: Callable[[float], object] = lambda seconds: None
     ) -> bool:
-        """Wait until the hands listen and have published their state.
+        """Wait until the hands have a command reader and have published their state.
 
         :param waiting: called every 50 ms with the seconds so far; may raise.
         :returns: False when it was stopped.
@@ -111,8 +112,8 @@ class LiveReplay:
     def play(self, turn: Callable[[ReplayMachine], object] = lambda machine: None) -> None:
         """Play until the machine's end.
 
-        :param turn: called in every turn; it may stop the machine, and must not block. If it
-            raises, the hands are left at rest first.
+        :param turn: called in every cycle; it may stop the machine, and must not block. If it
+            raises, the hands are brought to rest first.
         """
         self._watch.restart()
         try:
@@ -136,13 +137,13 @@ class LiveReplay:
             self._sole.poll()
             self._read()
             commands = machine.step(clock.now())
-            if self._watch.away() <= PAUSE:  # else they were made before a pause
+            if self._watch.away() <= PAUSE:  # otherwise they date from before a pause
                 self._send(commands)
             now = clock.now()
             wait_until(clock, machine.wakes_at(now), spin=SPIN)
 
     def _send(self, commands: Commands) -> None:
-        # stamped first: a command that a stop holds back here is old, and is seen to be
+        # timestamp first: a command delayed here by a stopped process is then recognised as stale
         now_ns = time.time_ns()
         for topic, payload in self._encode.encode(commands):
             self._writers[topic].write_raw(payload, now_ns)

@@ -1,4 +1,4 @@
-"""Play a plan on hands: states in, commands out, on the caller's clock.
+"""State machine that plays a plan on hands: states in, commands out, on the caller's clock.
 
 ::
 
@@ -10,13 +10,13 @@
   the last pause, and that reports no fault.
 * RAMP leads from the pose that the hand has *now* to the next one of the session, at a stated
   speed.
-* PLAY sends the newest command that is due. The session's time goes on by at most :data:`HOLD` a
-  turn: after a delay of the caller it goes on where it was, and nothing is skipped.
+* PLAY sends the newest command that is due. Session time advances by at most :data:`HOLD` a cycle:
+after a delay of the caller the session continues where it was, and nothing is skipped.
 * LEAVE commands the hand to stay where it is, its motors locked where the dialect has a mode byte,
   as the modelled teleoperation client does at its end.
 
-After a pause of the caller (:data:`~dexkit.command_age.PAUSE`) everything begins again with WAIT:
-the hand may be elsewhere by now, and is led from there to where the session was.
+After a pause of the caller (:data:`~dexkit.command_age.PAUSE`) the machine starts over with WAIT:
+the hand may have moved, and is led from there back to the session.
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ __all__ = [
 ]
 
 HOLD = 0.02
-"""Seconds by which the session's time goes on at most from turn to turn."""
+"""Largest advance of session time in one cycle, seconds."""
 RAMP_SPEED = 0.5
-"""rad/s of the way to the first pose."""
+"""Speed on the way to the first pose, rad/s."""
 _ARRIVE = 0.3
 """Seconds at the end of the ramp, for the hand to catch up."""
 _PATIENCE = 2.0
 """Seconds to wait for states after a pause."""
 _LEAVING = 0.25
-"""Seconds of commands to stay, at the end: as the modelled teleoperation client."""
+"""Seconds of hold commands at the end, as the modelled teleoperation client sends."""
 _REPEAT = 0.02
 """Seconds after which a command is sent again where none is due: far below any time-out."""
 _FAR = 0.25
-"""Part of a joint's stroke that it may be away from its command, unless stated."""
+"""Default of the largest distance from the command, as a part of the joint's stroke."""
 
 Commands = Mapping[Side, Sequence[JointCommand]]
 Values = tuple[float, ...]
 
 
 class Phase(str, Enum):
-    """What a replay is doing."""
+    """Phase of a replay."""
 
     WAIT = "waiting"
     RAMP = "ramp"
@@ -112,10 +112,10 @@ class Guards:
 
 @dataclass
 class Progress:
-    """What a replay has done.
+    """Counters of a replay.
 
-    :ivar sent: commands, all hands together; ``passes``: complete ones.
-    :ivar held: seconds by which the session's time was held, pauses left out.
+    :ivar sent: commands, all hands together; ``passes``: complete passes over the session.
+    :ivar held: seconds for which session time was held, pauses not included.
     :ivar farthest: by side, the largest distance of a joint from its command while playing, rad,
         with the joint's index and the session's time.
     """
@@ -130,7 +130,7 @@ class Progress:
 class ReplayMachine:
     """One replay.
 
-    :ivar phase: what it is doing.
+    :ivar phase: present phase.
     :ivar at: seconds of the session that have been played.
     :ivar end: why it has ended, or is about to; None before.
     :ivar reason: the same as a sentence.
@@ -157,7 +157,7 @@ class ReplayMachine:
         self._rows = {s: _Rows(plan, t) for s, t in plan.tracks.items()}
         self._times: dict[Side, list[float]] = {s: t.t.tolist() for s, t in plan.tracks.items()}
         self._next = dict.fromkeys(plan.sides, 0)
-        """Place of the first command of each hand that is not yet due."""
+        """Index of each hand's first command that is not yet due."""
         self._seen: dict[Side, tuple[float, HandSeen]] = {}
         self._sent: dict[Side, tuple[float, Sequence[JointCommand]]] = {}
         self._far_since: dict[tuple[Side, int], float] = {}
@@ -180,15 +180,15 @@ class ReplayMachine:
         """How far each joint, in its unit, may be away from its command."""
         return self._far[side]
 
-    # -- what happens
+    # -- inputs
 
     def receive(self, now: float, side: Side, seen: HandSeen) -> None:
-        """A state came. One that is not finite is none."""
+        """Note a state. A state that is not finite is ignored."""
         if side in self._rows and now >= self._not_before and all(map(math.isfinite, seen.q)):
             self._seen[side] = (now, seen)
 
     def stop(self, end: End, reason: str) -> None:
-        """Stop; a hand that was commanded is left at rest first."""
+        """Stop; a hand that was commanded is brought to rest first."""
         if self.phase in (Phase.LEAVE, Phase.END):
             return
         self.end, self.reason = end, reason
@@ -200,10 +200,10 @@ class ReplayMachine:
         self._enter(Phase.END)
 
     def pause(self, now: float) -> None:
-        """The caller was paused: wait for states of now, and ramp again.
+        """The caller was paused: wait for fresh states, and ramp again.
 
-        States count that come :data:`~dexkit.command_age.SETTLE` seconds later or more: those that
-        waited in a queue are of before.
+        States count only from :data:`~dexkit.command_age.SETTLE` seconds later on: earlier ones may
+        have waited in a queue.
         """
         self._not_before = now + SETTLE
         self._seen.clear()
@@ -213,9 +213,9 @@ class ReplayMachine:
         if self.phase in (Phase.RAMP, Phase.PLAY):
             self._enter(Phase.WAIT)
         elif self.phase is Phase.LEAVE:
-            self._enter(Phase.END)  # the last poses are old: nothing more is commanded
+            self._enter(Phase.END)  # the last poses are stale: no further commands
 
-    # -- what follows
+    # -- outputs
 
     @property
     def missing(self) -> tuple[Side, ...]:
@@ -223,7 +223,7 @@ class ReplayMachine:
         return tuple(s for s in self.plan.sides if not self._usable(s))
 
     def wakes_at(self, now: float) -> float:
-        """When :meth:`step` should be called next."""
+        """Time at which :meth:`step` should be called next."""
         if self.phase is Phase.PLAY:
             due = [
                 times[self._next[s]] - self.at
@@ -234,7 +234,7 @@ class ReplayMachine:
         return now + min(1.0 / self._hand.command_rate, _REPEAT / 2)
 
     def step(self, now: float) -> Commands:
-        """One turn: the commands to be sent now, none where nothing is due.
+        """Run one cycle; return the commands to send now, if any are due.
 
         :param now: seconds on a monotonic clock; not before the last call.
         """
@@ -265,7 +265,7 @@ class ReplayMachine:
         self.phase, self._since = phase, 0.0
 
     def _usable(self, side: Side) -> bool:
-        """Whether a state of a hand came that clients take for one."""
+        """Whether a hand has published a state that clients accept."""
         if side not in self._seen:
             return False
         q = self._seen[side][1].q
@@ -283,8 +283,8 @@ class ReplayMachine:
         if self._faulty():
             return
         self._from = {s: self._seen[s][1].q for s in self.plan.sides}
-        # to a goal beyond a joint's range, if that was accepted, it does not go further than to its
-        # end: a ramp takes no longer than a stroke does
+        # an accepted goal beyond a joint's range counts as the end of the range: a ramp takes no
+        # longer than a stroke
         way = max(
             abs(min(max(c.q, low), high) - q)
             for s, start in self._from.items()
@@ -301,7 +301,7 @@ class ReplayMachine:
         self._enter(Phase.RAMP)
 
     def _goal(self, side: Side) -> Sequence[JointCommand]:
-        """The command that a hand is to be at when the session goes on."""
+        """The command at which the session continues."""
         return self._rows[side][max(self._next[side] - 1, 0)]
 
     def _ramped(self) -> Commands:
@@ -344,14 +344,15 @@ class ReplayMachine:
         return {s: self._parting(s) for s in self._sent}
 
     def _parting(self, side: Side) -> Sequence[JointCommand]:
-        """Stay where it is. Of a hand that has fallen silent that is not known: only damp it."""
+        """Command to stay. The position of a silent hand is unknown: it is damped only."""
         known = side in self._seen and self.end is not End.SILENT
         pose = self._seen[side][1].q if known else tuple(c.q for c in self._sent[side][1])
         found = self._client.parting(pose)
         return found if known else tuple(c._replace(kp=0.0) for c in found)
 
     def _note(self, now: float, commands: Commands) -> Commands:
-        if commands and self._shared:  # one message for all hands: who is left out in it is limp
+        # one message for all hands: a hand that is missing in it goes limp
+        if commands and self._shared:
             commands = {**{s: motors for s, (_, motors) in self._sent.items()}, **commands}
         for side, motors in commands.items():
             self._sent[side] = (now, motors)
@@ -415,9 +416,7 @@ def _mode(plan: Plan, index: int, status: int) -> int:
 
 
 class _Rows:
-    """The commands of a track as they are sent, each made when it is asked for; torques in the
-    dialect's units.
-    """
+    """The commands of a track as sent, created on demand; torques in the dialect's units."""
 
     def __init__(self, plan: Plan, track: Track) -> None:
         n = track.q.shape[1]

@@ -1,10 +1,9 @@
-"""Check the commands of a session before they reach a hand, and cure what may be cured.
+"""Check the commands of a session before they reach a hand, and correct what options allow.
 
-Each thing that is wrong is a :class:`Finding` with a name. It is *refused*, unless an option cures
-it (:class:`Wishes`) or it is accepted by name. What is left is a :class:`Plan`.
+Each problem is a :class:`Finding` with a name. It is *refused*, unless an option cures it
+(:class:`Wishes`) or it is accepted by name. The result is a :class:`Plan`.
 
-Rates, velocities and gaps are those at the chosen pace, and in the dialect of the hand that is to
-be driven.
+Rates, velocities and gaps are calculated at the chosen pace and in the dialect of the driven hand.
 """
 
 from __future__ import annotations
@@ -47,21 +46,21 @@ _TICK = 1e-6
 _WINDOW = 0.05
 """Seconds over which a velocity is taken: genuine clients step by 0.18 rad in 5 ms."""
 _FASTER = 1.1
-"""Times its speed limit that a joint may be commanded to turn: a hand lags behind."""
+"""Largest commanded speed, as a multiple of the joint's limit: a hand lags behind."""
 _THIN = 0.4
-"""Part of the rate of the model's client below which commands are a staircase."""
+"""Lowest command rate, as a part of the client's, before commands count as a staircase."""
 _HIGH_GAINS = 2.0
-"""Times the gains of the model's client from which on they are too high."""
+"""Gains are too high from this multiple of the client's on."""
 _BEYOND = 0.02
-"""Part of the stroke beyond a limit that is rounding or calibration."""
+"""Excess over a limit that counts as rounding or calibration, as a part of the stroke."""
 _MOVES = 0.02
-"""Part of the stroke that a joint has to be commanded over to be meant to move."""
+"""Smallest commanded motion that counts as intended, as a part of the stroke."""
 _MOST = 1_000_000
-"""Commands of a hand that is resampled: more than an hour at 200 Hz."""
+"""Most commands after resampling: more than an hour at 200 Hz."""
 _TOLD = 5
-"""Things that an import has left out that are told one by one."""
+"""Omissions of an import that are listed one by one."""
 _FITS = 0.01
-"""Share of commands outside the limits up to which the other hand's limits fit."""
+"""Largest share of commands outside the other hand's limits for these to count as fitting."""
 
 GAINS = ("recorded", "model")
 LIMIT = ("refuse", "clamp")
@@ -78,11 +77,11 @@ ACCEPTABLE = (
     "thin-rate",
     "zero-gains",
 )
-"""Findings that may be accepted as they are."""
+"""Findings that may be accepted by name."""
 
 
 class Level(str, Enum):
-    """What a finding means for the replay."""
+    """Consequence of a finding for the replay."""
 
     NOTE = "note"
     CURED = "cured"
@@ -95,7 +94,7 @@ class Level(str, Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about a session that matters to a hand.
+    """A property of a session that matters to a hand.
 
     :param name: e.g. ``thin-rate``.
     :param where: side and joint, or empty.
@@ -112,7 +111,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Wishes:
-    """How a session is to be played.
+    """Options of a replay.
 
     :param sides: hands to drive; None for all that it commands.
     :param dialect: of the hands to be driven; None for that of the session.
@@ -186,7 +185,7 @@ def joint_limits(spoken: Dialect, side: Side) -> JointLimits:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The commands to one hand as they will be sent; fields as in :class:`HandCommands`."""
+    """The commands to be sent to one hand; fields as in :class:`HandCommands`."""
 
     t: Floats
     q: Floats
@@ -207,7 +206,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is to be sent to the hands of a dialect, in seconds from the first command."""
+    """The commands for the hands of a dialect; times in seconds from the first command."""
 
     name: str
     dialect: Dialect
@@ -231,7 +230,7 @@ class Plan:
 
 @dataclass(eq=False)
 class Prepared:
-    """The findings, in the order of the checks, and what would be sent.
+    """The findings, in the order of the checks, and the resulting plan.
 
     :ivar plan: without any command: None.
     """
@@ -252,11 +251,11 @@ class Prepared:
 
 
 def prepare(session: RecordedCommands, wishes: Wishes = Wishes()) -> Prepared:
-    """Check a session, cure it as wished, and make the plan.
+    """Check a session, correct it as the options say, and make the plan.
 
     :raises SessionError: it has no hand that dexkit knows.
-    :raises UsageError: the wishes contradict the session: another model's dialect, a side that it
-        does not have.
+    :raises UsageError: the options contradict the session: a dialect of another model, or a missing
+        side.
     """
     return _Preparation(session, wishes).run()
 
@@ -276,7 +275,7 @@ class _Preparation:
         self.found.findings.append(Finding(name, Level.NOTE, text, where, cure))
 
     def judge(self, name: str, text: str, cure: str, *, cured: bool, where: str = "") -> None:
-        """A finding that is cured, accepted, or refused."""
+        """Add a finding that is cured, accepted or refused."""
         level = Level.REFUSED
         if cured:
             level = Level.CURED
@@ -286,7 +285,7 @@ class _Preparation:
         self.found.findings.append(Finding(name, level, text, where, shown))
 
     def refuse(self, name: str, text: str, cure: str = "", where: str = "") -> None:
-        """A finding that no option accepts."""
+        """Add a finding that is always refused."""
         self.found.findings.append(Finding(name, Level.REFUSED, text, where, cure))
 
     # -- the steps
@@ -365,7 +364,7 @@ class _Preparation:
         return {s: commands[s] for s in Side if s in sides}
 
     def _usable(self, side: Side, given: HandCommands) -> HandCommands | None:
-        """Without what cannot be sent; None if nothing is left."""
+        """Drop commands that cannot be sent; None if nothing is left."""
         n = len(self.model.joints[side])
         shared = self.recorded.length > n
         odd = (given.counts < n) | ((given.counts > n) & (not shared))
@@ -413,7 +412,7 @@ class _Preparation:
         return kept if len(kept) else None
 
     def _translated(self, given: HandCommands) -> Track:
-        """In the radians of the dialect, and at the pace."""
+        """Convert to the radians of the dialect and the chosen pace."""
         scale = 1.0
         if self.spoken.name != self.recorded.name and self.spoken.is_gripper:
             scale = self.spoken.q_open / self.recorded.q_open
@@ -428,7 +427,7 @@ class _Preparation:
         )
 
     def _side(self, side: Side, track: Track) -> bool:
-        """Whether the commands fit the other hand, and not this one."""
+        """Check whether the commands fit the other hand instead of this one."""
         other = Side.RIGHT if side is Side.LEFT else Side.LEFT
         mine, its = (self._outside(track, s) for s in (side, other))
         if mine <= 0.5 or its > _FITS:
@@ -547,7 +546,7 @@ class _Preparation:
                 cured=clamp,
                 where=str(side),
             )
-        # a little beyond is rounding, and always put right
+        # a small excess is rounding, and is always clamped
         return (
             clamped
             if clamp
@@ -595,7 +594,7 @@ class _Preparation:
         return _inserted(track, gaps + 1, track.t[gaps + 1] - track.period, gaps)
 
     def _jumps(self, side: Side, track: Track) -> bool:
-        """Whether a joint would have to turn faster than it can."""
+        """Check whether a joint would have to turn faster than it can."""
         if len(track) < 2:
             return False
         limits = joint_limits(self.spoken, side)
@@ -621,7 +620,7 @@ class _Preparation:
         return True
 
     def _stretched(self, tracks: dict[Side, Track]) -> dict[Side, Track]:
-        """Give every joint the time that it needs, and commands on its way."""
+        """Stretch time so that every joint can follow, and interpolate commands."""
         needed = {s: self._needed(s, t) for s, t in tracks.items() if len(t) > 1}
 
         def slower(middle: Floats, dt: Floats) -> Floats:
@@ -649,7 +648,7 @@ class _Preparation:
         return np.asarray((np.abs(np.diff(q, axis=0)) / limits.dq).max(axis=1))
 
     def _rate(self, side: Side, track: Track) -> None:
-        """Check that the commands are no staircase."""
+        """Check that the command rate is not too low (a staircase)."""
         if len(track) < 2:
             self.note("single", "there is a single command", str(side))
             return
@@ -692,7 +691,7 @@ def _from_states(t: Floats, q: Floats, hand: HandModel) -> HandCommands:
 
 
 def _apart(t: Floats) -> Floats:
-    """Times that ascend strictly: of equal ones each later one by a microsecond."""
+    """Make times strictly ascending, by microseconds."""
     return np.asarray(
         np.maximum.accumulate(t - _TICK * np.arange(len(t))) + _TICK * np.arange(len(t))
     )
@@ -701,10 +700,10 @@ def _apart(t: Floats) -> Floats:
 def _warped(
     tracks: Mapping[Side, Track], change: Callable[[Floats, Floats], Floats]
 ) -> dict[Side, Track]:
-    """All tracks with the same change of time.
+    """Apply one change of time to all tracks.
 
-    :param change: takes the middles and the lengths of the pieces between any two commands, and
-        returns their new lengths.
+    :param change: takes the midpoints and the lengths of the intervals between commands, and
+        returns the new lengths.
     """
     grid = np.unique(np.concatenate([t.t for t in tracks.values()]))
     lengths = change((grid[1:] + grid[:-1]) / 2, np.diff(grid))
@@ -713,13 +712,13 @@ def _warped(
 
 
 def _inserted(track: Track, at: Ints, times: Floats, rows: Ints) -> Track:
-    """With further commands, equal to ``rows``, at places and times."""
+    """Insert copies of the commands ``rows`` at places and times."""
     tables = {name: np.insert(v, at, v[rows], axis=0) for name, v in vars(track).items()}
     return Track(**{**tables, "t": np.insert(track.t, at, times)})
 
 
 def _at_times(track: Track, times: Floats) -> Track:
-    """The commands at other times: on a straight line between two, gains and mode held."""
+    """The commands at other times: positions interpolated linearly, gains and mode held."""
     before = np.clip(np.searchsorted(track.t, times, side="right") - 1, 0, len(track) - 1)
 
     def line(table: Floats) -> Floats:
@@ -738,7 +737,7 @@ def _at_times(track: Track, times: Floats) -> Track:
 
 
 def _filled(track: Track, where: Flags, period: float) -> Track:
-    """With commands on a straight line in some of the intervals."""
+    """Insert linearly interpolated commands into some of the intervals."""
     times = [track.t]
     for i in np.flatnonzero(where):
         a, b = track.t[i], track.t[i + 1]

@@ -1,4 +1,4 @@
-"""What a replay looks at in the states of a hand: positions, torques, and what is wrong."""
+"""Decode the parts of hand states that a replay supervises: positions, torques and faults."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class HandSeen:
     tripped: tuple[bool, ...] = ()
 
     def problem(self, names: Sequence[str]) -> str:
-        """What is wrong with the hand, or empty.
+        """Describe the fault of the hand; empty if there is none.
 
         :param names: of the joints.
         """
@@ -57,7 +57,7 @@ class StateWire:
         self.topics = {s: spoken.topics(s)[1] for s in Side}
 
     def seen(self, topic: str, data: bytes) -> dict[Side, HandSeen]:
-        """The hands in a state message; one that it is too short for is left out.
+        """The hands in a state message; a hand beyond its end is left out.
 
         :raises WireError: it is not of the dialect's state type.
         """

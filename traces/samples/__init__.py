@@ -1,6 +1,6 @@
-"""The recordings that ship with dexkit: where they are and what happens in them.
+"""Find the recordings that ship with dexkit, and their labels.
 
-README.md beside them tells what is real in them and what is not.
+README.md in this folder says which parts are genuine and which simulated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SAMPLES: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class SampleEvent:
-    """Something that was made to happen during the recording."""
+    """A deliberate event during the recording."""
 
     wall_ns: int
     seconds_from_first_message: float
@@ -40,7 +40,7 @@ class SampleEvent:
 
 @dataclass(frozen=True)
 class SampleLabels:
-    """What is known of a recording from outside it.
+    """Labels of a recording that its contents do not give.
 
     :param first_message_ns: log time of the first message, ns since the epoch.
     :param operator_zero_ns: the earliest instant of the operator's motion, ns since the epoch.

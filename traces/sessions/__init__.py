@@ -1,6 +1,6 @@
-"""Sessions as data: cut, merge and compare recordings; other formats in and out.
+"""Cut, merge and compare recordings, and convert other session formats.
 
-Everything here goes through recordings: an importer writes one, an exporter reads one, and what is
-compared or aligned are the :class:`~dexkit.traces.sessions.streams.Stream` objects of one. See
+All modules work on recordings: an importer writes one, an exporter reads one, and
+:class:`~dexkit.traces.sessions.streams.Stream` objects of recordings are compared and aligned. See
 docs/sessions.md.
 """

@@ -1,9 +1,9 @@
-"""Find by how much one recording of a motion is later than another: cross-correlation.
+"""Find the time offset between two recordings of one motion by cross-correlation.
 
-Both sides are put on one grid, and for every shift the correlation coefficient of all joints
-together is computed over the samples that overlap (with masks, so that gaps do not count). The
-figure is 1 for the same motion; how far it lies above the best shift elsewhere tells whether the
-motion has one place only.
+Both sides are sampled on one grid, and for every shift the correlation coefficient of all joints
+together is computed over the overlapping samples (with masks, so that gaps do not count). It is 1
+for the same motion; its distance from the best coefficient at another shift tells whether the match
+is unique.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the motion of B is found in A.
+    """Offset of the motion of B in A, and its quality.
 
     :param offset: seconds by which B is later: a time of B minus ``offset`` is a time of A.
     :param correlation: coefficient at that shift, -1 to 1.
@@ -96,7 +96,7 @@ def align(
             a_power = a_power + sums[1]
             b_power = b_power + sums[2]
             overlap = np.maximum(overlap, n)
-    # a shift of a side that stands still there correlates by chance
+    # at a shift where one side stands still, the correlation is random
     floor = 0.05 * np.sqrt(a_power.max(initial=0.0) * b_power.max(initial=0.0))
     power = np.sqrt(np.maximum(a_power, 0) * np.maximum(b_power, 0))
     least = max(least_overlap, 0.5 * float(overlap.max(initial=0.0)) * step)

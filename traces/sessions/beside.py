@@ -1,9 +1,9 @@
-"""Give an episode the times of the wire: each frame's true time, from a recording made beside it.
+"""Find the true time of each frame of an episode from a DDS recording of the same session.
 
 xr_teleoperate writes no times. The actions of its frames are the commands that it sent, so the
-recorded commands tell when: cross-correlation finds where the episode lies in the recording and by
-how much its rate is off, and then frames whose action is on the wire as it stands, in float32, get
-the time of that command. The others lie between them.
+recorded commands give their times. Cross-correlation finds the episode's place in the recording and
+the error of its rate. Then each frame whose action equals a recorded command in float32 gets the
+time of that command; the other frames are interpolated.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from dexkit.traces.writer import RecordingWriter
 __all__ = ["LEAST_CONFIDENCE", "FrameTimes", "find_times", "write_beside"]
 
 LEAST_CONFIDENCE = 0.5
-"""Below it an episode is not taken to be in a recording."""
+"""Lowest confidence at which an episode counts as found in a recording."""
 LEAST_CORRELATION = 0.995
-"""The same: the actions are the commands, so nearly 1 is what an episode reaches."""
+"""Lowest correlation, likewise: the actions are the commands, so an episode reaches nearly 1."""
 # Largest rms of the differences between actions and commands, in standard deviations of the
-# commands: a coefficient does not see another amplitude.
+# commands: a correlation coefficient is blind to the amplitude.
 _APART = 0.1
 
 # Ratios of the true period to the nominal one: the loop is late, hardly ever early.
 _SLOWEST, _FASTEST = 2.2, 0.95
-# Seconds of an episode by which it is looked for, and of a step of that search.
+# Length of the part of an episode that is searched for, and of a step of that search, seconds.
 _CHUNK, _COARSE = 40.0, 0.05
-# Seconds around its expected time in which a frame's command is looked for.
+# Seconds around its expected time within which a frame's command is searched.
 _WINDOW = 0.5
-# Commands in a row with one value, beyond which it does not tell the time.
+# Largest number of consecutive equal commands that still gives a time.
 _RUN = 4
-# Share of the frames that must lie in the recording.
+# Smallest share of frames that must lie within the recording.
 _COVERED = 0.9
-# Seconds of the wire that are kept before the first and behind the last frame.
+# Seconds of the recording that are kept before the first and after the last frame.
 _MARGIN = 1.0
 
 Times = NDArray[np.int64]
@@ -63,13 +63,13 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class FrameTimes:
-    """Where an episode lies in a recording.
+    """The place of an episode in a recording.
 
     :param times_ns: of each frame, on the recording's clock.
     :param rate: frames a second, on average.
     :param correlation: of the actions with the commands in force at these times.
     :param elsewhere: the best coefficient at another place.
-    :param matched: share of the frames whose action is on the wire as it stands.
+    :param matched: share of the frames whose action equals a recorded command.
     """
 
     times_ns: Times
@@ -93,7 +93,7 @@ class FrameTimes:
 
 
 Pairs = Sequence[tuple[Floats, Stream]]
-"""The actions of a hand, and its commands on the wire."""
+"""The actions of a hand, and its recorded commands."""
 
 
 def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
@@ -160,7 +160,7 @@ def _coarse(pairs: Pairs, nominal: Floats) -> tuple[float, float, float]:
 
 
 def _liveliest(pairs: Pairs, nominal: Floats) -> slice:
-    """The frames in which most happens, so many seconds of them."""
+    """The stretch of given length with the most motion."""
     if nominal[-1] <= _CHUNK:
         return slice(0, len(nominal))
     moves = sum(
@@ -175,7 +175,7 @@ def _liveliest(pairs: Pairs, nominal: Floats) -> slice:
 
 
 def _refine(pairs: Pairs, nominal: Floats, begin: float, period: float) -> tuple[float, float]:
-    """Better values of both, for the whole episode."""
+    """Refine both values over the whole episode."""
     length = max(float(nominal[-1]), 1.0)
     widths = (min(0.03, 0.6 / length), 0.15)
     for _ in range(5):
@@ -194,8 +194,8 @@ def _refine(pairs: Pairs, nominal: Floats, begin: float, period: float) -> tuple
 
 
 def _agreement(pairs: Pairs, times: Floats) -> tuple[float, float]:
-    """Of the actions with the commands in force at these times, all joints together: correlation
-    coefficient, and rms of the differences in standard deviations.
+    """Agreement of the actions with the commands in force at these times, over all joints:
+    correlation coefficient, and rms difference in standard deviations.
     """
     at = np.round(times * 1e9).astype(np.int64)
     covariance = power_a = power_b = apart = 0.0
@@ -242,10 +242,10 @@ def _match(pairs: Pairs, expected: Floats) -> tuple[Floats, float]:
     kept = _ascending(anchors)
     if len(kept) < 2:
         return expected, float(matched.mean())
-    # what is left of the expected time is the loop's jitter and slow drift
+    # the residuals of the expected times are the loop's jitter and slow drift
     late = np.interp(np.arange(len(expected)), kept, anchors[kept] - expected[kept])
     times = expected + late
-    # equal times would not be those of two frames
+    # two frames must not get equal times
     least = 1e-6
     for i in range(1, len(times)):
         times[i] = max(times[i], times[i - 1] + least)
@@ -276,7 +276,7 @@ def _ascending(anchors: Floats) -> NDArray[np.intp]:
 def write_beside(
     session: Session, trace: Trace, out: Path, *, embed: bool = False, overwrite: bool = False
 ) -> tuple[int, FrameTimes]:
-    """Write an episode with the wire of its time: hands from the wire, the rest at its true time.
+    """Write an episode with its recording: hands from the recording, the rest at its true time.
 
     :returns: the number of messages, and where the episode lies.
     :raises SessionError: as :func:`find_times`, or most of the episode is not in the recording.
@@ -320,7 +320,7 @@ def write_beside(
 def _aligned(
     session: Session, found: FrameTimes, keep: NDArray[np.bool_], hands: set[str]
 ) -> Session:
-    """The session at its true times, without the hands that the wire has."""
+    """The session at its true times, without the hands that the recording has."""
     places = np.flatnonzero(keep)
     numbers = np.round((session.times_ns - (session.first_ns or 0)) * session.rate / 1e9)
     rest, current = [], "{}"

@@ -1,4 +1,4 @@
-"""Compare two recordings of one session: the same commands played twice, or to two hands.
+"""Compare two recordings of one session, such as two replays or two hands.
 
 B is shifted onto A (by the commands, whose motion is the same in both), then every joint that both
 have is compared at A's times, within what both cover and not across gaps.
@@ -22,7 +22,7 @@ from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 __all__ = ["Comparison", "JointDifference", "TopicCounts", "align_traces", "compare"]
 
 LEAST_CORRELATION = 0.9
-"""Below it two recordings are not taken for the same session."""
+"""Lowest confidence at which two recordings count as one session."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class JointDifference:
     :param rms: in ``unit``.
     :param worst: the largest difference, in ``unit``, ``worst_at`` seconds after A's first message.
     :param first_at: where it first exceeds the tolerance, likewise; None where it never does.
-    :param samples: places that were compared; 0: they have no time in common.
+    :param samples: number of compared samples; 0 if the recordings do not overlap.
     """
 
     part: str
@@ -59,7 +59,7 @@ class JointDifference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two recordings differ in.
+    """Differences of two recordings.
 
     :param offset: seconds by which B's clock is later than A's for the same motion.
     :param alignment: how that was found; None if it was given.

@@ -25,11 +25,11 @@ CUT, MERGE = "dexkit_cut", "dexkit_merge"
 
 Metadata = Mapping[str, Mapping[str, str]]
 
-# Totals of the recorder, which are those of the whole.
+# Totals of the recorder, which apply to the whole recording only.
 _RECORDER, _TOTALS = "dexkit_recorder", ("messages",)
 # ns of recorded time within which a second copy of a message is looked for.
 _WINDOW = 2 * 10**9
-# Common messages without which two clocks cannot be compared.
+# Fewest common messages for a comparison of two clocks.
 _LEAST_COMMON = 10
 
 
@@ -47,10 +47,10 @@ class Span:
 
 @dataclass(frozen=True)
 class Merged:
-    """What a merge did.
+    """Result of a merge.
 
     :param written: messages in the result.
-    :param duplicates: messages that were there already and were left out.
+    :param duplicates: duplicate messages that were left out.
     """
 
     written: int

@@ -1,6 +1,6 @@
-"""Episodes of xr_teleoperate: ``data.json`` of every published version of its writer.
+"""Read episodes of xr_teleoperate: ``data.json`` of every published version of its writer.
 
-The versions say ``1.0.0`` all; they are told apart by what they write
+All versions write ``1.0.0``; they are told apart by their contents
 (docs/sources/sessions.md#a1): ``left_hand`` for ``left_ee`` before v1.0, joint names of the left
 arm before v1.4, a file that is written item by item since v1.3. An interrupted file is salvaged up
 to its last whole item.
@@ -58,7 +58,7 @@ _COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
 _PICTURES = ("colors", "depths")
 _HANDS = {f"{side}_{end}": f"{side}{HAND}" for side in Side for end in ("ee", "hand")}
 _NS = 10**9
-# Hz that are believed of a file.
+# Plausible frame rates of a file, Hz.
 _RATES = (0.1, 2000.0)
 # Share of samples that must lie within a model's limits, and how far beyond they may lie, rad.
 _WITHIN, _BEYOND = 0.99, 0.35
@@ -73,8 +73,9 @@ _VERSIONS = {
 class Options:
     """How to import.
 
-    :param rate: frames a second in place of the file's; None for that.
-    :param hand: the model's name; ``"none"`` for no model; None to tell it by the number of joints.
+    :param rate: frames per second instead of the file's; None to use the file's.
+    :param hand: the model's name; ``"none"`` for no model; None to detect it by the number of
+        joints.
     :param correct: exchange sides where version and data say that they are swapped.
     """
 
@@ -84,7 +85,7 @@ class Options:
 
 
 DEFAULT = Options()
-"""Everything told by the source."""
+"""Default options: everything as in the source."""
 
 
 @dataclass
@@ -104,7 +105,8 @@ class Document:
     rest: dict[str, Any] = field(default_factory=dict)
 
 
-# -- the file ------------------------------------------------------------------------------------
+# -- reading the file
+# ------------------------------------------------------------------------------------
 
 
 def read_document(path: Path) -> Document:
@@ -113,7 +115,7 @@ def read_document(path: Path) -> Document:
     :raises SessionError: it cannot be read, or no item in it is whole.
     """
     data = read_bytes(path, _LARGEST, error=SessionError)
-    # an interrupted file may end within a character
+    # an interrupted file may end inside a character
     return parse_document(data.decode("utf-8-sig", "replace"), str(path))
 
 
@@ -149,7 +151,7 @@ def parse_document(text: str, origin: str) -> Document:
 
 
 def _salvage(text: str) -> dict[str, Any]:
-    """What is whole at the beginning of a document: its members, and the items of ``data``."""
+    """Recover the complete members and ``data`` items at the beginning of a document."""
     decoder = json.JSONDecoder()
     space = re.compile(r"[\s,]*")
     found: dict[str, Any] = {}
@@ -229,13 +231,14 @@ def _layout(document: Document) -> str:
     return "streamed" if document.streamed else "whole"
 
 
-# -- the frames ----------------------------------------------------------------------------------
+# -- building the frames
+# ----------------------------------------------------------------------------------
 
 
 def session_of(
     document: Document, source: Path, folder: Path, form: str, options: Options = DEFAULT
 ) -> Session:
-    """Make a session of frames as xr_teleoperate has them.
+    """Make a session from frames of xr_teleoperate.
 
     :raises SessionError: no frame can be used.
     """
@@ -535,7 +538,7 @@ def _cameras(items: Sequence[dict[str, Any]], folder: Path, problems: Problems) 
 def _rest(
     items: Sequence[dict[str, Any]], carried: Carried, cameras: Iterable[str], numbered: bool
 ) -> list[str]:
-    """What of each frame no part and no camera carries, as JSON; empty where it does not change.
+    """Data of each frame outside of parts and cameras, as JSON; empty where they do not change.
 
     :param numbered: the number of a frame follows from its time.
     """
@@ -565,7 +568,7 @@ def _rest(
 
 
 def _names(items: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """How the source calls each hand: ``{"left_hand": "left_ee"}``."""
+    """The source's name of each hand: ``{"left_hand": "left_ee"}``."""
     found = {}
     for item in items:
         for key in _DIRECTIONS:

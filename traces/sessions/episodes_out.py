@@ -1,7 +1,7 @@
 """Write episodes as xr_teleoperate does since v1.3.
 
-A session that was imported from an episode is written with its own frames, item by item as it was;
-any other recording is sampled at one rate.
+A session that was imported from an episode is written with its original frames and items; any other
+recording is sampled at one rate.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def export_episodes(
 
 
 def _text(info: Any, text: Any, items: Sequence[Any]) -> bytes:
-    """The file as xr_teleoperate lays it out, but for an item in one line."""
+    """The file in xr_teleoperate's layout, except that each item is on one line."""
     head = (json.dumps(value, ensure_ascii=False, indent=4) for value in (info, text))
     frames = ",\n".join(json.dumps(item, ensure_ascii=False) for item in items)
     text = '{{\n"info": {},\n"text": {},\n"data": [\n{}\n]\n}}'.format(*head, frames)
@@ -160,7 +160,7 @@ def _info(source: Source, rate: int, result: Result, start_ns: int) -> dict[str,
 
 
 def _name(part: str) -> str:
-    """What xr_teleoperate calls a part."""
+    """xr_teleoperate's name of a part."""
     return f"{part.removesuffix(HAND)}_ee" if part.endswith(HAND) else part
 
 
@@ -179,13 +179,13 @@ def _object(text: str | None) -> dict[str, Any] | None:
 def _as_it_was(
     source: Source, names: Mapping[str, Any], task: str | None, result: Result
 ) -> Episode:
-    """The frames of an imported episode, each as it stood in its file."""
+    """The original frames of an imported episode."""
     record, trace = source.record, source.trace
     rest = {
         m.log_time_ns: _object(ros_types.decode_string(m.data)) or {}
         for m in (trace.messages([REST_TOPIC]) if REST_TOPIC in trace.topics else ())
     }
-    if _ALIGNED in record:  # every frame has its number, and the hands are the wire's
+    if _ALIGNED in record:  # every frame has its number, and the hands come from the DDS recording
         times = set(rest)
     else:
         times = {t for s in source.streams for t in s.times_ns.tolist()} | rest.keys()
@@ -238,7 +238,7 @@ def _as_it_was(
 
 
 def _at_frames(stream: Stream, times: Sequence[int]) -> Stream:
-    """A stream of the wire at the times of the frames; without those where it has a gap."""
+    """A recorded stream at the times of the frames, without frames in its gaps."""
     at = np.array(times, dtype=np.int64)
     method = hold if stream.kind == COMMAND else interpolate
     values = {f: method(stream.times_ns, v, at) for f, v in stream.values.items()}
@@ -256,7 +256,7 @@ def _at_frames(stream: Stream, times: Sequence[int]) -> Stream:
 
 
 def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> None:
-    """Put the values of a stream where they stood."""
+    """Insert the values of a stream at their original places."""
     key = _KEYS[stream.kind]
     for suffix in (f"_{STATE}", f"_{COMMAND}"):
         name = name.removesuffix(suffix)

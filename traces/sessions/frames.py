@@ -1,7 +1,7 @@
-"""A recording as frames of one rate: states interpolated, commands held, nothing across a gap.
+"""Sample a recording as frames of one rate: states interpolated, commands held, no values in gaps.
 
-The grid is in the recording's own time: frame k is at start + k / fps. Where a stream has a gap
-there, there is no frame, and a new run of frames begins behind it.
+The grid is in the recording's own time: frame k is at start + k / fps. In a gap of a stream there
+is no frame, and a new run of frames begins after it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _LEAST = 2  # frames of a run
 class Pictures:
     """The single pictures of a camera.
 
-    :param load: the picture at a place, as its file has it; None where it cannot be had.
-    :param paths: where they are, or were, relative to the session.
+    :param load: returns the encoded picture at an index; None if it is not available.
+    :param paths: their files, present or former, relative to the session.
     """
 
     camera: str
@@ -54,8 +54,8 @@ class Source:
     """A recording to be sampled.
 
     :param streams: those with at least two samples.
-    :param lost: what frames cannot hold.
-    :param problems: what cannot be read.
+    :param lost: data that frames cannot represent.
+    :param problems: data that cannot be read.
     """
 
     trace: Trace
@@ -78,7 +78,7 @@ class Source:
 
     @property
     def rate(self) -> float:
-        """Frames a second that it has: its pictures', its commands', else its states', in Hz."""
+        """Its natural frame rate, Hz: of its pictures, else its commands, else its states."""
         for times in (
             [p.times_ns for p in self.pictures],
             [s.times_ns for s in self.streams if s.kind == COMMAND],
@@ -91,7 +91,7 @@ class Source:
 
     @property
     def task(self) -> str:
-        """What was to be done, as the recording says it."""
+        """The task stated in the recording."""
         return self.record.get("task", "")
 
 
@@ -102,7 +102,7 @@ class Frames:
     :param times_ns: shape (n,).
     :param values: by part, kind and field; shape (n, joints).
     :param pressure: by part, shape (n, elements).
-    :param pictures: by camera, the place of each frame's picture.
+    :param pictures: by camera, the index of each frame's picture.
     """
 
     times_ns: NDArray[np.int64]
@@ -194,7 +194,7 @@ def _reference(text: str) -> dict[str, object]:
 
 
 def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
-    """The frames of a recording, in runs without gaps; and what was left out.
+    """The frames of a recording in runs without gaps, and descriptions of omitted data.
 
     :raises SessionError: there is no time at which all streams have values.
     """

@@ -1,4 +1,4 @@
-"""The metadata record of an imported recording: where it is from and what it does not know."""
+"""The metadata record of an imported recording: its source, and which data are missing."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ RECORD = "dexkit_import"
 NOMINAL = "nominal"
 """Value of its ``clock``: the source has no times, only a rate that was asked for."""
 EPOCH_NS = 86_400 * 10**9
-"""Where nominal times begin in a session without a date: 1970-01-02, for 0 means "unknown"."""
+"""Begin of nominal times in a session without a date: 1970-01-02, because 0 means "unknown"."""
 _ABSENT = "absent "
 
 
 def absent_key(topic: str) -> str:
-    """The key that names the fields which a topic's messages have and the source had not."""
+    """Key of the list of fields of a topic's messages that the source does not have."""
     return f"{_ABSENT}{topic}"
 
 

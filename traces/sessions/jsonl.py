@@ -1,8 +1,8 @@
-"""Sessions as JSON lines: one frame a line, in the form of xr_teleoperate's items.
+"""Read sessions from JSON lines: one frame per line, in the form of xr_teleoperate's items.
 
 A line is an object with ``states`` and ``actions`` as in a ``data.json``, and ``timestamp_ns`` or
 ``timestamp`` (seconds) if there are times. A first line without them may hold ``info`` and
-``text``. A line that cannot be read is left out and told; the others stay.
+``text``. A line that cannot be read is skipped and reported.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LARGEST = 1 << 30
 
 
 def parse_lines(data: bytes) -> tuple[Document, list[str]]:
-    """The frames of a file, and the places of the lines that cannot be read."""
+    """The frames of a file, and the numbers of unreadable lines."""
     document, bad = Document(), []
     for number, line in enumerate(data.splitlines(), 1):
         if not line.strip():

@@ -1,4 +1,4 @@
-"""What reading and writing LeRobot datasets have in common (docs/sources/sessions.md#c)."""
+"""Names and formats shared by reading and writing LeRobot datasets (docs/sources/sessions.md#c)."""
 
 from __future__ import annotations
 

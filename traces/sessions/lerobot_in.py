@@ -1,9 +1,9 @@
 """Read LeRobot datasets of v2.0, v2.1 and v3.0: every episode as a session.
 
-A dataset has one vector of positions a frame, whose elements have names; the names tell hands and
-arms apart. unitree_lerobot names the right Dex3's columns thumb, index, middle, while the numbers
-are in the order of the wire, thumb, middle, index (docs/sources/sessions.md#b2): there the place
-counts and not the name, which is noted.
+A dataset has one vector of positions per frame with named elements; the names identify hands and
+arms. unitree_lerobot names the right Dex3's columns thumb, index, middle, while the numbers
+are in the order of the wire, thumb, middle, index (docs/sources/sessions.md#b2): there the index
+counts instead of the name, and a note says so.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Dataset:
     def read(self, episode: int) -> Session:
         """Read one episode.
 
-        :raises SessionError: its data are missing or of another form than the features say.
+        :raises SessionError: its data are missing or of another form than the features declare.
         """
         problems = Problems()
         row = self._rows[episode]
@@ -282,7 +282,7 @@ class Dataset:
                 yield Part(group.name, group.joints, good, group.model)
 
     def _groups(self, names: Sequence[str], corrections: list[str]) -> list[_Group]:
-        """The parts that a vector's elements belong to."""
+        """Assign a vector's elements to parts."""
         stated = self._stated_groups(names)
         if stated is not None:
             return stated
@@ -301,7 +301,7 @@ class Dataset:
         return groups
 
     def _stated_groups(self, names: Sequence[str]) -> list[_Group] | None:
-        """As dexkit's export wrote them down."""
+        """The assignment stored by dexkit's export."""
         stated = self._extension.get("parts")
         if not isinstance(stated, list):
             return None
@@ -345,7 +345,8 @@ class Dataset:
             return _Group(f"{side}{HAND}", tuple(j.name for j in hand.joints[side]), columns, hand)
         return None
 
-    # -- pictures and the rest -----------------------------------------------------------------
+    # -- pictures and other columns
+    # -----------------------------------------------------------------
 
     def _cameras(
         self, episode: int, row: Mapping[str, Any], table: Any, problems: Problems

@@ -1,7 +1,7 @@
 """Write LeRobot datasets v3.0, directly (docs/sources/sessions.md#c2).
 
 Every recording is an episode, or several where it has gaps. Features are named by joint; pictures
-are embedded as they are, without being encoded again.
+are embedded without being encoded again.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ _UNNAMED = "unnamed task"
 
 @dataclass
 class Result:
-    """What an export did.
+    """Result of an export.
 
-    :param lost: what the dataset cannot hold.
-    :param problems: what was left out, and recordings that were refused.
+    :param lost: data that the dataset cannot represent.
+    :param problems: omitted data and refused recordings.
     """
 
     episodes: int = 0
@@ -83,7 +83,7 @@ class _Feature:
 
 @dataclass(frozen=True)
 class _Scheme:
-    """What all episodes of a dataset have in common."""
+    """The features shared by all episodes of a dataset."""
 
     features: tuple[_Feature, ...]
     parts: tuple[dict[str, Any], ...]
@@ -252,7 +252,7 @@ class _Writer:
         return self.root / f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 
     def close(self) -> None:
-        """Write what is known at the end.
+        """Write totals and statistics.
 
         :raises SessionError: there is no episode.
         """
@@ -410,7 +410,7 @@ def _scheme(source: Source) -> _Scheme:
 
 
 def _names(streams: Sequence[Any]) -> tuple[str, ...]:
-    """A name of its own for each joint."""
+    """A unique name for each joint."""
     plain = [n for s in streams for n in s.names]
     if len(set(plain)) == len(plain):
         return tuple(plain)

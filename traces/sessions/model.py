@@ -1,14 +1,13 @@
-"""A session between its source format and a recording: frames of parts, pictures and the rest.
+"""Intermediate form of an imported session: frames of parts, pictures and other data.
 
 Importers make a :class:`Session`, :func:`write` makes a recording of it:
 
-* a hand whose model is known goes to the topics of that model, so that everything that works on
-  recordings works on it;
+* a hand of a known model goes to the topics of that model, so that all tools for recordings apply;
 * other groups of joints go to ``rt/session/PART/state`` and ``.../cmd`` as JointState;
 * pictures are referenced by path and time, or embedded as they are;
 * everything else goes, as JSON, to ``rt/session/frame/rest``, so that nothing is lost.
 
-The metadata record :data:`~dexkit.traces.sessions.imported.RECORD` says where the session is from,
+The metadata record :data:`~dexkit.traces.sessions.imported.RECORD` names the source of the session,
 whether its times were measured, what was corrected, and which fields are 0 because the source does
 not have them.
 """
@@ -53,20 +52,20 @@ MEASURED = "measured"
 REST_TOPIC = ros_types.group_topic("frame", "rest")
 _REFERENCE, _PICTURE = "reference", "compressed"
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
-# Problems that are told one by one.
+# Problems that are listed one by one.
 _MOST = 200
 
 
 class Problems:
-    """What is wrong with a source, as sentences; the same thing at many places is one of them."""
+    """Problems of a source as sentences; equal problems at several places are counted."""
 
     def __init__(self) -> None:
         self._places: dict[str, list[str]] = {}
 
     def add(self, what: str, place: str = "") -> None:
-        """Note a problem.
+        """Add a problem.
 
-        :param place: where; told for the first one, the others are counted.
+        :param place: where; given for the first, the others are counted.
         """
         if what in self._places or len(self._places) < _MOST:
             self._places.setdefault(what, []).append(place)
@@ -75,7 +74,7 @@ class Problems:
         return bool(self._places)
 
     def sentences(self) -> list[str]:
-        """One a problem."""
+        """One sentence for each problem."""
         found = []
         for what, places in self._places.items():
             more = f", and {len(places) - 1} more" if len(places) > 1 else ""
@@ -164,10 +163,10 @@ class Session:
 
 
 def models_by_joints(count: int) -> list[HandModel]:
-    """The hand models with so many joints, in radians.
+    """The hand models in radians with this number of joints.
 
-    Hands in parts of their travel are not told by their numbers: Inspire's and BrainCo's have six
-    joints from 0 to 1 each, and count in opposite directions.
+    Hands with q in parts of their travel cannot be detected this way: Inspire's and BrainCo's both
+    have six joints from 0 to 1, which count in opposite directions.
     """
     names = dict.fromkeys(d.model for d in DIALECTS.values())
     hands = [m for m in map(model, names) if m.unit == "rad"]
@@ -205,7 +204,7 @@ def messages(
 ) -> Iterator[tuple[int, int, bytes]]:
     """The messages of a session in order of time: time, channel, payload.
 
-    Adds the channels to the recording, and to the session's facts what the record is to say.
+    Adds channels to the recording, and facts for the metadata record to the session.
     """
     sources: list[tuple[int, Callable[[int], bytes | None]]] = []
     for part in session.parts:
@@ -228,7 +227,7 @@ def messages(
 
 
 def record_of(session: Session, *, embed: bool = False) -> dict[str, str]:
-    """What the metadata record says, after all messages were made."""
+    """The contents of the metadata record; call it after all messages were made."""
     record = {
         "version": __version__,
         "format": session.form,
@@ -336,7 +335,7 @@ def _motor_encoder(
 
 
 def _mode(dialect: Dialect, joint: int) -> int:
-    """The mode byte of a command that is followed."""
+    """The mode byte of a driving command."""
     if dialect.mode_byte is ModeByte.RIS:
         return joint | int(JointMode.FOC) << 4
     return int(JointMode.FOC) if dialect.mode_byte is ModeByte.STATUS else 0

@@ -1,8 +1,8 @@
-"""Payloads of earlier layouts of Unitree's messages, turned into the present ones by name.
+"""Convert payloads of earlier layouts of Unitree's messages to the present ones, by member name.
 
-The layout of a bag is that of its schema. Bags without schemas are tried with the present layout
-and with the earlier ones (docs/sources/unitree-dex.md#a3, docs/sources/sessions.md#d2): plain CDR
-does not say which it is, but a payload has the right length for one of them only.
+A bag's schema gives the layout. Without schemas the present and the earlier layouts are tried
+(docs/sources/unitree-dex.md#a3, docs/sources/sessions.md#d2): plain CDR does not name its layout,
+but a payload has the right length for only one of them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _FORMS = {
 
 
 def earlier_layouts(type_name: str) -> dict[str, schemas.Struct]:
-    """The layouts that a type had before, by their time."""
+    """Earlier layouts of a type, by date."""
     return {
         f"of {layout.when}": schemas.parse("omgidl", type_name, omgidl(layout.struct))
         for layout in EARLIER.get(type_name, ())
@@ -53,9 +53,9 @@ def earlier_layouts(type_name: str) -> dict[str, schemas.Struct]:
 def converter(
     type_name: str, recorded: schemas.Struct
 ) -> tuple[Callable[[bytes], bytes] | None, list[str]]:
-    """What turns payloads of a recorded layout into the present one.
+    """Make a converter from a recorded layout to the present one.
 
-    :returns: (None if they are the same as they are; the members that differ).
+    :returns: (converter, or None if the layouts are equal; the members that differ).
     :raises TraceUnsupported: dexkit does not know the type.
     """
     if type_name not in STRUCTS:
@@ -75,7 +75,7 @@ def converter(
 def matching_layout(
     type_name: str, payloads: Sequence[bytes]
 ) -> tuple[str, schemas.Struct | None] | None:
-    """The layout with which all payloads can be read: its time and structure.
+    """The layout that fits all payloads: its date and structure.
 
     ``("present", None)`` for the present one, None if there is none.
     """
@@ -101,7 +101,7 @@ def decode(layout: schemas.Struct, data: bytes) -> dict[str, Any]:
         raise WireError(f"{layout.name}: not plain CDR")
     reader = _Reader(data[4:], "<" if data[1] else ">")
     found: dict[str, Any] = reader.node(layout)
-    # writers may fill up to a multiple of four bytes
+    # writers may pad to a multiple of four bytes
     if reader.left >= 4:
         raise WireError(f"{layout.name}: {reader.left} bytes are left over")
     return found
@@ -147,7 +147,7 @@ class _Reader:
 
 
 def _message(layout: OwnStruct, cls: type[Any], values: dict[str, Any]) -> Any:
-    """A message of the present layout; members that the values lack have their default."""
+    """A message of the present layout; missing members get their default."""
     given: dict[str, Any] = {}
     for member in layout.fields:
         if member.name not in values:

@@ -30,20 +30,20 @@ class Picture:
 
 
 def safe_path(folder: Path, name: str) -> Path | None:
-    """The file that a session's path means; None if that is not below the session's folder."""
+    """The file of a session's path; None if it is outside of the session's folder."""
     pure = PurePosixPath(name.replace("\\", "/"))
     if not name or "\x00" in name or pure.is_absolute() or ".." in pure.parts:
         return None
     try:
         root = os.path.realpath(folder)
         found = os.path.realpath(os.path.join(root, *pure.parts))
-    except ValueError:  # not a name that a file can have
+    except ValueError:  # not a valid file name
         return None
     return Path(found) if os.path.commonpath([root, found]) == root else None
 
 
 def read_picture(folder: Path, name: str) -> tuple[Picture | None, str]:
-    """(the picture, or None; why it cannot be had, as the end of "pictures that ...")."""
+    """(the picture, or None; the reason, as the end of "pictures that ...")."""
     path = safe_path(folder, name)
     if path is None:
         return None, "are not below the session's folder"

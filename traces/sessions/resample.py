@@ -1,4 +1,4 @@
-"""Values of a stream at other times: held or interpolated, never across a gap."""
+"""Resample a stream: hold or interpolate, never across a gap."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["gap_of", "hold", "interpolate", "period_of"]
 
 Times = NDArray[np.int64]
 
-# ns by which a sample may be beside a wanted time and be taken as it is: times that are calculated
-# twice differ by rounding.
+# Tolerance, ns, within which a sample is used without interpolation: calculated times differ by
+# rounding.
 _SNAP = 1000
-# A gap is longer than so many usual periods, and at least so many seconds.
+# A gap is longer than this many periods, and at least this many seconds.
 _PERIODS = 10
 _LEAST = 0.1
 
@@ -25,7 +25,7 @@ def period_of(times_ns: Times) -> float:
 
 
 def gap_of(times_ns: Times) -> float:
-    """Seconds between two samples from which on they are taken to be apart."""
+    """Interval between two samples, seconds, that counts as a gap."""
     return max(_PERIODS * period_of(times_ns), _LEAST)
 
 
@@ -48,7 +48,7 @@ def hold(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None
 
 
 def interpolate(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None) -> Floats:
-    """Values between neighbours on a straight line; NaN outside and within a gap.
+    """Linear interpolation; NaN outside of the data and within a gap.
 
     :param values: shape (n, k).
     :param gap: seconds; None for :func:`gap_of`.

@@ -1,7 +1,7 @@
-"""The few standard ROS 2 types in imported recordings, as plain CDR.
+"""Encode and decode the standard ROS 2 types in imported recordings, as plain CDR.
 
-Imported data that no message of Unitree's can carry are written as types that Foxglove, PlotJuggler
-and rosbags know: groups of joints as ``sensor_msgs/msg/JointState``, pictures as
+Imported data that do not fit Unitree's messages use types that Foxglove, PlotJuggler and rosbags
+know: groups of joints as ``sensor_msgs/msg/JointState``, pictures as
 ``sensor_msgs/msg/CompressedImage``, everything else as JSON in ``std_msgs/msg/String``.
 """
 
@@ -53,7 +53,7 @@ class RosType:
 
     @property
     def dds_name(self) -> str:
-        """Its name on DDS, as the reader of recordings gives it."""
+        """Its DDS name, as in the reader of recordings."""
         return dds_type(self.ros_name)
 
     def definition(self, topic: str, metadata: dict[str, str] | None = None) -> Definition:
@@ -76,7 +76,7 @@ STRING = RosType("std_msgs/msg/String", "string data\n")
 
 @dataclass(frozen=True)
 class JointState:
-    """Joints of one instant; a column that is not known is empty.
+    """Joints at one time; an unknown column is empty.
 
     :param stamp_ns: ns since the epoch.
     """
@@ -90,7 +90,7 @@ class JointState:
 
 @dataclass(frozen=True)
 class CompressedImage:
-    """A picture as its file has it.
+    """An encoded picture.
 
     :param form: ``jpeg`` or ``png``.
     """
@@ -143,7 +143,7 @@ class _Out:
 
 
 class _In:
-    """Takes one field after the other.
+    """Reads fields in order.
 
     :raises WireError: not plain little-endian CDR, or it ends too early.
     """

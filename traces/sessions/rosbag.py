@@ -1,8 +1,8 @@
 """ROS 2 bags, sqlite3 and mcap, in and out, with the library rosbags (the extra ``rosbag``).
 
-A bag's topics are the DDS topics without ``rt/``, and its payloads are the samples. So nothing is
-decoded, except where a bag has an earlier layout of one of Unitree's types (unitree_ros2 before
-v0.3.0 had that of 2024): these are turned into the present layout, which is noted.
+A bag's topics are the DDS topics without ``rt/``, and its payloads are the samples, so they are
+copied. Only payloads in an earlier layout of one of Unitree's types (unitree_ros2 before v0.3.0 had
+that of 2024) are converted to the present one, with a note.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = ["export_bag", "import_bag", "is_bag"]
 
-# Payloads by which the layout of a topic without a schema is told.
+# Payloads examined to detect the layout of a topic without a schema.
 _TRIED = 50
-# What a bag has no place for: kept beside it, under this key of its custom data.
+# Key in the bag's custom data for everything that has no other place in a bag.
 _LOSSES = "dexkit.lost"
 _METADATA = "dexkit.metadata "
 
@@ -56,9 +56,9 @@ def is_bag(source: Path) -> bool:
 def import_bag(
     source: Path, out: Path, *, overwrite: bool = False
 ) -> tuple[int, list[str], Problems]:
-    """Write a bag as a recording.
+    """Convert a bag to a recording.
 
-    :returns: the number of messages, what was changed, and what could not be imported.
+    :returns: the number of messages, corrections, and data that could not be imported.
     :raises ExtraMissing: rosbags is not installed.
     :raises SessionError: it cannot be read, or nothing in it can be used.
     """
@@ -80,7 +80,7 @@ def import_bag(
                 _write_metadata(writer, reader, source, problems, corrections)
         except (SessionError, OSError):
             raise
-        except Exception as error:  # the library has many, for files of every kind of damage
+        except Exception as error:  # the library raises many kinds for damaged files
             raise SessionError(f"{source} cannot be read as a ROS 2 bag: {error}") from error
         if not writer.written:
             raise SessionError(
@@ -114,7 +114,7 @@ def _copy(
 def _channel(
     reader: Any, connection: Connection, problems: Problems, corrections: list[str]
 ) -> tuple[Definition, Convert | None] | None:
-    """How a connection is written; None if it is left out."""
+    """The channel for a connection; None if it is left out."""
     topic, type_name = dds_topic(connection.topic), dds_type(connection.msgtype)
     text = connection.msgdef.data if connection.msgdef else ""
     encoding = getattr(connection.msgdef.format, "name", "")
@@ -168,7 +168,7 @@ def _channel(
 def _write_metadata(
     writer: RecordingWriter, reader: Any, source: Path, problems: Problems, corrections: list[str]
 ) -> None:
-    """Write what the bag says beside its messages, and how it was imported."""
+    """Write the bag's metadata, and how it was imported."""
     storage = getattr(reader.storage, "metadata", None)
     record = {
         "version": __version__,
@@ -184,7 +184,7 @@ def _write_metadata(
             kept[str(key).removeprefix(_METADATA)] = values
         else:
             record[f"custom {key}"] = str(value)
-    # of a recording that was a session once, its own record stays
+    # a recording that was imported before keeps its own record
     for name, values in kept.items():
         writer.add_metadata(name, values)
     for number, text in enumerate(corrections, 1):
@@ -206,10 +206,10 @@ def _texts(value: object) -> dict[str, str] | None:
 
 
 def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str]:
-    """Write a recording as a bag, a folder.
+    """Convert a recording to a bag (a folder).
 
     :param storage: ``sqlite3`` or ``mcap``.
-    :returns: what the bag cannot hold.
+    :returns: descriptions of data that the bag cannot hold.
     :raises ExtraMissing: rosbags is not installed.
     :raises SessionError: ``out`` exists or cannot be written.
     """
@@ -227,7 +227,8 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
                     continue
                 try:
                     digest = _type_hash(ros_name, text)
-                except Exception as error:  # of the library: a definition that it cannot read
+                # raised by the library for a definition that it cannot read
+                except Exception as error:
                     lost.append(f"{key[0]}: its definition cannot be read: {error}")
                     continue
                 connections[key] = writer.add_connection(

@@ -1,9 +1,9 @@
-"""Whether the states of the two hands are swapped: they follow the commands of the other side.
+"""Detect swapped states of two hands: each follows the commands of the other side.
 
 xr_teleoperate v1.0 and v1.1 record the states of Inspire hands with the sides swapped
-(docs/sources/sessions.md#a4), and mixed versions of controller and main program can do the same to
-others. Version and data decide together: the sides are exchanged only where each hand's states
-follow the other hand's commands, and not its own.
+(docs/sources/sessions.md#a4), and mixed versions of controller and main program can cause the same
+with other hands. Version and data decide together: sides are exchanged only if each hand's states
+follow the other hand's commands and not its own.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from dexkit.traces.sessions.streams import COMMAND, STATE
 
 __all__ = ["SideEvidence", "swap_states", "swapped_sides"]
 
-# Seconds by which a hand is later than its command at most.
+# Largest delay of a hand behind its command, seconds.
 _LATEST = 0.6
-# Coefficient that the other side must reach, and by how much it must be better than the own one.
+# Smallest correlation with the other side, and its smallest margin over the own side.
 _LEAST = 0.7
 _LEAD = 0.3
 # Standard deviation, in units of the joints, below which nothing moves.
@@ -30,9 +30,9 @@ _STILL = 0.01
 
 @dataclass(frozen=True)
 class SideEvidence:
-    """How well states follow commands: of the own side, and of the other one; the worse hand.
+    """Correlation of states with the commands of the own and of the other side, for the worse hand.
 
-    NaN where a hand does not move, or both are commanded alike.
+    NaN if a hand does not move, or both have the same commands.
     """
 
     own: float
@@ -55,7 +55,7 @@ class SideEvidence:
 
 
 def swapped_sides(parts: Sequence[Part], rate: float) -> SideEvidence | None:
-    """How well the states of both hands follow the commands; None if there are not two hands."""
+    """Compute the evidence for swapped sides; None if there are not two hands."""
     hands = {p.name: p for p in parts if STATE in p.values and COMMAND in p.values}
     try:
         left, right = hands["left_hand"], hands["right_hand"]

@@ -1,4 +1,4 @@
-"""What a source to be imported is, and the sessions in it."""
+"""Detect the format of a source to be imported, and list its sessions."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ FORMATS = ("episodes", "jsonl", "lerobot", "rosbag2", "tables")
 
 @dataclass(frozen=True)
 class Report:
-    """What an import did.
+    """Result of an import.
 
     :param corrections: what was changed and why.
-    :param problems: what could not be taken over.
+    :param problems: what could not be imported.
     """
 
     form: str
@@ -47,7 +47,7 @@ class Entry:
 
 
 def beside(folder: Path, wire: Trace, options: Options = DEFAULT) -> Entry:
-    """An episode with the times of a recording that was made beside it."""
+    """An episode with times from a DDS recording of the same session."""
 
     def convert(out: Path, embed: bool, overwrite: bool) -> Report:
         session = episodes.read_episode(folder, options)
@@ -64,7 +64,7 @@ def beside(folder: Path, wire: Trace, options: Options = DEFAULT) -> Entry:
 def find(source: Path, form: str | None = None, options: Options = DEFAULT) -> list[Entry]:
     """The sessions of a source.
 
-    :param form: one of :data:`FORMATS`; None to tell it by the source.
+    :param form: one of :data:`FORMATS`; None to detect it.
     :raises SessionError: it is of no known format, or there is no session in it.
     :raises ExtraMissing: a library is missing.
     """

@@ -1,8 +1,8 @@
-"""The joints of a recording as streams: one table of numbers over time for each part and direction.
+"""Read the joints of a recording as streams: one table over time for each part and direction.
 
 A part is a hand of a side (``left_hand``), a robot (``g1``), or a group of joints that no message
-of Unitree's carries (``left_arm``, of an imported episode). Which topic, which motor and which
-joint belong together comes from the profiles in :mod:`dexkit.models` and :mod:`dexkit.robots`.
+of Unitree's carries (``left_arm``, of an imported episode). The profiles map topics and motors to
+joints: :mod:`dexkit.models` and :mod:`dexkit.robots`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MEMBERS = {
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """What was said of one part, in one direction.
+    """The states or the commands of one part.
 
     :param part: ``left_hand``, ``right_hand``, a robot's name, or the name of an imported group.
     :param kind: :data:`STATE` or :data:`COMMAND`.
@@ -49,8 +49,8 @@ class Stream:
     :param times_ns: reception, ns since the epoch, ascending, shape (n,).
     :param values: by field of :data:`FIELDS`, rad, rad/s and N·m, shape (n, n_joints); a field
         that the source does not have is missing here. NaN where a message lacks a joint.
-    :param pressure: of a state of a hand with sensors, as the message has it, shape
-        (n, number of elements); None without.
+    :param pressure: of a state of a hand with sensors, as in the message, shape (n, number of
+        elements); None without sensors.
     :param elements: a name for each of its columns.
     :param model: the hand model's or robot's name; empty for a group without a profile.
     """
@@ -81,13 +81,13 @@ class Stream:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """A name for each joint that is its own in the whole recording: ``left_thumb_0``."""
+        """Joint names that are unique in the recording: ``left_thumb_0``."""
         if self.model and self.part.endswith(HAND):
             return tuple(f"{self.part.removesuffix(HAND)}_{j}" for j in self.joints)
         return self.joints
 
     def between(self, begin_ns: int, end_ns: int) -> Stream:
-        """The part of it that was received in [begin, end)."""
+        """The samples received in [begin, end)."""
         a, b = np.searchsorted(self.times_ns, [begin_ns, end_ns])
         return replace(
             self,
@@ -203,7 +203,7 @@ def _pressure(columns: Columns, sensors: Sequence[Any]) -> tuple[Floats | None, 
 
 
 def _joint_states(topic: str, samples: SampleArray) -> Iterator[Stream]:
-    """Groups of joints as an import writes them: ``rt/session/PART/state``."""
+    """Read groups of joints as written by an import: ``rt/session/PART/state``."""
     pieces = topic.split("/")
     if not topic.startswith(SESSION) or len(pieces) != 4 or pieces[3] not in ("state", "cmd"):
         return

@@ -1,8 +1,8 @@
-"""Recordings as tables: a folder with one CSV or Parquet file a topic, and back, value by value.
+"""Convert recordings to and from tables: a folder with one CSV or Parquet file per topic, lossless.
 
 Every member of a message is a column, named by its path (``motor_state[3].q``), in its own type; a
 shorter sequence leaves its columns empty. Messages of types that dexkit does not know have their
-payload as one column. ``session.json`` has what belongs to no topic.
+payload as one column. ``session.json`` holds everything that belongs to no topic.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ABOUT = "session.json"
 _KEY = "dexkit_tables"
 _TIMES = ("log_time_ns", "publish_time_ns")
 _PAYLOAD = "payload"
-# Elements of a sequence that have columns.
+# Largest number of sequence elements with columns.
 _LONGEST = 256
 
 
@@ -81,14 +81,15 @@ def _leaves(kind: Struct, lengths: Mapping[str, int]) -> Iterator[_Leaf]:
                     yield _Leaf(f"{path}.{inner.path}", (*steps, *inner.steps), inner.dtype)
 
 
-# -- out -----------------------------------------------------------------------------------------
+# -- export
+# -----------------------------------------------------------------------------------------
 
 
 def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
     """Write a recording as tables.
 
     :param form: ``csv`` or ``parquet``.
-    :returns: what the tables cannot hold.
+    :returns: descriptions of data that the tables cannot hold.
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: ``out`` exists or cannot be written.
     """
@@ -176,15 +177,15 @@ def _export_topic(
 class _Column:
     """The values of a column.
 
-    :param there: which rows have one; None for all.
+    :param there: which rows have a value; None for all.
     """
 
     values: NDArray[Any]
     there: NDArray[np.bool_] | None = None
 
     def texts(self) -> list[str]:
-        """For CSV: the shortest text that is read as the same value."""
-        # by their bits: -0.0 equals 0.0 and NaN nothing
+        """For CSV: the shortest text that reads back as the same value."""
+        # compared by their bits, because -0.0 == 0.0 and NaN != NaN
         bits = self.values.view(f"u{self.values.itemsize}")
         different, places = np.unique(bits, return_inverse=True)
         different = different.view(self.values.dtype)
@@ -218,11 +219,12 @@ def _write(
     parquet.write_table(arrow.table(arrays, names=list(names)), str(path), compression="zstd")
 
 
-# -- in ------------------------------------------------------------------------------------------
+# -- import
+# ------------------------------------------------------------------------------------------
 
 
 def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[int, Problems]:
-    """Write tables as a recording.
+    """Convert tables to a recording.
 
     :returns: the number of messages, and what could not be imported.
     :raises ExtraMissing: pyarrow is not installed.
@@ -313,7 +315,7 @@ def _import_topic(
 def _encode(
     mt: MessageType, header: Sequence[str], columns: Sequence[Sequence[Any]], name: str
 ) -> tuple[list[tuple[int, int, bytes]], list[int]]:
-    """The messages of a table, and the numbers of rows that are none."""
+    """The messages of a table, and the numbers of invalid rows."""
     table = dict(zip(header, columns, strict=True))
     sequences = [f.name for f in mt.layout.fields if f.sequence]
     lengths = dict.fromkeys(sequences, 0)
@@ -364,10 +366,10 @@ def _encode(
 
 
 def _numbers(column: Sequence[Any], dtype: str) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """The values of a column, and which rows have one that its type can hold."""
+    """The values of a column, and which rows have a valid one."""
     kind = np.dtype(dtype)
     if kind.kind == "f" and {type(v) for v in column} <= {float, type(None)}:
-        # one by one: 0.0 equals -0.0 and is not the same
+        # one by one, because 0.0 == -0.0
         doubles = np.array([0.0 if v is None else v for v in column], dtype=np.float64)
         with np.errstate(over="ignore"):
             values = doubles.astype(kind)
@@ -382,7 +384,7 @@ def _numbers(column: Sequence[Any], dtype: str) -> tuple[NDArray[Any], NDArray[n
 
 
 def _number(value: Any, kind: np.dtype[Any]) -> Any:
-    """A value of that type; None if it is none."""
+    """Parse a value of that type; None if it is invalid."""
     if value is None or value == "" or isinstance(value, bytes):
         return None
     try:
@@ -412,7 +414,7 @@ def _read_csv(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
     except (ValueError, csv.Error) as error:
         raise SessionError(f"{path} cannot be read as CSV: {error}") from error
     width = len(header)
-    # a short row lacks its last values, which are then told as such
+    # a short row lacks its last values, which are reported as missing
     rows = [row[:width] + [""] * (width - len(row)) for row in rows]
     return header, list(zip(*rows, strict=True)) if rows else [()] * width
 

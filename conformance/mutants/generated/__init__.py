@@ -102,7 +102,7 @@ class Generated:
 
     @property
     def summary(self) -> str:
-        """What it does, in words."""
+        """Description of the hand."""
         if self.good:
             return "; ".join(f.made.summary for f in self.faults)
         return "; ".join(f.summary for f in self.faults)
@@ -191,7 +191,7 @@ def dialects(model_name: str | None = None, dialect_name: str | None = None) -> 
 
 
 def _joints(spoken: Dialect) -> tuple[str, ...]:
-    """Where on a side a fault can be: its first joint, its last one, all."""
+    """Joints of a side that a fault can affect: the first, the last, or all."""
     count = len(model(spoken.model).joints[Side.LEFT])
     return ("joint0",) if count == 1 else ("joint0", f"joint{count - 1}", "all")
 
@@ -215,9 +215,9 @@ def first_order(spoken: Dialect) -> Iterator[Generated]:
 
 
 def sample(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:
-    """So many different wrong hands: each class of faults and each dialect in turn.
+    """``count`` different wrong hands, over all classes of faults and dialects in turn.
 
-    A fifth of them is of the second order: two faults, or one with two conditions.
+    A fifth of them has two faults, or one fault with two conditions.
     """
     draw = random.Random(seed)
     kinds = list(KINDS)
@@ -251,7 +251,7 @@ def _drawn(draw: random.Random, spoken: Dialect, kind: str) -> Fault:
 
 
 def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:
-    """So many different good hands, with one to four deviations of different groups."""
+    """``count`` different good hands, with one to four deviations of different groups."""
     draw = random.Random(seed)
     found: dict[str, Generated] = {}
     turn = 0

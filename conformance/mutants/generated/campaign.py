@@ -12,7 +12,7 @@ import json
 import math
 import multiprocessing
 import signal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -41,7 +41,7 @@ GOOD = "good"
 
 @dataclass(frozen=True)
 class Trial:
-    """What became of one hand.
+    """Result of the trial of one hand.
 
     :param severity: ``must-breaking``, ``lesser``, ``equivalent``, or ``good``.
     :param in_kit: the severity of what shows under the kit's own stimulus alone.
@@ -206,11 +206,6 @@ class Campaign:
         finally:
             # not as a context manager, which would run the waiting trials
             pool.shutdown(cancel_futures=True)
-
-    def run_here(self, hands: Iterable[Generated]) -> None:
-        """Try the hands in this process."""
-        for hand in hands:
-            self._add(try_generated(hand, self.seed, self.kind))
 
     def _add(self, trial: Trial) -> Trial:
         self.trials.append(trial)

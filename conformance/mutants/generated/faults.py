@@ -1,6 +1,6 @@
-"""What can be wrong: the faults of generated hands, each independent of where and when it is.
+"""The faults of generated hands, each independent of place and time.
 
-Sizes are those of believable mistakes: a tenth of the range, a factor of the unit, a fraction of a
+Sizes are those of plausible mistakes: a tenth of the range, a factor of the unit, a fraction of a
 second. Whether one of them matters is not decided here but by
 :mod:`~dexkit.conformance.mutants.generated.oracle`.
 """
@@ -917,7 +917,7 @@ class _Moves(What):
     """Drives its joints to a place of its own, whatever is commanded."""
 
     def place(self, joint: int) -> float | None:
-        """Where it goes now, rad; None where it obeys."""
+        """The goal of its own motion, rad; None while it obeys."""
         raise AssertionError  # overridden
 
     def torque(self, joint: int, tau: float, dt: float) -> float:

@@ -1,4 +1,4 @@
-"""What good hands may do differently: deviations that no client notices, for generated good hands.
+"""Permitted deviations of generated good hands, which no client notices.
 
 Each stays within what the sources allow (docs/sources/unitree-dex.md#b2, #b4 of the same page): a
 vendor may measure more coarsely, have more friction, answer some milliseconds later, brake in

@@ -42,7 +42,7 @@ Flags = NDArray[np.bool_]
 
 FAR, FAR_S = 0.10, 0.15
 """Of the range, and seconds: 9 mm of a Dex1-1's jaw, or 10 degrees of a finger, for the time of an
-operator's reaction. A grasp that is so far off misses or crushes what it is for."""
+operator's reaction. A grasp with this error misses or crushes the object."""
 LATE_S = 0.25
 """Seconds by which a motion may be late and still be the commanded one: a human's reaction. Beyond
 that an operator oversteers."""
@@ -80,7 +80,7 @@ more, and a finger that is caught stays caught."""
 
 
 class Severity(Enum):
-    """What a fault does to who uses the hand."""
+    """Severity of a fault for the user of the hand."""
 
     EQUIVALENT = "equivalent"
     LESSER = "lesser"
@@ -107,7 +107,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Opinion:
-    """What the oracle says of a hand.
+    """The oracle's opinion of a hand.
 
     :param effects: the first effect of each kind, the gravest first.
     :param in_kit: the gravest severity under the kit's own stimulus.
@@ -120,7 +120,7 @@ class Opinion:
 
 @dataclass
 class _Observed:
-    """What an observer at one side of a run sees.
+    """Data that an observer of one side of a run records.
 
     :param t: seconds of every tick.
     :param q: true positions, shape (n, joints); dq, tau, contact and driven likewise.

@@ -50,7 +50,7 @@ class Report:
 
 @dataclass
 class Track:
-    """What one side has lived through since its service began: the data of every :class:`When`.
+    """History of one side since its service began: the data of every :class:`When`.
 
     :ivar motors: the newest command with finite values, as it was sent.
     :ivar raw: the newest command of the right length.
@@ -85,7 +85,7 @@ class Track:
 
 
 class What:
-    """What a fault changes. One object acts on the joints of one side in one run.
+    """Base class of faults. One object acts on the joints of one side in one run.
 
     Subclasses override the hooks that they need.
 
@@ -144,7 +144,7 @@ class What:
         return samples
 
     def tick(self, dt: float, active: bool) -> None:
-        """Let time pass, whether its condition is true or not."""
+        """Advance the time, whether its condition is true or not."""
 
     def replaced(self, motors: Motors, change: Callable[[int, Motor], Motor]) -> Motors:
         """The command with the motors of its joints changed."""
@@ -240,8 +240,8 @@ class Faulty(Service):
         raise AssertionError  # overridden
 
     def seen(self, side: Side) -> tuple[Sequence[float], ...]:
-        """What an observer at the fingers sees: q, dq, the motors' torques, the torques of contact,
-        of every joint, and 1 if the side is driven.
+        """True values at the fingers: q, dq, motor torques and contact torques of every joint, and
+        1 if the side is driven.
         """
         raise AssertionError  # overridden
 
@@ -276,9 +276,6 @@ class Faulty(Service):
     def _adopt(self) -> None:
         """Connect the mechanics with the hooks."""
         raise AssertionError  # overridden
-
-    def _active(self, what: What) -> bool:
-        return what.since is not None
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         """Take a command message; note whose it is and whether it has the usual length."""
@@ -320,7 +317,7 @@ class Faulty(Service):
         super().brake()
 
     def live(self, dt: float) -> None:
-        """Let time pass for conditions and mechanics."""
+        """Advance conditions and mechanics."""
         for side, track in self.tracks.items():
             if track.began < 0:
                 track.began = self.now

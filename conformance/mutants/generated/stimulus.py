@@ -72,7 +72,7 @@ def play_order(segments: Sequence[Segment]) -> tuple[tuple[Event, ...], tuple[St
 def conformance(
     dialect_name: str, sides: tuple[Side, ...]
 ) -> tuple[tuple[Event, ...], tuple[Stretch, ...]]:
-    """What the kit sends to the reference in a run of every phase, and its phases."""
+    """The kit's commands to the reference in a run of every phase, and the phases."""
     plan = plan_for(dialect_name, sides=sides)
     events: list[Event] = []
     reference = model(plan.dialect.model).reference.load()
@@ -450,7 +450,7 @@ _SEGMENTS: Mapping[str, tuple[Callable[[_Client], None], int]] = {
     "many at once": (_flood, 1),
     "load": (_load, 1),
 }
-"""What a client might do, and how often the random stimulus has it."""
+"""Actions of a client, and their frequency in the random stimulus."""
 
 
 def random_segments(plan: Plan[Side], seed: int) -> tuple[Segment, ...]:

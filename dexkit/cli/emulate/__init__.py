@@ -28,12 +28,12 @@ _DEVICES = {
     "g1": (
         "dexkit.cli.emulate.robot",
         "emulate_g1",
-        "Emulate the robot of a G1 (rt/lowcmd, rt/lowstate, unitree_hg).",
+        "Emulate a G1 without hands (rt/lowcmd, rt/lowstate, unitree_hg).",
     ),
     "h1": (
         "dexkit.cli.emulate.robot",
         "emulate_h1",
-        "Emulate the robot of an H1 (rt/lowcmd, rt/lowstate, unitree_go).",
+        "Emulate an H1 without hands (rt/lowcmd, rt/lowstate, unitree_go).",
     ),
     "lerobot-g1": (
         "dexkit.cli.emulate.lerobot",

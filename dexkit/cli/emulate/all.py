@@ -95,7 +95,7 @@ def emulate_all(
       dexkit emulate all --for lerobot --hands none
 
     Prints "ready: ..." when all topics are up, and what to start next. Ctrl-C or SIGTERM ends
-    it. When one part ends, all do, with its error and exit code.
+    it. When one part ends, all parts end, with its error and exit code.
     """  # noqa: D301  # click wants the backspace itself
     for_lerobot = client == _LEROBOT
     hands = hands or (_LEROBOT_HANDS if for_lerobot else _XR_HANDS)
@@ -137,7 +137,7 @@ def emulate_all(
 
 
 def _for_xr(robot: str, hands: str, domain: int) -> list[str]:
-    """How xr_teleoperate is started."""
+    """The command that starts xr_teleoperate."""
     if domain not in (0, 1):
         return ["xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md"]
     end = "" if hands == "none" else f" --ee={_HANDS[hands].client_option or hands}"
@@ -152,7 +152,7 @@ def _for_xr(robot: str, hands: str, domain: int) -> list[str]:
 
 
 def _for_lerobot(robot: str) -> list[str]:
-    """How LeRobot is started."""
+    """The command that starts LeRobot."""
     name = ROBOTS[robot].lerobot_name
     return [
         "next, with LeRobot (docs/lerobot.md):",

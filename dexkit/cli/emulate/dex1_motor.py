@@ -39,7 +39,7 @@ __all__ = ["emulate_dex1_motor"]
     "--wiring",
     type=click.IntRange(0),
     metavar="SEED",
-    help="Other ids, mirrored, offset and geared motors, at random, for a bring-up to find.",
+    help="Random ids, directions, offsets and gear ratios, to test a bring-up.",
 )
 @line_options(
     "motor",

@@ -69,8 +69,8 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     "--wiring",
     type=click.IntRange(0, 2**32 - 1),
     metavar="SEED",
-    help="Motors and sensors permuted on the buses, motors mirrored, offset and geared at random.  "
-    "[default: as dexkit assumes]",
+    help="Random bus addresses of motors and sensors, and random directions, offsets and gear "
+    "ratios.  [default: as dexkit assumes]",
 )
 @click.option(
     "--polled-sensors",

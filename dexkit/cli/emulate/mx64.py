@@ -50,10 +50,10 @@ __all__ = ["emulate_mx64"]
     type=click.Choice([str(rate) for rate in mx64.BAUD_RATES.values()]),
     default="1000000",
     metavar="B",
-    help="Bits a second that the servo is set to.",
+    help="Baud rate of the servo, bit/s.",
 )
 @click.option(
-    "--bare", is_flag=True, help="The servo without a gripper: its shaft turns freely all around."
+    "--bare", is_flag=True, help="Emulate the servo without a gripper: its shaft turns freely."
 )
 @object_option("Percent of opening at which the fingers touch an object")
 @start_option("Opening at first.", 50.0)
@@ -68,8 +68,8 @@ __all__ = ["emulate_mx64"]
     "--wiring",
     type=click.IntRange(0),
     metavar="SEED",
-    help="One gripper or two, dual or quad, with ids, directions, closed positions and strokes at "
-    "random, for a bring-up to find; instead of --id and what describes a gripper.",
+    help="One or two grippers, dual or quad, with random ids, directions, closed positions and "
+    "strokes, to test a bring-up; replaces --id and the options of a gripper.",
 )
 @line_time_option()
 @latency_timer_option(1.0)
@@ -79,7 +79,7 @@ __all__ = ["emulate_mx64"]
     "--eeprom",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Keep the servos' EEPROM here from run to run; it wins over --id and --baudrate.",
+    help="Keep the servos' EEPROM in this file between runs; it overrides --id and --baudrate.",
 )
 @any_baudrate_option()
 @click.option("--fast-reads", is_flag=True, help="Firmware with Fast Sync and Fast Bulk Read.")
@@ -107,8 +107,8 @@ def emulate_mx64(
 ) -> None:
     """Emulate a DYNAMIXEL MX-64 (Protocol 2.0) with an EZGripper on its shaft.
 
-    With --bare nothing is on the shaft, as ROBOTIS' own examples expect it: they go to and fro
-    between ends of the range that no gripper reaches.
+    Use --bare for ROBOTIS' own examples: they move between ends of the range that no gripper
+    reaches.
 
     Prints "ready: PATH ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
     link.
@@ -227,7 +227,7 @@ class _EepromFile:
                 ) from error
 
     def load(self, index: int) -> bytes | None:
-        """What servo ``index`` on the line had, or None."""
+        """The stored EEPROM of servo ``index`` on the line, or None."""
         return self._contents[index] if index < len(self._contents) else None
 
     def save(self, contents: list[bytes]) -> None:

@@ -98,7 +98,7 @@ def _command(model: RobotModel) -> click.Command:
             click.echo(f"stopped: {robot.robot.counters.summary() or 'no state was published'}")
 
     machine = f"\n    mode_machine is {model.mode_machine}, and commands must repeat it."
-    emulate.__doc__ = f"""Emulate an {model.name.upper()} on Unitree's low-level topics.
+    emulate.__doc__ = f"""Emulate Unitree's {model.name.upper()} on its low-level topics.
 
     {model.cmd_topic}, {model.arm_topic} and {model.state_topic} with {model.family} messages:
     {len(model.used)} joints in {model.slots} motor slots on a fixed base, IMU, battery and remote.

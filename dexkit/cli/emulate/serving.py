@@ -1,4 +1,4 @@
-"""What the emulators of devices on a line have in common: their options, and how they run."""
+"""Options and run loop shared by the emulators of devices on a line."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ class Served(Protocol):
 
     @property
     def ready_lines(self) -> Sequence[str]:
-        """What says that it is there."""
+        """Lines to print when it is ready."""
 
     @property
     def error(self) -> BaseException | None:
-        """What ended its service, or None."""
+        """The error that ended its service, or None."""
 
     @property
     def failure(self) -> Exception | None:
         """The first exception that its service has survived, or None."""
 
     def inject(self, spec: str) -> None:
-        """Have a fault."""
+        """Inject a fault."""
 
     def summaries(self) -> Sequence[str]:
-        """What was seen, a line each."""
+        """Counters, one line each."""
 
     def close(self) -> None:
         """Stop. May be called twice."""
@@ -65,7 +65,7 @@ def line_options(
             type=click.IntRange(9600, most),
             default=baudrate,
             metavar="B",
-            help=f"Bits a second that the {device} understands.",
+            help=f"Baud rate of the {device}.",
         ),
         line_time_option(),
         click.option(
@@ -73,7 +73,7 @@ def line_options(
             type=Number(0, 1000),
             default=0.0,
             metavar="MS",
-            help=f"From a request to its answer; what the real {device} needs is not known.",
+            help=f"Time from a request to its answer; that of the real {device} is not known.",
         ),
         latency_timer_option(latency_timer),
         fault_options(faults),

@@ -78,9 +78,9 @@ _TURNS = (True, True, True, False, False)
 
 @dataclass(frozen=True)
 class BusMap:
-    """Which packet is whose: (bus, id on that bus) of each joint and of each pressure sensor.
+    """Packet addresses: (bus, id on that bus) of each joint and of each pressure sensor.
 
-    :raises UsageError: no such bus or id, or the same one twice.
+    :raises UsageError: a bus or id is invalid or occurs twice.
     """
 
     motors: tuple[tuple[int, int], ...]
@@ -116,7 +116,7 @@ class DecodedCommand:
         False.
     :param present: which motors the frame addresses, shape (n_joints,).
     :param silent: those addressed only by a broadcast: they obey and do not answer.
-    :param problems: packets that were damaged or are for no motor of this hand.
+    :param problems: packets that were damaged, or addressed to no motor of this hand.
     """
 
     command: HandCommand
@@ -132,7 +132,7 @@ class HandCodec:
     :param joints: in the order of commands and states, with their gear ratios.
     :param layout: of the command frames that are encoded; both are decoded.
     :param head: of the command frames that are encoded.
-    :param mounting: direction, zero and gearing of the motors; by default :meth:`Mounting.of`.
+    :param mounting: direction, zero and gearing of the motors; by default :meth:`Mounting.default`.
     :param poll_sensors: whether the command frames that are encoded address the sensors, too.
 
     After each :meth:`decode`: ``problems``, what was lost of that frame; ``missing_motors`` and
@@ -150,7 +150,7 @@ class HandCodec:
         mounting: Mounting | None = None,
         poll_sensors: bool = False,
     ) -> None:
-        mounting = Mounting.of(joints) if mounting is None else mounting
+        mounting = Mounting.default(joints) if mounting is None else mounting
         for found, what in ((bus_map.motors, "the bus map"), (mounting.signs, "the mounting")):
             if len(joints) != len(found):
                 raise UsageError(f"{len(joints)} joint(s), but {what} has {len(found)} motor(s)")
@@ -171,7 +171,7 @@ class HandCodec:
             self._joints_at[bus, number] = [joint]
             self._joints_at.setdefault((bus, BROADCAST_ID), []).append(joint)
         self._zeros = [s * o for s, o in zip(mounting.signs, mounting.offsets, strict=True)]
-        # position, velocity and torque turn round with the sign, the gains do not
+        # position, velocity and torque change sign with it, the gains do not
         self._command_units = [
             tuple(
                 (sign if turns else 1) / scale.factor(ratio)
@@ -264,7 +264,7 @@ class HandCodec:
     # --- the device's side
 
     def decode_command(self, data: Bytes) -> DecodedCommand:
-        """What a command frame asks, whichever layout it has. Its head is not looked at.
+        """Decode a command frame of either layout. Its head is not checked.
 
         A later packet for the same motor replaces an earlier one.
 
@@ -385,7 +385,7 @@ def _encode_or_zero(scale: units.Scale, value: float) -> int:
 
 
 class _CommandEncoder:
-    """Writes into a frame that is kept, and whose fixed parts never change."""
+    """Encodes into one reused frame, whose fixed parts are written once."""
 
     def __init__(
         self,
@@ -406,7 +406,7 @@ class _CommandEncoder:
         for i, packet in zip(order, brake, strict=True):
             buses[motors[i][0]].append(packet)
         driven = [len(packets) for packets in buses]
-        for bus, number in polled:  # behind the motors; these bytes stay as they are
+        for bus, number in polled:  # after the motors; these bytes never change
             buses[bus].append(SensorCmd(number))
         template = pack_command(CommandFrame(buses, head=head), layout)
 
@@ -486,7 +486,7 @@ class _CommandEncoder:
                 values[4] = command.q[order]
         except (ValueError, IndexError):
             raise EncodeError(f"a command that is not for {self._n} joints") from None
-        # the sum is finite unless something is not (or overflows, which the second look excludes)
+        # the sum is finite unless a term is not (or it overflows, which the second check excludes)
         if not math.isfinite(self._flat.dot(self._ones)) and not np.isfinite(values).all():
             raise EncodeError("NaN or infinity in a command cannot be sent")
         np.multiply(values, self._factors, out=counts)
@@ -556,7 +556,7 @@ class _Gather:
 
 
 class _StatePlan:
-    """Where the packets of a state frame are, and how to get everything out of them at once.
+    """Offsets of the packets in a state frame, prepared for decoding all of them at once.
 
     :param motors: offset in the frame by joint; a joint without is missing.
     :param sensors: likewise by sensor.

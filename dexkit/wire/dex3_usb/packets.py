@@ -255,7 +255,7 @@ FROM_HAND = (MOTOR_STATE, SENSOR_STATE)
 
 @dataclass(frozen=True)
 class Problem:
-    """Bytes of a bus buffer that were lost, or a packet that is nobody's.
+    """Damaged bytes of a bus buffer, or a packet with an unknown address.
 
     :param bus: which one.
     :param offset: of the first byte in that buffer; None where the packet itself is good.
@@ -280,7 +280,7 @@ def scan_bus(
     :param kinds: structures that may occur; anything else counts as damaged.
     :return: (offset and structure of each good packet, what was lost).
 
-    Behind damaged bytes the search goes on at the next head. Bytes of a packet with a wrong CRC
+    After damaged bytes the search continues at the next head. Bytes of a packet with a wrong CRC
     can only hide a packet whose CRC is right: what looks like a head in them is not reported
     once more.
     """
@@ -461,7 +461,7 @@ def pack_command(frame: CommandFrame, layout: CommandLayout | None = None) -> by
 
 
 def parse_command(data: Bytes) -> CommandFrame:
-    """A frame to the hand; which layout is told by its length. Any head is taken.
+    """Parse a command frame; its length gives the layout. Any head is accepted.
 
     :raises TruncatedError: shorter than 1234 bytes, and not 734.
     :raises OversizeError: longer than 1234 bytes.

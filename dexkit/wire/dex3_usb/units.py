@@ -53,7 +53,7 @@ VELOCITY = Scale(
     "velocity", ("spd_des", "speed"), "rad/s", 256 / (2 * math.pi) / 100, *_INT16, power=1
 )
 TORQUE = Scale("torque", ("tor_des", "torque"), "N·m", 256e3, *_INT16, power=-1)
-# an int16 whose negative half would turn the joint's spring or damper round
+# an int16, whose negative half would invert the joint's stiffness or damping
 STIFFNESS = Scale("stiffness", ("k_pos",), "N·m/rad", 1280e3, 0, 0x7FFF, power=-2)
 DAMPING = Scale("damping", ("k_spd",), "N·m·s/rad", 1280e3 * 100, 0, 0x7FFF, power=-2)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.bridge.core import Commands, States
+from dexkit.bridge.forwarding import Commands, States
 from dexkit.clock import ManualClock
 from dexkit.doctor import dds as doctor_dds
 from dexkit.doctor import rtps
@@ -24,8 +24,8 @@ from dexkit.messages import layout, message_type, message_types
 from dexkit.messages.columns import Columns
 from dexkit.messages.packed import Packed
 from dexkit.models import DIALECTS, model
-from dexkit.service.core import HandCore
 from dexkit.service.dialects import dialect_map
+from dexkit.service.hand_core import HandCore
 from dexkit.teleop.client_codec import ClientWire
 from dexkit.traces import names as trace_names
 from dexkit.traces import schemas

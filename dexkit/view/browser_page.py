@@ -101,7 +101,7 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where a browser finds it."""
+        """URL for browsers."""
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 

@@ -60,7 +60,7 @@ class Group:
 
 @dataclass(frozen=True)
 class _Line:
-    """What the page says of one file."""
+    """A file's line on the page."""
 
     name: str
     overall: str
@@ -72,7 +72,7 @@ class _Line:
 
 
 class Summary:
-    """What the page says, collected file by file: its size does not grow with the archive's.
+    """Contents of the page, collected file by file; its size does not grow with the archive.
 
     :ivar groups: by title (``robot``, ``model``, ...) and name.
     :ivar requirements: by ``hand`` or ``client`` and id: in how many files it fails, and warns.
@@ -154,7 +154,7 @@ class Summary:
 
     @property
     def remarkable(self) -> int:
-        """How many files have failures, errors or warnings."""
+        """Number of files with failures, errors or warnings."""
         return self._count
 
 
