@@ -47,6 +47,9 @@ EMULATED: dict[str, Emulation] = {
     "dex3-usb": Emulation(("dex3-usb", "--port", "0"), False),
     "inspire-serial": Emulation(("rh56", "--side", "{side}"), True, {"timeout": "0.3"}),
     "inspire-modbus": Emulation(("rh56", "--modbus-tcp", "0"), False, {"timeout": "0.3"}),
+    "inspire-ftp-modbus": Emulation(
+        ("rh56", "--modbus-tcp", "0", "--tactile"), False, {"timeout": "0.3"}
+    ),
     "revo2-serial": Emulation(("revo2", "--side", "{side}"), True, {"timeout": "0.3"}),
 }
 """Backends whose device the kit can start itself."""

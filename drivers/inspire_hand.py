@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from dexkit.drivers.goal_hand import GoalHand
 from dexkit.drivers.setting_parsers import Parsers
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
-from dexkit.models import INSPIRE_DFX
+from dexkit.models import INSPIRE_DFX, HandModel
 from dexkit.wire import rh56
 from dexkit.wire.rh56 import Error, Register
 
@@ -28,8 +29,6 @@ __all__ = ["COMMON_SETTINGS", "InspireHand", "InspireSettings"]
 
 log = logging.getLogger(__name__)
 
-_HEALTH_EVERY = 20
-"""Errors and temperatures are read once in so many exchanges."""
 _HEALTH = int(Register.TEMPERATURE) + rh56.JOINTS - int(Register.ERROR)
 """Bytes from the errors to the end of the temperatures."""
 
@@ -67,7 +66,7 @@ class InspireSettings:
 
 
 class InspireHand(GoalHand):
-    """An Inspire RH56 over any register transport.
+    """An Inspire RH56 over any register transport; its class names the model.
 
     :param side: which hand.
     :param configuration: place, id, speed, limit of force and time-out.
@@ -76,6 +75,10 @@ class InspireHand(GoalHand):
     ``close`` has every joint hold where it is.
     """
 
+    model: ClassVar[HandModel] = INSPIRE_DFX
+    health_every: ClassVar[int] = 20
+    """Errors and temperatures are read once in so many exchanges."""
+
     def __init__(
         self,
         side: Side,
@@ -83,7 +86,7 @@ class InspireHand(GoalHand):
         *,
         clock: Clock | None = None,
     ) -> None:
-        super().__init__("RH56", INSPIRE_DFX, side, configuration.timeout, clock)
+        super().__init__("RH56", self.model, side, configuration.timeout, clock)
         self.configuration = configuration
         self._turn = 0
         self._errors = [Error(0)] * rh56.JOINTS
@@ -101,7 +104,7 @@ class InspireHand(GoalHand):
         """
 
     @abstractmethod
-    def _read(self, channel: Channel, register: Register, count: int) -> bytes:
+    def _read(self, channel: Channel, register: int, count: int) -> bytes:
         """Read ``count`` bytes of consecutive registers.
 
         :raises HandError: there is no answer.
@@ -126,9 +129,9 @@ class InspireHand(GoalHand):
             self._read_health()
 
     def _measure(self, command: HandCommand) -> HandState:
-        self._turn += 1
-        if self._turn % _HEALTH_EVERY == 1:
+        if self._turn % self.health_every == 0:
             self._read_health()
+        self._turn += 1
         self._read_angles()
         driven = command.mode == JointMode.FOC
         return HandState.from_values(
@@ -169,7 +172,10 @@ class InspireHand(GoalHand):
         self._positions = [min(max(angle, 0), rh56.FULL) for angle in rh56.numbers(data)]
 
     def _read_health(self) -> None:
-        data = self._ask(lambda to: self._read(to, Register.ERROR, _HEALTH))
+        self._take_health(self._ask(lambda to: self._read(to, Register.ERROR, _HEALTH)))
+
+    def _take_health(self, data: bytes) -> None:
+        """Take the registers from the errors to the temperatures."""
         errors = [Error(value) for value in data[: rh56.JOINTS]]
         if errors != self._errors:
             names = {

@@ -26,7 +26,7 @@ from dexkit.models import INSPIRE_DFX
 from dexkit.wire.modbus import Adu, Function, Request, TcpParser
 from dexkit.wire.rh56 import Register
 
-__all__ = ["PORT", "SETTINGS", "InspireModbus", "InspireModbusSettings", "backend"]
+__all__ = ["PARSERS", "PORT", "SETTINGS", "InspireModbus", "InspireModbusSettings", "backend"]
 
 PORT = 6000
 """Default address of the hand (docs/sources/unitree-dex.md#j2)."""
@@ -83,7 +83,7 @@ class InspireModbus(InspireHand):
         values = np.frombuffer(data, "<u2").tolist()
         self._exchange(channel, Request.write(register, values), before)
 
-    def _read(self, channel: Channel, register: Register, count: int) -> bytes:
+    def _read(self, channel: Channel, register: int, count: int) -> bytes:
         request = Request(Function.READ_HOLDING, register, (count + 1) // 2)
         return np.array(self._exchange(channel, request, None), "<u2").tobytes()[:count]
 
@@ -106,17 +106,17 @@ class InspireModbus(InspireHand):
                 )
 
 
-_PARSERS: Parsers = {
+PARSERS: Parsers = {
     "id": (int, "Modbus' unit (default 1)"),
     **COMMON_SETTINGS,
     "timeout": (float, "seconds to wait for an answer (default 0.1)"),
 }
-SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.items()}
+SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in PARSERS.items()}
 """Name and help of each setting."""
 
 
 def _make(options: BackendOptions) -> InspireModbus:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options, PARSERS)
     settings = InspireModbusSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireModbus(options.side, settings)
 

@@ -75,7 +75,7 @@ class InspireSerial(InspireHand):
         request = Frame(self._settings.id, Operation.WRITE, register, data)
         self._exchange(channel, request, 1, before)
 
-    def _read(self, channel: Channel, register: Register, count: int) -> bytes:
+    def _read(self, channel: Channel, register: int, count: int) -> bytes:
         return self._exchange(channel, rh56.read(self._settings.id, register, count), count, None)
 
     def _exchange(

@@ -1,12 +1,13 @@
 """An emulated Inspire RH56 on its serial line, or by Modbus on TCP: registers and joints.
 
-:mod:`dexkit.emulators.servo_mechanics` moves the joints, :mod:`dexkit.wire.rh56` has the frames.
+:mod:`dexkit.emulators.servo_mechanics` moves the joints, :mod:`dexkit.wire.rh56` has the frames;
+a hand with tactile areas feels what its fingers press on as a simulated one does
+(:mod:`dexkit.emulators.sim_inspire`).
 Implemented registers are those of :class:`~dexkit.wire.rh56.Register`. Others read as 0, and writes
 to them are answered without effect; no source says what the device does there.
 
 Forces are those of the mechanics, in thousandths; currents and temperatures are assumed. Not
-modelled: the tactile sensors of other models, how far a fast finger exceeds its limit of
-force, and storing of settings.
+modelled: how far a fast finger exceeds its limit of force, and storing of settings.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ from dexkit.emulators.modbus_line import tcp_answers
 from dexkit.emulators.request_line import RequestLine, ServedDevice
 from dexkit.emulators.serial_port import Port
 from dexkit.emulators.servo_mechanics import STEP, ServoMechanics
+from dexkit.emulators.sim_inspire import FtpMechanics
 from dexkit.emulators.tcp_port import TcpPort
 from dexkit.errors import WireError
-from dexkit.hand import HandCommand, JointMode, Side
-from dexkit.models import INSPIRE_DFX
+from dexkit.hand import Floats, HandCommand, JointMode, Side
+from dexkit.models import INSPIRE_DFX, INSPIRE_FTP
 from dexkit.wire.modbus import Function, TcpParser
 from dexkit.wire.rh56 import (
     BAUD_RATE,
@@ -56,6 +58,7 @@ class Rh56:
     :param number: its id on the line.
     :param object_at: percent of closing at which the joints touch an object; None for none.
     :param start: percent of closing at first; None for a relaxed pose.
+    :param tactile: an RH56DFTP, with tactile areas.
     :raises UsageError: a parameter is out of range.
     """
 
@@ -66,13 +69,15 @@ class Rh56:
         number: int = 1,
         object_at: float | None = None,
         start: float | None = None,
+        tactile: bool = False,
         now: float = 0.0,
     ) -> None:
         self.number = number
-        self.mechanics = ServoMechanics(
-            INSPIRE_DFX, side, object_at=object_at, start=start, resolution=1 / FULL
+        model, mechanics = (INSPIRE_FTP, FtpMechanics) if tactile else (INSPIRE_DFX, ServoMechanics)
+        self.mechanics = mechanics(
+            model, side, object_at=object_at, start=start, resolution=1 / FULL
         )
-        self._full = np.array([joint.dq_max for joint in INSPIRE_DFX.joints[side]])
+        self._full = np.array([joint.dq_max for joint in model.joints[side]])
         self._steps = FixedSteps(STEP)
         self._steps.restart(now)
         self.goals: list[int | None] = [None] * JOINTS
@@ -82,6 +87,7 @@ class Rh56:
             Register.SPEED_SET: [FULL] * JOINTS,
         }
         self.errors = [Error(0)] * JOINTS
+        self._felt: tuple[Floats, bytes] | None = None
         self._now = now
         self._drive()
 
@@ -186,12 +192,21 @@ class Rh56:
             Register.TEMPERATURE: bytes([_CELSIUS] * JOINTS),
             **{at: np.array(values, "<i2").tobytes() for at, values in words.items()},
         }
+        if isinstance(self.mechanics, FtpMechanics):
+            places[Register.TOUCH] = self._touch(self.mechanics)
         found = bytearray(count)
         for at, data in places.items():
-            for i, value in enumerate(data, int(at) - address):
-                if 0 <= i < count:
-                    found[i] = value
+            begin, end = max(address, at), min(address + count, at + len(data))
+            if begin < end:
+                found[begin - address : end - address] = data[begin - at : end - at]
         return bytes(found)
+
+    def _touch(self, hand: FtpMechanics) -> bytes:
+        pressure = hand.pressure
+        if self._felt is None or self._felt[0] is not pressure:
+            counts = np.rint(pressure[np.isfinite(pressure)])  # area after area
+            self._felt = pressure, counts.astype("<i2").tobytes()
+        return self._felt[1]
 
     @staticmethod
     def _status(goal: int | None, angle: int, dq: float, error: Error) -> Status:
@@ -287,6 +302,7 @@ class Rh56TcpHand(ServedDevice):
     """The device on a TCP port of this machine (Modbus), served in a thread.
 
     :param port: 0 for a free one.
+    :param tactile: an RH56DFTP, with tactile areas.
     :param faults: specifications, see :mod:`dexkit.emulators.faults`.
     :raises EmulatorError: the port cannot be had.
     :raises UsageError: a fault or a figure that cannot be.
@@ -299,12 +315,13 @@ class Rh56TcpHand(ServedDevice):
         port: int = 0,
         object_pct: float | None = None,
         start_pct: float | None = None,
+        tactile: bool = False,
         answer_time: float = 0.0,
         faults: Sequence[str] = (),
         seed: int = 0,
     ) -> None:
         now = RealClock().now()
-        self.device = Rh56(side, object_at=object_pct, start=start_pct, now=now)
+        self.device = Rh56(side, object_at=object_pct, start=start_pct, tactile=tactile, now=now)
         bus = RequestLine(
             self.device,
             TcpParser(),
@@ -316,7 +333,9 @@ class Rh56TcpHand(ServedDevice):
             start=now,
             seed=seed,
         )
-        super().__init__(TcpPort(bus, port), RH56_TCP_FAULTS, f"{side} modbus-tcp")
+        super().__init__(
+            TcpPort(bus, port), RH56_TCP_FAULTS, f"{side} modbus-tcp{tactile * ' tactile'}"
+        )
 
     def __enter__(self) -> Rh56TcpHand:
         return self

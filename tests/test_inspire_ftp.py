@@ -43,6 +43,7 @@ FTP = dialect("inspire_ftp")
 STATE, CTRL = message_type(FTP.state_type), message_type(FTP.cmd_type)
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 N = 6
+FULL_SPEED = INSPIRE_FTP.joints[Side.LEFT][0].dq_max
 RADIANS = re.compile(r"\brad\b|\bradians\b|N m\b|_rad\b")
 
 
@@ -147,7 +148,7 @@ def test_simulated_hand_measures_angles_and_forces() -> None:
     clock = ManualClock()
     hand = SimInspireFtp(RIGHT, clock=clock, object_at=60.0)
     hand.open()
-    command = HandCommand.position([0.1] * N, dq=[1.25] * N)
+    command = HandCommand.position([0.1] * N, dq=[FULL_SPEED] * N)
     for _ in range(100):
         clock.advance(0.01)
         state = hand.exchange(command)
@@ -176,7 +177,7 @@ def test_angles_are_thousandths_both_ways(angles: list[int]) -> None:
     command = mapping().command(sent, LEFT)
     assert command is not None
     assert np.allclose(command.q, np.array(angles) / 1000)
-    assert command.dq.tolist() == [1.25] * N
+    assert command.dq.tolist() == [FULL_SPEED] * N
     view = StateView(HandState.from_values(command.q, stamp=0.0), (0,) * N)
     assert STATE.decode(mapping().encode({LEFT: view})).angle_act == angles
 
@@ -189,9 +190,9 @@ def test_angles_are_thousandths_both_ways(angles: list[int]) -> None:
         ([ctrl([300] * 5)], None, None),
         ([ctrl([], 8, speed_set=[500] * N)], None, None),  # no goal yet
         ([ctrl([300] * 5 + [-1])], None, None),
-        ([ctrl([], 8, speed_set=[500] * N), ctrl([300] * N)], [0.3] * N, 0.625),
-        ([ctrl([300] * N), ctrl([-1] * 3 + [700] * 3)], [0.3] * 3 + [0.7] * 3, 1.25),
-        ([ctrl([300] * N), ctrl([], 8, speed_set=[2000] * N)], [0.3] * N, 1.25),
+        ([ctrl([], 8, speed_set=[500] * N), ctrl([300] * N)], [0.3] * N, FULL_SPEED / 2),
+        ([ctrl([300] * N), ctrl([-1] * 3 + [700] * 3)], [0.3] * 3 + [0.7] * 3, FULL_SPEED),
+        ([ctrl([300] * N), ctrl([], 8, speed_set=[2000] * N)], [0.3] * N, FULL_SPEED),
         ([ctrl([300] * N, 9, speed_set=[0] * N)], [0.3] * N, 0.0),
     ],
 )

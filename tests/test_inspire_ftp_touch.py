@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 
@@ -29,11 +30,16 @@ from dexkit.messages import message_type
 from dexkit.messages.inspire import inspire_hand_touch
 from dexkit.messages.integer_lists import IntegerLists
 from dexkit.models import INSPIRE_FTP, Dialect, dialect
+from dexkit.monitor.bars import UNICODE
+from dexkit.monitor.json_lines import json_line
+from dexkit.monitor.screen import hand_lines
 from dexkit.service import HandService
 from dexkit.service.dialects import StateView, dialect_map
 from dexkit.topics import roles
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.streams import _streams
+from dexkit.view.texts import hand_table
+from dexkit.watch import Collector, Picture, SubjectView
 from dexkit.watch.fields import parts_of
 from dexkit.watch.recorded import feed
 from tests.each import each
@@ -44,6 +50,7 @@ TOUCH, STATE = message_type(FTP.touch_type), message_type(FTP.state_type)
 LENGTHS = {area.member: area.elements for area in INSPIRE_FTP.areas}
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 N = 6
+FULL_SPEED = INSPIRE_FTP.joints[LEFT][0].dq_max
 
 # ------------------------------------------------------------------------------------ on the wire
 
@@ -98,7 +105,7 @@ def test_finger_that_presses_feels_it_and_no_other() -> None:
     def hold(q: list[float], steps: int) -> dict[str, int]:
         for _ in range(steps):
             clock.advance(0.01)
-            state = hand.exchange(HandCommand.position(q, dq=[1.25] * N))
+            state = hand.exchange(HandCommand.position(q, dq=[FULL_SPEED] * N))
         return felt(hand, state)
 
     opened = [0.85] * N
@@ -116,7 +123,7 @@ def test_free_hand_feels_nothing_at_its_ends() -> None:
     for q in (0.0, 1.0):
         for _ in range(120):
             clock.advance(0.01)
-            state = hand.exchange(HandCommand.position([q] * N, dq=[1.25] * N))
+            state = hand.exchange(HandCommand.position([q] * N, dq=[FULL_SPEED] * N))
         assert felt(hand, state) == {}
 
 
@@ -199,19 +206,60 @@ def test_touch_in_a_recording_is_no_stream_of_joints() -> None:
     recording = Recording.decode(trace)
     assert recording.touch[RIGHT].values.shape[1:] == (17, 112)
     assert np.isnan(recording.touch[RIGHT].values[0, 0, 9:]).all()
-    assert not parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields
+    assert len(parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields) == len(INSPIRE_FTP.areas)
     for topic, count in ((FTP.touch_topic_of(RIGHT), 0), (FTP.topics(RIGHT)[1], 1)):
         assert len(list(_streams(topic, trace.load([topic])[topic]))) == count
 
 
 def test_viewers_show_a_session_with_goals_alone_and_touch() -> None:
-    picture = feed(open_trace(sample_path("inspire_ftp_grip"))).picture(12.0)
+    collector = feed(open_trace(sample_path("inspire_ftp_grip")))
+    picture = collector.picture(12.0)
     assert {t.name: (t.role, t.undecodable) for t in picture.topics if "/touch/" in t.name} == {
         FTP.touch_topic_of(side): ("touch", 0) for side in Side
     }
     for view in picture.subjects:
         assert np.isfinite(view.target).all()
         assert np.isfinite(view.q).all()
+    felt_by = {view.subject: max(view.touched.values()) for view in picture.subjects}
+    assert felt_by[LEFT] == 0
+    _, counts = collector.curve(FTP.touch_topic_of(RIGHT), "fingerfour_palm_touch", 0.0, 14.0)
+    assert (min(counts), max(counts)) == (0, 1000)
+
+
+def looked_at(values: dict[str, list[int]]) -> SubjectView:
+    """A hand of which one touch message was seen."""
+    collector = Collector()
+    message = inspire_hand_touch(**{m: [0] * n for m, n in LENGTHS.items()})
+    for member, counts in values.items():
+        setattr(message, member, counts)
+    data = TOUCH.encode(message)
+    collector.take(FTP.touch_topic_of(RIGHT), TOUCH.name, [data], [10**9], [10**9])
+    (view,) = collector.picture(0.1).subjects
+    assert not collector.picture(2.0).subjects[0].touched["palm"] >= 0  # it is old
+    return view
+
+
+def test_viewers_show_the_most_that_each_finger_counts() -> None:
+    view = looked_at(
+        {
+            "fingerone_palm_touch": [0] * 79 + [-3],
+            "fingerfour_tip_touch": [7, *[0] * 8],
+            "fingerfour_top_touch": [0] * 40 + [812] + [0] * 55,
+            "palm_touch": [-5] * 100,  # shorter than it should be
+        }
+    )
+    assert view.touched == {
+        **{"pinky": 0.0, "ring": 0.0, "middle": 0.0},
+        **{"index": 812.0, "thumb": 0.0, "palm": -5.0},
+    }
+    lines = [line.plain for line in hand_lines(view, UNICODE, 39)]
+    assert lines[-2:] == [
+        "touch pinky 0  ring 0  middle 0",
+        "      index 812  thumb 0  palm -5",
+    ]
+    assert "index 812 · thumb 0" in hand_table(view, "right")
+    shown = json.loads(json_line(Picture(0.1, (), (view,)), (), 0))["subjects"][0]["touch"]
+    assert dict(zip([a.place for a in INSPIRE_FTP.areas], shown, strict=True))["index top"] == 812
 
 
 # ----------------------------------------------------------------------------------------- doctor

@@ -56,7 +56,7 @@ def as_rows(path: Path) -> list[Row]:
 # -- the shipped recordings ----------------------------------------------------------------------
 
 SYNTHETIC = ("dex5_synthetic",)  # never on DDS
-RECORDED_BY_DEXKIT = (*SYNTHETIC, "inspire_ftp_grip")
+RECORDED_BY_DEXKIT = (*SYNTHETIC, "brainco_grip", "inspire_dfx_grip", "inspire_ftp_grip")
 
 
 def readme_tables() -> dict[str, dict[str, list[float]]]:

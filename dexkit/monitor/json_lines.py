@@ -81,5 +81,6 @@ def _subject(view: SubjectView) -> dict[str, object]:
         "near_limit": near,
         "faults": view.faults,
         "pressure": _numbers(view.pressure),
+        "touch": _numbers(view.touch),
         "commanders": list(view.commanders),
     }

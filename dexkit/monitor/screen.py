@@ -165,8 +165,18 @@ def _beside(blocks: Iterable[list[Text]], cells: int) -> list[Text]:
 
 
 def hand_lines(view: SubjectView, signs: Signs, width: int) -> list[Text]:
-    """A hand: ages, who commands, faults, and a line for each joint."""
-    return [*_head(view), *(_joint(view, i, signs, width) for i in range(len(view.joints)))]
+    """A hand: ages, who commands, faults, a line for each joint, and what its fingers feel."""
+    joints = [_joint(view, i, signs, width) for i in range(len(view.joints))]
+    return [*_head(view), *joints, *_touch(view)]
+
+
+def _touch(view: SubjectView) -> list[Text]:
+    """The most that each finger feels, three fingers a line."""
+    told = [f"{one_line(name)} {number(count, 0)}" for name, count in view.touched.items()]
+    return [
+        Text(f"{'' if i else 'touch':6}{'  '.join(told[i : i + 3])}", "dim")
+        for i in range(0, len(told), 3)
+    ]
 
 
 def _head(view: SubjectView) -> list[Text]:

@@ -62,8 +62,14 @@ def hand_table(view: SubjectView, title: str) -> str:
         f"q {view.model.unit}</th>"
         '<th class="n">cmd</th><th>torque</th><th class="n">'
         f'{view.model.torque_unit.replace("N m", "N·m")}</th><th class="n">°C</th></tr>'
-        f"{''.join(rows)}</table></div>"
+        f"{''.join(rows)}</table>{_touch(view)}</div>"
     )
+
+
+def _touch(view: SubjectView) -> str:
+    """The most that each finger's tactile areas count."""
+    told = " · ".join(f"{escape(name)} {number(count, 0)}" for name, count in view.touched.items())
+    return f"<p>touch, most of each finger, counts: {told}</p>" if told else ""
 
 
 def _ages(view: SubjectView) -> str:

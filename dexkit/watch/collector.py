@@ -103,6 +103,8 @@ class SubjectView:
     :param near: which joints are near a limit: -1 the lower, 1 the upper one, 0 neither.
     :param pressure: of the sensor elements in the order of the model's sensors and their slots, in
         the message's unit; empty without sensors.
+    :param touch: of a hand with a touch topic: the most that an element of each of the model's
+        areas counts; NaN where it is not known or old, empty without a topic.
     :param commanders: processes that publish the command topic, as far as they say so.
     :param command_timeout: seconds after which a command no longer counts.
     """
@@ -121,6 +123,7 @@ class SubjectView:
     target: Floats
     near: NDArray[np.int8]
     pressure: Floats
+    touch: Floats
     commanders: tuple[str, ...]
     command_timeout: float
 
@@ -134,6 +137,16 @@ class SubjectView:
         """Torque as a part of each joint's largest, 0 to 1, shape (n_joints,); 0 where unknown."""
         most = np.array([j.tau_max for j in self.joints])
         return np.asarray(np.clip(np.abs(np.nan_to_num(self.tau)) / most, 0.0, 1.0))
+
+    @property
+    def touched(self) -> dict[str, float]:
+        """The largest of :attr:`touch` by finger, in the areas' order; empty without areas."""
+        fingers: dict[str, float] = {}
+        areas = self.model.areas if isinstance(self.model, HandModel) and len(self.touch) else ()
+        for area, count in zip(areas, self.touch.tolist(), strict=True):
+            finger = area.place.partition(" ")[0]
+            fingers[finger] = float(np.fmax(fingers.get(finger, math.nan), count))
+        return fingers
 
     @property
     def fraction(self) -> Floats:
@@ -192,10 +205,11 @@ class _Topic:
         self.offsets: dict[int, tuple[float, float]] = {}
         self.bad = History(0, most, seconds)
         self._factors = np.array([f.factor for f in self.fields])
+        paths = [f.paths for f in self.fields]
+        self._paths = [path for each in paths for path in each]
+        self._starts = np.cumsum([0, *(len(each) for each in paths)])[:-1]
         self._reader = (
-            RowReader(message_type(type_name).layout, [f.path for f in self.fields])
-            if self.fields
-            else None
+            RowReader(message_type(type_name).layout, self._paths) if self.fields else None
         )
         # the writer of each of the last samples, by time
         self._writers = History(1, most, seconds)
@@ -212,11 +226,11 @@ class _Topic:
         bad: NDArray[np.intp] = np.empty(0, dtype=np.intp)
         rows: Floats = np.empty((len(t), len(self.fields)))
         if isinstance(payloads, Columns):
-            rows = payloads.table([f.path for f in self.fields]) * self._factors
+            rows = self._shown(payloads.table(self._paths))
             bad = np.flatnonzero(~payloads.ok)
         elif self._reader is not None:
-            rows, good = self._reader.read(payloads)
-            rows *= self._factors
+            numbers_read, good = self._reader.read(payloads)
+            rows = self._shown(numbers_read)
             bad = np.flatnonzero(~good)
         order = np.argsort(t, kind="stable")
         self.history.append(t[order], rows[order])
@@ -224,6 +238,12 @@ class _Topic:
         self._writers.append(t[order], np.array(numbers, dtype=np.float64)[order, None])
         if len(bad):
             self.bad.append(np.sort(t[bad]), np.empty((len(bad), 0)))
+
+    def _shown(self, numbers: Floats) -> Floats:
+        """The fields of each sample, from all their numbers."""
+        if len(self._paths) > len(self.fields):
+            numbers = np.fmax.reduceat(numbers, self._starts, axis=1)
+        return np.asarray(numbers * self._factors)
 
     def _times(self, received: Floats, sent: Floats, writers: Times) -> Floats:
         t = received.copy()
@@ -450,6 +470,13 @@ class Collector:
                 fault = np.nan_to_num(bits).astype(np.uint32)
             pressure = _values(row, state, "pressure")
             pressure = np.where(pressure == NO_VALUE, np.nan, pressure)
+        touch: Floats = np.empty(0)
+        felt = found.get("touch")
+        if felt is not None:
+            row = felt[0].row(at) if felt[0].age(at) <= STALE else None
+            touch = np.full(len(felt[1].fields), np.nan)
+            if row is not None:
+                touch = _values(row, felt, "touch")
         target, command_age = nothing, math.nan
         command = found.get("cmd")
         if command is not None and (row := command[0].row(at)) is not None:
@@ -475,6 +502,7 @@ class Collector:
             target=target,
             near=near,
             pressure=pressure,
+            touch=touch,
             commanders=self._processes(command[0].name, "writer") if command else (),
             command_timeout=part.timeout,
         )

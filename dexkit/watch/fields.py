@@ -54,8 +54,9 @@ class Field:
     :param path: in the message, as :class:`~dexkit.messages.columns.Columns` takes it.
     :param name: for people: ``thumb_0 q``.
     :param quantity: ``q``, ``tau``, ``pressure``, ...
-    :param index: of the joint, or of the sensor; -1 for the whole hand.
+    :param index: of the joint, sensor or tactile area; -1 for the whole hand.
     :param factor: from the message's unit to that of ``unit``.
+    :param elements: of a list at ``path``, whose largest number it is; 0 for a single number.
     """
 
     path: str
@@ -64,13 +65,19 @@ class Field:
     index: int
     unit: str = ""
     factor: float = 1.0
+    elements: int = 0
+
+    @property
+    def paths(self) -> list[str]:
+        """Each number of the message that it is made of."""
+        return [f"{self.path}[{i}]" for i in range(self.elements)] or [self.path]
 
 
 @dataclass(frozen=True)
 class Part:
     """The part of a topic for one hand or robot.
 
-    :param kind: ``"cmd"``, ``"state"``, ``"low"`` or ``"touch"``, of which no numbers are shown.
+    :param kind: ``"cmd"``, ``"state"``, ``"low"`` or ``"touch"``.
     :param joints: in the units of the topic's dialect.
     :param expected: samples a second that the vendor's publisher sends.
     :param mode_byte: what the mode byte of a motor holds.
@@ -112,7 +119,12 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
     units = dialect.torque_units or (1.0,) * len(joints)
     first = dialect.index[side]
     fields: list[Field] = []
-    if kind != "touch":
+    if kind == "touch":
+        fields += [
+            Field(a.member, f"{a.place} touch", "touch", i, "counts", elements=a.elements)
+            for i, a in enumerate(hand.areas)
+        ]
+    else:
         slots = [(first + i, j) for i, j in enumerate(joints)]
         fields += _motor_fields(
             type_name, kind, slots, units, hand.unit, hand.torque_unit, dialect.speed_units

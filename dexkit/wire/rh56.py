@@ -72,6 +72,8 @@ class Register(IntEnum):
     ERROR = 1606
     STATUS = 1612
     TEMPERATURE = 1618
+    TOUCH = 3000
+    """Of a hand with tactile areas: their elements, 16 bits each, one area behind the other."""
 
 
 class Error(IntFlag):

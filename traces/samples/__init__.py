@@ -21,6 +21,8 @@ SAMPLES: tuple[str, ...] = (
     "dex1_hand_dropout",
     "dex1_legacy_v1_1",
     "dex3_pinch",
+    "brainco_grip",
+    "inspire_dfx_grip",
     "inspire_ftp_grip",
     "dex5_synthetic",
 )

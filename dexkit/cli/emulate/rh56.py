@@ -26,6 +26,7 @@ _SERIAL_ONLY = ("number", "baudrate", "line_time", "latency_timer", "any_baudrat
     metavar="PORT",
     help="Instead of --link: Modbus on this TCP port of 127.0.0.1; 0 takes a free one.",
 )
+@click.option("--tactile", is_flag=True, help="With --modbus-tcp: an RH56DFTP, with its areas.")
 @object_option("Percent of closing at which the joints touch an object")
 @start_option("Percent of closing at first; by default a relaxed pose.")
 @click.option(
@@ -46,6 +47,7 @@ def emulate_rh56(
     sides: tuple[Side, ...],
     link: str | None,
     tcp: int | None,
+    tactile: bool,
     object_pct: float | None,
     start: float | None,
     number: int,
@@ -80,11 +82,14 @@ def emulate_rh56(
                 port=tcp,
                 object_pct=object_pct,
                 start_pct=start,
+                tactile=tactile,
                 answer_time=answer_time * 1e-3,
                 faults=faults,
                 seed=seed,
             )
         else:
+            if tactile:
+                raise UsageError("--tactile is of a hand on the network", hint="--modbus-tcp PORT")
             hand = Rh56Hand(
                 sides[0],
                 link=link,
