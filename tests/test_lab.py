@@ -101,7 +101,7 @@ def test_a_record_says_when_the_joints_stood_still_and_no_motor_was_driven() -> 
     record.setpoint(0, 1.0)
     record.setpoint(1, 1.0)
     start = record.now()["t"]
-    record.look()
+    record.note_positions()
     place[0] = 0.5
     record.rests(0)
     assert record.stopped(start)["released"] is None

@@ -105,7 +105,7 @@ class Record:
         :returns: seconds ``still`` until no joint moved any more, and ``released`` until no motor
             was driven; ``released`` is None while one is.
         """
-        self.look()
+        self.note_positions()
         with self._lock:
             places = [(t, place) for t, place in self._places if t >= start]
             released = None if self._last else max(0.0, self._released - start)
