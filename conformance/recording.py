@@ -53,6 +53,7 @@ class TraceLike(Protocol):
 
     metadata: dict[str, dict[str, str]]
     warnings: list[str]
+    mixed_types: dict[str, str]
     truncated: bool
 
     @property

@@ -19,6 +19,7 @@ class MemoryTrace:
     endpoints: list[TraceEndpoint] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    mixed_types: dict[str, str] = field(default_factory=dict)
     truncated: bool = False
     rows: dict[tuple[str, str], list[tuple[int, int, bytes]]] = field(default_factory=dict)
 
