@@ -9,7 +9,7 @@ import pytest
 
 from dexkit import dds, domains
 from dexkit.dds import DdsNode
-from dexkit.domains import AUTOMATIC_DOMAINS, reserve_free_domain
+from dexkit.domains import AUTOMATIC_DOMAINS, ReservedDomain, reserve_free_domain
 from dexkit.errors import DexkitError
 from tests.dds_helpers import free_domain
 from tests.trace_helpers import STATE, STATE_TYPE
@@ -28,11 +28,16 @@ def reserve_elsewhere(domain: int) -> int:
     return subprocess.run([sys.executable, "-c", _RESERVE, str(domain)]).returncode
 
 
-def test_a_reserved_domain_is_refused_to_other_processes_until_it_is_closed() -> None:
+def test_a_domain_is_chosen_from_the_automatic_ones() -> None:
     with reserve_free_domain() as reserved:
         assert reserved.domain in AUTOMATIC_DOMAINS
-        assert reserve_elsewhere(reserved.domain) == 3
-    assert reserve_elsewhere(reserved.domain) == 0
+
+
+def test_a_reserved_domain_is_refused_to_other_processes_until_it_is_closed() -> None:
+    domain = AUTOMATIC_DOMAINS[0] - 1  # the tests beside this one choose automatic ones
+    with ReservedDomain(domain):
+        assert reserve_elsewhere(domain) == 3
+    assert reserve_elsewhere(domain) == 0
 
 
 def test_reservations_differ() -> None:
