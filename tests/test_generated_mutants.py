@@ -396,9 +396,24 @@ def test_an_outsider_that_fails_is_an_error(tmp_path: Path) -> None:
     )
     with pytest.raises(ConformanceError, match="A failed: RuntimeError: mine"):
         outsiders.try_hand(outsiders.load(str(path))[0])
-    with pytest.raises(ConformanceError, match="A failed: RuntimeError: mine") as caught:
-        list(outsiders.try_all(str(path), 1, jobs=1))
-    assert "hands.py" in caught.value.hint
+
+
+def test_a_hand_that_fails_leaves_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "hands.py"
+    fails = "    def live(self, dt): raise RuntimeError('mine')\n"
+    deaf = "    def motors(self, side, motors): pass\n"
+    path.write_text(
+        _HEAD
+        + f"@hand('good', dialects='unitree_go')\nclass A(ReferenceService):\n{fails}"
+        + f"@hand('must-breaking', dialects='unitree_go')\nclass B(ReferenceService):\n{deaf}"
+    )
+    out = tmp_path / "verdicts.json"
+    run = CliRunner().invoke(command, ["--from", str(path), "--json", str(out), "--jobs", "1"])
+    assert run.exit_code == 1, run.output
+    failed, found = json.loads(out.read_text())["hands"]
+    assert failed["problem"].startswith("A failed: RuntimeError: mine")
+    assert "hands.py" in failed["problem"]
+    assert (failed["right"], found["right"], found["problem"]) == (False, True, "")
 
 
 def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:

@@ -13,8 +13,11 @@ from dexkit.hand import Floats
 __all__: list[str] = []
 
 _AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
+_RESTARTED = ("restart", "service-restart")
 _AT_A_STOP = 0.05
 """Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
+_AT_REST_PART = 0.01
+"""Part of the range by which q may vary in the 0.1 s before a step that begins at rest."""
 _FAST_S = 0.05
 """Seconds over which the fastest part of a step is measured: several states of the slowest rate."""
 
@@ -84,11 +87,16 @@ def _duration(step: Step) -> float | None:
 
 
 def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
-    """The failure of a hand whose steps after bad commands have lost speed."""
-    for phase in ctx.phases("recover"):
+    """The failure of a hand whose steps after bad commands or a restart have lost speed."""
+    # after a restart the first step may begin softly
+    later = [p for name in _RESTARTED for p in ctx.phases(name)[1:]]
+    for phase in (*ctx.phases("recover"), *later):
         if not obeyed_before(ctx, phase):
             continue
         for step in steps_of(ctx, phase):
+            before = ctx.states.q[ctx.states.between(step.begin - 0.1, step.begin), step.joint]
+            if not (len(before) and np.ptp(before) < _AT_REST_PART * step.stroke):
+                continue  # it was under way, so that this is not the same step
             now = _fastest(step)
             known = [
                 # a hand of constant speed is not faster over a longer distance, a spring-like one

@@ -189,6 +189,17 @@ FOUGHT_OVER = (
 """Stimuli with bad or contradictory commands: a hand that obeys them may really oscillate."""
 
 
+def _noise(up: Floats, down: Floats) -> float:
+    """By how much q goes forth and back in most of the cells in which the joint stays, rad.
+
+    A sensor has its noise at rest as well as in motion; old values differ from fresh ones only
+    while the joint moves. 0 where it stays in fewer than half of the cells.
+    """
+    back = np.minimum(up, down)
+    stays = (up > 0) & (down > 0) & (np.abs(up - down) <= 0.5 * back)
+    return float(np.median(back[stays])) if 2 * int(stays.sum()) >= len(back) else 0.0
+
+
 @check("DEX1-FRESH-03", "DEX3-FRESH-03")
 def alternates(ctx: Context) -> Outcome:
     """Number of cells with a reversal of q, in the worst window."""
@@ -220,7 +231,10 @@ def alternates(ctx: Context) -> Outcome:
             for way in (1, -1)
         )
         back = np.minimum(up, down)
-        often = np.convolve(back >= limit, np.ones(count), "valid")
+        # even noise of +-a goes forth and back by a third of a from state to state
+        most_noise = ctx.tolerance("min_turn_stroke", joint) / 3 * len(t) / most
+        noise = min(_noise(np.asarray(up, dtype=float), np.asarray(down, dtype=float)), most_noise)
+        often = np.convolve(back >= limit + noise, np.ones(count), "valid")
         i = int(np.argmax(often))
         found = (int(often[i]), float(back[i : i + count].max()), joint, float(t[0]) + i * cell)
         worst = found if worst is None or found > worst else worst

@@ -16,6 +16,7 @@ from dexkit.conformance.checks.motion import (
     half_way,
     least_half_way,
     limited_by_speed,
+    limited_by_start,
     steps,
     steps_of,
 )
@@ -31,6 +32,7 @@ _STEPS = (
 _LEAST_STEP = 0.1  # of the stroke
 _REST_S, _REST_PART = 0.1, 0.01  # before a step: seconds, and part of the stroke that q may vary
 _BEGUN, _WAY = 0.01, 0.5  # parts of a step between which the motor must drive the joint
+_UNSEEN_S = 0.03  # s without a state, after which the motor may already brake the joint
 _STRONG = 0.5  # of the largest tau_est: values that count
 _CLEAR = 0.75  # part of them that must have the same sign
 
@@ -73,7 +75,10 @@ def _drive_of(ctx: Context, step: Step) -> _Drive | None:
     if not len(half):
         return None  # other requirements judge whether it arrives
     # before it moves, tau_est may still be that of the previous command
-    begin = float(step.t[np.argmax(part >= _BEGUN)])
+    first = int(np.argmax(part >= _BEGUN))
+    begin = float(step.t[first])
+    if np.diff(step.t[max(first - 1, 0) : half[0] + 1]).max(initial=0.0) > _UNSEEN_S:
+        return None  # no state shows the torque at the beginning
     return _driven(ctx, joint, way, begin, float(step.t[half[0]]))
 
 
@@ -293,7 +298,8 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
     """Time to half of a step with a third of the client's stiffness, compared with the client's
     stiffness.
 
-    A step at the joint's own top speed does not depend on gains, and is left out.
+    A step at the joint's own top speed, or within its soft start, does not depend on gains, and is
+    left out.
     """
     stiff = {s.joint: s for p in ctx.phases("stiff") for s in steps_of(ctx, p)}
     worst: tuple[float, int, float, float] | None = None
@@ -305,13 +311,16 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
         took, quick = least_half_way(step), max(quick, 1e-3)
         soon = took < ctx.tolerance("min_ratio") * quick
-        if soon and reference is not None and limited_by_speed(ctx, reference):
+        own = limited_by_speed, limited_by_start
+        if soon and reference is not None and any(by(ctx, reference) for by in own):
             limited += 1
             continue
         if worst is None or took / quick < worst[0]:
             worst = took / quick, step.joint, took, quick
     if worst is None and limited:
-        return ctx.absent("its own speed limits every joint's steps, whatever their gains are")
+        return ctx.absent(
+            "its own speed or start limits every joint's steps, whatever their gains are"
+        )
     if worst is None:
         return ctx.skipped("no state during the steps")
     ratio, joint, took, quick = worst

@@ -218,6 +218,26 @@ def unknown_status(ctx: Context) -> Outcome:
 
 
 _FORCE_S, _HELD = 0.3, 0.2  # s over which a force is taken, and the part of it that is below it
+_STANDS = 0.03  # part of the range: a joint that moves by less meanwhile stands
+
+
+def _first_force(ctx: Context, begin: float, end: float) -> tuple[Floats, Floats]:
+    """tau_est in size of each joint in the first piece in which it stands, and that piece's end.
+
+    A joint that is still on its way presses on nothing: its torque ends with its motion. 0 N m for
+    one that never stands.
+    """
+    strokes = np.array([j.stroke for j in ctx.joints])
+    felt, since = np.zeros(len(strokes)), np.full(len(strokes), np.inf)
+    for at in np.arange(begin, end - _FORCE_S + 1e-9, _FORCE_S / 3).tolist():
+        rows = ctx.states.between(at, at + _FORCE_S)
+        q = ctx.states.q[rows]
+        if not len(q):
+            continue
+        stands = np.isinf(since) & (np.ptp(q, axis=0) <= _STANDS * strokes)
+        felt[stands] = np.median(np.abs(ctx.states.tau[rows]), axis=0)[stands]
+        since[stands] = at + _FORCE_S
+    return felt, since
 
 
 @check("DEX3-FORCE-06")
@@ -234,20 +254,22 @@ def keeps_gripping(ctx: Context) -> Outcome:
         begin, end = ctx.span(phase)
         if end - begin < ctx.tolerance("min_hold_s"):
             continue
-        first = ctx.states.between(begin + 0.3, begin + 0.6)
         # the motors' own time-outs are a second after the last command
         quiet = [p for p in ctx.phases("guard") if p.begin_ns >= phase.end_ns]
         until = ctx.span(quiet[0])[0] + 0.7 if quiet else end
-        later = np.arange(begin + 0.6, end - _FORCE_S, _FORCE_S).tolist()
+        then, since = _first_force(ctx, begin + _FORCE_S, end - _FORCE_S)
+        pressing = np.flatnonzero(then >= ctx.tolerance("min_tau_nm")).tolist()
+        later = np.arange(begin + 2 * _FORCE_S, end - _FORCE_S, _FORCE_S).tolist()
         spans = [*((at, at + _FORCE_S) for at in later), (end - _FORCE_S, end)]
         spans.append((until - _FORCE_S, until))
         for a, b in spans:
             last = ctx.states.between(a, b)
-            if not len(ctx.states.t[first]) or not len(ctx.states.t[last]):
+            if not len(ctx.states.t[last]):
                 continue
-            then = np.median(np.abs(ctx.states.tau[first]), axis=0)
             now = np.quantile(np.abs(ctx.states.tau[last]), _HELD, axis=0)
-            for joint in np.flatnonzero(then >= ctx.tolerance("min_tau_nm")).tolist():
+            for joint in pressing:
+                if a < since[joint] - 1e-9:
+                    continue
                 part = float(now[joint] / then[joint])
                 found = (part, joint, float(then[joint]), float(now[joint]), a, b)
                 worst = found if worst is None or found < worst else worst

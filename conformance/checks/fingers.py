@@ -583,7 +583,7 @@ def brakes(ctx: Context) -> Outcome:
 @check("DEX3-GUARD-02")
 def reports_trip(ctx: Context) -> Outcome:
     """Bit 7 of the state's mode byte of each joint before and after the time-out."""
-    silences = _silences(ctx, "guard")
+    silences = _silences(ctx, "guard", "silence")
     for silence in silences:
         last, late, end = silence.last, silence.late, silence.end
         # protection is on for a while before: repeated commands must keep it from tripping

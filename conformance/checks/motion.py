@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,6 +115,9 @@ range per second."""
 _LARGER, _FASTER = 1.5, 1.2
 """Factor of size, and of speed: a step larger by this factor is faster by it, unless the joint's
 own top speed limits it."""
+_REST_S, _RESTS = 0.1, 0.01  # s before a step, and part of the range by which q may vary there
+_GROWS = 0.25
+"""Part of the growth of the error by which the way may grow where a soft start limits it."""
 _CHANGE, _WATCHED_S = 0.05, 0.25
 """Smallest change of a goal, as a part of the range, and the seconds after it in which a joint is
 fastest."""
@@ -180,18 +183,42 @@ def limited_by_speed(ctx: Context, step: Step) -> bool:
 
     Then the duration does not depend on gains. Without a larger change it is unknown: False.
     """
+    fastest = max((peak_speed(one) for one in _larger(ctx, step)), default=None)
+    return fastest is not None and fastest <= _FASTER * peak_speed(step)
+
+
+def limited_by_start(ctx: Context, step: Step) -> bool:
+    """Whether a joint's own soft start limits a step: after much larger changes of its goal from
+    rest it mostly came hardly further in the time in which this step got half-way.
+
+    Where gains limit the step, the way grows with the error.
+    """
+    half, grows = half_way(step), []
+    if half is None:
+        return False
+    for one in _larger(ctx, step):
+        before = ctx.states.q[ctx.states.between(one.begin - _REST_S, one.begin), step.joint]
+        if not float(np.ptp(before)) <= _RESTS * step.stroke:
+            continue
+        then = min(int(np.searchsorted(one.t, one.begin + half)), len(one.t) - 1)
+        further = abs(float(one.q[then]) - one.start) / (0.5 * abs(step.size)) - 1.0
+        grows.append(further / (abs(one.size / step.size) - 1.0))
+    return bool(grows) and median(np.array(grows)) <= _GROWS
+
+
+def _larger(ctx: Context, step: Step) -> Iterator[Step]:
+    """Motions of a step's joint after much larger changes of its goal, with the same stiffness."""
     given, states, joint = ctx.commands, ctx.states, step.joint
     spec = ctx.joints[joint]
     good = np.isfinite(given.q).all(axis=1) & np.isfinite(given.kp).all(axis=1)
     t, kp = given.t[good], given.kp[good, joint]
     goal = np.clip(given.q[good, joint], spec.q_min, spec.q_max)
     if not len(t):
-        return False
+        return
     stiff = float(
         kp[max(int(np.searchsorted(t, step.begin + 0.5 * (step.end - step.begin))) - 1, 0)]
     )
     changes = np.flatnonzero(np.abs(np.diff(goal, prepend=goal[0])) > _CHANGE * spec.stroke)
-    fastest: float | None = None
     for i, begin in zip(changes, t[changes].tolist(), strict=True):
         later = np.flatnonzero(np.abs(goal[i:] - goal[i]) > _CHANGE * spec.stroke)
         end = min(float(t[i + later[0]]) if len(later) else float(t[-1]), begin + _WATCHED_S)
@@ -205,8 +232,7 @@ def limited_by_speed(ctx: Context, step: Step) -> bool:
             continue
         one = replace(step, begin=begin, end=end, target=float(goal[i]), start=was, t=tq, q=q)
         if abs(float(q[-1]) - was) >= _CHANGE * spec.stroke:  # nothing holds it back
-            fastest = max(fastest or 0.0, peak_speed(one))
-    return fastest is not None and fastest <= _FASTER * peak_speed(step)
+            yield one
 
 
 def half_way(step: Step) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.recording import Recording
@@ -32,7 +32,6 @@ class _Felt:
     joints: dict[int, TrackingFigures]
 
 
-@lru_cache(maxsize=4)
 def _felt(recording: Recording, side: Side) -> _Felt | str:
     phases = recording.phases(OPERATOR, side)
     if not phases:
@@ -77,7 +76,7 @@ def _judge(
     """The joint with the worst figure against a tolerance."""
     side = ctx.side
     assert isinstance(side, Side), "these requirements are about hands"
-    found = _felt(ctx.recording, side)
+    found = ctx.once("felt", lambda: _felt(ctx.recording, side))
     if isinstance(found, str):
         return ctx.skipped(found)
     figures = {i: value(f) for i, f in found.joints.items()}

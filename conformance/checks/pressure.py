@@ -323,10 +323,10 @@ def _gives_way(ctx: Context, finger: str, begin: float, end: float, later: float
     """
     joints = [i for i, j in enumerate(ctx.joints) if j.closing and j.name.startswith(finger)]
     way = np.array([ctx.joints[i].closing / ctx.joints[i].stroke for i in joints])
-    soft, firm, again = (
-        np.median(ctx.states.q[ctx.states.between(t - _BEFORE_S, t)][:, joints], axis=0) * way
-        for t in (begin, end, later)
-    )
+    rows = [ctx.states.between(t - _BEFORE_S, t) for t in (begin, end, later)]
+    if not all(len(ctx.states.t[r]) for r in rows):
+        return False
+    soft, firm, again = (np.median(ctx.states.q[r][:, joints], axis=0) * way for r in rows)
     least = np.maximum(
         ctx.tolerance("min_way_stroke"), ctx.tolerance("min_fall_part") * (firm - soft)
     )

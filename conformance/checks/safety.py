@@ -704,3 +704,42 @@ def load(ctx: Context) -> Outcome:
     span = begin, end
     met = ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
     return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))
+
+
+@check("DEX1-LOAD-02", "DEX3-LOAD-02")
+def obeys_under_load(ctx: Context) -> Outcome:
+    """How far the hand follows the way out and back that it is commanded under load."""
+    worst: tuple[float, int, float, float, float] | None = None
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        begin, end = ctx.span(phase)
+        rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        t, goals = ctx.commands.t[rows], ctx.commands.q[rows]
+        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+        if not len(t) or not len(before) or not np.isfinite(goals).all():
+            continue
+        start = np.median(before, axis=0)
+        for joint in range(len(ctx.joints)):
+            way = goals[:, joint] - goals[0, joint]
+            turn = int(np.argmax(np.abs(way)))
+            size = float(way[turn])
+            if abs(size) < ctx.tolerance("min_way_stroke", joint):
+                continue
+            # it may still be on its way from the load before, or be held off its goal
+            origin = float(goals[0, joint])
+            if (float(start[joint]) - origin) * size < 0:
+                origin = float(start[joint])
+            until = float(t[turn]) + ctx.tolerance("max_delay_s")
+            q = ctx.states.q[ctx.states.between(float(t[turn]), until), joint]
+            made = float(((q - origin) / size).max()) if len(q) else 0.0
+            found = (made, joint, begin, until, size)
+            worst = found if worst is None or found < worst else worst
+    if worst is None:
+        return ctx.skipped("no way under load, or the hand had stopped obeying before")
+    made, joint, begin, until, size = worst
+    text = ctx.named(f"made {made:.0%} of a way of {size:.2f} {ctx.unit} under load", joint)
+    limit = ctx.tolerance("min_part")
+    if made >= limit:
+        return ctx.passed(f"{made:.0%}", text, part=made)
+    place = ctx.at(ctx.states.topic, begin, until)
+    outcome = ctx.failed(f"{made:.0%}", text, place, part=made).about(joint)
+    return outcome.if_late(until - begin)

@@ -111,7 +111,11 @@ def one_course(ctx: Context) -> Outcome:
 
 @check("DEX1-FIELD-20", "DEX3-FIELD-19")
 def at_rest(ctx: Context) -> Outcome:
-    """The largest mean of dq of a joint at rest."""
+    """The largest mean of dq of a joint at rest.
+
+    If q is measured every 50 ms, it stands that long when the next motion begins, and dq may
+    already show the motion: the end of a rest is left out.
+    """
     if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
     cell = ctx.tolerance("cell_s")
@@ -135,17 +139,19 @@ def at_rest(ctx: Context) -> Outcome:
         first = np.minimum(rows[:-1], len(q) - 1)
         low, high = np.minimum.reduceat(q, first), np.maximum.reduceat(q, first)
         mean = np.add.reduceat(dq, first) / np.maximum(np.diff(rows), 1)
+        if len(low) <= count:
+            continue
         lows, highs, fulls, means = (
-            np.lib.stride_tricks.sliding_window_view(x, count) for x in (low, high, full, mean)
+            np.lib.stride_tricks.sliding_window_view(x, count + 1) for x in (low, high, full, mean)
         )
         rest = fulls.all(axis=1)
         rest &= highs.max(axis=1) - lows.min(axis=1) <= ctx.tolerance("max_ripple_stroke", joint)
         rests += int(rest.sum())
         if not rest.any():
             continue
-        # without the first cell, in which it may come to rest; a tremor in the play of a gear has
-        # zero mean
-        last = np.where(rest, np.abs(means[:, 1:].mean(axis=1)), 0.0)
+        # without the first cell, in which it may come to rest, and the last, in which it may begin
+        # to move; a tremor in the play of a gear has zero mean
+        last = np.where(rest, np.abs(means[:, 1:-1].mean(axis=1)), 0.0)
         i = int(np.argmax(last))
         found = (float(last[i]) / spec.stroke, float(last[i]), joint, float(edges[i + count - 1]))
         worst = found if worst is None or found > worst else worst

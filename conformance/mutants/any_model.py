@@ -632,6 +632,16 @@ class WeakAfterNan(Service):
         super().motors(side, motors)
 
 
+@wrong_hand("DEX3-ABUSE-01", also=("DEX3-HOLD-01",), where=obeys_gains, whole=True)
+class WeakWhenRestarted(Service):
+    """Uses two fifths of the stiffness after a restart of its service, as settings are lost."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if self.restarted:
+            motors = tuple(replace(m, kp=0.4 * m.kp) for m in motors)
+        super().motors(side, motors)
+
+
 # ----------------------------------------------------------------------------------- safety
 
 
@@ -920,6 +930,22 @@ class StuttersUnderLoad(Service):
             for times in self.came.values()
         )
         return [] if busy and self.cycle % _too_slow(self) else super().publish()
+
+
+@wrong_hand(("DEX1-LOAD-02", "DEX3-LOAD-02"))
+class DeafToThousands(Service):
+    """Takes no command while more than 700 a second arrive, as its inbox overflows."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.came: dict[Side, deque[float]] = {s: deque(maxlen=70) for s in self.sides}
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        came = self.came[side]
+        full = len(came) == 70 and self.now - came[0] < 0.1
+        came.append(self.now)
+        if not full:
+            super().motors(side, motors)
 
 
 @wrong_hand(("DEX1-LOAD-01", "DEX3-LOAD-01"), where=_needs_many_states)

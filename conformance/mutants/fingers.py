@@ -1174,6 +1174,34 @@ class StuckAfterSilence(FingerService):
     hand_fault = _LatchesWithoutGuard
 
 
+class _BeginsAtZero(FingerHand):
+    expired = False
+    until = -math.inf
+
+    def expire(self) -> None:
+        super().expire()
+        self.expired = True
+
+    def command(self, motors: tuple[Motor, ...]) -> None:
+        if self.now < self.until + 0.1:
+            self.newest = ()  # an equal command counts again
+        super().command(motors)
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        if self.expired:
+            self.expired, self.until = False, self.now + 0.15
+        if self.now < self.until:
+            self.goal = np.minimum(np.maximum(0.0, self.low), self.high)
+
+
+@wrong_hand("DEX3-PATH-01", also=("DEX3-WDOG-03",))
+class BeginsAtZero(FingerService):
+    """Goes towards 0 for 0.15 s when the commands come again after a silence."""
+
+    hand_fault = _BeginsAtZero
+
+
 class _SleepsWithoutGuard(FingerHand):
     deaf_until = -math.inf
 
@@ -1240,7 +1268,7 @@ class _OneGuard(FingerHand):
         return status, np.full_like(guarded, guarded[-1])
 
 
-@wrong_hand("DEX3-GUARD-02", also=("DEX3-GUARD-03", "DEX3-HOLD-01", "DEX3-MODE-05"))
+@wrong_hand("DEX3-GUARD-01", also=("DEX3-HOLD-01", "DEX3-MODE-05"))
 class GuardOfTheLast(Dex3Service):
     """Applies the last motor's time-out bit to all."""
 
@@ -1263,6 +1291,24 @@ class HealsByItself(Dex3Service):
     """Clears its protection two seconds after it has tripped."""
 
     hand_fault = _Heals
+
+
+class _TripsOnce(FingerHand):
+    trips = 0
+
+    def expire(self) -> None:
+        before = self.tripped
+        super().expire()
+        self.trips += bool(self.guarded.any())
+        if self.trips > 1:
+            self.tripped = before
+
+
+@wrong_hand("DEX3-GUARD-01", whole=True)
+class TripsOnce(Dex3Service):
+    """Its protection trips the first time only: what it counts with is never set back."""
+
+    hand_fault = _TripsOnce
 
 
 class _FedByNews(FingerHand):

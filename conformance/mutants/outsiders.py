@@ -6,6 +6,7 @@ judged by every requirement in a whole conformance run on the virtual clock.
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import inspect
 import json
@@ -85,6 +86,7 @@ class Verdicts:
 
     :param failed: ids of MUSTs that fail; ``warned`` of other requirements that fail or warn;
         ``errors`` of those that could not be judged for a fault of the kit.
+    :param problem: why there are none: the hand's own code failed, and where. Empty otherwise.
     """
 
     name: str
@@ -95,11 +97,12 @@ class Verdicts:
     failed: tuple[str, ...]
     warned: tuple[str, ...]
     errors: tuple[str, ...]
+    problem: str = ""
 
     @property
     def right(self) -> bool:
         """Whether the checks agree: a good hand is not blamed, a wrong one for a right reason."""
-        if self.errors:
+        if self.errors or self.problem:
             return False
         if self.grade == "good":
             return not self.failed and not self.warned
@@ -258,20 +261,25 @@ def try_hand(each: Outsider) -> Verdicts:
         raise ConformanceError(
             f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
         ) from error
+    return _verdicts(each, blame(result))
+
+
+def _verdicts(each: Outsider, found: Blame, problem: str = "") -> Verdicts:
     summary = (each.made.__doc__ or "").strip().partition("\n")[0]
-    return Verdicts(each.name, summary, each.dialect.name, each.grade, each.expects, *blame(result))
+    about = each.name, summary, each.dialect.name, each.grade, each.expects
+    return Verdicts(*about, *found, problem)
 
 
 def try_all(
     source: str, count: int, stop: object = None, jobs: int | None = None
 ) -> Iterator[tuple[int, Verdicts]]:
     """Judge every hand of a source in worker processes; yield each, with its index in
-    :func:`load`, when it is done.
+    :func:`load`, when it is done. One whose own code failed has a ``problem``.
 
     :param count: how many hands it has.
     :param stop: ends it early when it becomes true.
     :param jobs: processes; one per processor by default.
-    :raises ConformanceError: a hand's own code failed, or ended its process.
+    :raises ConformanceError: a hand ended its process.
     """
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, context, ignore_interrupts)
@@ -279,10 +287,7 @@ def try_all(
         waiting = {pool.submit(_try_one, source, index): index for index in range(count)}
         while waiting and not stop:
             for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
-                index, found = waiting.pop(future), future.result()
-                if not isinstance(found, Verdicts):
-                    raise ConformanceError(found[0], hint=found[1])
-                yield index, found
+                yield waiting.pop(future), future.result()
     except BrokenProcessPool:
         raise ConformanceError(
             "a hand ended the process that tried it", hint="--jobs 1 shows after which hand"
@@ -294,22 +299,27 @@ def try_all(
 _loaded = cache(load)
 
 
-def _try_one(source: str, index: int) -> Verdicts | tuple[str, str]:
-    """The verdicts of a hand, or why there are none: not every error can be sent on."""
+def _try_one(source: str, index: int) -> Verdicts:
+    """The verdicts of a hand, or why there are none."""
+    each = _loaded(source)[index]
     try:
-        return try_hand(_loaded(source)[index])
-    except DexkitError as error:
-        return error.message, error.hint
+        return try_hand(each)
+    except ConformanceError as error:
+        return _verdicts(each, Blame((), (), ()), f"{error.message} ({error.hint})")
+    finally:
+        # a hand and its service are a cycle that holds large arrays, of whose size Python's own
+        # collector knows nothing
+        gc.collect()
 
 
 def print_verdicts(console: Console, found: Sequence[Verdicts]) -> None:
     """Print what became of each hand, those that the checks are wrong about first."""
     for v in sorted(found, key=lambda v: v.right):
-        ids = ", ".join(v.failed + v.warned + v.errors) or "nothing"
+        ids = v.problem or (", ".join(v.failed + v.warned + v.errors) or "nothing") + " found"
         state = "right" if v.right else "wrong"
         color = "green" if v.right else "red"
         console.print(
-            f"[{color}]{state}[/]  {escape(v.name)} ({v.grade}): {ids} found", soft_wrap=True
+            f"[{color}]{state}[/]  {escape(v.name)} ({v.grade}): {escape(ids)}", soft_wrap=True
         )
     right = sum(v.right for v in found)
     console.print(f"the checks are right about {right} of {len(found)} hands")

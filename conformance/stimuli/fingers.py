@@ -402,11 +402,20 @@ class FingerScript(HandScript):
         yield from self._to("resume", CLOSED - 5.0)
 
     def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
-        """No command to one side but rejected ones, while it moves and the other is commanded."""
+        """No command to one side but rejected ones, while it moves and the other is commanded.
+
+        Where motors have time-out protection, some have it: it must trip more than once. The first
+        step afterwards closes that hand, away from where a hand that begins at 0 would go.
+        """
         self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
-        yield from self._drive("drive", (side,), {})
+        yield from self._drive("drive", (side,), {}, guarded=self._once_more())
         yield from self._silence_alone("silence", side, {side: rejected} if rejected else {})
-        yield from self._everyone("resume", {s: self._home(s) for s in self.plan.sides}, most=1.5)
+        poses = {s: self._pose(s, CLOSED - 5.0 if s is side else OPEN) for s in self.plan.sides}
+        yield from self._everyone("resume", poses, most=1.5)
+
+    def _once_more(self) -> dict[Side, frozenset[int]]:
+        """The joints with time-out protection in a silence of one side."""
+        return self._next_splits() if "guard" in self.plan.phases else {}
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
         """Two motors with each other's id, and a goal elsewhere for the first."""
@@ -583,7 +592,11 @@ class FingerScript(HandScript):
         by_torque = self._by_torque()
         for s in sides:
             motors = self._guarded(self._motors(s, self._goal[s]), s, guarded or {})
-            far = self._pose(s, CLOSED)
+            # to the farther place, so that it lasts
+            far = max(
+                (self._pose(s, percent) for percent in (CLOSED, OPEN)),
+                key=lambda pose: sum(abs(pose[i] - self._goal[s][i]) for i in self._roles.slow),
+            )
             for i in self._roles.driven:
                 speed = math.copysign(_SPEED, self._joints[s][i].closing)
                 dq, tau = (0.0, _DAMPING * speed) if i == by_torque else (speed, 0.0)
@@ -781,9 +794,9 @@ class FingerScript(HandScript):
         """No commands to each hand alone."""
         sides = self.plan.sides
         if len(sides) == 1 and "guard" in self.plan.phases:
-            yield from self._drive("drive", sides, {})
+            yield from self._drive("drive", sides, {}, guarded=self._once_more())
             yield from self._silence("silence", self._model.command_timeout + 0.7)
-            yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
+            yield from self._to("resume", CLOSED - 5.0)
         if len(sides) > 1 and "silence" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 home = self._motors(side, self._home(side))

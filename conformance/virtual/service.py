@@ -37,6 +37,9 @@ class TopicDevice(ABC):
     """Seconds of a step of the virtual clock."""
     period = 0.003
     """Seconds from state to state."""
+    command_type = ""
+    """DDS type of its command topics; empty for the dialect's."""
+    state_type = ""
     serves_late_readers = True
     reader_durability = "Volatile"
     writer_reliability = "reliable"
@@ -54,8 +57,8 @@ class TopicDevice(ABC):
     ) -> None:
         self.dialect = dialect
         self.sides: tuple[Subject, ...] = tuple(sides)
-        self.command_type = dialect.cmd_type
-        self.state_type = dialect.state_type
+        self.command_type = self.command_type or dialect.cmd_type
+        self.state_type = self.state_type or dialect.state_type
         self.now = 0.0
         self.stamp = 0.0
         """Source timestamp of the command that is received, in its own time."""

@@ -61,12 +61,14 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
             by_index[index] = verdicts
             yield verdicts
 
-    with stop_on_signals() as stop:
-        _follow(len(hands), each(), stop)
-    found = [by_index[index] for index in sorted(by_index)]
-    outsiders.print_verdicts(console, found)
-    if json_path:
-        outsiders.write_verdicts(json_path, found)
+    try:
+        with stop_on_signals() as stop:
+            _follow(len(hands), each(), stop)
+    finally:  # what is done is kept when it is stopped, or a hand ends its process
+        found = [by_index[index] for index in sorted(by_index)]
+        outsiders.print_verdicts(console, found)
+        if json_path:
+            outsiders.write_verdicts(json_path, found)
     sys.exit(0 if all(v.right for v in found) else 1)
 
 

@@ -21,6 +21,7 @@ from dexkit.hand import Side
 __all__ = ["DEVIATIONS", "GROUPS"]
 
 W = TypeVar("W", bound=type[What])
+_ONE = {"one_joint": True}
 _found: dict[str, type[What]] = {}
 _groups: dict[str, list[str]] = {}
 
@@ -48,6 +49,19 @@ class _Noise(What):
 
 _add("noise", _Noise, "noise-q-small", "has noise of 0.02 % of the range on q", q=2e-4)
 _add("noise", _Noise, "noise-q", "has noise of 0.06 % of the range on q", q=6e-4)
+
+
+class _WideNoise(What):
+    """Every value within a part of the range is as likely."""
+
+    part = 0.007
+
+    def report(self, joint: int, values: Report) -> None:
+        span = self.rig.spans[self.side][joint]
+        values.q += self.random.uniform(-self.part, self.part) * span
+
+
+_add("noise", _WideNoise, "noise-q-wide", "has noise of up to 0.7 % of the range on q", **_ONE)
 _add("noise", _Noise, "noise-dq", "has noise of 1 % of the range in a second on dq", dq=0.01)
 _add("noise", _Noise, "noise-tau", "has noise of 3 % of a soft grip on tau_est", tau=0.03)
 
@@ -195,7 +209,6 @@ class _TopSpeed(What):
         return min(max(tau, low), high)
 
 
-_ONE = {"one_joint": True}
 _add("speed", _TopSpeed, "top-speed-4.5", "moves at 4.5 rad/s at most", rads=4.5, **_ONE)
 _add("speed", _TopSpeed, "top-speed-3.6", "moves at 3.6 rad/s at most", rads=3.6, **_ONE)
 
@@ -294,6 +307,15 @@ class _Jitters(What):
         return out
 
 
+class _Pauses(What):
+    """Publishes nothing for 72 ms in every 2.5 s."""
+
+    def publish(self, samples: list[Sample]) -> list[Sample]:
+        quiet = self.rig.now > 1.0 and self.rig.now % 2.5 < 0.072 and not self.rig.ended
+        return [] if quiet else samples
+
+
+_add("state", _Pauses, "pauses", "has a gap of 75 ms in every 2.5 s: a log is written")
 _add("state", _Jitters, "jitter-2", "publishes 2 % of its states a period late", part=0.02)
 _add("state", _Jitters, "jitter-5", "publishes 5 % of its states a period late", part=0.05)
 
