@@ -359,13 +359,13 @@ class EmptyNowAndThen(Service):
 # both sides do the same while one joint moves, so that only later steps show it
 @wrong_hand(
     "BRAINCO-SIDE-01",
-    also=("BRAINCO-LIFE-03", "BRAINCO-SAFE-01", "BRAINCO-SAFE-10", "BRAINCO-WDOG-01"),
+    also=("BRAINCO-SAFE-01", "BRAINCO-WDOG-01"),
     sides=BOTH,
 )
-@wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-SAFE-10"), sides=BOTH)
+@wrong_hand("DFX-SIDE-01", also=("DFX-WDOG-03",), sides=BOTH)
 @wrong_hand(
     "FTP-SIDE-01",
-    also=("FTP-SAFE-10", "FTP-SENS-04", "FTP-SIDE-02", "FTP-WDOG-01"),
+    also=("FTP-SENS-04", "FTP-SIDE-02", "FTP-WDOG-01", "FTP-WDOG-03"),
     sides=BOTH,
 )
 class Swapped(Service):

@@ -45,16 +45,13 @@ class Thousandths(ServoService):
 # with an object in one hand, the other one shows that it is held back
 @wrong_hand(
     "BRAINCO-SIDE-01",
-    also=(
-        *("BRAINCO-LIFE-03", "BRAINCO-MOVE-09", "BRAINCO-SAFE-01"),
-        *("BRAINCO-SAFE-10", "BRAINCO-WDOG-01"),
-    ),
+    also=("BRAINCO-MOVE-09", "BRAINCO-SAFE-01", "BRAINCO-WDOG-01"),
     sides=BOTH,
 )
-@wrong_hand("DFX-SIDE-01", also=("DFX-LIFE-03", "DFX-MOVE-09", "DFX-SAFE-10"), sides=BOTH)
+@wrong_hand("DFX-SIDE-01", also=("DFX-MOVE-09", "DFX-WDOG-03"), sides=BOTH)
 @wrong_hand(
     "FTP-SIDE-01",
-    also=("FTP-MOVE-09", "FTP-SAFE-10", "FTP-SIDE-02", "FTP-WDOG-01"),
+    also=("FTP-MOVE-09", "FTP-SIDE-02", "FTP-WDOG-01", "FTP-WDOG-03"),
     sides=BOTH,
 )
 class StatesSwapped(ServoService):
