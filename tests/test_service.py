@@ -136,7 +136,9 @@ def test_a_client_without_gains_is_counted_and_reported_the_setting(
     with caplog.at_level(logging.WARNING), serve(hand, node) as service:
         for number, q in enumerate((1.0, 2.0, 2.0)):
             node.deliver(CMD, encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q)])))
-            wait_until(lambda n=number: service.counters.received > n)  # type: ignore[misc]
+            wait_until(  # received comes before accepted
+                lambda n=number: service.snapshot()["hands"]["left"]["accepted"] > n  # type: ignore[misc]
+            )
         hands = service.snapshot()["hands"]["left"]
     assert (hands["accepted"], hands["zero_gains"]) == (3, 2)
     (said,) = [r.getMessage() for r in caplog.records if "stays limp" in r.getMessage()]
