@@ -783,7 +783,10 @@ class QueuesCommands(Service):
         super().live(dt)
 
 
-@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"), also=("DEX1-LOAD-01", "DEX3-LOAD-01"))
+@wrong_hand(
+    ("DEX1-SAFE-07", "DEX3-SAFE-08"),
+    also=("DEX1-LOAD-01", "DEX3-LOAD-01", "DEX3-LOAD-02"),
+)
 class StopsInABurst(Service):
     """Receives in its publishing thread: each waiting command delays the next state."""
 
