@@ -29,6 +29,7 @@ from typing import Any
 
 from dexkit import __version__, documents
 from dexkit.conformance.measure import Measure
+from dexkit.conformance.measured_q import MeasuredQ
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
 from dexkit.conformance.scores import NO_SCORE, Score
@@ -322,6 +323,8 @@ class RunResult:
         the kit, which is its own client.
     :param run: the run record (:mod:`~.run_record`); empty where no live run was made.
     :param score: how many wrong hands a run like this catches.
+    :param measured_q: for each hand, whether q is measured; empty where the kit made no live run.
+    :param manual_test: what the vendor says of the manual test of q; empty if nothing.
     """
 
     subject: dict[str, str]
@@ -337,6 +340,8 @@ class RunResult:
     client: list[Result] = field(default_factory=list)
     run: dict[str, str] = field(default_factory=dict)
     score: Score = NO_SCORE
+    measured_q: tuple[MeasuredQ, ...] = ()
+    manual_test: str = ""
 
     @property
     def partial(self) -> bool:
@@ -469,6 +474,10 @@ class RunResult:
             if self.client
             else None,
             "score": self.score.as_dict(),
+            "measured_q": {
+                "hands": [found.as_dict() for found in self.measured_q],
+                "manual_test": self.manual_test,
+            },
         }
 
     def write_json(self, path: Path) -> None:

@@ -75,7 +75,11 @@ def run_record(
         "claims": json.dumps(
             None
             if claims.units is None
-            else {"claims": dict(claims.units), "hand": dict(claims.hand)}
+            else {
+                "claims": dict(claims.units),
+                "hand": dict(claims.hand),
+                "manual_test": {"q_is_measured": claims.manual_test} if claims.manual_test else {},
+            }
         ),
     }
 
