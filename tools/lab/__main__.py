@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 import compileall
+import contextlib
 import platform
 import subprocess
 import sys
 import sysconfig
 import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from dexkit.errors import DexkitError
@@ -16,21 +21,23 @@ from tools.lab.control import Control
 from tools.lab.devices import Devices
 from tools.lab.initramfs import write_initramfs
 from tools.lab.machine import command_line, run_guest
-from tools.lab.packages import fetch, missing
+from tools.lab.packages import Kernel, fetch, missing
 from tools.lab.report import Case, write_reports
 
 ROOT = Path(__file__).resolve().parents[2]
-_PATIENCE = 600.0  # seconds for the whole session in the guest
+_PATIENCE = 600.0  # seconds for the whole session in a guest
+_GROUPS = ("dex3", "serial")
+"""Each has a guest of its own; they run at the same time."""
 
 
 def main() -> int:
-    """Boot the guest, run the session, write the report; returns the exit code."""
+    """Boot the guests, run the session, write the report; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tools.lab", description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build/lab", help="folder")
-    parser.add_argument("--only", default="", help="groups to run, with commas [default: all]")
+    parser.add_argument("--only", choices=_GROUPS, help="the group to run [default: all]")
     parser.add_argument("--accel", choices=("tcg", "kvm"), default="tcg")
-    parser.add_argument("--patience", type=float, default=_PATIENCE, help="seconds for the guest")
-    parser.add_argument("--cores", type=int, default=2, help="of the guest")
+    parser.add_argument("--patience", type=float, default=_PATIENCE, help="seconds for a guest")
+    parser.add_argument("--cores", type=int, default=1, help="of each guest")
     options = parser.parse_args()
     if platform.system() != "Linux" or platform.machine() != "x86_64":
         print("error: the lab needs Linux on x86-64", file=sys.stderr)
@@ -63,43 +70,38 @@ def _session(out: Path, options: argparse.Namespace) -> int:
 
     def report_case(case: Case) -> None:
         cases.append(case)
-        print(f"{case.status:8}{case.group:10} {case.name}: {case.said}", flush=True)
+        took = f"{case.seconds:.1f} s"
+        print(f"{case.status:8}{case.group:18} {case.name} ({took}): {case.said}", flush=True)
 
-    devices = Devices()
-    control = Control(devices, report_case)
-    try:
-        initramfs = out / "initramfs.gz"
-        python = Path(sys.prefix) / "bin/python"
-        write_initramfs(initramfs, kernel, f"cd {ROOT} && {python} -m tools.lab.guest")
-        words = {
-            "control": control.port,
-            "hands": devices.hands.port,
-            "adapters": devices.adapters.port,
-            "only": options.only,
-            "program": program,
-        }
-        console = out / "console.log"
-        command = command_line(
-            kernel, initramfs, console, words, accelerator=options.accel, cores=options.cores
-        )
-        print(f"booting {kernel.release} ({options.accel}); console: {console}", flush=True)
-        ended = run_guest(command, options.patience)
-    finally:
-        control.close()
-        devices.close()
-    if not (ended and control.finished):
-        why = "the session did not end" if ended else f"it did not end in {options.patience:.0f} s"
-        report_case(
-            Case("lab", "the guest's session", "failed", f"{why}; see {out / 'console.log'}")
-        )
-    if devices.failure is not None:
-        report_case(Case("lab", "the emulators", "failed", repr(devices.failure)))
+    initramfs = out / "initramfs.gz"
+    python = Path(sys.prefix) / "bin/python"
+    write_initramfs(initramfs, kernel, f"cd {ROOT} && {python} -m tools.lab.guest")
+    names = [options.only] if options.only else list(_GROUPS)
+    with contextlib.closing(Devices()) as devices, contextlib.ExitStack() as ended:
+        guests = []
+        for name in names:
+            control = ended.enter_context(contextlib.closing(Control(devices, report_case)))
+            words = {
+                "control": control.port,
+                "hands": devices.hands.port,
+                "adapters": devices.adapters.port,
+                "group": name,
+                "program": program,
+            }
+            guests.append(_Guest(name, control, out / f"console-{name}.log", words))
+        print(f"booting {kernel.release} ({options.accel}); consoles: {out}/console-*.log")
+        with ThreadPoolExecutor(len(guests)) as pool:
+            for done in pool.map(partial(_run, kernel, initramfs, options), guests):
+                if done:
+                    report_case(done)
+        if devices.failure is not None:
+            report_case(Case("lab", "the emulators", "failed", repr(devices.failure)))
     facts = {
         "kernel": f"{kernel.release} ({kernel.version})",
         "packages": ", ".join(kernel.packages),
-        "accelerator": f"{options.accel}, {options.cores} cores",
+        "accelerator": f"{options.accel}; {len(guests)} guests, cores of each: {options.cores}",
         "host": f"{platform.platform()}, Python {platform.python_version()}",
-        **control.facts,
+        **{f"{g.name}: {name}": fact for g in guests for name, fact in g.control.facts.items()},
         "whole run": f"{time.monotonic() - started:.0f} s",
     }
     write_reports(out, cases, facts)
@@ -108,6 +110,36 @@ def _session(out: Path, options: argparse.Namespace) -> int:
     print(f"report: {out / 'report.md'}, {out / 'junit.xml'}; {facts['whole run']}")
     print(f"{len(cases) - failed - skipped} passed, {failed} failed, {skipped} skipped")
     return 1 if failed or not cases else 0
+
+
+@dataclass(frozen=True)
+class _Guest:
+    """One guest: the group that it runs, its connection, its console, its kernel's words."""
+
+    name: str
+    control: Control
+    console: Path
+    words: Mapping[str, object]
+
+
+def _run(
+    kernel: Kernel, initramfs: Path, options: argparse.Namespace, guest: _Guest
+) -> Case | None:
+    """Run a guest until it ends; what went wrong, as a case, if it did not end by itself."""
+    command = command_line(
+        kernel,
+        initramfs,
+        guest.console,
+        guest.words,
+        accelerator=options.accel,
+        cores=options.cores,
+    )
+    ended = run_guest(command, options.patience)
+    if ended and guest.control.finished:
+        return None
+    why = "the session did not end" if ended else f"it did not end in {options.patience:.0f} s"
+    said = f"{why}; see {guest.console}"
+    return Case("lab", f"the session of the guest {guest.name}", "failed", said)
 
 
 def _compile() -> None:

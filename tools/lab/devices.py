@@ -27,8 +27,9 @@ from dexkit.wire import mx64
 
 __all__ = ["ADAPTERS", "Devices", "Record"]
 
-ADAPTERS = ("DKLAB001", "DKLAB002")
-"""Serial numbers of the USB-serial adapters: the MX-64's, the Dex1-1 motor's."""
+ADAPTERS = ("DKLAB001", "DKLAB002", "DKLAB003")
+"""Serial numbers of the USB-serial adapters: the MX-64's, the Dex1-1 motor's, and that of one that
+only takes a USB port."""
 _PERIOD = 0.01  # seconds between two looks at the joints
 _HEARD, _SHOWN = 1000, 60  # messages on a serial line that are remembered; bytes that are shown
 _LOOK_STEPS = 20  # of a motor's mechanics, 10 ms
@@ -119,7 +120,8 @@ class Record:
 
 
 class Devices:
-    """Both Dex3-1 hands on one USB/IP server; an MX-64 and a Dex1-1 motor behind adapters.
+    """Both Dex3-1 hands on one USB/IP server; an MX-64 and a Dex1-1 motor behind adapters, and an
+    adapter to take a port.
 
     :ivar records: of ``left`` and ``right`` (rad), ``mx64`` (percent of opening) and ``dex1``
         (rad).
@@ -136,6 +138,7 @@ class Devices:
             [
                 FtdiUsb(ServoBus([servo], start=now), ADAPTERS[0], model=FT232R),
                 FtdiUsb(MotorBus([motor], start=now), ADAPTERS[1], model=FT232H),
+                FtdiUsb(ServoBus([Servo(1, now=now)], start=now), ADAPTERS[2], model=FT232R),
             ]
         )
         self.adapters.start()

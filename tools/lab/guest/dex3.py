@@ -34,6 +34,7 @@ from tools.lab.guest.stops import run_stops
 __all__ = ["run_dex3"]
 
 _BUSID = {Side.LEFT: "1-1", Side.RIGHT: "1-2"}
+_STAND_IN = "1-3"  # an adapter that nothing else uses
 _EXCHANGES = 100
 _CYCLES = 20
 _FROZEN = 3  # seconds
@@ -214,6 +215,7 @@ class _Dex3:
             f"{side} {(_sum(b, 'exchanges') - _sum(a, 'exchanges')) / took:.0f}/s"
             for side, a, b in zip(Side, before, after, strict=True)
         ]
+        self.clients[Side.RIGHT].silent()  # the left hand has the faults
         errors = sum(_sum(b, "exchange_errors") for b in after)
         return (
             f"exchanges {', '.join(exchanged)}, {errors} errors; left state {rate:.0f} Hz at the "
@@ -325,7 +327,7 @@ class _Dex3:
                     stand_in = None
                 elif cycle % 2:
                     # something else takes the port first
-                    stand_in = attach(self.bench.words["adapters"], "1-1")
+                    stand_in = attach(self.bench.words["adapters"], _STAND_IN)
                 self.plug(Side.LEFT)
                 used.add(self.places[Side.LEFT])
 

@@ -1,23 +1,28 @@
 """Start dexkit's programs in the guest without importing Python's modules each time.
 
-On an emulated processor the imports of ``dexkit serve`` take longer than what it is started for. A
-server process (:mod:`multiprocessing.forkserver`) imports them once; each program is a fork of it:
-a process of its own, with its own user, signals, threads, libusb and DDS.
+On an emulated processor the imports of ``dexkit serve`` take longer than what it is started for.
+One process imports them once; the session and each program are forks of it: processes of their
+own, with their own user, signals, threads, libusb and DDS.
 """
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
-from multiprocessing.context import ForkServerContext
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
-__all__ = ["MODULES", "Program", "prepare"]
+from dexkit.dds import cyclone_type
+
+__all__ = ["MODULES", "Program", "with_programs"]
 
 MODULES = (
     "dexkit.cli.bringup",
@@ -25,32 +30,87 @@ MODULES = (
     "dexkit.cli.doctor",
     "dexkit.cli.doctor_devices",
     "dexkit.cli.serve",
-    "dexkit.dds",
+    "dexkit.doctor.dds",
+    "dexkit.doctor.environment",
+    "dexkit.doctor.link",
+    "dexkit.doctor.network",
+    "dexkit.doctor.observer",
+    "dexkit.doctor.report",
+    "dexkit.doctor.usb",
     "dexkit.drivers.dex1_serial",
     "dexkit.drivers.dex3_usb",
     "dexkit.drivers.dex3_usb.bringup",
     "dexkit.drivers.ezgripper",
     "dexkit.messages.unitree_go",
     "dexkit.messages.unitree_hg",
+    "dexkit.robots",
     "dexkit.service",
-    "tools.lab.guest.__main__",
+    "dexkit.view.process",
     "tools.lab.guest.probe",
     "usb.backend.libusb1",
+    "usb.util",
 )
-"""What the server imports. None of them starts a thread."""
+"""What is imported before the forks. None of them starts a thread."""
+_TYPES = (
+    "unitree_go::msg::dds_::MotorCmds_",
+    "unitree_go::msg::dds_::MotorStates_",
+    "unitree_hg::msg::dds_::HandCmd_",
+    "unitree_hg::msg::dds_::HandState_",
+)
+"""Of messages: CycloneDDS's classes for them take long to make, and CycloneDDS to be imported."""
 _PROBE = "probe"
+_POLL = 0.02  # seconds
+_CONTEXT = multiprocessing.get_context("fork")
 
 
-def _context() -> ForkServerContext:
-    return multiprocessing.get_context("forkserver")
+class _Server:
+    """The session's end of its connection to the process that forks the programs."""
+
+    def __init__(self) -> None:
+        self.connection: Connection | None = None
+        self._lock = threading.Lock()
+
+    def ask(self, *message: Any) -> Any:
+        """Send a request; the answer."""
+        assert self.connection is not None
+        with self._lock:
+            self.connection.send(message)
+            return self.connection.recv()
 
 
-def prepare() -> None:
-    """Start the server; it imports in the background."""
-    _context().set_forkserver_preload(list(MODULES))
-    from multiprocessing import forkserver
+_server = _Server()
 
-    forkserver.ensure_running()
+
+def with_programs(session: Callable[[], None]) -> None:
+    """Import what the programs need, run ``session`` in a fork, and fork its programs meanwhile."""
+    for name in MODULES:
+        importlib.import_module(name)
+    for name in _TYPES:
+        cyclone_type(name)
+    here, there = _CONTEXT.Pipe()
+
+    def run() -> None:
+        here.close()
+        _server.connection = there
+        session()
+
+    forked = _CONTEXT.Process(target=run)
+    forked.start()
+    there.close()
+    programs = {}
+    while True:
+        try:
+            what, *rest = here.recv()
+        except EOFError:
+            break
+        if what == "start":
+            program = _CONTEXT.Process(target=_main, args=rest)
+            program.start()
+            programs[program.pid] = program
+            here.send(program.pid)
+        else:
+            here.send(programs[rest[0]].exitcode)
+    forked.join()
 
 
 class Program:
@@ -75,9 +135,8 @@ class Program:
         self.words = words
         self.out = Path(f"/tmp/program-{time.monotonic_ns()}.log")
         self.out.touch()
-        arguments = (str(self.out), words, user, tuple(groups), terminal)
-        self._process = _context().Process(target=_main, args=arguments)
-        self._process.start()
+        start = ("start", str(self.out), words, user, tuple(groups), terminal)
+        self._pid: int = _server.ask(*start)
 
     def text(self, begin: int = 0) -> str:
         """What it has printed, from byte ``begin`` on."""
@@ -86,22 +145,24 @@ class Program:
     @property
     def code(self) -> int | None:
         """Its exit code; None while it runs."""
-        return self._process.exitcode
+        code: int | None = _server.ask("code", self._pid)
+        return code
 
     def signal(self, number: signal.Signals) -> None:
         """Send it a signal."""
-        assert self._process.pid is not None
-        os.kill(self._process.pid, number)
+        os.kill(self._pid, number)
 
     def wait(self, timeout: float) -> int:
         """Wait for its end; its exit code.
 
         :raises subprocess.TimeoutExpired: it runs on.
         """
-        self._process.join(timeout)
-        if self._process.exitcode is None:
-            raise subprocess.TimeoutExpired(self.words, timeout)
-        return self._process.exitcode
+        end = time.monotonic() + timeout
+        while (code := self.code) is None:
+            if time.monotonic() > end:
+                raise subprocess.TimeoutExpired(self.words, timeout)
+            time.sleep(_POLL)
+        return code
 
     def close(self, patience: float) -> None:
         """End it as Ctrl-C does, or at once if that takes longer than ``patience`` seconds."""
@@ -110,8 +171,8 @@ class Program:
             try:
                 self.wait(patience)
             except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.join()
+                self.signal(signal.SIGKILL)
+                self.wait(patience)
 
 
 def _main(
