@@ -178,7 +178,7 @@ def _label(css: str, where: str, text: str) -> str:
     return f'<span class="{css}" style="{where}">{escape(text)}</span>'
 
 
-def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str) -> list[str]:
+def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str, desk: int = _DESK) -> list[str]:
     """Labels below; every other one, and what the unit covers on phones, is for wide pages only."""
 
     def is_free(at: float, text: str, width: float) -> bool:
@@ -189,7 +189,7 @@ def _x_ticks(axes: _Axes, ticks: Sequence[float], unit: str) -> list[str]:
     for i, tick in enumerate(ticks):
         at = axes.across(tick)
         text = f"{tick:g}"
-        if len(ticks) > 1 and (at > 93 or not is_free(at, text, _DESK)):
+        if len(ticks) > 1 and (at > 93 or not is_free(at, text, desk)):
             continue
         wide = i % 2 or not is_free(at, text, _PHONE)
         found.append(_label("x wide" if wide else "x", f"left:{at:.2f}%", text))
@@ -261,6 +261,7 @@ def chart(
     levels: Sequence[Level] = (),
     ranges: Sequence[Range] = (),
     height: int = 210,
+    width: int = _DESK,
     include: Sequence[float] = (),
     legend: bool = True,
     titled: bool = True,
@@ -270,6 +271,7 @@ def chart(
     :param title: its subject; screen readers read it.
     :param titled: whether the title is shown above it as well.
     :param span: of the horizontal axis.
+    :param width: pixels across it on a wide page, for which labels are placed.
     :param include: values that the vertical axis must reach.
     """
     curves: list[tuple[Line, Floats, Floats]] = []
@@ -312,7 +314,7 @@ def chart(
     labels = [
         *_band_labels(shown, axes),
         *_y_ticks(axes, [(t, f"{t:g}") for t in ticks], y_unit),
-        *_x_ticks(axes, nice_ticks(*span, 8), x_unit),
+        *_x_ticks(axes, nice_ticks(*span, 8), x_unit, width),
     ]
     keys = [(line.label, line.css) for line in lines] if legend else []
     if any(b.css == "busy" for b in shown):

@@ -39,6 +39,7 @@ _WRONG = {
     Condition.REVERSED: "moves against its commands",
     Condition.OTHER: "its commands move another joint",
 }
+_PLOT = 200  # pixels across a plot where several are side by side
 _TRAVEL, _FORCE = "full travel", "full force"  # units of a profile
 _EFFORTS = {"A": "current", _FORCE: "force"}  # what a hand reports in the place of torques, by unit
 _LACKS = {Touch.DEAD: "does not answer to touch", Touch.NO_VALUE: "has no value"}
@@ -340,6 +341,7 @@ def _effort(
         x_unit=unit,
         span=(spec.q_min, spec.q_max),
         height=170,
+        width=_PLOT,
         include=(0.0,),
     )
 
@@ -359,7 +361,12 @@ def _over_time(joint: JointResult, name: str, title: str, before: Series | None,
     lines = [Line("earlier run", "other", before.t, before.q)] if before else []
     lines += [Line("command", "cmd", s.t, s.command), Line("q", "state", s.t, s.q)]
     return chart(
-        f"{joint.name}: {title}", lines, y_unit=unit, span=(0.0, float(s.t[-1]) or 1.0), height=170
+        f"{joint.name}: {title}",
+        lines,
+        y_unit=unit,
+        span=(0.0, float(s.t[-1]) or 1.0),
+        height=170,
+        width=_PLOT,
     )
 
 
@@ -381,6 +388,7 @@ def _start(
         y_unit=torque,
         span=(0.0, float(s.t[-1]) or 1.0),
         height=170,
+        width=_PLOT,
         levels=levels,
         include=(0.0,),
     )
