@@ -443,6 +443,13 @@ def test_nothing_measured_is_not_good() -> None:
     assert replace(good(), spoiled=1).verdict is Verdict.INCOMPLETE
 
 
+@each("hand", ["dex1", "brainco"])
+def test_the_page_tells_the_way_up_from_the_way_down(hand: str) -> None:
+    page = render_selftest(result_of(examined(hand, joints=[0])[0], {}))
+    sweep = page.split("over its range, moved slowly", 1)[1].split("</svg>", 1)[0]
+    assert sweep.count('class="state line"') == sweep.count('class="cmd line"') == 1
+
+
 def test_page_lists_changes_for_the_worse_and_loads_nothing() -> None:
     result = worn("play=0.05")
     page = render_selftest(result, good())

@@ -350,7 +350,8 @@ def _ways(s: Series | None) -> list[tuple[str, Floats, Floats]]:
     """(name, q, torque) of the way up and the way down."""
     if s is None or len(s.q) < 3:
         return []
-    top = int(np.argmax(s.command))
+    # a servo that positions itself is commanded to the end at once, and stays commanded there
+    top = int(np.flatnonzero(s.command == s.command.max())[-1]) + 1
     return [("q rising", s.q[:top], s.tau[:top]), ("q falling", s.q[top:], s.tau[top:])]
 
 

@@ -83,9 +83,9 @@ KINDS = (
     Kind("range", "range", Unit.Q, -1, 0.95, 0.0, 0.03, "from end to end, led there slowly"),
     Kind("zero", "zero", Unit.Q, 0, 0.05, 0.0, 0.02, "what is missing at the lower end, less that "
          "at the upper one: q is off by so much if it is not 0"),
-    Kind("start+", "torque to start, q rising", Unit.TORQUE, 1, 0.5, 0.3, 0.03,
+    Kind("start+", "torque to start, q rising", Unit.TORQUE, 1, 0.5, 0.3, 0.01,
          "highest before the joint moved under a command that creeps away, in mid range"),
-    Kind("start-", "torque to start, q falling", Unit.TORQUE, 1, 0.5, 0.3, 0.03, "likewise"),
+    Kind("start-", "torque to start, q falling", Unit.TORQUE, 1, 0.5, 0.3, 0.01, "likewise"),
     Kind("repeatability", "repeatability", Unit.Q, 1, 0.01, 0.5, 0.003,
          "largest difference of three places of rest for one command, from the same direction"),
     Kind("play", "play", Unit.Q, 1, 0.02, 0.5, 0.004, "how far apart it rests when it comes from "
