@@ -14,11 +14,11 @@ from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.known_backends import (
-    EMULATED,
     EXTERNAL,
-    ON_USB,
     ROBOT_EMULATORS,
     SIMULATED,
+    emulator_of,
+    has_usb_requirements,
 )
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
@@ -175,7 +175,7 @@ class SuiteOptions:
                     f"an object at {pct:g} % of {of_what}",
                     hint=f"{low} to {high} % leaves room to move",
                 )
-        started = backend in EMULATED or backend in SIMULATED
+        started = backend in SIMULATED or emulator_of(backend) is not None
         if not objects and started and not devices:
             by_side = {s: p for s, p in model(chosen.model).objects.items() if s in sides}
         if domain is None and (backend == EXTERNAL or devices):
@@ -192,7 +192,7 @@ class SuiteOptions:
             if file is not None and not os.access(file.absolute().parent, os.W_OK):
                 raise UsageError(f"cannot write {file}: its directory is read-only")
         every = catalogue(chosen.model, "robot" if of_robot else "dds")
-        if backend in ON_USB:
+        if has_usb_requirements(backend):
             every += catalogue(chosen.model, "usb")
         claims = Claims.load(capabilities, chosen.model)
         requirements = select(claims.apply(every), prefixes=require, level=level)
@@ -238,11 +238,10 @@ class SuiteOptions:
     @property
     def subject(self) -> dict[str, str]:
         """Backend, device and object, for a result's ``subject``."""
-        emulated = self.backend in EMULATED and not self.devices
         about = {"backend": self.backend}
         if self.devices:
             about["device"] = ", ".join(f"{s} {d}" for s, d in self.devices.items())
-        elif emulated:
+        elif emulator_of(self.backend) is not None:
             about["device"] = "emulated"
         if self.objects:
             about["object"] = ", ".join(f"{s} at {p:g} %" for s, p in self.objects.items())
@@ -313,7 +312,7 @@ def _dialect(
     from dexkit.backends import BackendOptions, backend
 
     found = backend(name)
-    if found.needs_device and not devices and name not in EMULATED:
+    if found.needs_device and not devices and found.emulator is None:
         raise UsageError(f"the backend {name} needs a device", hint=f"give {found.needs}")
     values = dict(s.partition("=")[::2] for s in settings)
     its_model = model(found.model_of(BackendOptions(side, devices.get(side), values)))

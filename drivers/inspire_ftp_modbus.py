@@ -18,7 +18,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.inspire_modbus import PARSERS, InspireModbus, InspireModbusSettings
@@ -164,4 +164,7 @@ backend = Backend(
     make=_make,
     needs="--device left=HOST --device right=HOST",
     settings=SETTINGS,
+    emulator=Emulator(
+        ("rh56", "--modbus-tcp", "0", "--tactile"), linked=False, settings=SHARED_MACHINE
+    ),
 )

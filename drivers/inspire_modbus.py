@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, TcpChannel, tcp_address
@@ -127,4 +127,5 @@ backend = Backend(
     make=_make,
     needs="--device left=HOST --device right=HOST",
     settings=SETTINGS,
+    emulator=Emulator(("rh56", "--modbus-tcp", "0"), linked=False, settings=SHARED_MACHINE),
 )

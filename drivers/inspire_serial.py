@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, SerialChannel
@@ -113,4 +113,5 @@ backend = Backend(
     make=_make,
     needs="--device left=PATH --device right=PATH",
     settings=SETTINGS,
+    emulator=Emulator(("rh56", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, SerialChannel
@@ -204,4 +204,5 @@ backend = Backend(
     make=_make,
     needs="--device left=PATH --device right=PATH",
     settings=SETTINGS,
+    emulator=Emulator(("revo2", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

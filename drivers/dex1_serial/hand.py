@@ -9,18 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.bringup.settings_file import SettingsFile
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex1_serial.discovery import find_motor
 from dexkit.drivers.dex1_serial.line import LATE, LineStatistics, MotorLine
-from dexkit.drivers.dex1_serial.settings import (
-    SETTINGS,
-    Dex1Settings,
-    from_options,
-    with_stored,
-)
+from dexkit.drivers.dex1_serial.settings import SETTINGS, Dex1Settings, from_options, with_stored
 from dexkit.drivers.serial_port import find_device
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
@@ -368,4 +363,5 @@ backend = Backend(
     needs="--device PATH or USB serial number, if the port is not to be looked for",
     settings=SETTINGS,
     bringup=Lazy("dexkit.drivers.dex1_serial.bringup:bench"),
+    emulator=Emulator(("dex1-motor", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE, WriteDeadline
 from dexkit.drivers.ezgripper import calibration
@@ -33,17 +33,8 @@ from dexkit.drivers.ezgripper.options import (
     stored_device,
 )
 from dexkit.drivers.ezgripper.restart import GripperStatistics, Restart
-from dexkit.drivers.ezgripper.scaling import (
-    STROKE,
-    joint_of_ticks,
-    joint_speed,
-)
-from dexkit.drivers.ezgripper.servo import (
-    Servo,
-    ServoGroup,
-    ServoStatistics,
-    line_time,
-)
+from dexkit.drivers.ezgripper.scaling import STROKE, joint_of_ticks, joint_speed
+from dexkit.drivers.ezgripper.servo import Servo, ServoGroup, ServoStatistics, line_time
 from dexkit.drivers.ezgripper.unit import Unit
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.errors import HandError, HandLost, HandRefused, UsageError
@@ -514,6 +505,9 @@ def _create_hand(options: BackendOptions) -> EZGripper:
     return EZGripper(device, options.side, configuration)
 
 
+_EMULATED_ZERO = "1510"
+"""Encoder tick of an emulated servo's zero; the driver gets it as well, and need not calibrate."""
+
 backend = Backend(
     summary="SAKE EZGripper with an MX-64 servo (Protocol 2.0) on a serial port",
     model=DEX1_1.name,
@@ -522,4 +516,9 @@ backend = Backend(
     "calibration file",
     settings={name: meaning for name, (_, meaning) in PARSERS.items()},
     bringup=Lazy("dexkit.drivers.ezgripper.bringup:bench"),
+    emulator=Emulator(
+        ("mx64", "--closed-at", _EMULATED_ZERO),
+        linked=True,
+        settings={**SHARED_MACHINE, "zero": _EMULATED_ZERO},
+    ),
 )
