@@ -15,7 +15,7 @@ from dexkit.backends import BackendOptions, backend
 from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
 from dexkit.bringup.script import describe
 from dexkit.cli.held_key import Terminal
-from dexkit.cli.options import FILE, Number, set_option, side_option
+from dexkit.cli.options import FILE, Number, set_option, setting, side_option
 from dexkit.cli.remarks import remark
 from dexkit.clock import Rate
 from dexkit.errors import HandTimeout, UsageError
@@ -140,9 +140,7 @@ def command(
 def _settings(texts: tuple[str, ...], usb: str | None) -> dict[str, str]:
     values = {}
     for text in (*texts, *([] if usb is None else [f"usb={usb}"])):
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise UsageError(f"--set {text} is not KEY=VALUE")
+        key, value = setting(text)
         if key in values:
             raise UsageError(f"{key} is given twice")
         values[key] = value

@@ -9,6 +9,7 @@ import click
 
 from dexkit.cli.options import (
     FILE,
+    dialect_option,
     grade_option,
     html_option,
     junit_option,
@@ -34,12 +35,10 @@ from dexkit.robots import ROBOTS
     type=click.Choice(["left", "right", "both"]),
     help="Hands to judge. Default: those of the run, else all hands in the recording.",
 )
-@click.option(
-    "--dialect",
-    type=click.Choice(["auto", *DIALECTS, *ROBOTS]),
+@dialect_option(
+    "Dialect of the hand, or model of the robot; auto takes it from topics and types.",
     default="auto",
-    show_default=True,
-    help="Dialect of the hand, or model of the robot; auto takes it from topics and types.",
+    others=("auto", *ROBOTS),
 )
 @require_option("DEX1-RATE")
 @click.option(

@@ -11,7 +11,7 @@ import click
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from dexkit.cli.options import FILE, require_option, verbose_option
+from dexkit.cli.options import FILE, dialect_option, require_option, verbose_option
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
@@ -100,7 +100,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     is_flag=True,
     help="With --generated: in thorough runs, which take ten times as long.",
 )
-@click.option("--dialect", help="With --generated: only hands with this dialect.")
+@dialect_option("With --generated: only hands with this dialect.")
 @click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
 @click.option(
     "--resume",

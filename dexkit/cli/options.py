@@ -19,13 +19,13 @@ from dexkit.hand import Side
 from dexkit.models import DIALECTS
 
 __all__ = [
-    "DIALECT",
     "DOMAIN",
     "FILE",
     "Number",
     "any_baudrate_option",
     "dds_options",
     "devices_by_side",
+    "dialect_option",
     "duration_option",
     "fault_options",
     "force_option",
@@ -39,6 +39,7 @@ __all__ = [
     "markdown_option",
     "network_options",
     "object_option",
+    "overwrite_option",
     "peer_addresses",
     "quiet_option",
     "real_time_option",
@@ -46,11 +47,13 @@ __all__ = [
     "seed_option",
     "session_options",
     "set_option",
+    "setting",
     "side_option",
     "start_option",
     "topic_option",
     "verbose_option",
     "view_option",
+    "wait_option",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -93,7 +96,6 @@ class _Sides(click.Choice):  # type: ignore[type-arg]
 
 DOMAIN = click.IntRange(0, 230)
 """A DDS domain; those above have no ports (RTPS 9.6.1.1)."""
-DIALECT = click.Choice(list(DIALECTS))
 FILE = click.Path(path_type=Path)
 
 
@@ -334,6 +336,35 @@ def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side,
     return by_side
 
 
+def dialect_option(
+    help: str, *, default: str | None = None, others: Sequence[str] = ()
+) -> Callable[[F], F]:
+    """``--dialect``: a dialect's name, or None.
+
+    :param default: None for none, and for no default in ``--help``.
+    :param others: further values.
+    """
+    return click.option(
+        "--dialect",
+        type=click.Choice([*DIALECTS, *others]),
+        default=default,
+        show_default=default is not None,
+        help=help,
+    )
+
+
+def wait_option(help: str, *, default: float | None = 10.0) -> Callable[[F], F]:
+    """``--wait S``: seconds of patience with hands that are not there yet; None for no limit."""
+    return click.option(
+        "--wait",
+        type=Number(min=0),
+        default=default,
+        show_default=default is not None,
+        metavar="S",
+        help=help,
+    )
+
+
 def set_option(help: str) -> Callable[[F], F]:
     """``--set KEY=VALUE``, repeated, as ``settings``."""
     return click.option(
@@ -343,6 +374,17 @@ def set_option(help: str) -> Callable[[F], F]:
         metavar="KEY=VALUE",
         help=help,
     )
+
+
+def setting(text: str) -> tuple[str, str]:
+    """Key and value of a ``--set KEY=VALUE``.
+
+    :raises UsageError: it is none.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise UsageError(f"--set {text} is not KEY=VALUE")
+    return key, value
 
 
 # ------------------------------------------------------------------------------ running
@@ -385,6 +427,14 @@ def quiet_option() -> Callable[[F], F]:
 
 
 # ------------------------------------------------------------------------------ output
+
+
+def overwrite_option(what: str) -> Callable[[F], F]:
+    """``--force`` of the commands that write a recording.
+
+    :param what: is overwritten.
+    """
+    return click.option("--force", is_flag=True, help=f"Overwrite {what}.")
 
 
 def json_option(help: str) -> Callable[[F], F]:

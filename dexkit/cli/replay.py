@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.options import (
-    DIALECT,
     FILE,
     Number,
     dds_options,
+    dialect_option,
     force_option,
     html_option,
     session_options,
     side_option,
     topic_option,
+    wait_option,
 )
 from dexkit.command_age import PAUSE
 from dexkit.errors import DdsError, UsageError
@@ -78,12 +79,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
 )
 @html_option()
 @side_option("Hands to drive.  [default: all that the session commands]")
-@click.option(
-    "--dialect",
-    "dialect_name",
-    type=DIALECT,
-    help="Dialect of the hands to drive.  [default: the session's]",
-)
+@dialect_option("Dialect of the hands to drive.  [default: the session's]")
 @click.option(
     "--pace",
     "--speed",
@@ -181,14 +177,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
 @click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
 @session_options()
 @dds_options()
-@click.option(
-    "--wait",
-    type=Number(min=0),
-    default=10.0,
-    show_default=True,
-    metavar="S",
-    help="Wait up to S seconds for the hands.",
-)
+@wait_option("Wait up to S seconds for the hands.")
 @force_option()
 @click.option(
     "--as-recorded",
@@ -227,7 +216,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
     options = Options(rate=given["rate"], hand=given["hand"], correct=not given["keep_sides"])
     wishes = Wishes(
         sides=given["sides"],
-        dialect=given["dialect_name"],
+        dialect=given["dialect"],
         pace=given["pace"],
         gains=given["gains"],
         resample=given["resample"],

@@ -14,14 +14,15 @@ import click
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.options import (
-    DIALECT,
     Number,
     dds_options,
     devices_by_side,
+    dialect_option,
     force_option,
     quiet_option,
     real_time_option,
     set_option,
+    setting,
     side_option,
     view_option,
 )
@@ -32,14 +33,7 @@ from dexkit.models import MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 from dexkit.sd_notify import notify, watchdog
-from dexkit.service import (
-    Estimation,
-    Fill,
-    HandService,
-    Publisher,
-    diagnose,
-    prepare_process,
-)
+from dexkit.service import Estimation, Fill, HandService, Publisher, diagnose, prepare_process
 from dexkit.service import real_time as real_time_priority
 from dexkit.stop_signals import StopRequest, stop_on_signals
 
@@ -71,10 +65,8 @@ _LONELY = 10.0  # seconds without a client before a hint
     metavar="URL",
     help="USB hands on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
 )
-@click.option(
-    "--dialect",
-    type=DIALECT,
-    help="Topics, types and units.  [default: the model's first: "
+@dialect_option(
+    "Topics, types and units.  [default: the model's first: "
     + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())
     + "]",
 )
@@ -227,9 +219,7 @@ def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[st
     """The settings of each hand."""
     values: dict[Side, dict[str, str]] = {side: {} for side in sides}
     for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise UsageError(f"--set {text} is not KEY=VALUE")
+        key, value = setting(text)
         prefix, dot, rest = key.partition(".")
         if dot and prefix in [str(s) for s in Side]:
             if Side(prefix) not in values:
