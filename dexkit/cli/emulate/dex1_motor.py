@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
-from dexkit.cli.emulate.serving import line_options, serve
+from dexkit.cli.emulate.serving import line_options, line_settings, serve
 from dexkit.cli.options import Number, object_option, side_option, start_option
 from dexkit.errors import UsageError
 from dexkit.hand import Side
@@ -54,14 +56,8 @@ def emulate_dex1_motor(
     start: float,
     zero_error: float,
     wiring: int | None,
-    baudrate: int,
-    line_time: bool,
-    answer_time: float,
-    latency_timer: float,
-    faults: tuple[str, ...],
     faults_from_stdin: bool,
-    seed: int,
-    any_baudrate: bool,
+    **line: Any,
 ) -> None:
     """Emulate the motor of a Dex1-1 (Unitree M4010) with the gripper on its shaft.
 
@@ -70,6 +66,8 @@ def emulate_dex1_motor(
     """
     from dexkit.emulators.m4010 import Dex1Motors, Firmware, Wiring
 
+    on_line = line_settings(line)
+    firmware = Firmware(baudrate=on_line.pop("baudrate"), answer_time=on_line.pop("answer_time"))
     with (
         stop_on_signals() as request,
         Dex1Motors(
@@ -79,12 +77,8 @@ def emulate_dex1_motor(
             start_pct=start,
             zero_error=zero_error,
             wiring=None if wiring is None else Wiring.random(wiring),
-            firmware=Firmware(baudrate=baudrate, answer_time=answer_time * 1e-3),
-            line_time=line_time,
-            latency_timer=latency_timer * 1e-3,
-            faults=faults,
-            seed=seed,
-            check_baudrate=not any_baudrate,
+            firmware=firmware,
+            **on_line,
         ) as motors,
     ):
         serve(motors, request, faults_from_stdin=faults_from_stdin)
