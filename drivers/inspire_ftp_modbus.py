@@ -153,7 +153,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def _make(options: BackendOptions) -> InspireFtpModbus:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options.settings, _PARSERS)
     settings = InspireFtpModbusSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireFtpModbus(options.side, settings)
 

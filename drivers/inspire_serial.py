@@ -102,7 +102,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def _make(options: BackendOptions) -> InspireSerial:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options.settings, _PARSERS)
     settings = InspireSerialSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireSerial(options.side, settings)
 

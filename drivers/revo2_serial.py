@@ -193,7 +193,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def _make(options: BackendOptions) -> Revo2Serial:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options.settings, _PARSERS)
     settings = Revo2Settings(device=options.device, **values)  # type: ignore[arg-type]
     return Revo2Serial(options.side, settings)
 

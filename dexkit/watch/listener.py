@@ -5,7 +5,6 @@ from __future__ import annotations
 import fnmatch
 import threading
 from collections.abc import Iterable
-from types import TracebackType
 
 from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, Reader
 from dexkit.errors import DdsError, UsageError
@@ -46,12 +45,7 @@ class Listener:
     def __enter__(self) -> Listener:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def close(self) -> None:

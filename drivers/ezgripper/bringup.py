@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dexkit.backends import BackendOptions
-from dexkit.bringup.bench import Drive, JointChoice, Plan, Reading, Snapshot, Zero
+from dexkit.bringup.bench import Drive, Plan, Reading, Snapshot, gripper_choices
 from dexkit.bringup.findings import Findings
 from dexkit.bringup.script import travel_key
 from dexkit.bringup.settings_file import SettingsFile
@@ -49,7 +49,16 @@ _WIDEST = 1.2
 def plan_of(side: Side) -> Plan:
     """Plan the bring-up: which servos move this side's gripper, and where it is closed."""
     return Plan(
-        tuple(_choice(each, wanted=each is side) for each in Side),
+        gripper_choices(
+            DEX1_1,
+            side,
+            (STROKES[0] / STROKE, _WIDEST),
+            # closed first: whether there is a stop at the open end is not documented, and a tendon
+            # must not be wound up the other way
+            first=-1,
+            most_travel=_WIDEST * DEX1_1.joints[side][0].stroke,
+            motors=2,
+        ),
         1.0,
         part="gripper",
         nudge=0.5,
@@ -57,28 +66,6 @@ def plan_of(side: Side) -> Plan:
         torque=round(0.15 * CURRENT_LIMIT * _JOINT_TORQUE, 2),
         most_torque=round(0.30 * CURRENT_LIMIT * _JOINT_TORQUE, 2),
         speed=0.5,
-    )
-
-
-def _choice(side: Side, *, wanted: bool) -> JointChoice:
-    spec = DEX1_1.joints[side][0]
-    return JointChoice(
-        str(side),
-        spec.q_min,
-        spec.q_max,
-        "opened",
-        "closed",
-        (STROKES[0] / STROKE, _WIDEST),
-        "closed",
-        # closed first: whether there is a stop at the open end is not documented, and a tendon must
-        # not be wound up the other way
-        first=-1,
-        most_travel=_WIDEST * spec.stroke,
-        stops=(spec.q_min, spec.q_max),
-        zero_from=Zero.LOW_STOP,
-        measured=True,
-        motors=2,
-        wanted=wanted,
     )
 
 
