@@ -87,7 +87,7 @@ class Figure:
         self._elements = self._balls(f"{name}/elements", elements, 0.0045) if elements else None
         bottom = -0.85 if self._drawing.robot else -0.05 - 0.026 * row
         turn = mount * np.array([1.0, -1.0, -1.0, -1.0])  # labels are placed upright
-        self._upright = scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
+        scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
         self._label = scene.add_label(
             f"{name}/upright/title", title, position=(0.0, 0.0, bottom), anchor="top-center"
         )
