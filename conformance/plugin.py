@@ -169,7 +169,9 @@ def pytest_configure(config: pytest.Config) -> None:
     except DexkitError as error:
         raise _usage(error) from error
     if config.getoption("numprocesses", None):
-        raise pytest.UsageError("one hand, one run: the suite does not work with pytest-xdist's -n")
+        raise pytest.UsageError(
+            "the suite judges one hand in one run; pytest-xdist's -n cannot divide it"
+        )
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -143,7 +143,7 @@ class SuiteOptions:
         :raises BackendError: no such backend.
         """
         if quick and thorough:
-            raise UsageError("--quick and --thorough are two runs: choose one")
+            raise UsageError("--quick and --thorough exclude each other")
         of_robot = _robot_of(backend, dialect_name)
         if of_robot:
             _refuse_for_robots(
@@ -280,7 +280,7 @@ def _robot_of(backend: str, dialect_name: str | None) -> str:
         wanted and not started and backend != EXTERNAL
     ):
         raise UsageError(
-            f"{backend} does not speak {dialect_name}",
+            f"{backend} has no dialect {dialect_name}",
             hint=f"robots: --backend {' or '.join(ROBOT_EMULATORS)}, or external with --dialect "
             f"{' or '.join(ROBOTS)}",
         )
@@ -290,7 +290,7 @@ def _robot_of(backend: str, dialect_name: str | None) -> str:
 def _refuse_for_robots(**given: Any) -> None:
     wrong = [f"--{name}" for name, value in given.items() if value]
     if wrong:
-        raise UsageError(f"{', '.join(wrong)} is about hands, and a robot is to be judged")
+        raise UsageError(f"{', '.join(wrong)}: for hands only, and this run judges a robot")
 
 
 def _dialect(
@@ -304,7 +304,7 @@ def _dialect(
 
     The model is an attribute of a hand object: one is created, and not opened.
 
-    :raises UsageError: the backend needs a device, or its hand does not speak that dialect.
+    :raises UsageError: the backend needs a device, or its model does not have that dialect.
     :raises BackendError: it makes no hand.
     """
     if name == EXTERNAL:
@@ -320,7 +320,7 @@ def _dialect(
     chosen = dialect(wanted) if wanted else spoken[0]
     if chosen not in spoken:
         raise UsageError(
-            f"{name} is a {its_model.title}, which does not speak {chosen.name}",
+            f"{name} is a {its_model.title}, which has no dialect {chosen.name}",
             hint=f"--dialect {' or '.join(d.name for d in spoken)}",
         )
     return chosen
@@ -408,7 +408,7 @@ def run_suite(
             if trace.damage:
                 raise ConformanceError(
                     f"the run's recording is damaged, nothing is judged: {trace.damage[0]}",
-                    hint=f"look after the disk that holds {path}",
+                    hint=f"check the disk that holds {path}",
                 )
             result = judge_recording(options, view)
     return result

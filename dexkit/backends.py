@@ -249,11 +249,11 @@ def _check(hand: object, side: Side, model: str) -> None:
         )
     if spec.side is not side:
         raise BackendBroken(
-            f"{name} was asked for the {side} hand, and its spec has {spec.side}",
-            hint="hand the side that is given on to the spec",
+            f"{name} was made for the {side} hand, but its spec has {spec.side}",
+            hint="pass the given side to the spec",
         )
     if model and spec.model != model:
-        raise BackendBroken(f"the backend declares a {model}, and {name} is a {spec.model}")
+        raise BackendBroken(f"the backend declares the model {model}, but {name} has {spec.model}")
 
 
 def _where(error: BaseException) -> str:

@@ -593,7 +593,7 @@ def _filter_interfaces(number: int, interface: str, before: dict[int, int]) -> D
             )
             return None
         raise DdsSetupError(
-            f"other networks than {interface} cannot be kept out of domain {number}: "
+            f"packets of networks other than {interface} cannot be kept out of domain {number}: "
             f"{error.strerror or error}",
             hint=interface_filter.HINT,
         ) from error

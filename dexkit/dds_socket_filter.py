@@ -149,7 +149,7 @@ class DomainSockets:
             if not waiting.poll(0):
                 return
         raise DdsSetupError(
-            f"{self.interface} brings more for this domain than this process can read",
+            f"{self.interface} receives more for this domain than this process can read",
             hint="is something flooding its ports? The machine may also be overloaded: try again",
         )
 

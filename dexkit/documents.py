@@ -192,7 +192,7 @@ def _without_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise ValueError(f"the key {one_line(key, 40)!r} is there twice")
+            raise ValueError(f"the key {one_line(key, 40)!r} occurs twice")
         found[key] = value
     return found
 

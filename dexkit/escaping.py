@@ -119,7 +119,7 @@ class Guard:
     def write(self, text: str) -> int:
         """Write ``text``, cleaned."""
         if not isinstance(text, str):
-            raise TypeError(f"text is written here, not {type(text).__name__}")
+            raise TypeError(f"only text can be written, not {type(text).__name__}")
         begin = _CLEAR_LINE if text.startswith(_CLEAR_LINE) and self.isatty() else ""
         self.write_trusted(begin + visible(text.removeprefix(begin)))
         return len(text)

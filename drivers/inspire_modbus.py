@@ -67,13 +67,15 @@ class InspireModbus(InspireHand):
 
     def _connect(self) -> Channel:
         if self._settings.device is None:
-            raise HandNotFound("where is the hand?", hint=f"--device HOST, with port {PORT}")
+            raise HandNotFound(
+                "no address of the hand is given", hint=f"--device HOST, with port {PORT}"
+            )
         self._parser.reset()
         return TcpChannel(*tcp_address(self._settings.device, PORT), _CONNECT)
 
     def _absent(self, place: str) -> HandNotFound:
         return HandNotFound(
-            f"somebody listens on {place}, and no hand answers there as unit {self._settings.id}",
+            f"{place} accepts connections, but no hand answers there as unit {self._settings.id}",
             hint="does another program use the hand? Other units: --set id=255",
         )
 
@@ -102,7 +104,7 @@ class InspireModbus(InspireHand):
         finally:
             if self._parser.broken:
                 raise HandLost(
-                    f"what {channel.place} sends is not Modbus", hint="is it the hand's address?"
+                    f"{channel.place} does not send Modbus", hint="is it the hand's address?"
                 )
 
 

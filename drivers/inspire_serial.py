@@ -55,9 +55,7 @@ class InspireSerial(InspireHand):
 
     def _connect(self) -> Channel:
         if self._settings.device is None:
-            raise HandNotFound(
-                "which serial port is the hand on?", hint="--device PATH or USB serial number"
-            )
+            raise HandNotFound("no serial port is given", hint="--device PATH or USB serial number")
         return SerialChannel(self._settings.device, self._settings.baudrate)
 
     def _absent(self, place: str) -> HandNotFound:

@@ -93,9 +93,7 @@ class Revo2Serial(GoalHand):
 
     def _connect(self) -> Channel:
         if self.configuration.device is None:
-            raise HandNotFound(
-                "which serial port is the hand on?", hint="--device PATH or USB serial number"
-            )
+            raise HandNotFound("no serial port is given", hint="--device PATH or USB serial number")
         return SerialChannel(self.configuration.device, self.configuration.baudrate)
 
     def _absent(self, place: str) -> HandNotFound:

@@ -186,7 +186,7 @@ def test_unattended_bringup_refuses_real_hands(emulated: Dex3Hands, tmp_path: Pa
         [*place, *answers, "--unattended", "--set", f"config={tmp_path / 'c'}", "--speed", "2"]
     )
     assert code == 2
-    assert "'thumb' is no answer" in err
+    assert "'thumb' is not a valid answer" in err
     assert "sensors answer: by themselves" in out
     assert not commands(tmp_path)[-1]["driven"]
 

@@ -198,7 +198,7 @@ class RecordingFile:
     def _busy_error(self) -> UsageError:
         return UsageError(
             f"{self.path} is being recorded by another program",
-            hint="choose another name, or stop that one",
+            hint="choose another name, or stop that program",
         )
 
     def close(self, *, keep: bool) -> None:

@@ -48,7 +48,7 @@ class HandWire:
     def __init__(self, spoken: Dialect, side: Side) -> None:
         if spoken.commands_both:
             raise UsageError(
-                f"a command of {spoken.name} moves both hands, and a self-test one",
+                f"a command of {spoken.name} moves both hands, but a self-test drives one",
                 hint="test it where it is driven: dexkit selftest BACKEND",
             )
         self.dialect, self.side = spoken, side

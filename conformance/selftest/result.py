@@ -400,7 +400,8 @@ def check_baseline(baseline: SelfTestResult, about: Mapping[str, str], path: Pat
         mine, its = about.get(key, ""), baseline.hand.get(key, "")
         if mine and its and mine != its:
             raise UsageError(
-                f"{path} is of another hand: its {key} is {one_line(its)}, not {one_line(mine)}",
+                f"{path} belongs to another hand: its {key} is {one_line(its)}, not "
+                f"{one_line(mine)}",
                 hint="compare a hand with an earlier run of itself",
             )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from dexkit import documents
-from dexkit.backends import BackendOptions, backend
+from dexkit.backends import BackendOptions, backend, list_backends
 from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
 from dexkit.bringup.script import describe
 from dexkit.cli.held_key import Terminal
@@ -98,13 +98,13 @@ def command(
     if len(sides) != 1:
         raise UsageError("one hand at a time", hint="--side left or --side right")
     if unattended and answers_path is None:
-        raise UsageError("--unattended needs --answers FILE: nobody is there to be asked")
+        raise UsageError("--unattended needs --answers FILE: there is no operator to ask")
     documents.check_output_paths([save_answers], [answers_path])
     kind = backend(backend_name)
     if kind.bringup is None:
+        having = [b.name for b in list_backends() if b.backend and b.backend.bringup]
         raise UsageError(
-            f"{backend_name} has nothing that a bring-up finds",
-            hint="dex3-usb, dex1-serial and ezgripper have",
+            f"the backend {backend_name} has no bring-up", hint=f"these have: {', '.join(having)}"
         )
     texts = _settings(settings, usb)
     options = BackendOptions(sides[0], device, texts)
@@ -242,7 +242,7 @@ class _Run:
         if text is not None:
             if text not in question.choices:
                 raise UsageError(
-                    f"{question.key}: {one_line(text, 40)!r} is no answer to that",
+                    f"{question.key}: {one_line(text, 40)!r} is not a valid answer",
                     hint=f"{question.text} {', '.join(question.choices)}",
                 )
             click.echo(f"{question.text} {text}")

@@ -183,7 +183,7 @@ def command(
         _print_store(store)
         return
     if device is not None and side is not None:
-        raise UsageError("--side means nothing beside --device for an ezgripper")
+        raise UsageError("for an ezgripper, --side cannot be combined with --device")
     if device is None and side is None:
         raise UsageError(
             "no gripper is given",
@@ -261,7 +261,7 @@ def _refuse_foreign(ctx: click.Context, known: set[str], gripper: str) -> None:
         name = parameter.name or ""
         source = ctx.get_parameter_source(name)
         if name not in known and source is not click.core.ParameterSource.DEFAULT:
-            raise UsageError(f"{parameter.opts[0]} means nothing for {gripper}")
+            raise UsageError(f"{parameter.opts[0]} does not apply to {gripper}")
 
 
 def _zero_and_speed(

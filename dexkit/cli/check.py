@@ -157,7 +157,8 @@ def command(
         )
     if trace.damage:
         raise ConformanceError(
-            f"the recording is damaged, and the verdict is of what is left: {trace.damage[0]}",
+            "the recording is damaged; the verdict covers the readable part only: "
+            f"{trace.damage[0]}",
             hint="'dexkit info' names all of the damage; record again, or copy the file again",
         )
     sys.exit(result.exit_code(None if grade is None else Kind(grade)))

@@ -95,7 +95,7 @@ def _spans(
     if phases:
         if stimulus is None:
             raise UsageError(
-                f"{trace.path.name} has no phases: no conformance run recorded it",
+                f"{trace.path.name} has no phases: it was not recorded by a conformance run",
                 hint="name times with --from and --to",
             )
         known = [p for p in stimulus.phases if p.end_ns]

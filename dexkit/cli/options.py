@@ -326,7 +326,7 @@ def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side,
             side, path = sides[0], text
         else:
             raise UsageError(
-                f"which hand is {text}?", hint="--device left=PATH --device right=PATH"
+                f"--device {text} names no side", hint="--device left=PATH --device right=PATH"
             )
         if side not in sides:
             raise UsageError(f"--device {text}, but only the {sides[0]} hand is served")

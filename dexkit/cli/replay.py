@@ -242,7 +242,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
     if given["rehearse"]:
         code = _rehearse(prepared, guards, source, session.name, given["html_path"], ctx) or code
     elif given["html_path"] is not None:
-        raise UsageError("--report is the page of a rehearsal", hint="add --rehearse")
+        raise UsageError("--report writes the page of a rehearsal", hint="add --rehearse")
     if prepared.refused:
         _print_refusal(source, prepared)
         return 1
@@ -260,8 +260,9 @@ def _as_recorded(ctx: click.Context, source: Path, given: dict[str, Any]) -> int
         name = str(parameter.name)
         if name not in _AS_RECORDED and ctx.get_parameter_source(name) is stated:
             raise UsageError(
-                f"{parameter.opts[0]} is not for a recording that is published as it is",
-                hint="leave out --as-recorded, --topic and --no-wait to play it with care",
+                f"{parameter.opts[0]} does not apply to a recording that is published as it is",
+                hint="leave out --as-recorded, --topic and --no-wait to play it checked and "
+                "supervised",
             )
     return play_as_recorded(
         source,
@@ -476,7 +477,7 @@ class _Waiting:
         node, missing = live.node, live.machine.missing
         if live.unsubscribed:
             topics = ", ".join(map(one_line, live.unsubscribed))
-            waits, lacks = f"a subscriber of {topics}", f"no process subscribes {topics}"
+            waits, lacks = f"a subscriber of {topics}", f"no process subscribes to {topics}"
         else:
             sides = " and ".join(map(str, missing))
             waits = f"state of the {sides} hand"

@@ -139,7 +139,7 @@ def command(
         for text in settings:
             if text.partition("=")[0].rpartition(".")[2] == "usb":
                 raise UsageError(
-                    f"--usb {usb} and --set {text} are two places",
+                    f"--usb {usb} and --set {text} name different places",
                     hint="--usb is short for --set usb=URL, for all hands",
                 )
         settings = (*settings, f"usb={usb}")
@@ -211,7 +211,7 @@ def command(
         if isinstance(service.failure, TopicConflict):
             raise service.failure
         if service.failure is not None:
-            raise DexkitError(f"the service died: {service.failure}")
+            raise DexkitError(f"the service failed: {service.failure}")
     return 0
 
 
@@ -239,8 +239,8 @@ def _dialect(hands: Sequence[Hand], name: str | None) -> Dialect:
     chosen = dialect_by_name(name)
     if chosen.model != model.name:
         raise UsageError(
-            f"a {model.name} does not speak {name}",
-            hint=f"it speaks {', '.join(d.name for d in model.dialects)}",
+            f"a {model.name} has no dialect {name}",
+            hint=f"its dialects: {', '.join(d.name for d in model.dialects)}",
         )
     return chosen
 

@@ -121,7 +121,7 @@ def command(
         _list()
         return 0
     if profile_name is None:
-        raise UsageError("no profile", hint="'dexkit teleop --list' names them")
+        raise UsageError("no profile is given", hint="'dexkit teleop --list' lists them")
     spoken = dialect_by_name(dialect)
     chosen = _profile(profile_name, spoken)
     client = client_for(

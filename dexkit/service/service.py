@@ -234,7 +234,7 @@ class HandService:
         :raises TopicConflict: another program publishes the state topic (unless ``force``).
         """
         if self._started:
-            raise UsageError("a service starts once")
+            raise UsageError("a service cannot be started twice")
         self._started = True
         try:
             self._start()
@@ -703,7 +703,7 @@ class HandService:
             self._count_publish_error(error)
             return False
         if not written:
-            self._count_publish_error(TimeoutError("a reliable reader does not keep up"))
+            self._count_publish_error(TimeoutError("a reliable reader is too slow"))
         return written
 
     def _count_publish_error(self, error: Exception) -> None:

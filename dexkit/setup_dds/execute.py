@@ -124,7 +124,7 @@ class _Task:
             self._run(command, environment, "CycloneDDS cannot be built")
         library = library_at(prefix, "source", self._interpreter.processor)
         if library is None:
-            raise DdsBuildFailed(f"the build of {action.folder} makes no libddsc.so")
+            raise DdsBuildFailed(f"the build of {action.folder} did not make libddsc.so")
         files = {
             f"{pinned_wheel.LIBRARY_FOLDER}/{library.file}": (
                 Path(library.folder, library.file).read_bytes()
@@ -136,7 +136,7 @@ class _Task:
             except OSError as error:
                 raise DdsBuildFailed(
                     f"{action.folder} has no {name}: {error.strerror}",
-                    hint="the licence belongs into the wheel; use a complete checkout",
+                    hint="the wheel must contain the licence; use a complete checkout",
                 ) from error
             files[f"dist-info/licenses/cyclonedds/{name}"] = text
         return library, files
@@ -238,7 +238,7 @@ def _failure(what: str, done: Done, machine: Machine) -> DdsBuildFailed:
         last = [line.strip() for line in done.output.splitlines() if line.strip()][-1:]
         return DdsBuildFailed(
             f"{what}: {last[0] if last else f'exit code {done.code}'}",
-            hint="the log has all that was printed",
+            hint="the whole output is in the log",
         )
     return DdsBuildFailed(f"{what}: {cause.message}", hint=cause.hint)
 

@@ -265,7 +265,7 @@ def decode(data: bytes) -> Packet:
     if len(data) < length + _OVERHEAD:
         raise TruncatedError(f"{len(data)} bytes of a packet of {length + _OVERHEAD}")
     if len(data) > length + _OVERHEAD:
-        raise WireError(f"{len(data) - length - _OVERHEAD} bytes behind the packet")
+        raise WireError(f"{len(data) - length - _OVERHEAD} bytes after the packet")
     packet = _packet(data)
     if not packet.crc_ok:
         raise ChecksumError(

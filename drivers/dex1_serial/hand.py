@@ -311,7 +311,7 @@ class Dex1Serial:
             self._forget_offset()
         if abs(q - position) > _CALIBRATION_TOLERANCE:
             raise HandRefused(
-                f"motor {self.id} says that it is calibrated, but is at {q:.2f} rad",
+                f"motor {self.id} reports that it is calibrated, but is at {q:.2f} rad",
                 hint="hold the jaws still, switch its supply off and on, and try again",
             )
         return q

@@ -118,7 +118,7 @@ def probe(wire: Wire) -> Found:
         )
     raise HandRefused(
         "the hand answers, and no motor obeys: " + "; ".join(tried),
-        hint="keep this line: the frame differs from all readings of the manual",
+        hint="please report this line: the frame differs from all readings of the manual",
     )
 
 

@@ -335,8 +335,8 @@ class EZGripper:
             return self._found[unit.key]
         if not may_move:
             raise HandRefused(
-                f"the gripper {unit.key} has no zero: calibration is not repeated by itself",
-                hint="see that it is empty and start again",
+                f"the gripper {unit.key} has no zero: calibration is not repeated automatically",
+                hint="check that it is empty, and start again",
             )
         if configuration.calibrate is not Calibrate.YES and unit.record.zero is not None:
             return unit.record.zero

@@ -67,7 +67,7 @@ class Dex3Hands:
         seed: int = 0,
     ) -> None:
         if not sides or len(set(sides)) != len(sides):
-            raise UsageError("one hand a side, and at least one")
+            raise UsageError("give one hand for each side, and at least one")
         if len(serials) > len(sides):
             raise UsageError(f"{len(serials)} serial numbers for {len(sides)} hand(s)")
         plan = [parse_fault(spec, DEX3_FAULTS) for spec in faults]

@@ -197,7 +197,7 @@ class EmulatedRobot:
         self._heard = True
         sole.check()
         raise TopicConflict(  # it has gone meanwhile, or is not discovered
-            f"somebody already publishes {model.state_topic} on domain {self.domain}",
+            f"another program already publishes {model.state_topic} on domain {self.domain}",
             hint="stop the other robot, choose another --domain, or add --force",
         )
 
@@ -296,4 +296,4 @@ def run_robot(
             if isinstance(robot.failure, TopicConflict):
                 raise robot.failure
             if robot.failure is not None:
-                raise DdsError(f"the {model.name} died: {robot.failure}") from robot.failure
+                raise DdsError(f"the {model.name} failed: {robot.failure}") from robot.failure

@@ -132,8 +132,8 @@ def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
     poor = correlation < LEAST_CORRELATION or apart > _APART
     if poor or found.confidence < LEAST_CONFIDENCE:
         raise SessionError(
-            f"the episode is not in the recording for certain: {found}; actions and commands are "
-            f"apart by {apart:.2f} of their motion"
+            f"the episode was not found in the recording with certainty: {found}; actions and "
+            f"commands differ by {apart:.2f} of their motion"
         )
     return found
 

@@ -97,13 +97,15 @@ def emulate_all(
     hands = hands or (_LEROBOT_HANDS if for_lerobot else _XR_HANDS)
     domain = domain if domain is not None else 0 if for_lerobot else 1
     if for_lerobot and not ROBOTS[robot].lerobot_name:
-        raise click.UsageError(f"LeRobot does not know the {robot}")
+        raise click.UsageError(f"LeRobot does not support the {robot}")
     if for_lerobot and interface != "lo":
-        raise click.UsageError("--for lerobot is on loopback: --interface does not go with it")
+        raise click.UsageError(
+            "--for lerobot uses loopback only; it cannot be combined with --interface"
+        )
     if ports is not None and not for_lerobot:
-        raise click.UsageError("--ports is for --for lerobot")
+        raise click.UsageError("--ports needs --for lerobot")
     if hands == "none" and (dialect or settings):
-        raise click.UsageError("--dialect and --set are for hands, and there are none")
+        raise click.UsageError("--dialect and --set need hands")
     common = ["--domain", str(domain), "--interface", interface]
     common += ["--force"] * force + ["--quiet"] * quiet
     parts = {robot: ("emulate", robot, *common)}

@@ -92,7 +92,8 @@ def _places(links: tuple[str, ...], sides: tuple[Side, ...]) -> dict[Side, str]:
         name, _, path = text.partition("=")
         if name not in [str(side) for side in sides] or Side(name) in places or not path:
             raise UsageError(
-                f"--link {text}: which line is it?", hint="--link left=PATH --link right=PATH"
+                f"--link {text} is not left=PATH or right=PATH of a hand that is emulated",
+                hint="--link left=PATH --link right=PATH",
             )
         places[Side(name)] = path
     if set(places) != set(sides):

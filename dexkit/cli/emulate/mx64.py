@@ -134,7 +134,7 @@ def emulate_mx64(
     grippers = [(number, mechanics) for number in ids]
     if wiring is not None:
         _refuse_gripper_options(
-            "--wiring says it", "bare", "ids", "object_pct", "start", "closed_at"
+            "--wiring sets it", "bare", "ids", "object_pct", "start", "closed_at"
         )
         sides = Wiring.random(wiring).servos.values()
         grippers = [pair for servos_of in sides for pair in servos_of.items()]
@@ -200,7 +200,7 @@ def _refuse_gripper_options(why: str, *names: str) -> None:
     for name in names:
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
             option = next(p.opts[0] for p in context.command.params if p.name == name)
-            raise click.UsageError(f"{option} is of a gripper, and {why}")
+            raise click.UsageError(f"{option} describes a gripper, and {why}")
 
 
 class _EepromFile:

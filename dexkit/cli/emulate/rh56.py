@@ -66,7 +66,8 @@ def emulate_rh56(
     side, on_line = one_side(sides), line_settings(line)
     if (link is None) == (tcp is None):
         raise UsageError(
-            "where is the hand to be?", hint="--link PATH for a serial line, or --modbus-tcp PORT"
+            "no place for the hand is given",
+            hint="--link PATH for a serial line, or --modbus-tcp PORT",
         )
     with stop_on_signals() as request:
         hand: Rh56Hand | Rh56TcpHand
@@ -82,7 +83,7 @@ def emulate_rh56(
             )
         else:
             if tactile:
-                raise UsageError("--tactile is of a hand on the network", hint="--modbus-tcp PORT")
+                raise UsageError("--tactile needs --modbus-tcp", hint="--modbus-tcp PORT")
             hand = Rh56Hand(
                 side,
                 link=link,
@@ -105,5 +106,5 @@ def _refuse_serial_options() -> None:
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
             option = next(p.opts[0] for p in context.command.params if p.name == name)
             raise UsageError(
-                f"{option} is of a serial line, and --modbus-tcp has none", hint="leave it out"
+                f"{option} applies to a serial line, not to --modbus-tcp", hint="leave it out"
             )
