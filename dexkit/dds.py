@@ -670,7 +670,7 @@ class _Handle:
     def wait_matched(self, timeout: float | None = None, count: int = 1) -> bool:
         """Wait until at least ``count`` endpoints match.
 
-        :param timeout: seconds; None waits for ever.
+        :param timeout: seconds; None waits without limit.
         :returns: False on time-out, or when it is closed or the dispatcher dies meanwhile.
         """
         with self.node._changed:
@@ -835,7 +835,7 @@ class Reader(_Handle):
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until something has arrived since the last :meth:`take`.
 
-        :param timeout: seconds; None waits for ever.
+        :param timeout: seconds; None waits without limit.
         :returns: False on time-out, or when the reader is closed meanwhile. After True
             :meth:`take` may, rarely, still return nothing: a writer that goes away wakes, too.
         """
@@ -873,7 +873,7 @@ class Discovery:
     ) -> bool:
         """Wait until ``predicate`` of all endpoints is true; it is tried at every change.
 
-        :param timeout: seconds; None waits for ever.
+        :param timeout: seconds; None waits without limit.
         :returns: whether it became true.
         """
         node = self._node

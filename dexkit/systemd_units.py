@@ -59,7 +59,7 @@ Description=dexkit: {side} hand ({what})
 # the interface may come later still: --wait-for-interface
 Wants=network-online.target
 After=network-online.target
-# a hand is tried for ever
+# retries of a hand have no limit
 StartLimitIntervalSec=0
 
 [Service]

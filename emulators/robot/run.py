@@ -126,7 +126,7 @@ class EmulatedRobot:
     def start(self) -> EmulatedRobot:
         """Publish states and obey commands from now on.
 
-        :raises TopicConflict: somebody else publishes the state (unless ``force``).
+        :raises TopicConflict: another program publishes the state (unless ``force``).
         :raises DdsError: the topics cannot be made.
         """
         if self._writer is not None:
@@ -284,7 +284,7 @@ def run_robot(
     """Run a robot until ``stop`` is set.
 
     :param ready: set when its topics are up.
-    :raises TopicConflict: somebody else publishes the state (unless ``force``).
+    :raises TopicConflict: another program publishes the state (unless ``force``).
     :raises DdsError: the topics cannot be made, or writing to them failed.
     """
     with EmulatedRobot(
