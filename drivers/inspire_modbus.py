@@ -118,7 +118,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in PARSERS.item
 
 
 def _make(options: BackendOptions) -> InspireModbus:
-    values = parse_settings(options, PARSERS)
+    values = parse_settings(options.settings, PARSERS)
     settings = InspireModbusSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireModbus(options.side, settings)
 

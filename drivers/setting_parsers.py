@@ -22,6 +22,6 @@ def parse_settings(texts: Mapping[str, str], parsers: Parsers) -> dict[str, obje
         parse, meaning = parsers[name]
         try:
             values[name] = parse(text)
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
     return values

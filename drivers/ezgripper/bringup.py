@@ -18,7 +18,7 @@ from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.discovery import find_device, find_servos, latency_warning
-from dexkit.drivers.ezgripper.options import GripperSettings, parse_settings, stored_device
+from dexkit.drivers.ezgripper.options import GripperSettings, settings_of, stored_device
 from dexkit.drivers.ezgripper.recovery import motor_error
 from dexkit.drivers.ezgripper.scaling import (
     CURRENT_LIMIT,
@@ -268,6 +268,6 @@ class EZGripperBench:
 
 def bench(options: BackendOptions) -> EZGripperBench:
     """The bench of ``dexkit bringup ezgripper``."""
-    configuration = parse_settings(options)
+    configuration = settings_of(options)
     device = options.device or stored_device(Store(configuration.config), options.side)
     return EZGripperBench(device, options.side, configuration)

@@ -29,7 +29,7 @@ from dexkit.drivers.ezgripper.options import (
     Calibrate,
     GripperSettings,
     ZeroGains,
-    parse_settings,
+    settings_of,
     stored_device,
 )
 from dexkit.drivers.ezgripper.restart import GripperStatistics, Restart
@@ -497,7 +497,7 @@ class EZGripper:
 
 
 def _create_hand(options: BackendOptions) -> EZGripper:
-    configuration = parse_settings(options)
+    configuration = settings_of(options)
     store = Store(configuration.config)
     device = options.device or stored_device(store, options.side)
     if not options.device and not {"id", "ids"} & options.settings.keys():
