@@ -25,7 +25,7 @@ __all__ = ["Rig", "RigOptions", "Tool"]
 
 
 class Tool(child_processes.Tool):
-    """A ``dexkit`` command in a process of its own; a context manager.
+    """A ``dexkit`` command in its own process; a context manager.
 
     :raises ConformanceError: it ends, or says nothing, before it is ready; its last words are
         in the message.

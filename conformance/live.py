@@ -410,7 +410,7 @@ class _Client:
             writer.wait_matched(max(0.0, end - time.monotonic()))
 
     def wait_alone(self, timeout: float) -> bool:
-        """Wait until nobody publishes state any more; False when somebody still does."""
+        """Wait until no participant publishes state any more; False when one still does."""
         return self._node.discovery.wait(
             lambda endpoints: (
                 not any(e.kind == "writer" and e.topic in self._states for e in endpoints)

@@ -1,4 +1,4 @@
-"""Pytest options of the conformance suite, and what a run of it prints.
+"""Pytest options of the conformance suite, and the output of a run.
 
 Registered through the entry point ``pytest11``, so that the suite also runs outside a checkout:
 ``pytest --pyargs dexkit.conformance --backend ezgripper``. It is loaded in every pytest run of

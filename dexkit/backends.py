@@ -224,7 +224,7 @@ _PARTS = ("spec", "open", "close", "exchange")
 
 
 def _check(hand: object, side: Side, model: str) -> None:
-    """Refuse what a backend that is still being written makes instead of the hand.
+    """Check that the object made by a backend is a hand of the right side and model.
 
     :raises BackendBroken: naming what is missing or wrong.
     """
@@ -300,7 +300,7 @@ def backend(name: str) -> Backend:
 
 
 def list_backends() -> list[BackendInfo]:
-    """Every registered backend, built-in and plug-in, with what is wrong with it, if anything."""
+    """Every registered backend, built-in and plug-in, with its error if it cannot be used."""
     rows = []
     registered = entry_points(GROUP)
     for entry in sorted(

@@ -104,7 +104,7 @@ _BUILTIN = b"org::eclipse::cyclonedds::builtin::"  # types of a node's own disco
 
 @dataclass(frozen=True)
 class Qos:
-    """The policies that decide whether two endpoints match and what is kept.
+    """The QoS policies of an endpoint: reliability, durability and history.
 
     :param reliability: ``"reliable"`` or ``"best_effort"``.
     :param durability: ``"volatile"``, ``"transient_local"``, ``"transient"``, ``"persistent"``.
@@ -1258,7 +1258,7 @@ def _uuid(key: Any) -> str:
 
 
 def _text(data: bytes | None) -> str:
-    """Text that a peer announced; what is not UTF-8 becomes U+FFFD."""
+    """Text that a peer announced; bytes that are not UTF-8 become U+FFFD."""
     return (data or b"").decode("utf-8", "replace")
 
 
@@ -1372,7 +1372,7 @@ def _policies(qos: Qos, user_data: bytes = b"", most: int | None = None) -> Any:
 
 
 def _qos_of(qos: int, kind: str) -> Qos:
-    """The policies of a discovered endpoint; what it does not announce has DDS's default."""
+    """The policies of a discovered endpoint; one that it does not announce has DDS's default."""
     cyclone = _cyclone()
     value, depth, duration = ctypes.c_int32(), ctypes.c_int32(), ctypes.c_int64()
     reliable = kind == "writer"

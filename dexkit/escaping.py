@@ -130,7 +130,7 @@ class Guard:
             self.write(line)
 
     def write_trusted(self, text: str) -> None:
-        """Write ``text`` as it is, but for what the stream's encoding lacks."""
+        """Write ``text`` unchanged, except for characters that the stream's encoding lacks."""
         self._check()
         if not text:
             return  # /dev/full takes not even that, and click tries it

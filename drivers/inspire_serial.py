@@ -1,4 +1,4 @@
-"""Driver of Inspire's RH56DFX on a serial port of its own (docs/inspire.md).
+"""Driver of Inspire's RH56DFX on a serial port (docs/inspire.md).
 
 The frames are in :mod:`dexkit.wire.rh56`, their use in :mod:`dexkit.drivers.inspire_hand`.
 """

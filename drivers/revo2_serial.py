@@ -1,4 +1,4 @@
-"""Driver of BrainCo's Revo2 on a serial port of its own, Modbus RTU (docs/brainco.md).
+"""Driver of BrainCo's Revo2 on a serial port, Modbus RTU (docs/brainco.md).
 
 Each exchange writes goals and speeds where they have changed, and reads position, speed, current
 and status of every motor in one request. The registers are in :mod:`dexkit.wire.revo2`.

@@ -161,5 +161,5 @@ class Browser:
             )
 
     def picture(self) -> bytes:
-        """What is seen, as PNG."""
+        """The page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

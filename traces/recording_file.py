@@ -317,7 +317,7 @@ class RecordingFile:
             )
 
     def verify(self) -> None:
-        """Check that it holds what was committed.
+        """Check that the file holds the committed data.
 
         It is read only if its modification time has changed since the last commit, because reading
         a long recording again would delay its end.

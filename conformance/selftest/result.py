@@ -1,4 +1,4 @@
-"""The result of a self-test: what was found, judged by the model and beside an earlier run."""
+"""The result of a self-test: its figures, judged by the model and against an earlier run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _NOISIER = (2.0, 100.0)
 
 
 class Verdict(str, Enum):
-    """What is said of the hand."""
+    """Verdict on the hand."""
 
     GOOD = "good"
     INCOMPLETE = "incomplete"

@@ -1,4 +1,4 @@
-"""The manifest of a signed archive: its files with digests, and what was judged, as JSON.
+"""The manifest of a signed archive: its files with digests, and the judged hand, as JSON.
 
 The signature is over the bytes of the manifest. Through the digests it covers all other files.
 """

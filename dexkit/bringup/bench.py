@@ -79,7 +79,7 @@ class Zero(str, Enum):
 
 @dataclass(frozen=True)
 class JointChoice:
-    """A joint that a motor may move: what is not known of it, and how it is found.
+    """A joint that a motor may move: its unknown properties, and how they are found.
 
     A motor reports ``ratio / reference * (sign * q + offset)``.
 
@@ -225,7 +225,7 @@ class Bench(Protocol):
         ...
 
     def exchange(self, drive: Drive | None) -> Snapshot:
-        """Send one frame and return what the hand answers.
+        """Send one frame and return the hand's answer.
 
         :param drive: the one motor that may move; None locks all.
         :raises HandError: as :meth:`dexkit.hand.Hand.exchange`.

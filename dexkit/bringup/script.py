@@ -1,4 +1,4 @@
-"""The order of a bring-up: what moves, what is asked, and what follows; sans-IO.
+"""The order of a bring-up: motions, questions and conclusions; sans-IO.
 
 :func:`script` is a generator of actions. A motion gives back how it ended and where, a question its
 answer, a touch the sensor that felt it. What ``findings`` already has is skipped.

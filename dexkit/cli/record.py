@@ -163,7 +163,7 @@ def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:
 
 
 def _refuse_empty(node: DdsNode, recording: DdsRecording, waited: float) -> None:
-    """Report that nothing was received, and what was on the domain instead.
+    """Report that nothing was received, and the topics that are on the domain.
 
     :raises TraceError: always, with exit code 1.
     """

@@ -462,7 +462,7 @@ def _print_end(machine: ReplayMachine) -> int:
 
 
 class _Waiting:
-    """Says what is waited for, and gives up."""
+    """Prints the missing hands while the command waits for them, and ends the wait."""
 
     def __init__(self, live: LiveReplay, patience: float) -> None:
         self._live, self._patience = live, patience

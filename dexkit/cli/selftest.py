@@ -275,7 +275,7 @@ def _turn(stop: StopRequest, quiet: bool) -> Iterator[Callable[[SelfTest], None]
 def _finish(
     result: SelfTestResult, baseline: SelfTestResult | None, json_path: Path, page: Path
 ) -> int:
-    """Write and print what was found; the exit code."""
+    """Write and print the result; returns the exit code."""
     from dexkit.conformance.report.selftest import print_selftest, render_selftest
     from dexkit.conformance.selftest.result import Verdict
     from dexkit.documents import write_file

@@ -151,16 +151,16 @@ def position_command(hand: HandModel, q: ArrayLike) -> HandCommand:
 
 
 class NoTopics:
-    """A :class:`~dexkit.service.service.Node` on which nobody is."""
+    """A :class:`~dexkit.service.service.Node` without other participants."""
 
     def writer(self, topic: str, type_name: str, *, user_data: bytes = b"") -> _Nobody:
-        """A writer that nobody reads."""
+        """A writer without readers."""
         return _Nobody()
 
     def reader(
         self, topic: str, type_name: str, *, on_data: Callable[[], object] | None = None
     ) -> _Nobody:
-        """A reader to which nobody writes."""
+        """A reader without writers."""
         return _Nobody()
 
     def endpoints(self) -> Sequence[Any]:

@@ -450,7 +450,7 @@ class HandService:
             self._log_once(remark.counter, remark.text)
 
     def _log_once(self, kind: str, text: str) -> None:
-        """Log what is odd about a command, each kind only once."""
+        """Log the remarks about a command, each kind only once."""
         if kind not in self._logged:
             self._logged.add(kind)
             log.warning("%s: a command was odd (counted, logged once): %s", self.cmd_topic, text)

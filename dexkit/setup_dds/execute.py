@@ -52,7 +52,7 @@ def carry_out(
     *,
     install: bool = True,
 ) -> Installed:
-    """Do what a plan says, and try the result.
+    """Carry out a plan, and test the result.
 
     :param wheel_folder: where the wheel is also kept.
     :param install: False makes the wheel, and leaves the environment alone.
@@ -187,7 +187,7 @@ class _Task:
         return self._pip
 
     def install(self, wheel: Path) -> None:
-        """Install the wheel; what it depends on before that, so that it is the last step."""
+        """Install the wheel as the last step, after its dependencies."""
         python = self._interpreter.executable
         if self._interpreter.pip:
             begin, again = [python, "-m", "pip", "install", *_PIP], ["--force-reinstall"]
@@ -212,7 +212,7 @@ class _Task:
         )
 
     def check(self, folder: str, state: str) -> Installed:
-        """Try what is installed, or unpacked in ``folder``."""
+        """Test the installed package, or the one unpacked in ``folder``."""
         command = probe.command(self._interpreter.executable, folder, send=True)
         done = self._runner.run(command)
         return check(probe.result_of(done.code, done.output), state)
@@ -244,7 +244,7 @@ def _failure(what: str, done: Done, machine: Machine) -> DdsBuildFailed:
 
 
 def check(found: Installed, state: str) -> Installed:
-    """Judge what the child process found.
+    """Judge the findings of the child process.
 
     :param state: what the error adds: whether something was installed.
     :raises DdsBuildFailed: it cannot be used.

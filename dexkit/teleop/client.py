@@ -243,7 +243,7 @@ class TeleopClient(ABC):
         return {s: "every q is exactly 0" for s in self._awaited if not any(latest[s])}
 
     def begin_again(self) -> None:
-        """Forget every state, and what was made of them; the operator's targets stay.
+        """Discard every state and the values derived from them; the operator's targets stay.
 
         For after a pause of the caller. The genuine client does not; it is restarted.
         """
@@ -422,7 +422,7 @@ class FingerClient(TeleopClient):
 
 
 class RightHandClient(FingerClient):
-    """A client that looks at the right hand alone to see whether states come
+    """A client that waits for states of the right hand only
     (docs/sources/unitree-dex.md#j2).
     """
 

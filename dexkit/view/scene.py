@@ -116,7 +116,7 @@ class Figure:
         )
 
     def update(self, view: SubjectView) -> None:
-        """Show another state; what has not changed is not sent."""
+        """Show another state; only changes are sent."""
         drawn = self._drawing.at(view)
         self._place(self._bodies, "bodies", drawn.bodies)
         if len(drawn.pins):

@@ -61,7 +61,7 @@ class Listener:
         return sum(r.refused for r in self._readers.values())
 
     def poll(self) -> int:
-        """Pass on what has come since the last call; returns the number of samples.
+        """Pass on the samples since the last call; returns their number.
 
         :raises DdsError: DDS no longer works.
         """

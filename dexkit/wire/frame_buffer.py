@@ -6,7 +6,7 @@ __all__ = ["FrameBuffer"]
 
 
 class FrameBuffer:
-    """What the parsers of all streams have: the bytes of a frame that is not complete yet.
+    """Base of the parsers of byte streams: holds the bytes of a frame that is not complete yet.
 
     :ivar skipped: bytes that belonged to no frame.
     """

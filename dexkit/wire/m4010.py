@@ -178,7 +178,7 @@ class Setpoint(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What a motor measures, at the joint: rad, rad/s, N·m."""
+    """Measurements of a motor, at the joint: rad, rad/s, N·m."""
 
     q: float
     dq: float

@@ -46,7 +46,7 @@ _CRC = 2
 
 
 class Function(IntEnum):
-    """What a request does."""
+    """Modbus function codes."""
 
     READ_HOLDING = 3
     READ_INPUT = 4

@@ -230,8 +230,8 @@ class EZGripperBench:
         return found
 
     def settings(self, findings: Findings) -> dict[str, str]:
-        """Settings that follow from the findings; for two servos only the ids, the file holds the
-        rest.
+        """Settings that follow from the findings; for two servos only the ids; the others are in
+        the file.
         """
         records = self.records(findings)
         if not records:

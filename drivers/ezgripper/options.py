@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class ZeroGains(str, Enum):
-    """What a command without gains (kp = kd = dq = tau = 0) does."""
+    """Effect of a command without gains (kp = kd = dq = tau = 0)."""
 
     LIMP = "limp"
     POSITION = "position"

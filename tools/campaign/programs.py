@@ -86,7 +86,7 @@ class Client:
 
 @dataclass
 class Scene:
-    """What a program works with in a batch.
+    """The devices and clients of a program in a batch.
 
     :ivar client: a client, where the program has one.
     :ivar device: the emulated device, where it drives one, and ``bench`` what knows it.
@@ -105,7 +105,7 @@ class Scene:
 
     @property
     def scratch(self) -> Path:
-        """A folder of its own."""
+        """The folder of the batch."""
         return self.batch.scratch
 
     def position(self) -> float | None:
@@ -120,7 +120,7 @@ Stage = Callable[[Scene], "contextlib.AbstractContextManager[None]"]
 
 @dataclass(frozen=True)
 class Spec:
-    """A program and how it is known to work.
+    """A program with the test that it works.
 
     :param command: its arguments behind ``python -m``.
     :param stage: what must be there for it.
@@ -317,7 +317,9 @@ def _serve(backend: str) -> Callable[[Scene], list[str]]:
 
 
 def _served() -> dict[str, Callable[[Path], Bench]]:
-    """What is served, by backend: simulated hands with torque control, and the emulated devices."""
+    """The benches of ``serve``, by backend: simulated hands with torque control, emulated
+    devices.
+    """
     found: dict[str, Callable[[Path], Bench]] = {
         m.simulator: partial(Bench, backend=m.simulator)
         for m in BUILT_IN

@@ -177,7 +177,7 @@ Random = np.random.Generator
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, and what an audit must say of a file that has it.
+    """A fault, and the expected result of an audit of a file that has it.
 
     :param apply: changes a session, on one side; for a fault of the file, its bytes.
     :param find: requirements of which at least one must fail or warn, without the prefix.
@@ -319,7 +319,7 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Answer:
-    """What is true of a generated file.
+    """The known facts of a generated file.
 
     :param find: ids of which one must fail or warn, on ``side``; ``also`` may fail, too.
     """

@@ -77,7 +77,7 @@ class Task:
 
 
 def tasks(model_name: str, hands: Counts | None = None, *, most: int | None = None) -> list[Task]:
-    """What is tried of a model.
+    """The trials of a model.
 
     :param hands: how many; None for those of :func:`counts_of`.
     :param most: not more hands than that in any kind of run.

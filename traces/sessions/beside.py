@@ -276,7 +276,8 @@ def _ascending(anchors: Floats) -> NDArray[np.intp]:
 def write_beside(
     session: Session, trace: Trace, out: Path, *, embed: bool = False, overwrite: bool = False
 ) -> tuple[int, FrameTimes]:
-    """Write an episode with its recording: hands from the recording, the rest at its true time.
+    """Write an episode with its recording: hands from the recording, all other data at its true
+    time.
 
     :returns: the number of messages, and where the episode lies.
     :raises SessionError: as :func:`find_times`, or most of the episode is not in the recording.

@@ -117,7 +117,7 @@ def one_side(sides: Sequence[Side]) -> Side:
 
 
 def serve(device: Served, request: StopRequest, *, faults_from_stdin: bool) -> None:
-    """Serve until a stop is requested; then close the device and say what was seen.
+    """Serve until a stop is requested; then close the device and print its counters.
 
     :raises EmulatorError: its service ended, or it failed inside.
     """
