@@ -15,7 +15,7 @@ from dexkit.backends import BackendOptions, backend, list_backends
 from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
 from dexkit.bringup.script import describe
 from dexkit.cli.held_key import Terminal
-from dexkit.cli.options import FILE, Number, set_option, setting, side_option
+from dexkit.cli.options import FILE, Number, set_option, setting, side_option, usb_option
 from dexkit.cli.remarks import remark
 from dexkit.clock import Rate
 from dexkit.errors import HandTimeout, UsageError
@@ -39,11 +39,7 @@ _LOST_ANSWERS = 3
     help="Serial number, address or port of the device.",
 )
 @set_option("Setting of the backend, e.g. config=FILE; 'dexkit backends' lists the settings.")
-@click.option(
-    "--usb",
-    metavar="URL",
-    help="USB hand on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
-)
+@usb_option("USB hand")
 @click.option(
     "--torque",
     type=Number(0.01, 3.0),

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.options import Number
+from dexkit.cli.options import Number, one_side_option
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
@@ -67,11 +67,9 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
 @click.command()
 @click.argument("gripper", type=click.Choice(["ezgripper", "dex1-serial"]), default="ezgripper")
 @click.option("--device", metavar="PATH|SERIAL", help="Serial port, or its USB serial number.")
-@click.option(
-    "--side",
-    type=click.Choice(["left", "right"]),
-    help="Side of the gripper. Required for dex1-serial; for an EZGripper it selects the adapter "
-    "that the file names for this side.",
+@one_side_option(
+    "Side of the gripper. Required for dex1-serial; for an EZGripper it selects the adapter "
+    "that the file names for this side."
 )
 @click.option(
     "--id",

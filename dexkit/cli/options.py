@@ -39,10 +39,12 @@ __all__ = [
     "markdown_option",
     "network_options",
     "object_option",
+    "one_side_option",
     "overwrite_option",
     "peer_addresses",
     "quiet_option",
     "real_time_option",
+    "recording_option",
     "require_option",
     "seed_option",
     "session_options",
@@ -51,9 +53,11 @@ __all__ = [
     "side_option",
     "start_option",
     "topic_option",
+    "usb_option",
     "verbose_option",
     "view_option",
     "wait_option",
+    "wiring_option",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -312,6 +316,25 @@ def side_option(
     return click.option("--side", "sides", type=_Sides(), required=required, help=help, **given)
 
 
+def one_side_option(help: str, *, required: bool = False) -> Callable[[F], F]:
+    """``--side`` of the commands for one hand, as text ``side``, or None."""
+    return click.option(
+        "--side", type=click.Choice(list(map(str, Side))), required=required, help=help
+    )
+
+
+def usb_option(hands: str) -> Callable[[F], F]:
+    """``--usb URL``.
+
+    :param hands: what the help calls the devices: ``USB hand`` or ``USB hands``.
+    """
+    return click.option(
+        "--usb",
+        metavar="URL",
+        help=f"{hands} on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
+    )
+
+
 def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:
     """The paths of ``--device``, given as PATH or SIDE=PATH.
 
@@ -471,6 +494,20 @@ def markdown_option(default: str = "") -> Callable[[F], F]:
     )
 
 
+def recording_option(then: str = "") -> Callable[[F], F]:
+    """``--recording RUN.mcap``: the recording of a result.
+
+    :param then: what the command does with it, for the help.
+    """
+    return click.option(
+        "--recording",
+        type=click.Path(exists=True, path_type=Path),
+        metavar="RUN.mcap",
+        help=f"The recording that was judged{then}. Default: the one that the result names, if it "
+        "lies beside it.",
+    )
+
+
 def verbose_option(help: str) -> Callable[[F], F]:
     """``-v``, ``--verbose``."""
     return click.option("-v", "--verbose", is_flag=True, help=help)
@@ -534,6 +571,11 @@ def object_option(when: str) -> Callable[[F], F]:
 def start_option(help: str, default: float | None = None) -> Callable[[F], F]:
     """``--start PCT``."""
     return click.option("--start", type=Number(0, 100), default=default, metavar="PCT", help=help)
+
+
+def wiring_option(help: str) -> Callable[[F], F]:
+    """``--wiring SEED``: an emulated device whose wiring is random."""
+    return click.option("--wiring", type=click.IntRange(0, 2**32 - 1), metavar="SEED", help=help)
 
 
 def line_time_option() -> Callable[[F], F]:

@@ -18,6 +18,7 @@ from dexkit.cli.options import (
     dialect_option,
     force_option,
     html_option,
+    one_side_option,
     quiet_option,
     set_option,
     setting,
@@ -46,9 +47,7 @@ whose client asks for all of it, are tried at it."""
 @click.command("selftest")
 @click.argument("backend_name", metavar="[BACKEND]", required=False)
 @click.option("--external", is_flag=True, help="Test a hand that is already served on DDS.")
-@click.option(
-    "--side", type=click.Choice([str(s) for s in Side]), required=True, help="Hand to test."
-)
+@one_side_option("Hand to test.", required=True)
 @click.option("--device", metavar="PATH", help="Path or serial number of the device.")
 @set_option("Setting of the backend; 'dexkit backends' lists them.")
 @dialect_option("With --external: the dialect of the hand.")

@@ -24,6 +24,7 @@ from dexkit.cli.options import (
     set_option,
     setting,
     side_option,
+    usb_option,
     view_option,
 )
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
@@ -60,11 +61,7 @@ _LONELY = 10.0  # seconds without a client before a hint
     "Setting of the backend, e.g. object=40; left.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."
 )
-@click.option(
-    "--usb",
-    metavar="URL",
-    help="USB hands on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
-)
+@usb_option("USB hands")
 @dialect_option(
     "Topics, types and units.  [default: the model's first: "
     + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())

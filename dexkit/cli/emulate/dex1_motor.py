@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, serve
-from dexkit.cli.options import Number, object_option, side_option, start_option
+from dexkit.cli.options import Number, object_option, side_option, start_option, wiring_option
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
@@ -37,12 +37,7 @@ __all__ = ["emulate_dex1_motor"]
     metavar="RAD",
     help="Report the position too large by this, until it is calibrated.",
 )
-@click.option(
-    "--wiring",
-    type=click.IntRange(0),
-    metavar="SEED",
-    help="Random ids, directions, offsets and gear ratios, to test a bring-up.",
-)
+@wiring_option("Random ids, directions, offsets and gear ratios, to test a bring-up.")
 @line_options(
     "motor",
     baudrate=m4010.BAUD_RATE,

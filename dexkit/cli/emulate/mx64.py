@@ -20,6 +20,7 @@ from dexkit.cli.options import (
     object_option,
     seed_option,
     start_option,
+    wiring_option,
 )
 from dexkit.clock import RealClock
 from dexkit.errors import EmulatorError, UsageError
@@ -64,12 +65,9 @@ __all__ = ["emulate_mx64"]
     metavar="TICK",
     help="Encoder tick at which the fingers are closed.",
 )
-@click.option(
-    "--wiring",
-    type=click.IntRange(0),
-    metavar="SEED",
-    help="One or two grippers, dual or quad, with random ids, directions, closed positions and "
-    "strokes, to test a bring-up; replaces --id and the options of a gripper.",
+@wiring_option(
+    "One or two grippers, dual or quad, with random ids, directions, closed positions and "
+    "strokes, to test a bring-up; replaces --id and the options of a gripper."
 )
 @line_time_option()
 @latency_timer_option(1.0)
