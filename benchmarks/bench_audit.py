@@ -25,13 +25,15 @@ from benchmarks import Result
 from dexkit.conformance.audit.audit import Audit, Limits, Outcome, Runner, in_this_process
 from dexkit.conformance.audit.cluster import THIS_MACHINE
 from dexkit.conformance.audit.journal import Journal
+from dexkit.models import BUILT_IN, HandModel
 from tools.generate_archive import ANSWERS, generate
 from tools.generate_archive.score import score
 
 _FILES = int(os.environ.get("FILES", "12"))
 _SECONDS = float(os.environ.get("SECONDS", "60"))
 _PEER_FILES = int(os.environ.get("PEER_FILES", "10"))
-_TARGETS = {"dex1-1": 1000.0, "dex3-1": 600.0}
+_GRIPPER_TARGET, _HAND_TARGET = 1000.0, 600.0
+"""Times real time, for hands of one joint and of several."""
 
 
 def run() -> list[Result]:
@@ -46,7 +48,7 @@ def run() -> list[Result]:
         one, own = _audit(archive, folder / "one", Limits().pool(1))
         many, _ = _audit(archive, folder / "many", Limits().pool(cores))
         files = _facts(folder / "one", one, own)
-        found = [result for model in _TARGETS for result in _speed(model, files)]
+        found = [result for hand in BUILT_IN for result in _speed(hand, files)]
         found += [_scaling(one, many, cores), _score(archive, folder / "many")]
         if importlib.util.find_spec("ray") is not None:
             ray, _ = _audit(archive, folder / "ray", Limits().cluster(THIS_MACHINE))
@@ -77,12 +79,13 @@ def _facts(out: Path, outcome: Outcome, own: float) -> list[tuple[Path, dict[str
     return found
 
 
-def _speed(model: str, files: Sequence[tuple[Path, dict[str, Any]]]) -> list[Result]:
-    mine = [(path, facts) for path, facts in files if facts["model"] == model]
+def _speed(hand: HandModel, files: Sequence[tuple[Path, dict[str, Any]]]) -> list[Result]:
+    mine = [(path, facts) for path, facts in files if facts["model"] == hand.name]
     if not mine:
         return []
-    name, unit = f"dexkit audit, {model}, a core in steady state", "times real time"
-    speed, target = _rate(facts for _, facts in mine), _TARGETS[model]
+    name, unit = f"dexkit audit, {hand.name}, a core in steady state", "times real time"
+    target = _GRIPPER_TARGET if hand.dialects[0].is_gripper else _HAND_TARGET
+    speed = _rate(facts for _, facts in mine)
     about = f"{len(mine)} files"
     some = mine[:: max(1, len(mine) // _PEER_FILES)][:_PEER_FILES]
     found = [

@@ -17,10 +17,11 @@ from typing import NamedTuple
 from benchmarks import Result
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
+from dexkit.models import DEX1_1, DEX3_1
 from dexkit.traces import Recorder, open_trace, sample_path
 
 _TARGET = 200.0
-_SAMPLES = {"Dex1-1": "dex1_pick_place", "Dex3-1": "dex3_pinch"}
+_HANDS = (DEX1_1, DEX3_1)
 _LENGTHS = (600.0, 60.0)
 """Seconds that are made of a session. Of a minute Python itself and numpy take a good part."""
 
@@ -37,7 +38,8 @@ def run() -> list[Result]:
         os.sched_setaffinity(0, {min(cores)})
         try:
             floor = _process(folder, "-c", "import numpy").seconds
-            for title, sample in _SAMPLES.items():
+            for hand in _HANDS:
+                title, sample = hand.title.partition(" ")[0], str(hand.session)
                 judge(Recording.decode(open_trace(sample_path(sample))))  # loads what it needs
                 for wanted in _LENGTHS:
                     path = Path(folder) / f"{sample}_{wanted:g}.mcap"

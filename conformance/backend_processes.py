@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dexkit import child_processes
+from dexkit.backends import Emulator
 from dexkit.backends import backend as find_backend
-from dexkit.conformance.known_backends import EMULATED, EXTERNAL, ROBOT_EMULATORS, SIMULATED
+from dexkit.conformance.known_backends import EXTERNAL, ROBOT_EMULATORS, SIMULATED, emulator_of
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side, Subject
 from dexkit.models import Dialect
@@ -24,7 +25,7 @@ __all__ = ["Rig", "RigOptions", "Tool"]
 
 
 class Tool(child_processes.Tool):
-    """A ``dexkit`` command in a process of its own; a context manager.
+    """A ``dexkit`` command in its own process; a context manager.
 
     :raises ConformanceError: it ends, or says nothing, before it is ready; its last words are
         in the message.
@@ -59,9 +60,9 @@ class RigOptions:
         return tuple(s for s in self.sides if isinstance(s, Side))
 
     @property
-    def emulated(self) -> bool:
-        """Whether the device is emulated by a process of the kit's."""
-        return self.backend in EMULATED and not self.devices
+    def emulator(self) -> Emulator | None:
+        """How the kit emulates the device; None where there is a real one, or none."""
+        return None if self.devices else emulator_of(self.backend)
 
     @property
     def usb_server(self) -> str:
@@ -130,17 +131,17 @@ class Rig:
         described = find_backend(options.backend) if options.backend in SIMULATED else None
         if described is not None and "pose" in described.settings:
             self._poses = self._stack.enter_context(TemporaryFolder("poses"))
-        if not options.emulated:
+        emulator = options.emulator
+        if emulator is None:
             return
         folder = self._stack.enter_context(TemporaryFolder("hands"))
-        emulation = EMULATED[options.backend]
-        emulators = {}
+        tools = {}
         for s in options.hands:
-            command = emulation.command(s, folder / f"hand-{s}")
-            emulators[s] = self._tool(*command, *_object(options, s))
-        for s, tool in emulators.items():
+            command = emulator.command(s, folder / f"hand-{s}")
+            tools[s] = self._tool(*command, *_object(options, s))
+        for s, tool in tools.items():
             tool.wait_ready(self._stop)
-            self.devices[s] = str(folder / f"hand-{s}") if emulation.linked else tool.place
+            self.devices[s] = str(folder / f"hand-{s}") if emulator.linked else tool.place
 
     def serve(self) -> None:
         """Start the services, and wait until they are ready.
@@ -163,10 +164,9 @@ class Rig:
     def _start_hands(self) -> list[Tool]:
         options = self.options
         settings = list(options.settings)
-        if options.emulated:
+        if (emulator := options.emulator) is not None:
             given = {s.partition("=")[0] for s in settings}
-            needed = EMULATED[options.backend].settings
-            settings += [f"{k}={v}" for k, v in needed.items() if k not in given]
+            settings += [f"{k}={v}" for k, v in emulator.settings.items() if k not in given]
         return [self._serve(group, settings) for group in self._groups()]
 
     def end_services(self) -> bool | None:

@@ -32,7 +32,7 @@ _LAST_S = 0.2
 
 
 class Loopback:
-    """Calibrates in threads of its own, while other things are waited for; a context manager.
+    """Calibrates in its own threads during other waits; a context manager.
 
     :param receiver: the node that the run is recorded with.
     :param count: messages.

@@ -43,7 +43,11 @@ def conformance_run(request: pytest.FixtureRequest) -> RunResult:
         try:
             result = run_suite(options, report, stop.event)
         except KeyboardInterrupt:
-            end("the run was interrupted", 130, "; nothing was judged, which is not a pass")
+            end(
+                "the run was interrupted",
+                130,
+                "; nothing was judged, which is not a pass",
+            )
         except DexkitError as error:
             if not stop:
                 hint = f"\n{error.hint}" if error.hint else ""

@@ -221,12 +221,13 @@ def _require_hand(node: DdsNode, options: LiveOptions) -> None:
     others = sorted({e.topic for e in node.endpoints() if not e.own and e.topic.startswith("rt/")})
     speaks = [d.name for d in DIALECTS.values() if any(d.topics(s)[1] in others for s in Side)]
     raise ConformanceError(
-        f"no hand on domain {rig.domain}: nobody publishes {states} or listens for commands",
+        f"no hand on domain {rig.domain}: no program publishes {states} or subscribes to the "
+        "commands",
         hint=f"there is {', '.join(others)}"
         + (f": --dialect {' or '.join(speaks)}" if speaks else "")
         if others
-        else f"is it served on this domain, and on the interface {rig.interface}? "
-        "0 is the robot's domain, 1 that of simulated hands; 'dexkit doctor' looks around",
+        else f"is it served on this domain, and on the interface {rig.interface}? 0 is the robot's "
+        "domain, 1 that of simulated hands; 'dexkit doctor' examines the network",
     )
 
 
@@ -409,7 +410,7 @@ class _Client:
             writer.wait_matched(max(0.0, end - time.monotonic()))
 
     def wait_alone(self, timeout: float) -> bool:
-        """Wait until nobody publishes state any more; False when somebody still does."""
+        """Wait until no participant publishes state any more; False when one still does."""
         return self._node.discovery.wait(
             lambda endpoints: (
                 not any(e.kind == "writer" and e.topic in self._states for e in endpoints)

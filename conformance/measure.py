@@ -107,7 +107,7 @@ class Measure:
 
     @classmethod
     def of_dict(cls, data: dict[str, Any]) -> Measure:
-        """The measure that :meth:`as_dict` gave; ``margin`` is computed anew."""
+        """The measure that :meth:`as_dict` gave; ``margin`` is computed again."""
         names = ("value", "limit", "unit", "larger_is_worse", "error")
         return cls(quantity=Quantity(data["quantity"]), **{name: data[name] for name in names})
 

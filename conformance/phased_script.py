@@ -48,7 +48,7 @@ class PhasedScript(ABC, Generic[A, O, P]):
         """The whole script."""
 
     def _do(self, action: A) -> Generator[A, O, O]:
-        """Yield an action to the player; return what was observed after it."""
+        """Yield an action to the player; return the observation after it."""
         self._obs = yield action
         return self._obs
 

@@ -1,4 +1,4 @@
-"""Pytest options of the conformance suite, and what a run of it prints.
+"""Pytest options of the conformance suite, and the output of a run.
 
 Registered through the entry point ``pytest11``, so that the suite also runs outside a checkout:
 ``pytest --pyargs dexkit.conformance --backend ezgripper``. It is loaded in every pytest run of
@@ -169,7 +169,9 @@ def pytest_configure(config: pytest.Config) -> None:
     except DexkitError as error:
         raise _usage(error) from error
     if config.getoption("numprocesses", None):
-        raise pytest.UsageError("one hand, one run: the suite does not work with pytest-xdist's -n")
+        raise pytest.UsageError(
+            "the suite judges one hand in one run; pytest-xdist's -n cannot divide it"
+        )
 
 
 @pytest.hookimpl(tryfirst=True)

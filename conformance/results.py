@@ -280,7 +280,7 @@ class Grade:
 
     @property
     def judged(self) -> bool:
-        """Whether the run has anything to say of the kind; a blocked requirement counts."""
+        """Whether the run has a result of the kind; a blocked requirement counts."""
         left_out = (Verdict.NOT_APPLICABLE, Verdict.NOT_CLAIMED)
         return any(n for v, n in self.counts.items() if v not in left_out)
 

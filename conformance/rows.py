@@ -1,4 +1,4 @@
-"""Rows of columns: select them without copies, find those of a time, look at ranges of them."""
+"""Rows of columns: select them without copies, find those of a time, read ranges of them."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class Setting(str, Enum):
 
     @property
     def remark(self) -> str:
-        """What a sentence says of it; empty for a whole run."""
+        """Its description in a sentence; empty for a whole run."""
         whole = self is Setting.WHOLE
         return "" if whole else "; the service not restarted, nothing in the hands"
 
@@ -215,7 +215,7 @@ class Entry:
 
 @cache
 def catalogue_digest(model: str) -> str:
-    """Digest of a hand model's requirements on DDS: of what they ask for, not of how it is said.
+    """Digest of a hand model's requirements on DDS: of their limits, not of their wording.
 
     It changes when a requirement comes or goes, or when its level, its limits, its stimulus or
     what it depends on changes.

@@ -14,11 +14,11 @@ from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.known_backends import (
-    EMULATED,
     EXTERNAL,
-    ON_USB,
     ROBOT_EMULATORS,
     SIMULATED,
+    emulator_of,
+    has_usb_requirements,
 )
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
@@ -143,7 +143,7 @@ class SuiteOptions:
         :raises BackendError: no such backend.
         """
         if quick and thorough:
-            raise UsageError("--quick and --thorough are two runs: choose one")
+            raise UsageError("--quick and --thorough exclude each other")
         of_robot = _robot_of(backend, dialect_name)
         if of_robot:
             _refuse_for_robots(
@@ -175,7 +175,7 @@ class SuiteOptions:
                     f"an object at {pct:g} % of {of_what}",
                     hint=f"{low} to {high} % leaves room to move",
                 )
-        started = backend in EMULATED or backend in SIMULATED
+        started = backend in SIMULATED or emulator_of(backend) is not None
         if not objects and started and not devices:
             by_side = {s: p for s, p in model(chosen.model).objects.items() if s in sides}
         if domain is None and (backend == EXTERNAL or devices):
@@ -192,7 +192,7 @@ class SuiteOptions:
             if file is not None and not os.access(file.absolute().parent, os.W_OK):
                 raise UsageError(f"cannot write {file}: its directory is read-only")
         every = catalogue(chosen.model, "robot" if of_robot else "dds")
-        if backend in ON_USB:
+        if has_usb_requirements(backend):
             every += catalogue(chosen.model, "usb")
         claims = Claims.load(capabilities, chosen.model)
         requirements = select(claims.apply(every), prefixes=require, level=level)
@@ -238,11 +238,10 @@ class SuiteOptions:
     @property
     def subject(self) -> dict[str, str]:
         """Backend, device and object, for a result's ``subject``."""
-        emulated = self.backend in EMULATED and not self.devices
         about = {"backend": self.backend}
         if self.devices:
             about["device"] = ", ".join(f"{s} {d}" for s, d in self.devices.items())
-        elif emulated:
+        elif emulator_of(self.backend) is not None:
             about["device"] = "emulated"
         if self.objects:
             about["object"] = ", ".join(f"{s} at {p:g} %" for s, p in self.objects.items())
@@ -281,7 +280,7 @@ def _robot_of(backend: str, dialect_name: str | None) -> str:
         wanted and not started and backend != EXTERNAL
     ):
         raise UsageError(
-            f"{backend} does not speak {dialect_name}",
+            f"{backend} has no dialect {dialect_name}",
             hint=f"robots: --backend {' or '.join(ROBOT_EMULATORS)}, or external with --dialect "
             f"{' or '.join(ROBOTS)}",
         )
@@ -291,7 +290,7 @@ def _robot_of(backend: str, dialect_name: str | None) -> str:
 def _refuse_for_robots(**given: Any) -> None:
     wrong = [f"--{name}" for name, value in given.items() if value]
     if wrong:
-        raise UsageError(f"{', '.join(wrong)} is about hands, and a robot is to be judged")
+        raise UsageError(f"{', '.join(wrong)}: for hands only, and this run judges a robot")
 
 
 def _dialect(
@@ -305,7 +304,7 @@ def _dialect(
 
     The model is an attribute of a hand object: one is created, and not opened.
 
-    :raises UsageError: the backend needs a device, or its hand does not speak that dialect.
+    :raises UsageError: the backend needs a device, or its model does not have that dialect.
     :raises BackendError: it makes no hand.
     """
     if name == EXTERNAL:
@@ -313,7 +312,7 @@ def _dialect(
     from dexkit.backends import BackendOptions, backend
 
     found = backend(name)
-    if found.needs_device and not devices and name not in EMULATED:
+    if found.needs_device and not devices and found.emulator is None:
         raise UsageError(f"the backend {name} needs a device", hint=f"give {found.needs}")
     values = dict(s.partition("=")[::2] for s in settings)
     its_model = model(found.model_of(BackendOptions(side, devices.get(side), values)))
@@ -321,7 +320,7 @@ def _dialect(
     chosen = dialect(wanted) if wanted else spoken[0]
     if chosen not in spoken:
         raise UsageError(
-            f"{name} is a {its_model.title}, which does not speak {chosen.name}",
+            f"{name} is a {its_model.title}, which has no dialect {chosen.name}",
             hint=f"--dialect {' or '.join(d.name for d in spoken)}",
         )
     return chosen
@@ -409,7 +408,7 @@ def run_suite(
             if trace.damage:
                 raise ConformanceError(
                     f"the run's recording is damaged, nothing is judged: {trace.damage[0]}",
-                    hint=f"look after the disk that holds {path}",
+                    hint=f"check the disk that holds {path}",
                 )
             result = judge_recording(options, view)
     return result

@@ -35,7 +35,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def test_requirement(requirement: str, side: str, request: pytest.FixtureRequest) -> None:
-    """Report what the run found."""
+    """Report the run's result of one requirement."""
     if request.config.stash.get(OPTIONS_KEY, None) is None:
         pytest.skip(HOW)
     run = request.getfixturevalue("conformance_run")

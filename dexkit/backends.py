@@ -17,18 +17,13 @@ import inspect
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dexkit.errors import (
-    BackendBroken,
-    BackendConflict,
-    DexkitError,
-    UnknownBackend,
-    UsageError,
-)
+from dexkit.errors import BackendBroken, BackendConflict, DexkitError, UnknownBackend, UsageError
 from dexkit.hand import Hand, HandSpec, Side
 from dexkit.lazy import Lazy
 from dexkit.plugins import entry_points, import_object, is_own, origin, where
@@ -36,7 +31,16 @@ from dexkit.plugins import entry_points, import_object, is_own, origin, where
 if TYPE_CHECKING:
     from dexkit.bringup import Bench
 
-__all__ = ["GROUP", "Backend", "BackendInfo", "BackendOptions", "backend", "list_backends"]
+__all__ = [
+    "GROUP",
+    "SHARED_MACHINE",
+    "Backend",
+    "BackendInfo",
+    "BackendOptions",
+    "Emulator",
+    "backend",
+    "list_backends",
+]
 
 GROUP = "dexkit.backends"
 
@@ -70,6 +74,35 @@ class BackendOptions:
 
 
 @dataclass(frozen=True)
+class Emulator:
+    """How ``dexkit emulate`` emulates a backend's device: one process a hand.
+
+    :param arguments: of ``dexkit emulate``, without object; ``{side}`` is the hand's.
+    :param linked: whether its path is given by ``--link``. Otherwise it prints its address as the
+        first word after ``ready:``, and gets ``--side``.
+    :param settings: those with which the backend has to be served then, by key.
+    """
+
+    arguments: tuple[str, ...]
+    linked: bool
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+    def command(self, side: Side, path: Path) -> tuple[str, ...]:
+        """The arguments of ``dexkit`` for one hand.
+
+        :param path: of the link, where there is one.
+        """
+        place = ("--link", str(path)) if self.linked else ("--side", str(side))
+        arguments = [argument.format(side=side) for argument in self.arguments]
+        return ("emulate", *arguments, *place)
+
+
+SHARED_MACHINE: Mapping[str, str] = {"timeout": "0.3"}
+"""The setting of a driver whose emulated device shares the machine with other processes, and may
+answer late."""
+
+
+@dataclass(frozen=True)
 class Backend:
     """A driver or simulated hand, with its settings.
 
@@ -82,6 +115,9 @@ class Backend:
     :param settings: name and help of each ``--set`` setting.
     :param bringup: makes the :class:`~dexkit.bringup.Bench` of ``dexkit bringup``, or None.
     :param udev_rules: makes the udev rules that give users access to its USB device, or None.
+    :param emulator: how its device is emulated, so that the conformance kit can start one; None
+        where dexkit emulates none.
+    :param usb_requirements: whether the USB requirements of the model apply to its device.
     """
 
     summary: str
@@ -92,6 +128,8 @@ class Backend:
     settings: dict[str, str] = field(default_factory=dict)
     bringup: Lazy[Callable[[BackendOptions], Bench]] | None = None
     udev_rules: Lazy[Callable[[], str]] | None = None
+    emulator: Emulator | None = None
+    usb_requirements: bool = False
 
     def create(self, options: BackendOptions) -> Hand:
         """Make the hand; nothing is opened yet.
@@ -186,7 +224,7 @@ _PARTS = ("spec", "open", "close", "exchange")
 
 
 def _check(hand: object, side: Side, model: str) -> None:
-    """Refuse what a backend that is still being written makes instead of the hand.
+    """Check that the object made by a backend is a hand of the right side and model.
 
     :raises BackendBroken: naming what is missing or wrong.
     """
@@ -211,11 +249,11 @@ def _check(hand: object, side: Side, model: str) -> None:
         )
     if spec.side is not side:
         raise BackendBroken(
-            f"{name} was asked for the {side} hand, and its spec has {spec.side}",
-            hint="hand the side that is given on to the spec",
+            f"{name} was made for the {side} hand, but its spec has {spec.side}",
+            hint="pass the given side to the spec",
         )
     if model and spec.model != model:
-        raise BackendBroken(f"the backend declares a {model}, and {name} is a {spec.model}")
+        raise BackendBroken(f"the backend declares the model {model}, but {name} has {spec.model}")
 
 
 def _where(error: BaseException) -> str:
@@ -262,7 +300,7 @@ def backend(name: str) -> Backend:
 
 
 def list_backends() -> list[BackendInfo]:
-    """Every registered backend, built-in and plug-in, with what is wrong with it, if anything."""
+    """Every registered backend, built-in and plug-in, with its error if it cannot be used."""
     rows = []
     registered = entry_points(GROUP)
     for entry in sorted(

@@ -75,7 +75,7 @@ def _await_end(pipe: int) -> None:
 
 
 class Tool:
-    """A ``dexkit`` command in a process of its own; a context manager.
+    """A ``dexkit`` command in its own process; a context manager.
 
     :param arguments: of ``dexkit``.
     :param on_line: is given each line that it prints, in a thread that must not be kept long.

@@ -104,7 +104,7 @@ _BUILTIN = b"org::eclipse::cyclonedds::builtin::"  # types of a node's own disco
 
 @dataclass(frozen=True)
 class Qos:
-    """The policies that decide whether two endpoints match and what is kept.
+    """The QoS policies of an endpoint: reliability, durability and history.
 
     :param reliability: ``"reliable"`` or ``"best_effort"``.
     :param durability: ``"volatile"``, ``"transient_local"``, ``"transient"``, ``"persistent"``.
@@ -593,7 +593,7 @@ def _filter_interfaces(number: int, interface: str, before: dict[int, int]) -> D
             )
             return None
         raise DdsSetupError(
-            f"other networks than {interface} cannot be kept out of domain {number}: "
+            f"packets of networks other than {interface} cannot be kept out of domain {number}: "
             f"{error.strerror or error}",
             hint=interface_filter.HINT,
         ) from error
@@ -670,7 +670,7 @@ class _Handle:
     def wait_matched(self, timeout: float | None = None, count: int = 1) -> bool:
         """Wait until at least ``count`` endpoints match.
 
-        :param timeout: seconds; None waits for ever.
+        :param timeout: seconds; None waits without limit.
         :returns: False on time-out, or when it is closed or the dispatcher dies meanwhile.
         """
         with self.node._changed:
@@ -835,7 +835,7 @@ class Reader(_Handle):
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until something has arrived since the last :meth:`take`.
 
-        :param timeout: seconds; None waits for ever.
+        :param timeout: seconds; None waits without limit.
         :returns: False on time-out, or when the reader is closed meanwhile. After True
             :meth:`take` may, rarely, still return nothing: a writer that goes away wakes, too.
         """
@@ -873,7 +873,7 @@ class Discovery:
     ) -> bool:
         """Wait until ``predicate`` of all endpoints is true; it is tried at every change.
 
-        :param timeout: seconds; None waits for ever.
+        :param timeout: seconds; None waits without limit.
         :returns: whether it became true.
         """
         node = self._node
@@ -1258,7 +1258,7 @@ def _uuid(key: Any) -> str:
 
 
 def _text(data: bytes | None) -> str:
-    """Text that a peer announced; what is not UTF-8 becomes U+FFFD."""
+    """Text that a peer announced; bytes that are not UTF-8 become U+FFFD."""
     return (data or b"").decode("utf-8", "replace")
 
 
@@ -1372,7 +1372,7 @@ def _policies(qos: Qos, user_data: bytes = b"", most: int | None = None) -> Any:
 
 
 def _qos_of(qos: int, kind: str) -> Qos:
-    """The policies of a discovered endpoint; what it does not announce has DDS's default."""
+    """The policies of a discovered endpoint; one that it does not announce has DDS's default."""
     cyclone = _cyclone()
     value, depth, duration = ctypes.c_int32(), ctypes.c_int32(), ctypes.c_int64()
     reliable = kind == "writer"

@@ -25,7 +25,7 @@ def loaded_libraries(maps: str) -> tuple[str, ...]:
 
 
 def loaded_here() -> tuple[str, ...]:
-    """Those of this process; empty where the system does not say."""
+    """The libraries that this process has loaded; empty where the system does not list them."""
     try:
         return loaded_libraries(Path("/proc/self/maps").read_text(errors="replace"))
     except OSError:

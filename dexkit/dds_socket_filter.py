@@ -48,7 +48,7 @@ def open_sockets() -> dict[int, int]:
 
 
 class DomainSockets:
-    """The sockets of one domain, restricted to what comes by its interface, or from this machine.
+    """The sockets of one domain, restricted to packets of its interface and of this machine.
 
     The domain is to be deaf at first: it must not receive what came before the filter was set.
 
@@ -149,7 +149,7 @@ class DomainSockets:
             if not waiting.poll(0):
                 return
         raise DdsSetupError(
-            f"{self.interface} brings more for this domain than this process can read",
+            f"{self.interface} receives more for this domain than this process can read",
             hint="is something flooding its ports? The machine may also be overloaded: try again",
         )
 
@@ -204,7 +204,7 @@ class DomainSockets:
 
     @contextlib.contextmanager
     def ending(self) -> Iterator[None]:
-        """Keep the end of the domain, within this context, from waiting for ever.
+        """Within this context the end of the domain does not wait without limit.
 
         CycloneDDS wakes its threads by packets to itself, which do not arrive when the interface
         is gone or down. Here they come by loopback.

@@ -192,13 +192,13 @@ def _without_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise ValueError(f"the key {one_line(key, 40)!r} is there twice")
+            raise ValueError(f"the key {one_line(key, 40)!r} occurs twice")
         found[key] = value
     return found
 
 
 def _limit_depth(document: Any) -> None:
-    """Refuse what is nested too deeply, or has huge numbers (TOML's parser leaves them).
+    """Refuse a document that is nested too deeply, or has huge numbers (TOML's parser leaves them).
 
     :raises ValueError: it is.
     """
@@ -247,7 +247,7 @@ def _identity(path: Path) -> object:
 
 
 def write_file(path: Path, content: str | bytes | Iterable[bytes]) -> None:
-    """Write a file in one step: until it is whole, and on any error, what was there stays.
+    """Write a file in one step: until it is complete, and on any error, the old file stays.
 
     A device or a pipe is written as it is, and a link keeps leading to the file.
 

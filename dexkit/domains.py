@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import random
 import socket
-from types import TracebackType
 
 from dexkit.errors import DexkitError
 
@@ -46,12 +45,7 @@ class ReservedDomain:
     def __enter__(self) -> ReservedDomain:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
 

@@ -144,7 +144,7 @@ class CommandRejected(HandError, ValueError):
 
 
 class WireError(DexkitError, ValueError):
-    """Bytes that are not what they claim to be."""
+    """Bytes that are not a valid message, frame or packet."""
 
 
 class TruncatedError(WireError):
@@ -188,7 +188,7 @@ class DdsLibraryMissing(DdsInstallError):
 
 
 class DdsBuildFailed(DdsInstallError):
-    """A step of the installation failed, or what was built does not work."""
+    """A step of the installation failed, or the built package does not work."""
 
     exit_code = 1
 
@@ -246,7 +246,7 @@ class BackendConflict(BackendError):
 
 
 class BackendBroken(BackendError):
-    """The plug-in cannot be imported, or what it names is not a backend."""
+    """The plug-in cannot be imported, or the object that it names is not a backend."""
 
 
 class ModelBroken(DexkitError):

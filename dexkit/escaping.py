@@ -119,7 +119,7 @@ class Guard:
     def write(self, text: str) -> int:
         """Write ``text``, cleaned."""
         if not isinstance(text, str):
-            raise TypeError(f"text is written here, not {type(text).__name__}")
+            raise TypeError(f"only text can be written, not {type(text).__name__}")
         begin = _CLEAR_LINE if text.startswith(_CLEAR_LINE) and self.isatty() else ""
         self.write_trusted(begin + visible(text.removeprefix(begin)))
         return len(text)
@@ -130,7 +130,7 @@ class Guard:
             self.write(line)
 
     def write_trusted(self, text: str) -> None:
-        """Write ``text`` as it is, but for what the stream's encoding lacks."""
+        """Write ``text`` unchanged, except for characters that the stream's encoding lacks."""
         self._check()
         if not text:
             return  # /dev/full takes not even that, and click tries it

@@ -248,7 +248,7 @@ class HandCommand:
 
     @classmethod
     def brake(cls, n_joints: int) -> HandCommand:
-        """Brake every joint: what the vendor's service sends on time-out
+        """Brake every joint, as the vendor's service does on time-out
         (docs/sources/unitree-dex.md#b2).
         """
         return cls(
@@ -303,7 +303,7 @@ class SupplyState:
 
 @dataclass(frozen=True, eq=False)
 class HandState:
-    """One state. What a backend does not know stays NaN (or None): nothing is invented.
+    """One state. Values that a backend does not know stay NaN (or None).
 
     :param q: joint position, rad, shape (n_joints,).
     :param temperature: of the motor's case, °C, shape (n_joints,).

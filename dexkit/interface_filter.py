@@ -115,7 +115,7 @@ def interface_addresses(interface: str) -> set[str]:
 
 
 def is_loopback(interface: str) -> bool:
-    """Whether what is sent by this interface stays on this machine."""
+    """Whether packets sent by this interface stay on this machine."""
     if sys.platform != "linux":
         return interface.startswith("lo")
     return bool(interface_flags(interface) & _IFF_LOOPBACK)

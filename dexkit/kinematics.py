@@ -94,7 +94,7 @@ class Pin:
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A tree of links, and what is drawn of them.
+    """A tree of links with their drawn shapes.
 
     :param segments: parents before children.
     :param elements: in the order of the model's sensors and their slots.

@@ -76,8 +76,8 @@ class PublicKey:
             raise UsageError(f"{path} holds no public key")
         if "PRIVATE KEY" in lines[0] or "secret key" in lines[0]:
             raise UsageError(
-                f"{path} is a private key, which belongs to whoever signs",
-                hint="the public one is beside it: KEY.pub",
+                f"{path} is a private key; to verify needs the public one",
+                hint="it is in KEY.pub",
             )
         if lines[0].startswith("untrusted comment:") and len(lines) > 1:
             lines = lines[1:]
@@ -124,7 +124,7 @@ def require(tool: str) -> str:
     found = shutil.which(tool)
     if found is None:
         raise SigningError(
-            f"{tool} is not installed, and signatures are made and checked by it",
+            f"{tool} is not installed; it makes and checks the signatures",
             hint=f"install the package {PACKAGES[tool]}: sudo apt install {PACKAGES[tool]}",
         )
     return found

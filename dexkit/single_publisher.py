@@ -153,7 +153,7 @@ class SolePublisher:
         self.begin(wake)
 
     def begin(self, wake: Callable[[], object] = lambda: None) -> None:
-        """End of :meth:`settle`: from now on :meth:`poll` judges what is discovered."""
+        """End of :meth:`settle`: from now on :meth:`poll` judges discovered publishers."""
         self._phase = _Phase.RUN
         for topics in self._node_topics:
             discovery = getattr(topics.node, "discovery", None)

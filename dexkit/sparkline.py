@@ -13,7 +13,7 @@ ASCII = "_.-=+*#@"
 
 
 def resampled(t: Floats, values: Floats, width: int, begin: float, end: float) -> Floats:
-    """The mean of what is finite in each of ``width`` equal stretches of [begin, end]; else NaN.
+    """The mean of the finite values in each of ``width`` equal stretches of [begin, end]; else NaN.
 
     :param t: of the values, shape (n,).
     """

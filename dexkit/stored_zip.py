@@ -93,7 +93,7 @@ def _end(count: int, size: int, offset: int) -> bytes:
 def pack(contents: Sequence[Content]) -> Iterator[bytes]:
     """The bytes of an archive, in pieces.
 
-    :raises ArchiveError: a name is not safe or there twice, they are too many, or too large.
+    :raises ArchiveError: a name is not safe or occurs twice, they are too many, or too large.
     """
     names = [content.name for content in contents]
     if len({name.casefold() for name in names}) < len(names) or len(names) > MOST_MEMBERS:
@@ -125,7 +125,7 @@ def read_directory(file: BinaryIO, origin: object) -> list[Member]:
     end = _at(file, max(0, size - _END.size), _END.size)
     if len(end) < _END.size or end[:4] != b"PK\5\6":
         if _at(file, 0, 4) == b"PK\3\4":
-            raise ArchiveError(f"{origin} is cut short, or has something behind its end")
+            raise ArchiveError(f"{origin} is cut short, or has data after its end")
         raise ArchiveError(
             f"{origin} is not a zip archive", hint="'dexkit sign' writes what this can verify"
         )

@@ -35,7 +35,7 @@ def _quoted(word: str) -> str:
     :raises UsageError: it holds a control character.
     """
     if any(ord(c) < 32 for c in word):
-        raise UsageError(f"{word!r} cannot be in a unit")
+        raise UsageError(f"{word!r} cannot be written into a systemd unit")
     word = word.replace("%", "%%").replace("$", "$$")
     if _PLAIN.fullmatch(word):
         return word
@@ -48,10 +48,10 @@ def unit(side: Side, command: Sequence[str], *, user: str, what: str) -> str:
     :param command: the command line, program first.
     :param user: who runs it.
     :param what: the hand, for its description.
-    :raises UsageError: a word or name cannot be in a unit.
+    :raises UsageError: a word or name cannot be written into a unit.
     """
     if not re.fullmatch(r"[a-z_][a-z0-9_-]*\$?", user):
-        raise UsageError(f"{user!r} is no name of a user")
+        raise UsageError(f"{user!r} is not a user name")
     return f"""\
 # Written by dexkit install-service (docs/install-service.md).
 [Unit]
@@ -59,7 +59,7 @@ Description=dexkit: {side} hand ({what})
 # the interface may come later still: --wait-for-interface
 Wants=network-online.target
 After=network-online.target
-# a hand is tried for ever
+# retries of a hand have no limit
 StartLimitIntervalSec=0
 
 [Service]

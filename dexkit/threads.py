@@ -94,8 +94,7 @@ class Worker(threading.Thread):
             raise self.failure
         raise DexkitError(
             f"the {self.what} thread died: {type(self.failure).__name__}: {self.failure}",
-            hint="that is a mistake of dexkit's if it is not a full disk or the like: "
-            "please report it",
+            hint="unless the disk is full or the like, this is a bug in dexkit: please report it",
         ) from self.failure
 
 

@@ -27,7 +27,7 @@ class Role:
 
 
 def topics_of(dialect: Dialect) -> Iterator[tuple[str, Role]]:
-    """Each topic of a dialect and what it is."""
+    """Each topic of a dialect and its role."""
     sides: dict[tuple[str, str, str], list[Side]] = {}
     for side in Side:
         cmd, state = dialect.topics(side)

@@ -142,7 +142,7 @@ def _in_order(
             waiting.append(child)
             yield child
     if given < len(by_child):
-        raise UsageError(f"{path}: its links form a ring")
+        raise UsageError(f"{path}: its links form a loop")
 
 
 def _origin(element: ElementTree.Element, path: Path) -> tuple[Vector, Vector]:
@@ -216,7 +216,7 @@ def _vector(text: str, path: Path) -> Vector:
     except ValueError:
         raise UsageError(f"{path}: {text[:60]!r} is not three numbers") from None
     if not all(math.isfinite(v) and abs(v) < 1e4 for v in (x, y, z)):
-        raise UsageError(f"{path}: {text[:60]!r} is no place or angle")
+        raise UsageError(f"{path}: {text[:60]!r} is not a position or angle")
     return x, y, z
 
 

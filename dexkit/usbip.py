@@ -302,7 +302,7 @@ class UsbIpBackend(USBIPBackend):  # type: ignore[misc]  # the package has no ty
         try:
             return super()._get_config_data(dev, config_index)
         except (ValueError, IndexError, struct.error) as error:
-            raise USBError(f"a broken configuration: {error}", errno=errno.EPROTO) from error
+            raise USBError(f"an invalid USB configuration: {error}", errno=errno.EPROTO) from error
 
     def _import_device(self, dev: Any) -> Connection:
         self._deadline = time.monotonic() + _GREETING

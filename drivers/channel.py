@@ -150,7 +150,7 @@ class TcpChannel(Channel):
         try:
             fcntl.ioctl(self._socket.fileno(), termios.TIOCOUTQ, count)
         except OSError as error:
-            raise HandLost(f"{self.place} has gone away: {error}") from error
+            raise HandLost(f"the connection to {self.place} is lost: {error}") from error
         return count[0]
 
     def close(self) -> None:

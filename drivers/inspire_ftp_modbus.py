@@ -18,7 +18,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.inspire_modbus import PARSERS, InspireModbus, InspireModbusSettings
@@ -153,7 +153,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def _make(options: BackendOptions) -> InspireFtpModbus:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options.settings, _PARSERS)
     settings = InspireFtpModbusSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireFtpModbus(options.side, settings)
 
@@ -164,4 +164,7 @@ backend = Backend(
     make=_make,
     needs="--device left=HOST --device right=HOST",
     settings=SETTINGS,
+    emulator=Emulator(
+        ("rh56", "--modbus-tcp", "0", "--tactile"), linked=False, settings=SHARED_MACHINE
+    ),
 )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, TcpChannel, tcp_address
@@ -67,13 +67,15 @@ class InspireModbus(InspireHand):
 
     def _connect(self) -> Channel:
         if self._settings.device is None:
-            raise HandNotFound("where is the hand?", hint=f"--device HOST, with port {PORT}")
+            raise HandNotFound(
+                "no address of the hand is given", hint=f"--device HOST, with port {PORT}"
+            )
         self._parser.reset()
         return TcpChannel(*tcp_address(self._settings.device, PORT), _CONNECT)
 
     def _absent(self, place: str) -> HandNotFound:
         return HandNotFound(
-            f"somebody listens on {place}, and no hand answers there as unit {self._settings.id}",
+            f"{place} accepts connections, but no hand answers there as unit {self._settings.id}",
             hint="does another program use the hand? Other units: --set id=255",
         )
 
@@ -102,7 +104,7 @@ class InspireModbus(InspireHand):
         finally:
             if self._parser.broken:
                 raise HandLost(
-                    f"what {channel.place} sends is not Modbus", hint="is it the hand's address?"
+                    f"{channel.place} does not send Modbus", hint="is it the hand's address?"
                 )
 
 
@@ -116,7 +118,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in PARSERS.item
 
 
 def _make(options: BackendOptions) -> InspireModbus:
-    values = parse_settings(options, PARSERS)
+    values = parse_settings(options.settings, PARSERS)
     settings = InspireModbusSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireModbus(options.side, settings)
 
@@ -127,4 +129,5 @@ backend = Backend(
     make=_make,
     needs="--device left=HOST --device right=HOST",
     settings=SETTINGS,
+    emulator=Emulator(("rh56", "--modbus-tcp", "0"), linked=False, settings=SHARED_MACHINE),
 )

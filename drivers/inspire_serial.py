@@ -1,4 +1,4 @@
-"""Driver of Inspire's RH56DFX on a serial port of its own (docs/inspire.md).
+"""Driver of Inspire's RH56DFX on a serial port (docs/inspire.md).
 
 The frames are in :mod:`dexkit.wire.rh56`, their use in :mod:`dexkit.drivers.inspire_hand`.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, SerialChannel
@@ -55,9 +55,7 @@ class InspireSerial(InspireHand):
 
     def _connect(self) -> Channel:
         if self._settings.device is None:
-            raise HandNotFound(
-                "which serial port is the hand on?", hint="--device PATH or USB serial number"
-            )
+            raise HandNotFound("no serial port is given", hint="--device PATH or USB serial number")
         return SerialChannel(self._settings.device, self._settings.baudrate)
 
     def _absent(self, place: str) -> HandNotFound:
@@ -102,7 +100,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def _make(options: BackendOptions) -> InspireSerial:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options.settings, _PARSERS)
     settings = InspireSerialSettings(device=options.device, **values)  # type: ignore[arg-type]
     return InspireSerial(options.side, settings)
 
@@ -113,4 +111,5 @@ backend = Backend(
     make=_make,
     needs="--device left=PATH --device right=PATH",
     settings=SETTINGS,
+    emulator=Emulator(("rh56", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

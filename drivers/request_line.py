@@ -126,8 +126,8 @@ class RequestLine:
         self._late = True
         if channel.unsent:
             raise HandLost(
-                f"{place} does not take what is sent; the connection is given up, so that no old "
-                "goal arrives later",
+                f"{place} does not accept data; the connection is closed, so that no old goal "
+                "arrives later",
                 hint="check the network and the hand's supply",
             )
         raise HandTimeout(

@@ -1,4 +1,4 @@
-"""Driver of BrainCo's Revo2 on a serial port of its own, Modbus RTU (docs/brainco.md).
+"""Driver of BrainCo's Revo2 on a serial port, Modbus RTU (docs/brainco.md).
 
 Each exchange writes goals and speeds where they have changed, and reads position, speed, current
 and status of every motor in one request. The registers are in :mod:`dexkit.wire.revo2`.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.channel import Channel, SerialChannel
@@ -93,9 +93,7 @@ class Revo2Serial(GoalHand):
 
     def _connect(self) -> Channel:
         if self.configuration.device is None:
-            raise HandNotFound(
-                "which serial port is the hand on?", hint="--device PATH or USB serial number"
-            )
+            raise HandNotFound("no serial port is given", hint="--device PATH or USB serial number")
         return SerialChannel(self.configuration.device, self.configuration.baudrate)
 
     def _absent(self, place: str) -> HandNotFound:
@@ -193,7 +191,7 @@ SETTINGS: dict[str, str] = {name: meaning for name, (_, meaning) in _PARSERS.ite
 
 
 def _make(options: BackendOptions) -> Revo2Serial:
-    values = parse_settings(options, _PARSERS)
+    values = parse_settings(options.settings, _PARSERS)
     settings = Revo2Settings(device=options.device, **values)  # type: ignore[arg-type]
     return Revo2Serial(options.side, settings)
 
@@ -204,4 +202,5 @@ backend = Backend(
     make=_make,
     needs="--device left=PATH --device right=PATH",
     settings=SETTINGS,
+    emulator=Emulator(("revo2", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

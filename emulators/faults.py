@@ -214,7 +214,7 @@ class Fault:
     """One fault, parsed.
 
     :param at: seconds after the start.
-    :param duration: seconds, or None for ever.
+    :param duration: seconds, or None for no end.
     :param params: the kind's own keys.
     :param device: id of the device that it affects, or None for all.
     :param lasting: it goes on until ``duration`` has passed (:class:`FaultKind`).

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from dexkit.errors import UsageError
 
-__all__ = ["FixedSteps", "Joint", "Wall"]
+__all__ = ["FixedSteps", "Joint", "Wall", "check_closing"]
 
 _STILL = 1e-9  # rad/s; a slower joint rests
 
@@ -209,3 +209,18 @@ class Joint:
         self.q = q + dt * velocity
         end = torque - damping * velocity
         return low if end < low else high if end > high else end
+
+
+def check_closing(object_at: float | None, start: float | None) -> None:
+    """Check where a hand touches its object, and where it starts, in percent of closing.
+
+    :raises UsageError: a value is out of range, or the hand would start inside the object.
+    """
+    if object_at is not None and not 0.0 < object_at < 100.0:
+        raise UsageError(f"an object is touched between 0 and 100 % closed, not {object_at}")
+    if start is not None and not 0.0 <= start <= 100.0:
+        raise UsageError(f"start is a percentage of closing, not {start}")
+    if start is not None and object_at is not None and start > object_at:
+        raise UsageError(
+            f"the hand would start inside the object: start {start:g} %, object {object_at:g} %"
+        )

@@ -129,7 +129,7 @@ class LineServer(ABC):
             self._wait(line.next_time)
 
     def _wait(self, next_time: float | None) -> None:
-        """Sleep until the next event, and read what the client sent."""
+        """Sleep until the next event, and read the client's bytes."""
         deadline = self._clock.now() + (BUSY_TICK if self.line.busy else _IDLE_TICK)
         sharp = next_time is not None and next_time < deadline
         if sharp and next_time is not None:

@@ -20,6 +20,7 @@ _BYTE_GAP = 5e-3  # s after which a frame begun is dropped; assumed
 
 FrameT = TypeVar("FrameT")
 FoundFrameT = TypeVar("FoundFrameT", covariant=True)
+ServedT = TypeVar("ServedT", bound="ServedDevice")
 
 
 class AskedDevice(Protocol):
@@ -203,7 +204,7 @@ class ServedDevice:
         """Stop, and remove the path. May be called twice."""
         self.port.close()
 
-    def __enter__(self) -> ServedDevice:
+    def __enter__(self: ServedT) -> ServedT:
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -18,12 +18,12 @@ import numpy as np
 
 from dexkit.clock import RealClock
 from dexkit.emulators.faults import REVO2_FAULTS, parse_fault
-from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.emulators.modbus_line import rtu_answers
 from dexkit.emulators.request_line import RequestLine, ServedDevice
 from dexkit.emulators.serial_port import Port
-from dexkit.emulators.servo_mechanics import STEP, ServoMechanics
-from dexkit.hand import HandCommand, JointMode, Side
+from dexkit.emulators.servo_device import ServoDevice
+from dexkit.emulators.servo_mechanics import ServoMechanics
+from dexkit.hand import Side
 from dexkit.models import BRAINCO_REVO2
 from dexkit.wire.modbus import Exceptional, Function, Refusal, RtuParser
 from dexkit.wire.revo2 import (
@@ -46,12 +46,10 @@ __all__ = ["Revo2", "Revo2Hand"]
 # (docs/sources/unitree-dex.md#j1): BrainCo's library reads both
 _FIRMWARE = "1.0.14.U"
 _SERIAL_NUMBER = {Side.LEFT: "BCXRL000000DEXKIT", Side.RIGHT: "BCXRR000000DEXKIT"}
-_NEAR = 0.01  # of the travel within which a joint that stands has arrived
 _PAIRS = 2 * JOINTS
-_DRIVEN, _RESTING = int(JointMode.FOC), int(JointMode.BRAKE)
 
 
-class Revo2:
+class Revo2(ServoDevice):
     """The device: registers and joints.
 
     :param number: its Modbus unit; None for that of its side.
@@ -71,28 +69,13 @@ class Revo2:
     ) -> None:
         self.side = side
         self.number = UNITS[side] if number is None else number
-        self.mechanics = ServoMechanics(
+        joints = BRAINCO_REVO2.joints[side]
+        mechanics = ServoMechanics(
             BRAINCO_REVO2, side, object_at=object_at, start=start, resolution=1 / FULL
         )
-        joints = BRAINCO_REVO2.joints[side]
-        self._full = np.array([joint.dq_max for joint in joints])
+        super().__init__(mechanics, joints, FULL, now)
         self._limit = np.array([joint.tau_max for joint in joints])
-        self._steps = FixedSteps(STEP)
-        self._steps.restart(now)
-        self.goals: list[int | None] = [None] * JOINTS
-        """Goal of each joint; None before the first command."""
         self.speeds = [FULL] * JOINTS
-        self._now = now
-
-    def advance_to(self, now: float) -> None:
-        """Advance the joints to ``now``."""
-        self.mechanics.step(self._steps.due(now))
-        self._now = now
-
-    @property
-    def resting(self) -> bool:
-        """Whether no joint moves."""
-        return not self.mechanics.state(self._now).dq.any()
 
     def strike(self, kind: str) -> None:
         """Do nothing: the device has no fault kind of its own."""
@@ -119,7 +102,7 @@ class Revo2:
                 raise Refusal(Exceptional.ILLEGAL_VALUE)
             self.goals = list(values[::2])
             self.speeds = [speed or FULL for speed in values[1::2]]
-            self._drive()
+            self.drive(self.speeds, [goal is not None for goal in self.goals])
         elif address == Holding.UNIT_MODE and len(values) == 1:
             if values[0] != UnitMode.NORMALISED:
                 raise Refusal(Exceptional.ILLEGAL_VALUE)
@@ -127,12 +110,6 @@ class Revo2:
             self.number = values[0]
         else:
             raise Refusal(Exceptional.ILLEGAL_ADDRESS)
-
-    def _drive(self) -> None:
-        speeds = np.array(self.speeds) / FULL * self._full
-        command = HandCommand.position([(goal or 0) / FULL for goal in self.goals], dq=speeds)
-        command.mode[:] = [_RESTING if goal is None else _DRIVEN for goal in self.goals]
-        self.mechanics.apply(command)
 
     def _holdings(self) -> dict[int, int]:
         now = [round(q * FULL) for q in self.mechanics.q]
@@ -147,15 +124,15 @@ class Revo2:
         }
 
     def _inputs(self) -> dict[int, int]:
-        state = self.mechanics.state(self._now)
+        state = self.mechanics.state(self.now)
         q = np.round(state.q * FULL).astype(int).tolist()
-        dq = np.round(state.dq / self._full * FULL).astype(int).tolist()
+        dq = np.round(state.dq / self.full_speed * FULL).astype(int).tolist()
         current = np.round(state.tau_est / self._limit * FULL).astype(int).tolist()
         status = [
             MotorStatus.RUNNING
             if speed
             else MotorStatus.IDLE
-            if goal is None or abs(goal - at) <= _NEAR * FULL
+            if self.arrived(goal, at)
             else MotorStatus.STALLED
             for goal, at, speed in zip(self.goals, q, dq, strict=True)
         ]
@@ -218,6 +195,3 @@ class Revo2Hand(ServedDevice):
         port = Port(bus, link, check_baudrate=check_baudrate)
         description = f"{side} id={device.number} baudrate={baudrate}"
         super().__init__(port, REVO2_FAULTS, description)
-
-    def __enter__(self) -> Revo2Hand:
-        return self

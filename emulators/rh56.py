@@ -19,15 +19,15 @@ import numpy as np
 
 from dexkit.clock import RealClock
 from dexkit.emulators.faults import RH56_FAULTS, RH56_TCP_FAULTS, Fault, parse_fault
-from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.emulators.modbus_line import tcp_answers
 from dexkit.emulators.request_line import RequestLine, ServedDevice
 from dexkit.emulators.serial_port import Port
-from dexkit.emulators.servo_mechanics import STEP, ServoMechanics
+from dexkit.emulators.servo_device import ServoDevice
+from dexkit.emulators.servo_mechanics import ServoMechanics
 from dexkit.emulators.sim_inspire import FtpMechanics
 from dexkit.emulators.tcp_port import TcpPort
 from dexkit.errors import WireError
-from dexkit.hand import Floats, HandCommand, JointMode, Side
+from dexkit.hand import Floats, Side
 from dexkit.models import INSPIRE_DFX, INSPIRE_FTP
 from dexkit.wire.modbus import Function, TcpParser
 from dexkit.wire.rh56 import (
@@ -48,11 +48,9 @@ from dexkit.wire.rh56 import (
 __all__ = ["Rh56", "Rh56Hand", "Rh56TcpHand", "rh56_bus"]
 
 _CELSIUS = 35  # assumed
-_NEAR = 0.01  # of the travel within which a joint that stands has arrived
-_MODE = int(JointMode.FOC), int(JointMode.BRAKE)
 
 
-class Rh56:
+class Rh56(ServoDevice):
     """The device: registers and joints.
 
     :param number: its id on the line.
@@ -74,32 +72,15 @@ class Rh56:
     ) -> None:
         self.number = number
         model, mechanics = (INSPIRE_FTP, FtpMechanics) if tactile else (INSPIRE_DFX, ServoMechanics)
-        self.mechanics = mechanics(
-            model, side, object_at=object_at, start=start, resolution=1 / FULL
-        )
-        self._full = np.array([joint.dq_max for joint in model.joints[side]])
-        self._steps = FixedSteps(STEP)
-        self._steps.restart(now)
-        self.goals: list[int | None] = [None] * JOINTS
-        """Goal of each joint; None while it stays where it is."""
+        servos = mechanics(model, side, object_at=object_at, start=start, resolution=1 / FULL)
+        super().__init__(servos, model.joints[side], FULL, now)
         self.words = {
             Register.FORCE_SET: [FULL] * JOINTS,
             Register.SPEED_SET: [FULL] * JOINTS,
         }
         self.errors = [Error(0)] * JOINTS
         self._felt: tuple[Floats, bytes] | None = None
-        self._now = now
         self._drive()
-
-    def advance_to(self, now: float) -> None:
-        """Advance the joints to ``now``."""
-        self.mechanics.step(self._steps.due(now))
-        self._now = now
-
-    @property
-    def resting(self) -> bool:
-        """Whether no joint moves."""
-        return not self.mechanics.state(self._now).dq.any()
 
     def strike(self, kind: str) -> None:
         """Apply the fault ``locked``."""
@@ -161,14 +142,11 @@ class Rh56:
     def _drive(self) -> None:
         """Apply goals and speeds."""
         driven = [g is not None and not e for g, e in zip(self.goals, self.errors, strict=True)]
-        speeds = np.array(self.words[Register.SPEED_SET]) / FULL * self._full
-        command = HandCommand.position([(goal or 0) / FULL for goal in self.goals], dq=speeds)
-        command.mode[:] = [_MODE[not on] for on in driven]
-        self.mechanics.apply(command)
+        self.drive(self.words[Register.SPEED_SET], driven)
 
     def read(self, address: int, count: int) -> bytes:
         """Read ``count`` bytes of registers from an address."""
-        state = self.mechanics.state(self._now)
+        state = self.mechanics.state(self.now)
         angles = np.round(state.q * FULL).astype(int).tolist()
         forces = np.round(np.abs(state.tau_est) * FULL).astype(int).tolist()
         goals = [UNCHANGED if goal is None else goal for goal in self.goals]
@@ -208,14 +186,12 @@ class Rh56:
             self._felt = pressure, counts.astype("<i2").tobytes()
         return self._felt[1]
 
-    @staticmethod
-    def _status(goal: int | None, angle: int, dq: float, error: Error) -> Status:
+    def _status(self, goal: int | None, angle: int, dq: float, error: Error) -> Status:
         if error:
             return Status.LOCKED_ROTOR
         if dq:
             return Status.OPENING if dq > 0 else Status.CLOSING
-        arrived = goal is None or abs(goal - angle) <= _NEAR * FULL
-        return Status.ARRIVED if arrived else Status.FORCE_REACHED
+        return Status.ARRIVED if self.arrived(goal, angle) else Status.FORCE_REACHED
 
 
 def rh56_bus(
@@ -294,9 +270,6 @@ class Rh56Hand(ServedDevice):
         port = Port(bus, link, check_baudrate=check_baudrate)
         super().__init__(port, RH56_FAULTS, f"{side} id={number} baudrate={baudrate}")
 
-    def __enter__(self) -> Rh56Hand:
-        return self
-
 
 class Rh56TcpHand(ServedDevice):
     """The device on a TCP port of this machine (Modbus), served in a thread.
@@ -336,6 +309,3 @@ class Rh56TcpHand(ServedDevice):
         super().__init__(
             TcpPort(bus, port), RH56_TCP_FAULTS, f"{side} modbus-tcp{tactile * ' tactile'}"
         )
-
-    def __enter__(self) -> Rh56TcpHand:
-        return self

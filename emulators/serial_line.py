@@ -129,7 +129,7 @@ class SerialLine(ABC):
         return min(times, default=None)
 
     def behind(self, now: float) -> float:
-        """Seconds that the line still needs for what was sent already."""
+        """Seconds that the line still needs for the bytes already sent."""
         return max(0.0, self._line_free - now) if self.line_time else 0.0
 
     def due(self, now: float) -> bytes:

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dexkit.emulators.finger_mechanics import SETTINGS
+from dexkit.emulators.joint_mechanics import check_closing
 from dexkit.emulators.wear import JointWear
-from dexkit.errors import UsageError
 from dexkit.hand import Floats, HandCommand, HandState, JointMode, JointSpec, Side
 from dexkit.models import HandModel
 
@@ -121,14 +121,7 @@ class ServoMechanics:
         start: float | None = None,
         resolution: float = 0.0,
     ) -> None:
-        if object_at is not None and not 0.0 < object_at < 100.0:
-            raise UsageError(f"an object is touched between 0 and 100 % closed, not {object_at}")
-        if start is not None and not 0.0 <= start <= 100.0:
-            raise UsageError(f"start is a percentage of closing, not {start}")
-        if start is not None and object_at is not None and start > object_at:
-            raise UsageError(
-                f"the hand would start inside the object: start {start:g} %, object {object_at:g} %"
-            )
+        check_closing(object_at, start)
         self.side = side
         self._resolution = resolution
         self._servos: list[_Servo] = []

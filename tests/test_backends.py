@@ -213,7 +213,7 @@ class TestByPath:
             ("WithoutClose", "no spec and no open and no close and no exchange", "a Hand has"),
             ("SpecMethod", "spec is a method, not a HandSpec", "a property"),
             ("SpecBroken", "no attribute '_speck'", f"at {__file__}"),
-            ("AlwaysLeft", "asked for the right hand, and its spec has left", "hand the side"),
+            ("AlwaysLeft", "made for the right hand, but its spec has left", "pass the given side"),
             ("WithPort", "missing 1 required positional argument: 'port'", "with the side alone"),
         ],
     )
@@ -228,7 +228,7 @@ class TestByPath:
         kind = backend("tests.service_helpers:ScriptedHand")
         assert kind.model_of(LEFT) == "dex1-1"
         wrong = replace(kind, model="dex3-1")
-        with pytest.raises(BackendBroken, match="declares a dex3-1"):
+        with pytest.raises(BackendBroken, match="declares the model dex3-1"):
             wrong.create(LEFT)
 
     @pytest.mark.parametrize(

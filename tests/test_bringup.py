@@ -222,7 +222,7 @@ def test_heat_and_silence_end_it(tmp_path: Path) -> None:
     stuck = Bring(tmp_path)
     for joint in range(7):
         stuck.mcu.mechanics.jam(joint, True)
-    with pytest.raises(HandFault, match="moves neither way"):
+    with pytest.raises(HandFault, match="moves in neither direction"):
         stuck.until_question()
 
 
@@ -230,11 +230,11 @@ def test_unseen_motion_ends_the_bringup(tmp_path: Path) -> None:
     bring = Bring(tmp_path)
     question = bring.until_question()
     assert question is not None
-    with pytest.raises(UsageError, match="no answer"):
+    with pytest.raises(UsageError, match="not a valid answer"):
         bring.session.answer("the small one")
-    with pytest.raises(HandFault, match="nobody saw"):
+    with pytest.raises(HandFault, match="operator saw none"):
         bring.session.answer("nothing")
-    with pytest.raises(HandFault, match="nobody saw"):
+    with pytest.raises(HandFault, match="operator saw none"):
         bring.cycle()
 
 
@@ -289,7 +289,7 @@ def test_it_resumes_where_it_was(tmp_path: Path) -> None:
 
 @each("document", [{"motors": 1}, {"motors": {"0.0": {}}}, {"travel": {"x": {"ratio": "y"}}}])
 def test_damaged_findings_are_refused(document: dict[str, object]) -> None:
-    with pytest.raises(UsageError, match="no findings"):
+    with pytest.raises(UsageError, match="cannot read the findings"):
         Findings.from_document(document, {})
 
 

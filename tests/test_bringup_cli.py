@@ -175,7 +175,7 @@ def test_unattended_bringup_refuses_real_hands(emulated: Dex3Hands, tmp_path: Pa
         ([*place, *answers], "needs a terminal"),
         ([*place, "--unattended"], "needs --answers"),
         ([*place, "--answers", str(tmp_path / "none.json"), "--unattended"], "no answers"),
-        (["bringup", "sim-dex3", "--side", "left"], "nothing that a bring-up finds"),
+        (["bringup", "sim-dex3", "--side", "left"], "has no bring-up"),
         (["bringup", "dex3-usb", "--side", "both"], "one hand at a time"),
     ):
         code, _, err = hostile.run_command(arguments)
@@ -186,7 +186,7 @@ def test_unattended_bringup_refuses_real_hands(emulated: Dex3Hands, tmp_path: Pa
         [*place, *answers, "--unattended", "--set", f"config={tmp_path / 'c'}", "--speed", "2"]
     )
     assert code == 2
-    assert "'thumb' is no answer" in err
+    assert "'thumb' is not a valid answer" in err
     assert "sensors answer: by themselves" in out
     assert not commands(tmp_path)[-1]["driven"]
 

@@ -330,11 +330,11 @@ def test_hand_options_are_refused_for_robots() -> None:
     assert {r.level for r in quick} == {Level.MUST}
     assert 10 < len(quick) < len(options.requirements)
     for wrong in ({"side": "left"}, {"devices": ["/dev/null"]}, {"settings": ["a=b"]}):
-        with pytest.raises(UsageError, match="is about hands"):
+        with pytest.raises(UsageError, match="for hands only"):
             SuiteOptions.make(backend="sim-h1", **wrong)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="sim-h1 does not speak g1"):
+    with pytest.raises(UsageError, match="sim-h1 has no dialect g1"):
         SuiteOptions.make(backend="sim-h1", dialect_name="g1")
-    with pytest.raises(UsageError, match="sim-dex1 does not speak h1"):
+    with pytest.raises(UsageError, match="sim-dex1 has no dialect h1"):
         SuiteOptions.make(backend="sim-dex1", dialect_name="h1")
     assert SuiteOptions.make(backend="external", dialect_name="h1").domain == 0
 

@@ -652,10 +652,10 @@ def test_calibration_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> Non
     ("arguments", "expected"),
     [
         (["dex1-serial"], "no hand is given"),
-        (["dex1-serial", "--side", "left", "--speed"], "--speed means nothing for dex1-serial"),
+        (["dex1-serial", "--side", "left", "--speed"], "--speed does not apply to dex1-serial"),
         (
             ["ezgripper", "--side", "left", "--device", "x"],
-            "--side means nothing beside --device",
+            "--side cannot be combined with --device",
         ),
     ],
 )

@@ -290,7 +290,7 @@ def test_any_state_can_be_sent(
 
 def test_another_model_is_refused() -> None:
     spec = HandSpec(model="other-hand", side=LEFT, joints=DEX1_1.joints[LEFT], io_rate=100.0)
-    with pytest.raises(UsageError, match="other-hand does not speak unitree_go"):
+    with pytest.raises(UsageError, match="other-hand has no dialect unitree_go"):
         dialect_map(dialect("unitree_go"), {LEFT: spec})
 
 

@@ -102,7 +102,7 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
 
 def test_duplicate_key_and_non_finite_number_are_refused() -> None:
     for text, why in (
-        ('{"a": 1, "a": 2}', "the key 'a' is there twice"),
+        ('{"a": 1, "a": 2}', "the key 'a' occurs twice"),
         ('{"a": NaN}', "NaN is not a number"),
         ('{"a": -1e400}', "-1e400 is not a finite number"),
         ('{"a": ' + "9" * 40 + "}", "has more than 20 digits"),

@@ -176,7 +176,7 @@ class TestArguments:
     def test_hand_settings_without_hands_are_refused(self) -> None:
         result = CliRunner().invoke(cli, ["emulate", "all", "--hands", "none", "--set", "a=b"])
         assert result.exit_code == 2
-        assert "there are none" in result.output
+        assert "need hands" in result.output
 
     def test_it_is_listed_with_the_robots(self) -> None:
         listed = CliRunner().invoke(emulate, ["--help"]).output

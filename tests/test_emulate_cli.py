@@ -516,4 +516,4 @@ def test_a_bare_servo_has_no_gripper_to_set(option: str, tmp_path: Path) -> None
     )
     assert result.exit_code == 2
     assert option.partition("=")[0] in result.output
-    assert "is of a gripper" in result.output
+    assert "describes a gripper" in result.output

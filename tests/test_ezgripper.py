@@ -944,7 +944,7 @@ def test_calibration_without_fingers_on_the_tendon(tmp_path: Path) -> None:
         hand = EZGripper(
             gripper.path, configuration=configured(tmp_path, zero=None, calibrate=Calibrate.AUTO)
         )
-        with pytest.raises(CalibrationFailed, match="met no stop"):
+        with pytest.raises(CalibrationFailed, match="reached no stop"):
             hand.open()
 
 

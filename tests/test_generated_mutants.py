@@ -76,7 +76,7 @@ def test_thousands_of_good_hands_have_one_deviation_of_each_group() -> None:
     [
         ("dex1-1", "names no generated hand"),
         ("dex9-1/unitree_go:q-echo@left,joint0,always", "no hand model"),
-        ("dex3-1/unitree_go:q-echo@left,joint0,always", "does not speak"),
+        ("dex3-1/unitree_go:q-echo@left,joint0,always", "has no dialect"),
         ("dex1-1/unitree_go:q-ech@left,joint0,always", "'q-ech' in"),
         ("dex1-1/unitree_go:q-echo@top,joint0,always", "'top' in"),
         ("dex1-1/unitree_go:q-echo@left,joint7,always", "'joint7' in"),
@@ -271,7 +271,7 @@ def test_a_campaign_is_resumed_and_not_done_again(tmp_path: Path) -> None:
     assert set(again._done()) == {h.name for h in hands[:2]}
     campaign.write_json(score)
     assert json.loads(score.read_text())["score"]["good"]["count"] == 2
-    with pytest.raises(UsageError, match="is of seed 1"):
+    with pytest.raises(UsageError, match="has the seed 1"):
         Campaign(2, done)._done()
     with pytest.raises(UsageError, match="is of default runs, not quick ones"):
         Campaign(1, done, kind=RunKind.QUICK)._done()
@@ -307,14 +307,17 @@ def test_a_quick_run_judges_only_its_requirements() -> None:
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        (["--good"], "go with --generated"),
-        (["--quick"], "go with --generated"),
-        (["--thorough", "--from", "a.py"], "go with --generated"),
-        (["--generated", "1", "--quick", "--thorough"], "two runs"),
-        (["--generated", "1", "--require", "DEX1"], "do not go together"),
+        (["--good"], "need --generated"),
+        (["--quick"], "need --generated"),
+        (["--thorough", "--from", "a.py"], "need --generated"),
+        (["--generated", "1", "--quick", "--thorough"], "exclude each other"),
+        (["--generated", "1", "--require", "DEX1"], "cannot be combined"),
         (["--generated", "1", "--model", "h1"], "is a robot"),
-        (["--generated", "1", "--dialect", "x"], "speak x"),
-        (["--from", "a.py", "--model", "dex1-1"], "--from says"),
+        (
+            ["--generated", "1", "--model", "dex1-1", "--dialect", "dex3"],
+            "dex1-1 has no dialect dex3",
+        ),
+        (["--from", "a.py", "--model", "dex1-1"], "combined with --from"),
         (["--from", "there-is-none.py"], "no such file"),
     ],
 )
@@ -422,7 +425,7 @@ def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
     path.write_text(
         _HEAD + "@hand('good', dialects='unitree_go')\nclass A(ReferenceService):\n" + body
     )
-    with pytest.raises(ConformanceError, match="ended the process"):
+    with pytest.raises(ConformanceError, match="ended its worker process"):
         list(outsiders.try_all(str(path), 1, jobs=1))
 
 

@@ -10,7 +10,6 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from dexkit.backends import BackendOptions, backend
-from dexkit.conformance.known_backends import EMULATED
 from dexkit.drivers import inspire_ftp_modbus
 from dexkit.drivers.inspire_ftp_modbus import InspireFtpModbus, InspireFtpModbusSettings
 from dexkit.drivers.inspire_modbus import InspireModbus, InspireModbusSettings
@@ -168,7 +167,8 @@ def test_a_hand_without_tactile_areas_feels_nothing() -> None:
 
 def test_settings() -> None:
     assert backend("inspire-ftp-modbus") is inspire_ftp_modbus.backend
-    assert "--tactile" in EMULATED["inspire-ftp-modbus"].arguments
+    assert inspire_ftp_modbus.backend.emulator is not None
+    assert "--tactile" in inspire_ftp_modbus.backend.emulator.arguments
     options = BackendOptions(Side.LEFT, "10.0.0.2:7000", {"id": "255", "areas": "5"})
     made = inspire_ftp_modbus.backend.make(options)
     assert isinstance(made, InspireFtpModbus)

@@ -163,7 +163,7 @@ def test_another_server_is_not_taken_for_a_hand(
 
 
 def test_refused_connection_and_missing_address() -> None:
-    with pytest.raises(HandNotFound, match="where is the hand"):
+    with pytest.raises(HandNotFound, match="no address of the hand"):
         InspireModbus(Side.LEFT).open()
     with TcpPort(Rh56TcpHand().port.line) as port:
         place = port.path

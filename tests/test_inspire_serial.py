@@ -289,7 +289,7 @@ def test_a_port_that_goes_away_is_reported_and_found_again(emulated: Rh56Hand) -
 
 
 def test_hands_that_are_not_there() -> None:
-    with pytest.raises(HandNotFound, match="which serial port"):
+    with pytest.raises(HandNotFound, match="no serial port is given"):
         InspireSerial(Side.LEFT).open()
     with Rh56Hand(Side.LEFT, number=2) as other:
         with pytest.raises(HandNotFound, match="no hand with id 1"):

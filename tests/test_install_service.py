@@ -96,9 +96,12 @@ def test_words_are_quoted_as_systemd_reads_them() -> None:
     [
         (("no-such-hand", "--side", "left"), "no-such-hand"),
         (("sim-dex1", "--side", "left", "--user", "no such user"), "there is no user"),
-        (("ezgripper", "--side", "both", "--device", "/dev/ttyUSB0"), "which hand is"),
+        (("ezgripper", "--side", "both", "--device", "/dev/ttyUSB0"), "names no side"),
         (("ezgripper", "--side", "left", "--device", "/dev/null"), "no serial adapter"),
-        (("sim-dex1", "--side", "left", "--set", "a=\n", "--user", "root"), "cannot be in a unit"),
+        (
+            ("sim-dex1", "--side", "left", "--set", "a=\n", "--user", "root"),
+            "cannot be written into a systemd unit",
+        ),
     ],
 )
 def test_backends_that_cannot_be_a_service_are_refused(words: tuple[str, ...], said: str) -> None:

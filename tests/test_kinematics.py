@@ -217,7 +217,7 @@ def test_a_bad_urdf_is_refused(tmp_path: Path) -> None:
         ('<robot><joint name="gripper" type="revolute"><parent link="a"/><child link="b"/>'
          '<origin xyz="0 0"/></joint></robot>', "three numbers"),
         ('<robot><joint name="gripper" type="revolute"><parent link="a"/><child link="b"/>'
-         '<origin xyz="0 0 nan"/></joint></robot>', "no place"),
+         '<origin xyz="0 0 nan"/></joint></robot>', "not a position"),
     ):  # fmt: skip
         path.write_text(text)
         with pytest.raises(UsageError, match=why):

@@ -499,7 +499,7 @@ def test_without_a_filter_nothing_starts(
         main([*arguments, "--domain", str(free_domain())])
     assert ended.value.code == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "other networks than lo cannot be kept out" in said
+    assert "networks other than lo cannot be kept out" in said
     assert interface_filter.ALL_INTERFACES in said
 
 

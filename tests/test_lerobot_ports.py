@@ -333,8 +333,8 @@ def test_g1_moves_by_commands_of_lerobot_and_stops_cleanly() -> None:
 @each(
     ("arguments", "text"),
     [
-        (["all", "--for", "lerobot", "--robot", "h1"], "does not know the h1"),
-        (["all", "--ports", "1,2,3"], "for --for lerobot"),
+        (["all", "--for", "lerobot", "--robot", "h1"], "does not support the h1"),
+        (["all", "--ports", "1,2,3"], "needs --for lerobot"),
         (["lerobot-g1", "--ports", "1,2"], "three of them"),
         (["lerobot-g1", "--ports", "1,2,70000"], "three of them"),
     ],

@@ -512,9 +512,9 @@ def test_faults_from_input_and_the_end_of_it(tmp_path: Path) -> None:
 @each(
     ("arguments", "says"),
     [
-        (["--link", "left=a", "--link", "left=b"], "which line"),
+        (["--link", "left=a", "--link", "left=b"], "is not left=PATH"),
         (["--side", "both", "--link", "left=a"], "for each side"),
-        (["--side", "left", "--link", "right=a"], "which line"),
+        (["--side", "left", "--link", "right=a"], "is not left=PATH"),
         (["--link", "{dir}/t", "--fault", "melt"], "no kind 'melt'"),
         (["--link", "{dir}/none/t"], "cannot make the link"),
         ([], "Missing option"),

@@ -93,7 +93,7 @@ def test_wrong_hand_is_refused_and_missing_hand_is_not_found(emulated: Revo2Hand
         driver(emulated, Side.LEFT, id=127).open()
     with pytest.raises(HandNotFound, match="no hand with id 126"):
         driver(emulated, Side.LEFT, timeout=0.02).open()
-    with pytest.raises(HandNotFound, match="which serial port"):
+    with pytest.raises(HandNotFound, match="no serial port is given"):
         Revo2Serial(Side.LEFT).open()
     with driver(emulated) as hand:
         assert hand.spec.side is Side.RIGHT

@@ -215,13 +215,16 @@ class TestArguments:
             (["sim-dex1", "--side", "left", "--set", "right.start=1"], "only the left"),
             (
                 ["dex3-usb", "--side", "left", "--usb", "usbip://h", "--set", "left.usb=system"],
-                "two places",
+                "different places",
             ),
-            (["sim-dex1", "--side", "left", "--dialect", "dex3"], "does not speak dex3"),
-            (["sim-dex3", "--side", "left", "--dialect", "unitree_go"], "it speaks dex3"),
+            (["sim-dex1", "--side", "left", "--dialect", "dex3"], "has no dialect dex3"),
+            (["sim-dex3", "--side", "left", "--dialect", "unitree_go"], "its dialects: dex3"),
             (["sim-dex1", "--side", "left", "--usb", "usbip://x:1"], "no setting 'usb'"),
             (["ezgripper", "--side", "left"], "names none for the left hand"),
-            (["ezgripper", "--side", "both", "--device", "/dev/x"], "which hand is /dev/x"),
+            (
+                ["ezgripper", "--side", "both", "--device", "/dev/x"],
+                "--device /dev/x names no side",
+            ),
             (
                 ["ezgripper", "--side", "both", "--device", "left=/dev/x"],
                 "names none for the right",

@@ -128,8 +128,8 @@ def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
 def test_an_episode_of_another_session_is_refused(tmp_path: Path) -> None:
     folder, _ = beside(tmp_path / "e", "dex1_pick_place", rate=28)
     for other, why in (
-        ("dex1_legacy_v1_1", "not in the recording for certain"),
-        ("dex1_idle_then_startle", "not in the recording for certain"),
+        ("dex1_legacy_v1_1", "not found in the recording with certainty"),
+        ("dex1_idle_then_startle", "not found in the recording with certainty"),
         ("dex3_pinch", "no commands of a hand"),
     ):
         code, output = dexkit("import", folder, tmp_path / "m.mcap", "--wire", sample_path(other))

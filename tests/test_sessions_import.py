@@ -518,7 +518,7 @@ def test_a_dataset_does_not_lead_elsewhere(tmp_path: Path) -> None:
     info["data_path"] = "../../{episode_index}.parquet"
     (source / "meta" / "info.json").write_text(json.dumps(info))
     code, output = dexkit("import", source, tmp_path / "out.mcap")
-    assert (code, "leads out of the dataset" in output) == (2, True)
+    assert (code, "points outside the dataset" in output) == (2, True)
 
 
 # -- ROS 2 bags ----------------------------------------------------------------------------------

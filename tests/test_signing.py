@@ -543,8 +543,8 @@ HOSTILE = {
     "without its end": (GOOD[:-22], "cut short"),
     "half": (GOOD[: len(GOOD) // 2], "cut short"),
     "something before": (b"#!/bin/sh\n" + GOOD, "directory"),
-    "something behind": (GOOD + b"x", "cut short, or has something behind"),
-    "a comment": (GOOD[:-2] + b"\1\0x", "cut short, or has something behind"),
+    "something behind": (GOOD + b"x", "cut short, or has data after its end"),
+    "a comment": (GOOD[:-2] + b"\1\0x", "cut short, or has data after its end"),
     "a huge directory": (patched(GOOD, -10, struct.pack("<L", 0xFFFFFFFF)), "directory"),
     "a huge member": (
         patched(GOOD, len(GOOD) - 22 - 47 + 20, struct.pack("<2L", 2**32 - 1, 2**32 - 1)),

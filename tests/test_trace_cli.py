@@ -230,7 +230,7 @@ def test_record_on_no_such_interface(tmp_path: Path) -> None:
 def test_replay_names_the_topics_that_nobody_subscribes() -> None:
     done = run("replay", sample_path("dex1_pick_place"), "--wait", "0.3", "--domain", free_domain())
     assert done.returncode == 1
-    assert f"no process subscribes {CMD}, {RIGHT}" in done.stderr
+    assert f"no process subscribes to {CMD}, {RIGHT}" in done.stderr
     assert "dexkit serve" in done.stderr
 
 

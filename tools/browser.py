@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 __all__ = ["Browser", "chromium"]
@@ -89,12 +88,7 @@ class Browser:
     def __enter__(self) -> Browser:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self._socket.close()
         self._process.terminate()
         self._process.wait(PATIENCE)
@@ -167,5 +161,5 @@ class Browser:
             )
 
     def picture(self) -> bytes:
-        """What is seen, as PNG."""
+        """The page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

@@ -300,7 +300,7 @@ def record_topics(
     :raises UsageError: neither ``stop`` nor ``duration`` would ever end it.
     """
     if stop is None and duration is None:
-        raise UsageError("a recording needs a duration or something that stops it")
+        raise UsageError("a recording needs a duration or a stop event")
     stop = stop if stop is not None else threading.Event()
     recording = DdsRecording(node, recorder, topics, types=types)
     end = None if duration is None else time.monotonic() + duration

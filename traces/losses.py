@@ -145,7 +145,7 @@ class _Pace:
 
 
 class Losses:
-    """Counts what was lost.
+    """Counts lost samples.
 
     :ivar datagrams: dropped by the kernel.
     :ivar lost: samples by topic, by the status of DDS.

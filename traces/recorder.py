@@ -75,7 +75,7 @@ class _Foreign(NamedTuple):
 
 
 class _Channel:
-    """One topic and type; its mcap id once the writer has met it."""
+    """One topic and type; its mcap id once the writer has registered it."""
 
     def __init__(self, topic: str, kind: MessageType | _Foreign, metadata: dict[str, str]) -> None:
         self.topic = topic
@@ -201,7 +201,7 @@ class Recorder:
         self._thread.start()
 
     def close(self) -> None:
-        """Write what is queued, finish the file. May be called twice.
+        """Write the queued messages, finish the file. May be called twice.
 
         :raises TraceError: writing failed; what was written before can be read.
         """

@@ -198,7 +198,7 @@ class RecordingFile:
     def _busy_error(self) -> UsageError:
         return UsageError(
             f"{self.path} is being recorded by another program",
-            hint="choose another name, or stop that one",
+            hint="choose another name, or stop that program",
         )
 
     def close(self, *, keep: bool) -> None:
@@ -317,7 +317,7 @@ class RecordingFile:
             )
 
     def verify(self) -> None:
-        """Check that it holds what was committed.
+        """Check that the file holds the committed data.
 
         It is read only if its modification time has changed since the last commit, because reading
         a long recording again would delay its end.

@@ -219,7 +219,7 @@ def _resolve(name: str, structs: _Structs) -> Struct:
     def node(raw: object, depth: int) -> Node:
         if depth > _MAX_DEPTH:
             raise TraceUnsupported(
-                f"the schema nests deeper than {_MAX_DEPTH} levels, or in itself"
+                f"the schema nests deeper than {_MAX_DEPTH} levels, or contains itself"
             )
         if isinstance(raw, str):
             return raw
@@ -467,7 +467,9 @@ class _IdlParser:
             while self._peek() in ("long", "short"):
                 words.append(self._next())
             if self._peek() == "double":
-                raise TraceUnsupported("the schema has a long double, which dexkit lacks")
+                raise TraceUnsupported(
+                    "the schema has a long double, which dexkit does not support"
+                )
             name = " ".join(words)
         else:
             name = self._scoped_name()

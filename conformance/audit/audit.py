@@ -154,7 +154,7 @@ class Audit:
         self._before: dict[str, Entry] = {}  # of changed files, which may be the same inside
 
     def run(self, runner: Runner, stop: object = None, progress: Progress | None = None) -> Outcome:
-        """Examine what is new or changed, and write tables and page, also after a stop.
+        """Examine new and changed files, and write tables and page, also after a stop.
 
         :param stop: ends it early when it becomes true.
         :raises OutputError: something cannot be written.

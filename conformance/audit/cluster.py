@@ -60,7 +60,7 @@ class Cluster:
         except (OSError, ValueError, RuntimeError) as error:
             raise ConformanceError(
                 f"no Ray cluster at {address}: {one_line(str(error), 300)}",
-                hint="'ray start --head' starts one; --ray local has one for this audit alone",
+                hint="'ray start --head' starts one; --ray local starts one for this audit only",
             ) from error
         self._examine = ray.remote(num_cpus=1, max_retries=_AGAIN)(_examine)
         self._limits = limits
@@ -143,7 +143,7 @@ def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileReco
     mine = settings_key(task.labels)
     if mine != settings:
         raise RuntimeError(
-            f"its dexkit or catalogue is another one than the audit's ({mine}, not {settings})"
+            f"its dexkit or catalogue differs from the audit's ({mine}, not {settings})"
         )
 
     def too_long(signum: int, frame: FrameType | None) -> None:

@@ -122,7 +122,7 @@ class Object:
         self.check()
 
     def check(self) -> None:
-        """Raise OSError if it is no longer what it was."""
+        """Raise OSError if the object has changed."""
         self._files.invalidate_cache()
         about = self._files.info(self._path)
         if (int(about.get("size") or 0), tag_of(about)) != (self.size, self._tag):
@@ -155,7 +155,7 @@ class RangeFile(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        """Read what is in one block."""
+        """Read from one block."""
         number, begin = divmod(self._at, BLOCK)
         if self._at >= self._source.size:
             return 0

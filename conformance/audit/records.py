@@ -135,7 +135,7 @@ class FileRecord:
 
     @property
     def badness(self) -> tuple[int, int, int]:
-        """For sorting, worst first: failures, then files that say nothing, then warnings."""
+        """For sorting, worst first: failures, then files without verdicts, then warnings."""
         found = list(self.verdicts().values())
         return (
             -found.count(Verdict.FAIL),

@@ -106,7 +106,7 @@ class Late:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a check found.
+    """Result of a check.
 
     :param met: whether the requirement is met; None when it could not be judged.
     :param cause: the likely cause, where the check can determine it; else the requirement's.

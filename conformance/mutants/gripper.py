@@ -861,7 +861,7 @@ class _NoWatchdog(ReferenceHand):
 # its mode byte is correct, but equals a constant one
 @wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
 class NoWatchdog(ReferenceService):
-    """Follows the last command for ever."""
+    """Follows the last command without end."""
 
     hand = _NoWatchdog
 
@@ -916,7 +916,7 @@ class BrakesOnce(ReferenceService):
     ),
 )
 class NoWatchdogWhenRestarted(ReferenceService):
-    """Follows the last command for ever after a restart of its service."""
+    """Follows the last command without end after a restart of its service."""
 
     def begin(self, now: float) -> None:
         super().begin(now)

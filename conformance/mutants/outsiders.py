@@ -290,7 +290,7 @@ def try_all(
                 yield waiting.pop(future), future.result()
     except BrokenProcessPool:
         raise ConformanceError(
-            "a hand ended the process that tried it", hint="--jobs 1 shows after which hand"
+            "the code of a hand ended its worker process", hint="--jobs 1 shows after which hand"
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)

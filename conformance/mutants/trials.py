@@ -28,7 +28,7 @@ from dexkit.conformance.virtual import TopicDevice, run_virtual
 from dexkit.conformance.virtual.client import run_client
 from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.hand import ROBOT, Side, Subject
-from dexkit.models import dialect, model
+from dexkit.models import DEX1_1, dialect, model
 from dexkit.robots import ROBOTS
 
 __all__ = ["TRIALS", "plan_for", "run_mutant", "run_usb_mutant"]
@@ -58,7 +58,7 @@ def _session(model_name: str) -> Session | None:
 
 
 def plan_for(
-    name: str = "unitree_go",
+    name: str = DEX1_1.dialects[0].name,
     *,
     sides: Sequence[Subject] | None = None,
     run: RunKind = RunKind.DEFAULT,

@@ -409,7 +409,7 @@ class ForgivesItself(ReferenceDevice):
 
 @wrong_hand("DEX3USB-PROT-04")
 class NeverForgives(ReferenceDevice):
-    """Stays tripped for ever."""
+    """Stays tripped without end."""
 
     def command(self, joint: int, order: Motor) -> None:
         kept = self.tripped[joint]

@@ -253,7 +253,7 @@ def _cell(name: str, group: Sequence[Result]) -> str:
 
 
 def render_comparison_markdown(comparison: Comparison) -> str:
-    """The comparison as Markdown: regressions, differences, the rest folded away."""
+    """The comparison as Markdown: regressions, differences, all other requirements folded away."""
     runs, names = comparison.runs, comparison.names
     lines = [f"## Comparison: {len(runs)} runs as {model_title(runs[0])}", ""]
     rows = []

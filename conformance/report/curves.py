@@ -58,7 +58,7 @@ class Recorded:
 
 
 def recorded(trace: Trace, name: str = "", begin_ns: int | None = None) -> Recorded:
-    """Read what is drawn of a recording.
+    """Read the curves of a recording.
 
     :param begin_ns: log time of second 0; None for the first message.
     :raises TraceUnreadable: the file cannot be read.

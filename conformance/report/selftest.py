@@ -432,7 +432,7 @@ def _limits(name: str) -> str:
 
 
 def print_selftest(result: SelfTestResult) -> None:
-    """Print the figures of every joint, what is wrong, and the verdict."""
+    """Print the figures of every joint, the faults, and the verdict."""
     from rich.table import Table
 
     from dexkit.console import Console, markup

@@ -373,9 +373,14 @@ def _kind(entry: Mapping[str, Any], where: str) -> Kind:
         raise UsageError(f"{where}: kind is one of {', '.join(map(str, Kind))}")
     kind = Kind(name)
     if kind is Kind.SAFETY and not entry.get("original"):
-        raise UsageError(f"{where}: a safety requirement says what the original does: original")
+        raise UsageError(
+            f"{where}: a safety requirement needs the key original: what the original does"
+        )
     if kind is Kind.DROP_IN and entry.get("original"):
-        raise UsageError(f"{where}: original is for safety requirements: the original meets others")
+        raise UsageError(
+            f"{where}: only safety requirements have the key original: the original "
+            "meets the others"
+        )
     return kind
 
 

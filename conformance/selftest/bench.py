@@ -1,4 +1,4 @@
-"""Moves the joints of a hand, and keeps what was commanded and measured.
+"""Moves the joints of a hand, and stores commands and measurements.
 
 A generator yields each command and is sent the state that the exchange of this command returned.
 Time is the states' stamps. A joint is never commanded further than :attr:`Setup.lead` from where it

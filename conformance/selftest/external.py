@@ -48,7 +48,7 @@ class HandWire:
     def __init__(self, spoken: Dialect, side: Side) -> None:
         if spoken.commands_both:
             raise UsageError(
-                f"a command of {spoken.name} moves both hands, and a self-test one",
+                f"a command of {spoken.name} moves both hands, but a self-test drives one",
                 hint="test it where it is driven: dexkit selftest BACKEND",
             )
         self.dialect, self.side = spoken, side
@@ -65,7 +65,9 @@ class HandWire:
         self._first = spoken.index[side]
 
     def encode(self, command: HandCommand, q: Floats) -> bytes:
-        """A command on the wire. A joint that brakes is told to stay at ``q``, without gains."""
+        """A command on the wire. A joint that brakes is commanded to stay at ``q``, without
+        gains.
+        """
         rows = []
         for j, mode in enumerate(command.mode.tolist()):
             if mode == JointMode.BRAKE:
@@ -212,7 +214,7 @@ class ExternalHand:
         self._spec = replace(self._spec, io_rate=min(rate, self._spec.io_rate))
 
     def close(self) -> None:
-        """Nothing more is sent: the service's time-out brakes what is not at rest."""
+        """Nothing more is sent: the service's time-out brakes moving joints."""
 
     def exchange(self, command: HandCommand) -> HandState:
         """Publish a command, and return the newest state.
@@ -233,7 +235,7 @@ class ExternalHand:
         return self._last
 
     def _read(self) -> int:
-        """Take what has come; how many states it was."""
+        """Take new states; returns their number."""
         now = self._clock.now()
         samples = self._reader.take()
         for sample in samples[-1:]:

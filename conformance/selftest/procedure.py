@@ -156,7 +156,7 @@ class Procedure:
         self.doing, self.part = doing, part
 
     def _usable(self, j: int) -> bool:
-        """Whether a joint was tried and does what it should."""
+        """Whether a joint was tested and works."""
         return self.found.joints[j].nudged and self.found.joints[j].alive
 
     def _joint(self, j: int) -> JointSpec:
@@ -409,7 +409,7 @@ class Procedure:
     # -- touch -----------------------------------------------------------------------------------
 
     def _feel(self) -> Turns[None]:
-        """Wait for somebody to press each element; the hand is at rest."""
+        """Wait for the operator to press each element; the hand is at rest."""
         self.found.touched = True
         for packet, sensor in enumerate(self.profile.sensors):
             elements = [e for e in self.found.elements if e.packet == packet]

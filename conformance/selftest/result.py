@@ -1,4 +1,4 @@
-"""The result of a self-test: what was found, judged by the model and beside an earlier run."""
+"""The result of a self-test: its figures, judged by the model and against an earlier run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _NOISIER = (2.0, 100.0)
 
 
 class Verdict(str, Enum):
-    """What is said of the hand."""
+    """Verdict on the hand."""
 
     GOOD = "good"
     INCOMPLETE = "incomplete"
@@ -400,7 +400,8 @@ def check_baseline(baseline: SelfTestResult, about: Mapping[str, str], path: Pat
         mine, its = about.get(key, ""), baseline.hand.get(key, "")
         if mine and its and mine != its:
             raise UsageError(
-                f"{path} is of another hand: its {key} is {one_line(its)}, not {one_line(mine)}",
+                f"{path} belongs to another hand: its {key} is {one_line(its)}, not "
+                f"{one_line(mine)}",
                 hint="compare a hand with an earlier run of itself",
             )
 

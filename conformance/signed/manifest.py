@@ -1,4 +1,4 @@
-"""The manifest of a signed archive: its files with digests, and what was judged, as JSON.
+"""The manifest of a signed archive: its files with digests, and the judged hand, as JSON.
 
 The signature is over the bytes of the manifest. Through the digests it covers all other files.
 """
@@ -179,7 +179,7 @@ class Manifest:
 def _files(entries: Any, origin: str) -> tuple[File, ...]:
     """The files that a manifest lists.
 
-    :raises ArchiveError: a role or name is there twice or not allowed; no result or recording.
+    :raises ArchiveError: a role or name occurs twice or is not allowed; no result or recording.
     """
     if not isinstance(entries, list) or len(entries) > len(ROLES):
         raise ArchiveError(f"{origin}: files must be a list of at most {len(ROLES)}")
@@ -189,7 +189,7 @@ def _files(entries: Any, origin: str) -> tuple[File, ...]:
         _has(entry, ("role", "name", "size", "sha256"), f"{origin}: files")
         role, name, size, sha256 = (entry[k] for k in ("role", "name", "size", "sha256"))
         if role not in ROLES or any(f.role == role for f in found):
-            raise ArchiveError(f"{origin}: {one_line(role, 40)!r} is no role, or there twice")
+            raise ArchiveError(f"{origin}: {one_line(role, 40)!r} is not a role, or occurs twice")
         if not isinstance(name, str) or not is_safe_name(name) or name.casefold() in taken:
             raise ArchiveError(f"{origin}: {one_line(name, 120)!r} cannot be the name of a file")
         if type(size) is not int or not 0 <= size <= LARGEST_MEMBER:

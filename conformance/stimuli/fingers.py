@@ -539,7 +539,7 @@ class FingerScript(HandScript):
             self._goal.update(poses)
             phase = self._begin("ends", sides, targets=targets)
             free = [s for s in sides if self._reachable(s)]
-            # an object holds some joints back for ever
+            # an object holds some joints back until the end
             yield from self._until_settled(
                 phase, free, least=self._least if free else 1.0, most=1.5, stand=self._standing
             )

@@ -476,7 +476,7 @@ class HandScript(Script[Side]):
         yield from self._do(Leave())
 
     def _foreign(self) -> Steps:
-        """A stranger publishes another type on the command topics, with far targets."""
+        """Another participant publishes another type on the command topics, with far targets."""
         self._report("another type on the command topics: it must not reach the hand")
         yield from self._hold(0.2)
         far = self._codec.encode_foreign(

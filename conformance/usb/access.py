@@ -219,7 +219,7 @@ class _UsbIp:
             why = "refused" if busy else error.__cause__ or error.strerror or error
             raise ConformanceError(
                 f"{self._url}: {why}",
-                hint="somebody else may have attached it"
+                hint="another client may have attached it"
                 if busy
                 else "is the server running, and is the hand not attached elsewhere?",
             ) from error

@@ -228,7 +228,7 @@ class Dex3Hand(FingerHand):
         super().expire()
 
     def pressures(self) -> Floats:
-        """Shape (9, 12): what the sensor packets hold."""
+        """Values of the sensor packets, shape (9, 12)."""
         if not self.touches:
             return _UNTOUCHED
         felt = np.array(_UNTOUCHED)

@@ -65,7 +65,7 @@ class FtpHand(InspireHand):
 
 
 class FtpService(ServoService):
-    """Each hand on topics of its own, in lists of integers."""
+    """Each hand on its own topics, in lists of integers."""
 
     hand = FtpHand
     touch_period = 0.04

@@ -108,7 +108,9 @@ class OriginalService(ReferenceService):
     gone_s = None  # and deletes no writer: it stays announced until its lease has run out
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
-        """Take a command message; of an empty one, what the last one left in memory."""
+        """Take a command message; an empty one has the values of the last one, which are still in
+        memory.
+        """
         super().receive(topic, payload, client)
         for side in self.sides:
             if self.codec.command_topics[side] != topic:

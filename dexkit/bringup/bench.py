@@ -8,10 +8,22 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
+from dexkit.hand import Side
+from dexkit.models import HandModel
+
 if TYPE_CHECKING:
     from dexkit.bringup.findings import Findings
 
-__all__ = ["Bench", "Drive", "JointChoice", "Plan", "Reading", "Snapshot", "Zero"]
+__all__ = [
+    "Bench",
+    "Drive",
+    "JointChoice",
+    "Plan",
+    "Reading",
+    "Snapshot",
+    "Zero",
+    "gripper_choices",
+]
 
 
 @dataclass(frozen=True)
@@ -67,7 +79,7 @@ class Zero(str, Enum):
 
 @dataclass(frozen=True)
 class JointChoice:
-    """A joint that a motor may move: what is not known of it, and how it is found.
+    """A joint that a motor may move: its unknown properties, and how they are found.
 
     A motor reports ``ratio / reference * (sign * q + offset)``.
 
@@ -101,6 +113,40 @@ class JointChoice:
     motors: int = 1
     most_travel: float | None = None
     wanted: bool = True
+
+
+def gripper_choices(
+    hand: HandModel,
+    wanted: Side,
+    ratios: tuple[float, ...],
+    *,
+    travel: float | None = None,
+    **more: Any,
+) -> tuple[JointChoice, ...]:
+    """The grippers of both sides, whose motors may be on one line.
+
+    :param wanted: the side that is brought up.
+    :param ratios: the lowest and the highest gear ratio.
+    :param travel: rad between the stops; by default the joint's stroke.
+    :param more: other values of each :class:`JointChoice`.
+    """
+    return tuple(
+        JointChoice(
+            str(side),
+            spec.q_min,
+            spec.q_max,
+            "opened",
+            "closed",
+            ratios,
+            "closed",
+            stops=(spec.q_min, spec.q_max if travel is None else spec.q_min + travel),
+            zero_from=Zero.LOW_STOP,
+            measured=True,
+            wanted=side is wanted,
+            **more,
+        )
+        for side, (spec,) in hand.joints.items()
+    )
 
 
 @dataclass(frozen=True)
@@ -179,7 +225,7 @@ class Bench(Protocol):
         ...
 
     def exchange(self, drive: Drive | None) -> Snapshot:
-        """Send one frame and return what the hand answers.
+        """Send one frame and return the hand's answer.
 
         :param drive: the one motor that may move; None locks all.
         :raises HandError: as :meth:`dexkit.hand.Hand.exchange`.

@@ -105,6 +105,6 @@ class Findings:
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise UsageError(
-                f"these are no findings of a bring-up: {type(error).__name__}: {error}",
-                hint="begin anew: dexkit bringup ... --restart",
+                f"cannot read the findings of a bring-up: {type(error).__name__}: {error}",
+                hint="start again: dexkit bringup ... --restart",
             ) from error

@@ -1,4 +1,4 @@
-"""The order of a bring-up: what moves, what is asked, and what follows; sans-IO.
+"""The order of a bring-up: motions, questions and conclusions; sans-IO.
 
 :func:`script` is a generator of actions. A motion gives back how it ended and where, a question its
 answer, a touch the sensor that felt it. What ``findings`` already has is skipped.
@@ -133,8 +133,8 @@ def _identify(plan: Plan, motor: str, findings: Findings) -> _Script:
         )
         if name == NOTHING:
             raise HandFault(
-                f"motor {motor} reports motion that nobody saw",
-                hint="is this the hand that you look at? Its serial number is in the first lines",
+                f"motor {motor} reports motion, but the operator saw none",
+                hint="is this the hand in front of you? Its serial number is in the first lines",
             )
         if name == AGAIN:
             continue
@@ -160,7 +160,7 @@ def _nudge(motor: str, nudge: float) -> Generator[Action, Any, int]:
         if moved:
             return way
     raise HandFault(
-        f"motor {motor} moves neither way",
+        f"motor {motor} moves in neither direction",
         hint="is its joint blocked? If not, more torque: --torque; or the frame is not obeyed: "
         "docs/bringup.md",
     )
@@ -182,7 +182,7 @@ def _travel(plan: Plan, joint: JointChoice, motor: str, findings: Findings) -> _
             target = start + direction * sign * far
             end, ends[direction] = yield Go(motor, target, f"{key}: {seen}, to its stop")
             if end is not End.STALLED and (joint.most_travel is None or not last):
-                raise HandFault(f"{key} meets no stop", hint=f"is it the right {plan.part}?")
+                raise HandFault(f"{key} reached no stop", hint=f"is it the right {plan.part}?")
             if end is not End.STALLED:
                 ends[direction] = ends[joint.first] + direction * sign * (stops[1] - stops[0])
         free = yield Question(

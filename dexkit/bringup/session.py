@@ -84,7 +84,7 @@ class Session:
         question = self.question
         if question is None or text not in question.choices:
             known = ", ".join(question.choices) if question else "there is no question"
-            raise UsageError(f"{text!r} is no answer here", hint=known)
+            raise UsageError(f"{text!r} is not a valid answer", hint=known)
         if text != AGAIN:
             self.findings.answers[question.key] = text
         try:

@@ -156,8 +156,8 @@ def _run(argv: list[str] | None) -> int:
 
 
 def _print_error(error: DexkitError) -> None:
-    """Print an error: one line, then what to do, indented, so that no part of it looks like
-    something else that dexkit prints.
+    """Print an error: one line, then the hint, indented, so that no part of it can be taken for
+    other output of dexkit.
     """
     click.echo(f"error: {one_line(error.message, REMARK)}", err=True)
     for line in error.hint.splitlines():

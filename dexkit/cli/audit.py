@@ -123,7 +123,9 @@ def command(
 
     assert _FAIL_ON == FAIL_ON
     if ray is not None and jobs is not None:
-        raise click.UsageError("--jobs is for this machine's processes; a cluster has its own")
+        raise click.UsageError(
+            "--jobs counts processes on this machine; it cannot be combined with --ray"
+        )
     limits = Limits(seconds=timeout, memory=memory * 2**20, max_size=max_size * 2**20)
     audit = Audit(
         locations,
@@ -154,7 +156,7 @@ def command(
         raise click.Abort
     if not outcome.total:
         raise ConformanceError(
-            "there is no session, which is not a pass",
+            "no session was found, which is not a pass",
             hint="sessions are files that end in .mcap; 'dexkit import' makes them of others"
             if any(map(is_url, locations))
             else "sessions are files that end in .mcap",

@@ -121,7 +121,7 @@ def command(
     if isinstance(bridge.failure, TopicConflict):
         raise bridge.failure
     if bridge.failure is not None:
-        raise DexkitError(f"the bridge died: {bridge.failure}")
+        raise DexkitError(f"the bridge failed: {bridge.failure}")
     if trouble:
         raise TopicConflict(trouble, hint=Bridge.CONFLICT_HINT)
     return 0

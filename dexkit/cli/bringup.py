@@ -11,11 +11,11 @@ from pathlib import Path
 import click
 
 from dexkit import documents
-from dexkit.backends import BackendOptions, backend
+from dexkit.backends import BackendOptions, backend, list_backends
 from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
 from dexkit.bringup.script import describe
 from dexkit.cli.held_key import Terminal
-from dexkit.cli.options import FILE, Number, set_option, side_option
+from dexkit.cli.options import FILE, Number, set_option, setting, side_option, usb_option
 from dexkit.cli.remarks import remark
 from dexkit.clock import Rate
 from dexkit.errors import HandTimeout, UsageError
@@ -39,11 +39,7 @@ _LOST_ANSWERS = 3
     help="Serial number, address or port of the device.",
 )
 @set_option("Setting of the backend, e.g. config=FILE; 'dexkit backends' lists the settings.")
-@click.option(
-    "--usb",
-    metavar="URL",
-    help="USB hand on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
-)
+@usb_option("USB hand")
 @click.option(
     "--torque",
     type=Number(0.01, 3.0),
@@ -98,13 +94,13 @@ def command(
     if len(sides) != 1:
         raise UsageError("one hand at a time", hint="--side left or --side right")
     if unattended and answers_path is None:
-        raise UsageError("--unattended needs --answers FILE: nobody is there to be asked")
+        raise UsageError("--unattended needs --answers FILE: there is no operator to ask")
     documents.check_output_paths([save_answers], [answers_path])
     kind = backend(backend_name)
     if kind.bringup is None:
+        having = [b.name for b in list_backends() if b.backend and b.backend.bringup]
         raise UsageError(
-            f"{backend_name} has nothing that a bring-up finds",
-            hint="dex3-usb, dex1-serial and ezgripper have",
+            f"the backend {backend_name} has no bring-up", hint=f"these have: {', '.join(having)}"
         )
     texts = _settings(settings, usb)
     options = BackendOptions(sides[0], device, texts)
@@ -140,9 +136,7 @@ def command(
 def _settings(texts: tuple[str, ...], usb: str | None) -> dict[str, str]:
     values = {}
     for text in (*texts, *([] if usb is None else [f"usb={usb}"])):
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise UsageError(f"--set {text} is not KEY=VALUE")
+        key, value = setting(text)
         if key in values:
             raise UsageError(f"{key} is given twice")
         values[key] = value
@@ -244,7 +238,7 @@ class _Run:
         if text is not None:
             if text not in question.choices:
                 raise UsageError(
-                    f"{question.key}: {one_line(text, 40)!r} is no answer to that",
+                    f"{question.key}: {one_line(text, 40)!r} is not a valid answer",
                     hint=f"{question.text} {', '.join(question.choices)}",
                 )
             click.echo(f"{question.text} {text}")

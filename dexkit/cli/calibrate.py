@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.options import Number
+from dexkit.cli.options import Number, one_side_option
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
@@ -67,11 +67,9 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
 @click.command()
 @click.argument("gripper", type=click.Choice(["ezgripper", "dex1-serial"]), default="ezgripper")
 @click.option("--device", metavar="PATH|SERIAL", help="Serial port, or its USB serial number.")
-@click.option(
-    "--side",
-    type=click.Choice(["left", "right"]),
-    help="Side of the gripper. Required for dex1-serial; for an EZGripper it selects the adapter "
-    "that the file names for this side.",
+@one_side_option(
+    "Side of the gripper. Required for dex1-serial; for an EZGripper it selects the adapter "
+    "that the file names for this side."
 )
 @click.option(
     "--id",
@@ -183,7 +181,7 @@ def command(
         _print_store(store)
         return
     if device is not None and side is not None:
-        raise UsageError("--side means nothing beside --device for an ezgripper")
+        raise UsageError("for an ezgripper, --side cannot be combined with --device")
     if device is None and side is None:
         raise UsageError(
             "no gripper is given",
@@ -261,7 +259,7 @@ def _refuse_foreign(ctx: click.Context, known: set[str], gripper: str) -> None:
         name = parameter.name or ""
         source = ctx.get_parameter_source(name)
         if name not in known and source is not click.core.ParameterSource.DEFAULT:
-            raise UsageError(f"{parameter.opts[0]} means nothing for {gripper}")
+            raise UsageError(f"{parameter.opts[0]} does not apply to {gripper}")
 
 
 def _zero_and_speed(

@@ -9,6 +9,7 @@ import click
 
 from dexkit.cli.options import (
     FILE,
+    dialect_option,
     grade_option,
     html_option,
     junit_option,
@@ -34,12 +35,10 @@ from dexkit.robots import ROBOTS
     type=click.Choice(["left", "right", "both"]),
     help="Hands to judge. Default: those of the run, else all hands in the recording.",
 )
-@click.option(
-    "--dialect",
-    type=click.Choice(["auto", *DIALECTS, *ROBOTS]),
+@dialect_option(
+    "Dialect of the hand, or model of the robot; auto takes it from topics and types.",
     default="auto",
-    show_default=True,
-    help="Dialect of the hand, or model of the robot; auto takes it from topics and types.",
+    others=("auto", *ROBOTS),
 )
 @require_option("DEX1-RATE")
 @click.option(
@@ -158,7 +157,8 @@ def command(
         )
     if trace.damage:
         raise ConformanceError(
-            f"the recording is damaged, and the verdict is of what is left: {trace.damage[0]}",
+            "the recording is damaged; the verdict covers the readable part only: "
+            f"{trace.damage[0]}",
             hint="'dexkit info' names all of the damage; record again, or copy the file again",
         )
     sys.exit(result.exit_code(None if grade is None else Kind(grade)))

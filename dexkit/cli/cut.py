@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import FILE, Number, topic_option
+from dexkit.cli.options import FILE, Number, overwrite_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
 
@@ -39,7 +39,7 @@ __all__ = ["command"]
     help="Seconds to keep before and after each phase.",
 )
 @topic_option("Keep", "all")
-@click.option("--force", is_flag=True, help="Overwrite OUT.")
+@overwrite_option("OUT")
 def command(
     file: Path,
     out: Path,
@@ -95,7 +95,7 @@ def _spans(
     if phases:
         if stimulus is None:
             raise UsageError(
-                f"{trace.path.name} has no phases: no conformance run recorded it",
+                f"{trace.path.name} has no phases: it was not recorded by a conformance run",
                 hint="name times with --from and --to",
             )
         known = [p for p in stimulus.phases if p.end_ns]

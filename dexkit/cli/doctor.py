@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import (
-    DIALECT,
     DOMAIN,
     Number,
+    dialect_option,
     found_interface,
     json_option,
     network_options,
@@ -85,7 +85,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 @click.option(
     "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand model.  [default: any]"
 )
-@click.option("--dialect", type=DIALECT, help="Only this dialect.  [default: any]")
+@dialect_option("Only this dialect.  [default: any]")
 @click.option(
     "--device",
     "devices",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import FILE, session_options
+from dexkit.cli.options import FILE, overwrite_option, session_options
 from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
@@ -31,7 +31,7 @@ __all__ = ["command"]
     help="A recording made while the episodes were: it gives their frames true times.",
 )
 @click.option("--embed-pictures", is_flag=True, help="Put single pictures into the recording.")
-@click.option("--force", is_flag=True, help="Overwrite existing recordings.")
+@overwrite_option("existing recordings")
 def command(
     source: Path,
     out: Path,

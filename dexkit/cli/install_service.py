@@ -12,10 +12,10 @@ import click
 
 from dexkit.backends import backend
 from dexkit.cli.options import (
-    DIALECT,
     DOMAIN,
     Number,
     devices_by_side,
+    dialect_option,
     set_option,
     side_option,
 )
@@ -41,7 +41,7 @@ _UNITS, _RULES = Path("/etc/systemd/system"), Path("/etc/udev/rules.d")
     "gives it the name /dev/dexkit-SIDE.",
 )
 @set_option("Setting of the backend, as of 'dexkit serve'.")
-@click.option("--dialect", type=DIALECT, help="As for 'dexkit serve'.")
+@dialect_option("As for 'dexkit serve'.")
 @click.option("--domain", type=DOMAIN, default=0, show_default=True, help="DDS domain.")
 @click.option(
     "--interface",

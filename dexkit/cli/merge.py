@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import FILE
+from dexkit.cli.options import FILE, overwrite_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
 
@@ -29,7 +29,7 @@ __all__ = ["command"]
     help="Put the later files on the first one's clock, by the messages that both have.",
 )
 @click.option("--keep-duplicates", is_flag=True, help="Keep messages that several files have.")
-@click.option("--force", is_flag=True, help="Overwrite OUT.")
+@overwrite_option("OUT")
 def command(
     files: tuple[Path, ...],
     shifts: tuple[str, ...],

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import click
@@ -102,7 +101,7 @@ def command(
 
 
 class _Watch:
-    """Polls the listener, and shows what is known."""
+    """Polls the listener, and shows the collected state."""
 
     def __init__(
         self, listener: Listener, recording: _Log, period: float, duration: float | None
@@ -233,12 +232,7 @@ class _Log:
     def __enter__(self) -> _Log:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self._stop()
 
     @property
@@ -251,7 +245,7 @@ class _Log:
         return f"REC {recorder.path} {recorder.written} messages{lost}"
 
     def toggle(self) -> str:
-        """Begin or end one; returns what has happened."""
+        """Begin or end a recording; returns the text for the status line."""
         return self._stop() if self._running is not None else self._start()
 
     def _start(self) -> str:

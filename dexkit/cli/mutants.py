@@ -11,7 +11,7 @@ import click
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from dexkit.cli.options import FILE, require_option, verbose_option
+from dexkit.cli.options import FILE, dialect_option, require_option, verbose_option
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
@@ -100,7 +100,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     is_flag=True,
     help="With --generated: in thorough runs, which take ten times as long.",
 )
-@click.option("--dialect", help="With --generated: only hands with this dialect.")
+@dialect_option("With --generated: only hands with this dialect.")
 @click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
 @click.option(
     "--resume",
@@ -155,15 +155,20 @@ def command(
     caught and no good one is blamed, 1 otherwise.
     """
     if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:
-        raise UsageError("--generated, --hand, --from and --require do not go together")
+        raise UsageError("--generated, --hand, --from and --require cannot be combined")
     if generated is None and not names and (good or dialect or resume or quick or thorough):
-        raise UsageError("--good, --quick, --thorough, --dialect and --resume go with --generated")
+        raise UsageError("--good, --quick, --thorough, --dialect and --resume need --generated")
     if quick and thorough:
-        raise UsageError("--quick and --thorough are two runs: choose one")
+        raise UsageError("--quick and --thorough exclude each other")
     if source is not None and model is not None:
-        raise UsageError("--from says which models its hands are of", hint="leave out --model")
+        raise UsageError(
+            "--model cannot be combined with --from: the file's hands have their models",
+            hint="leave out --model",
+        )
     if listed and (json_path or source is not None or resume):
-        raise UsageError("--list tries no hand: it goes with --model, --require and --generated")
+        raise UsageError(
+            "--list tries no hand; it can be combined with --model, --require and --generated"
+        )
     if json_path:
         json_path = json_path.absolute()
     if resume:

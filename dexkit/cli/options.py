@@ -19,13 +19,13 @@ from dexkit.hand import Side
 from dexkit.models import DIALECTS
 
 __all__ = [
-    "DIALECT",
     "DOMAIN",
     "FILE",
     "Number",
     "any_baudrate_option",
     "dds_options",
     "devices_by_side",
+    "dialect_option",
     "duration_option",
     "fault_options",
     "force_option",
@@ -39,18 +39,25 @@ __all__ = [
     "markdown_option",
     "network_options",
     "object_option",
+    "one_side_option",
+    "overwrite_option",
     "peer_addresses",
     "quiet_option",
     "real_time_option",
+    "recording_option",
     "require_option",
     "seed_option",
     "session_options",
     "set_option",
+    "setting",
     "side_option",
     "start_option",
     "topic_option",
+    "usb_option",
     "verbose_option",
     "view_option",
+    "wait_option",
+    "wiring_option",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -93,7 +100,6 @@ class _Sides(click.Choice):  # type: ignore[type-arg]
 
 DOMAIN = click.IntRange(0, 230)
 """A DDS domain; those above have no ports (RTPS 9.6.1.1)."""
-DIALECT = click.Choice(list(DIALECTS))
 FILE = click.Path(path_type=Path)
 
 
@@ -310,6 +316,25 @@ def side_option(
     return click.option("--side", "sides", type=_Sides(), required=required, help=help, **given)
 
 
+def one_side_option(help: str, *, required: bool = False) -> Callable[[F], F]:
+    """``--side`` of the commands for one hand, as text ``side``, or None."""
+    return click.option(
+        "--side", type=click.Choice(list(map(str, Side))), required=required, help=help
+    )
+
+
+def usb_option(hands: str) -> Callable[[F], F]:
+    """``--usb URL``.
+
+    :param hands: what the help calls the devices: ``USB hand`` or ``USB hands``.
+    """
+    return click.option(
+        "--usb",
+        metavar="URL",
+        help=f"{hands} on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
+    )
+
+
 def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:
     """The paths of ``--device``, given as PATH or SIDE=PATH.
 
@@ -324,7 +349,7 @@ def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side,
             side, path = sides[0], text
         else:
             raise UsageError(
-                f"which hand is {text}?", hint="--device left=PATH --device right=PATH"
+                f"--device {text} names no side", hint="--device left=PATH --device right=PATH"
             )
         if side not in sides:
             raise UsageError(f"--device {text}, but only the {sides[0]} hand is served")
@@ -332,6 +357,35 @@ def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side,
             raise UsageError(f"two devices for the {side} hand: {by_side[side]} and {path}")
         by_side[side] = path
     return by_side
+
+
+def dialect_option(
+    help: str, *, default: str | None = None, others: Sequence[str] = ()
+) -> Callable[[F], F]:
+    """``--dialect``: a dialect's name, or None.
+
+    :param default: None for none, and for no default in ``--help``.
+    :param others: further values.
+    """
+    return click.option(
+        "--dialect",
+        type=click.Choice([*DIALECTS, *others]),
+        default=default,
+        show_default=default is not None,
+        help=help,
+    )
+
+
+def wait_option(help: str, *, default: float | None = 10.0) -> Callable[[F], F]:
+    """``--wait S``: seconds of patience with hands that are not there yet; None for no limit."""
+    return click.option(
+        "--wait",
+        type=Number(min=0),
+        default=default,
+        show_default=default is not None,
+        metavar="S",
+        help=help,
+    )
 
 
 def set_option(help: str) -> Callable[[F], F]:
@@ -343,6 +397,17 @@ def set_option(help: str) -> Callable[[F], F]:
         metavar="KEY=VALUE",
         help=help,
     )
+
+
+def setting(text: str) -> tuple[str, str]:
+    """Key and value of a ``--set KEY=VALUE``.
+
+    :raises UsageError: it is none.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise UsageError(f"--set {text} is not KEY=VALUE")
+    return key, value
 
 
 # ------------------------------------------------------------------------------ running
@@ -387,6 +452,14 @@ def quiet_option() -> Callable[[F], F]:
 # ------------------------------------------------------------------------------ output
 
 
+def overwrite_option(what: str) -> Callable[[F], F]:
+    """``--force`` of the commands that write a recording.
+
+    :param what: is overwritten.
+    """
+    return click.option("--force", is_flag=True, help=f"Overwrite {what}.")
+
+
 def json_option(help: str) -> Callable[[F], F]:
     """``--json`` of the commands that print their result, as ``as_json``."""
     return click.option("--json", "as_json", is_flag=True, help=help)
@@ -418,6 +491,20 @@ def markdown_option(default: str = "") -> Callable[[F], F]:
         type=FILE,
         metavar="FILE",
         help=f"Write a summary in Markdown; - prints it.{suffix}",
+    )
+
+
+def recording_option(then: str = "") -> Callable[[F], F]:
+    """``--recording RUN.mcap``: the recording of a result.
+
+    :param then: what the command does with it, for the help.
+    """
+    return click.option(
+        "--recording",
+        type=click.Path(exists=True, path_type=Path),
+        metavar="RUN.mcap",
+        help=f"The recording that was judged{then}. Default: the one that the result names, if it "
+        "lies beside it.",
     )
 
 
@@ -484,6 +571,11 @@ def object_option(when: str) -> Callable[[F], F]:
 def start_option(help: str, default: float | None = None) -> Callable[[F], F]:
     """``--start PCT``."""
     return click.option("--start", type=Number(0, 100), default=default, metavar="PCT", help=help)
+
+
+def wiring_option(help: str) -> Callable[[F], F]:
+    """``--wiring SEED``: an emulated device whose wiring is random."""
+    return click.option("--wiring", type=click.IntRange(0, 2**32 - 1), metavar="SEED", help=help)
 
 
 def line_time_option() -> Callable[[F], F]:

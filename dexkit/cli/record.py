@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit import threads
-from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
+from dexkit.cli.options import FILE, dds_options, duration_option, overwrite_option, topic_option
 from dexkit.cli.remarks import remark, remarks
 from dexkit.cli.status_line import Stderr
 from dexkit.errors import DexkitError, TraceError, UsageError
@@ -32,7 +32,7 @@ __all__ = ["command"]
 @topic_option("Record", "every topic of a known type, also those that appear later")
 @dds_options()
 @duration_option()
-@click.option("--force", is_flag=True, help="Overwrite OUT, when the first message arrives.")
+@overwrite_option("OUT, when the first message arrives")
 @click.option(
     "--beside-episodes",
     "episodes",
@@ -163,7 +163,7 @@ def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:
 
 
 def _refuse_empty(node: DdsNode, recording: DdsRecording, waited: float) -> None:
-    """Report that nothing was received, and what was on the domain instead.
+    """Report that nothing was received, and the topics that are on the domain.
 
     :raises TraceError: always, with exit code 1.
     """

@@ -1,4 +1,4 @@
-"""Say on standard error what a command noticed, a line each."""
+"""Print the warnings of a command on standard error, one line each."""
 
 from __future__ import annotations
 

@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.options import (
-    DIALECT,
     FILE,
     Number,
     dds_options,
+    dialect_option,
     force_option,
     html_option,
     session_options,
     side_option,
     topic_option,
+    wait_option,
 )
 from dexkit.command_age import PAUSE
 from dexkit.errors import DdsError, UsageError
@@ -78,12 +79,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
 )
 @html_option()
 @side_option("Hands to drive.  [default: all that the session commands]")
-@click.option(
-    "--dialect",
-    "dialect_name",
-    type=DIALECT,
-    help="Dialect of the hands to drive.  [default: the session's]",
-)
+@dialect_option("Dialect of the hands to drive.  [default: the session's]")
 @click.option(
     "--pace",
     "--speed",
@@ -181,14 +177,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
 @click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
 @session_options()
 @dds_options()
-@click.option(
-    "--wait",
-    type=Number(min=0),
-    default=10.0,
-    show_default=True,
-    metavar="S",
-    help="Wait up to S seconds for the hands.",
-)
+@wait_option("Wait up to S seconds for the hands.")
 @force_option()
 @click.option(
     "--as-recorded",
@@ -227,7 +216,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
     options = Options(rate=given["rate"], hand=given["hand"], correct=not given["keep_sides"])
     wishes = Wishes(
         sides=given["sides"],
-        dialect=given["dialect_name"],
+        dialect=given["dialect"],
         pace=given["pace"],
         gains=given["gains"],
         resample=given["resample"],
@@ -253,7 +242,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
     if given["rehearse"]:
         code = _rehearse(prepared, guards, source, session.name, given["html_path"], ctx) or code
     elif given["html_path"] is not None:
-        raise UsageError("--report is the page of a rehearsal", hint="add --rehearse")
+        raise UsageError("--report writes the page of a rehearsal", hint="add --rehearse")
     if prepared.refused:
         _print_refusal(source, prepared)
         return 1
@@ -271,8 +260,9 @@ def _as_recorded(ctx: click.Context, source: Path, given: dict[str, Any]) -> int
         name = str(parameter.name)
         if name not in _AS_RECORDED and ctx.get_parameter_source(name) is stated:
             raise UsageError(
-                f"{parameter.opts[0]} is not for a recording that is published as it is",
-                hint="leave out --as-recorded, --topic and --no-wait to play it with care",
+                f"{parameter.opts[0]} does not apply to a recording that is published as it is",
+                hint="leave out --as-recorded, --topic and --no-wait to play it checked and "
+                "supervised",
             )
     return play_as_recorded(
         source,
@@ -472,7 +462,7 @@ def _print_end(machine: ReplayMachine) -> int:
 
 
 class _Waiting:
-    """Says what is waited for, and gives up."""
+    """Prints the missing hands while the command waits for them, and ends the wait."""
 
     def __init__(self, live: LiveReplay, patience: float) -> None:
         self._live, self._patience = live, patience
@@ -487,7 +477,7 @@ class _Waiting:
         node, missing = live.node, live.machine.missing
         if live.unsubscribed:
             topics = ", ".join(map(one_line, live.unsubscribed))
-            waits, lacks = f"a subscriber of {topics}", f"no process subscribes {topics}"
+            waits, lacks = f"a subscriber of {topics}", f"no process subscribes to {topics}"
         else:
             sides = " and ".join(map(str, missing))
             waits = f"state of the {sides} hand"

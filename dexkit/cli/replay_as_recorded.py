@@ -142,8 +142,8 @@ def _wait_for_readers(
         missing = [t for t, w in writers.items() if not w.matched]
     if missing and not stop:
         raise DdsError(
-            f"no process subscribes {', '.join(missing)} on domain {node.domain}, {node.interface} "
-            f"(waited {patience:g} s)",
+            f"no process subscribes to {', '.join(missing)} on domain {node.domain}, "
+            f"{node.interface} (waited {patience:g} s)",
             hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
             "anyway with --no-wait",
         )

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import html_option, junit_option, markdown_option, verbose_option
+from dexkit.cli.options import (
+    html_option,
+    junit_option,
+    markdown_option,
+    recording_option,
+    verbose_option,
+)
 from dexkit.documents import check_output_paths, write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
@@ -37,13 +43,7 @@ def _address(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
 
 @click.command("report")
 @click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
-@click.option(
-    "--recording",
-    type=click.Path(exists=True, path_type=Path),
-    metavar="RUN.mcap",
-    help="The recording that was judged: the page then shows plots. Default: the one that the "
-    "result names, if it lies beside it.",
-)
+@recording_option(": the page then shows plots")
 @html_option()
 @markdown_option()
 @junit_option()

@@ -12,14 +12,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.options import (
-    DIALECT,
     FILE,
     Number,
     dds_options,
+    dialect_option,
     force_option,
     html_option,
+    one_side_option,
     quiet_option,
     set_option,
+    setting,
+    wait_option,
 )
 from dexkit.cli.status_line import StatusLine
 from dexkit.errors import DdsError, UsageError
@@ -44,17 +47,10 @@ whose client asks for all of it, are tried at it."""
 @click.command("selftest")
 @click.argument("backend_name", metavar="[BACKEND]", required=False)
 @click.option("--external", is_flag=True, help="Test a hand that is already served on DDS.")
-@click.option(
-    "--side", type=click.Choice([str(s) for s in Side]), required=True, help="Hand to test."
-)
+@one_side_option("Hand to test.", required=True)
 @click.option("--device", metavar="PATH", help="Path or serial number of the device.")
 @set_option("Setting of the backend; 'dexkit backends' lists them.")
-@click.option(
-    "--dialect",
-    "dialect_name",
-    type=DIALECT,
-    help="With --external: the dialect of the hand.",
-)
+@dialect_option("With --external: the dialect of the hand.")
 @click.option(
     "--joint",
     "joints",
@@ -94,14 +90,7 @@ whose client asks for all of it, are tried at it."""
 )
 @html_option()
 @dds_options()
-@click.option(
-    "--wait",
-    type=Number(min=0),
-    default=10.0,
-    show_default=True,
-    metavar="S",
-    help="With --external: wait up to S seconds for the hand.",
-)
+@wait_option("With --external: wait up to S seconds for the hand.")
 @force_option()
 @quiet_option()
 def command(backend_name: str | None, **given: Any) -> int:
@@ -122,9 +111,9 @@ def command(backend_name: str | None, **given: Any) -> int:
         )
     if given["external"] and (given["device"] or given["settings"]):
         raise UsageError("--device and --set are for a backend, not for --external")
-    if backend_name is not None and given["dialect_name"]:
+    if backend_name is not None and given["dialect"]:
         raise UsageError("--dialect is for --external: a backend is driven without DDS")
-    if given["external"] and given["dialect_name"] is None:
+    if given["external"] and given["dialect"] is None:
         raise UsageError("--external needs --dialect", hint="e.g. --dialect unitree_go")
     from dexkit.conformance.selftest.bench import Setup
     from dexkit.conformance.selftest.live import run
@@ -190,17 +179,12 @@ def _hand(
     if name is not None:
         from dexkit.backends import BackendOptions, backend
 
-        settings = {}
-        for text in given["settings"]:
-            key, equals, value = text.partition("=")
-            if not equals or not key:
-                raise UsageError(f"--set {text} is not KEY=VALUE")
-            settings[key] = value
+        settings = dict(map(setting, given["settings"]))
         return backend(name).create(BackendOptions(side, given["device"], settings)), None
     from dexkit.conformance.selftest.external import ExternalHand
     from dexkit.dds import DdsNode
 
-    spoken = dialect_by_name(given["dialect_name"])
+    spoken = dialect_by_name(given["dialect"])
     node = stack.enter_context(DdsNode(domain=given["domain"], interface=given["interface"]))
 
     def waiting(seconds: float) -> None:
@@ -290,7 +274,7 @@ def _turn(stop: StopRequest, quiet: bool) -> Iterator[Callable[[SelfTest], None]
 def _finish(
     result: SelfTestResult, baseline: SelfTestResult | None, json_path: Path, page: Path
 ) -> int:
-    """Write and print what was found; the exit code."""
+    """Write and print the result; returns the exit code."""
     from dexkit.conformance.report.selftest import print_selftest, render_selftest
     from dexkit.conformance.selftest.result import Verdict
     from dexkit.documents import write_file

@@ -14,15 +14,17 @@ import click
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.options import (
-    DIALECT,
     Number,
     dds_options,
     devices_by_side,
+    dialect_option,
     force_option,
     quiet_option,
     real_time_option,
     set_option,
+    setting,
     side_option,
+    usb_option,
     view_option,
 )
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
@@ -32,14 +34,7 @@ from dexkit.models import MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 from dexkit.sd_notify import notify, watchdog
-from dexkit.service import (
-    Estimation,
-    Fill,
-    HandService,
-    Publisher,
-    diagnose,
-    prepare_process,
-)
+from dexkit.service import Estimation, Fill, HandService, Publisher, diagnose, prepare_process
 from dexkit.service import real_time as real_time_priority
 from dexkit.stop_signals import StopRequest, stop_on_signals
 
@@ -66,15 +61,9 @@ _LONELY = 10.0  # seconds without a client before a hint
     "Setting of the backend, e.g. object=40; left.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."
 )
-@click.option(
-    "--usb",
-    metavar="URL",
-    help="USB hands on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
-)
-@click.option(
-    "--dialect",
-    type=DIALECT,
-    help="Topics, types and units.  [default: the model's first: "
+@usb_option("USB hands")
+@dialect_option(
+    "Topics, types and units.  [default: the model's first: "
     + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())
     + "]",
 )
@@ -147,7 +136,7 @@ def command(
         for text in settings:
             if text.partition("=")[0].rpartition(".")[2] == "usb":
                 raise UsageError(
-                    f"--usb {usb} and --set {text} are two places",
+                    f"--usb {usb} and --set {text} name different places",
                     hint="--usb is short for --set usb=URL, for all hands",
                 )
         settings = (*settings, f"usb={usb}")
@@ -219,7 +208,7 @@ def command(
         if isinstance(service.failure, TopicConflict):
             raise service.failure
         if service.failure is not None:
-            raise DexkitError(f"the service died: {service.failure}")
+            raise DexkitError(f"the service failed: {service.failure}")
     return 0
 
 
@@ -227,9 +216,7 @@ def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[st
     """The settings of each hand."""
     values: dict[Side, dict[str, str]] = {side: {} for side in sides}
     for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise UsageError(f"--set {text} is not KEY=VALUE")
+        key, value = setting(text)
         prefix, dot, rest = key.partition(".")
         if dot and prefix in [str(s) for s in Side]:
             if Side(prefix) not in values:
@@ -249,8 +236,8 @@ def _dialect(hands: Sequence[Hand], name: str | None) -> Dialect:
     chosen = dialect_by_name(name)
     if chosen.model != model.name:
         raise UsageError(
-            f"a {model.name} does not speak {name}",
-            hint=f"it speaks {', '.join(d.name for d in model.dialects)}",
+            f"a {model.name} has no dialect {name}",
+            hint=f"its dialects: {', '.join(d.name for d in model.dialects)}",
         )
     return chosen
 

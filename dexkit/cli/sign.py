@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.options import recording_option
 from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
@@ -13,13 +14,7 @@ from dexkit.escaping import one_line
 
 @click.command("sign")
 @click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
-@click.option(
-    "--recording",
-    type=click.Path(exists=True, path_type=Path),
-    metavar="RUN.mcap",
-    help="The recording that was judged. Default: the one that the result names, if it lies beside "
-    "it.",
-)
+@recording_option()
 @click.option(
     "--page",
     type=click.Path(exists=True, path_type=Path),

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.options import (
-    DIALECT,
-    Number,
     dds_options,
+    dialect_option,
     duration_option,
     force_option,
     json_option,
     side_option,
+    wait_option,
 )
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
-from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 from dexkit.stop_signals import stop_on_signals
@@ -54,27 +54,19 @@ _MS = 1e3
 @click.command("teleop")
 @click.argument("profile_name", metavar="PROFILE", required=False)
 @click.option("--list", "list_profiles", is_flag=True, help="List the profiles and exit.")
-@click.option(
-    "--dialect",
-    "dialect_name",
-    type=DIALECT,
-    default="unitree_go",
-    show_default=True,
-    help="Dialect of the hands: "
+@dialect_option(
+    "Dialect of the hands: "
     + "; ".join(f"{', '.join(d.name for d in m.dialects)} ({m.name})" for m in MODELS.values())
     + ".",
+    default=DEX1_1.dialects[0].name,
 )
 @dds_options()
 @side_option("Hands to drive. The genuine client drives both, and waits for both.", default="both")
 @duration_option(
     "Drive for S seconds, repeating the profile.  [default: once through it]", least=0.5
 )
-@click.option(
-    "--wait",
-    "patience",
-    type=Number(min=0),
-    metavar="S",
-    help="Wait up to S seconds for states.  [default: no limit, as the genuine client]",
+@wait_option(
+    "Wait up to S seconds for states.  [default: no limit, as the genuine client]", default=None
 )
 @click.option(
     "--release",
@@ -100,12 +92,12 @@ _MS = 1e3
 def command(
     profile_name: str | None,
     list_profiles: bool,
-    dialect_name: str,
+    dialect: str,
     domain: int,
     interface: str,
     sides: tuple[Side, ...],
     duration: float | None,
-    patience: float | None,
+    wait: float | None,
     release_name: str | None,
     simulated: bool,
     record_path: Path | None,
@@ -129,8 +121,8 @@ def command(
         _list()
         return 0
     if profile_name is None:
-        raise UsageError("no profile", hint="'dexkit teleop --list' names them")
-    spoken = dialect_by_name(dialect_name)
+        raise UsageError("no profile is given", hint="'dexkit teleop --list' lists them")
+    spoken = dialect_by_name(dialect)
     chosen = _profile(profile_name, spoken)
     client = client_for(
         spoken,
@@ -149,7 +141,7 @@ def command(
             _record(stack, record_path, spoken, domain, interface)
         node = stack.enter_context(DdsNode(domain=domain, interface=interface))
         live = LiveClient(node, client, force=force)
-        waiting = _WaitReport(node, spoken, patience)
+        waiting = _WaitReport(node, spoken, wait)
         if not live.wait_ready(stop.event, waiting):
             return 130
         _print_to_stderr(
@@ -228,10 +220,10 @@ def _record(stack: ExitStack, path: Path, spoken: Dialect, domain: int, interfac
 class _WaitReport:
     """Prints what the client waits for, as xr_teleoperate does, and a hint after a while."""
 
-    def __init__(self, node: DdsNode, spoken: Dialect, patience: float | None) -> None:
+    def __init__(self, node: DdsNode, spoken: Dialect, wait: float | None) -> None:
         self._node = node
         self._spoken = spoken
-        self._patience = patience
+        self._patience = wait
         self._reported: Mapping[Side, str] | None = None
         self._helped = False
 

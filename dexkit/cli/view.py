@@ -108,7 +108,7 @@ def command(
     Exit code: 0; 2 wrong usage, an unusable recording, or a missing package.
     """
     if len(recordings) + live > 2:
-        raise UsageError("at most two can be shown at once")
+        raise UsageError("at most two recordings can be shown at once")
     if (out is None) is (to == "rerun"):
         raise UsageError("--to rerun and --out go together", hint="--to rerun --out session.rrd")
     from dexkit.view.forward import forward

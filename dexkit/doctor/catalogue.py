@@ -64,7 +64,7 @@ class Finding:
         return self.diagnosis.id
 
 
-_WAITS = "the client prints 'Waiting to subscribe dds...' for ever"
+_WAITS = "the client hangs at 'Waiting to subscribe dds...'"
 _E, _W, _N = Severity.ERROR, Severity.WARNING, Severity.NOTE
 
 # In the order in which they are reported: causes before their effects.

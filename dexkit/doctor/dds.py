@@ -177,7 +177,7 @@ class _Window:
             raise
         except OSError as error:
             self.socket.close()
-            raise DdsSetupError(f"cannot look at {interface}: {error.strerror}") from error
+            raise DdsSetupError(f"cannot examine {interface}: {error.strerror}") from error
         self.watches: dict[bytes, _Watch] = {}
         self.observer = Observer(
             os.urandom(12),
@@ -199,7 +199,8 @@ class _Window:
         except OSError as error:
             if not interface_filter.all_interfaces_allowed():
                 raise DdsSetupError(
-                    f"other networks than {self.interface} cannot be kept out: {error.strerror}",
+                    f"packets of networks other than {self.interface} cannot be kept out: "
+                    f"{error.strerror}",
                     hint=interface_filter.HINT,
                 ) from error
 

@@ -1,4 +1,4 @@
-"""Measure the link to another machine: round trips, what the samples say, and the buffers here.
+"""Measure the link to another machine: round trips, intervals of samples, and receive buffers.
 
 No privilege and no program at the other end are needed. A round trip is an ICMP echo where the
 system permits it, else a TCP connection to a closed port, which is refused at once. The samples of
@@ -156,7 +156,7 @@ def link_to(
     rmem_max: int | None = None,
     dropped: int = 0,
 ) -> Link:
-    """Derive the figures of a link from what was measured.
+    """Derive the figures of a link from its measurements.
 
     :param by_multicast: the domains as seen with announcements by multicast only.
     :param by_unicast: as seen with announcements to the machine itself.

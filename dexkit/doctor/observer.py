@@ -153,7 +153,7 @@ class Observer:
         return out
 
     def tick(self, now: float) -> list[Send]:
-        """Return what is to be sent again, because an answer is missing."""
+        """Return the packets to be sent again because an answer is missing."""
         out: list[Send] = []
         for peer in self._peers.values():
             waiting = [w for w, history in peer.histories.items() if not history.complete]

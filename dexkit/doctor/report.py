@@ -73,7 +73,7 @@ def print_report(
     result: Verdict,
     states: list[Readiness],
 ) -> None:
-    """Verdict, findings with remedies, then what is where."""
+    """Print the verdict, the findings with remedies, then the participants and topics found."""
     colour = "green" if result.healthy else "red"
     console.print(f"[bold {colour}]{escape(result.text)}[/]")
     for finding in findings:

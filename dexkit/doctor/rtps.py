@@ -233,7 +233,7 @@ class ParticipantData:
 
 @dataclass(frozen=True)
 class Policies:
-    """Quality of service of an endpoint, what it does not announce being the default.
+    """Quality of service of an endpoint; a policy that it does not announce has the default.
 
     :param reliability: ``"reliable"`` or ``"best_effort"``.
     :param durability: ``"volatile"``, ``"transient_local"``, ``"transient"``, ``"persistent"``.

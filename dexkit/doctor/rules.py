@@ -839,7 +839,7 @@ def _absent(
 
 
 def _instead(view: DomainView, dialect: Dialect) -> _Part | None:
-    """A hand of another model than a dialect's, for which no client of its own is there."""
+    """A hand of another model than the dialect's, without a client for that model."""
     served = _hands(view, Scope())
     if any(p.role.dialect.model == dialect.model for p in served):
         return None

@@ -44,13 +44,13 @@ def is_limp(motor: Any, dialect: Dialect) -> bool:
 
 
 def _plain(topic: str) -> str:
-    """A name without what is most often wrong with one."""
+    """A topic's name without the differences that are the most frequent mistakes."""
     text = re.sub(r"/+", "/", topic.lower()).strip("/")
     return text.removeprefix("rt/")
 
 
 def nearly(topic: str, among: Iterable[str] = ()) -> tuple[str, str] | None:
-    """The hand topic that was probably meant by a name that is none, and what is wrong with it.
+    """The hand topic that an unknown name is nearest to, and the difference.
 
     :param among: names to choose from; default all hand topics.
     """

@@ -460,7 +460,9 @@ class _Group:
         return self.rows[0]
 
     def places(self, steps: _Steps) -> tuple[np.dtype[Any], list[int]]:
-        """Type, and first byte of each number, of what a path names; none that it lacks."""
+        """Type and first byte of each number that a path names, without those that the payload
+        lacks.
+        """
         return self._layout.places(steps)
 
 

@@ -38,7 +38,7 @@ class JointLists:
         return self.lists["q"][0]
 
     def motors(self, message: Any, kind: type[Any]) -> list[Any]:
-        """The motors of a message; what a shorter list lacks is 0."""
+        """The motors of a message; elements that a shorter list lacks are 0."""
         found = []
         for i in range(len(getattr(message, self.sequence))):
             motor = kind()
@@ -67,7 +67,7 @@ def _fault(error: int) -> int:
 
 
 def to_int16(value: float) -> int:
-    """The nearest 16-bit integer; -1, which leaves a joint alone, for what is not a number."""
+    """The nearest 16-bit integer; -1, which leaves a joint alone, for NaN."""
     return -1 if value != value else round(min(max(value, -32768.0), 32767.0))
 
 

@@ -38,7 +38,7 @@ __all__ = [
 
 @dataclass(slots=True)
 class RequestIdentity_:
-    """Which request, and what it asks.
+    """Number of a request and its API function.
 
     DDS type ``unitree_api::msg::dds_::RequestIdentity_``.
     """

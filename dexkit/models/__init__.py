@@ -32,6 +32,7 @@ from dexkit.models.profile import (
     JointRoles,
     ModeByte,
     PressureSensor,
+    ScoredHands,
     TouchArea,
 )
 from dexkit.plugins import entry_points, import_object, origin
@@ -55,6 +56,7 @@ __all__ = [
     "ModeByte",
     "ModelPlugin",
     "PressureSensor",
+    "ScoredHands",
     "TouchArea",
     "dialect",
     "model",

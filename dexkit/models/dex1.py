@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel
+from dexkit.models.profile import Dialect, HandModel, ScoredHands
 
 __all__ = ["DEX1_1"]
 
@@ -86,6 +86,7 @@ DEX1_1 = HandModel(
     objects={Side.RIGHT: 37.0},
     session="dex1_pick_place",
     simulator="sim-dex1",
+    scored_hands=ScoredHands(quick=40, default=40, thorough=20, external=40),
     client=Lazy("dexkit.teleop.client:Dex1Client"),
     operator_profiles=Lazy("dexkit.teleop.profiles:gripper_profiles"),
     skeleton=Lazy("dexkit.models.skeletons:dex1"),

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from dexkit.errors import UsageError
-from dexkit.hand import HandSpec, JointSpec, Side, Subject
+from dexkit.hand import HandSpec, JointMode, JointSpec, Side, Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ __all__ = [
     "JointRoles",
     "ModeByte",
     "PressureSensor",
+    "ScoredHands",
     "TouchArea",
 ]
 
@@ -149,6 +150,15 @@ class Dialect:
         """Whether kp and kd of a command have an effect."""
         return not (self.interface_specification or self.position_servo)
 
+    def mode(self, index: int, status: JointMode) -> int:
+        """The mode byte that a client sends to a motor.
+
+        :param index: of the motor within its hand.
+        """
+        if self.mode_byte is ModeByte.RIS:
+            return index | status << 4
+        return int(status) if self.mode_byte is ModeByte.STATUS else 0
+
     @property
     def command_fields(self) -> tuple[str, ...]:
         """The numbers of a motor's command that have an effect."""
@@ -255,6 +265,20 @@ class HandLayout:
     palm_sensors: tuple[tuple[float, float], ...] = ()
 
 
+@dataclass(frozen=True)
+class ScoredHands:
+    """Number of generated wrong hands that ``python -m tools.scores`` tries in runs of each kind.
+    A run for which it is 0 has no score.
+
+    :param external: in quick and in default runs of a service that the kit does not start.
+    """
+
+    quick: int
+    default: int
+    thorough: int = 0
+    external: int = 0
+
+
 _FINGER_CLIENT: Lazy[type[TeleopClient]] = Lazy("dexkit.teleop.client:FingerClient")
 _FINGER_PROFILES: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = Lazy(
     "dexkit.teleop.profiles:finger_profiles"
@@ -312,6 +336,8 @@ class HandModel:
     :param session: the recorded session to replay: name of a sample of dexkit, or path of a
         recording; empty where there is none.
     :param reference: service on a virtual clock that does everything right.
+    :param scored_hands: how many generated wrong hands its runs are scored by; only the models of
+        dexkit itself are scored.
     :param wrong_hands: of a model of another package, the module whose classes have the decorator
         ``dexkit.conformance.mutants.wrong_hand``: they prove its requirements.
 
@@ -355,6 +381,7 @@ class HandModel:
     roles: JointRoles | None = None
     objects: Mapping[Side, float] = field(default_factory=dict)
     session: str | Path = ""
+    scored_hands: ScoredHands = ScoredHands(quick=20, default=20)
     wrong_hands: Lazy[ModuleType] | None = None
     layout: HandLayout | None = None
     skeleton: Lazy[Callable[[Side], Skeleton]] | None = None

@@ -98,7 +98,7 @@ def _title(shown: Shown, width: int) -> Text:
 
 
 def _scrolled(lines: list[Text], room: int, scroll: int) -> list[Text]:
-    """The lines that are seen, and above and below them what is not."""
+    """The visible lines, with notes of how many are hidden above and below."""
     if len(lines) <= room:
         return lines
     if room < 3:

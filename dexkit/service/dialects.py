@@ -132,7 +132,7 @@ class DialectMap(ABC):
     """Messages of one dialect from and to the values of the hands that share a topic pair.
 
     :param specs: the hands by side; exactly one where each side has its own topics.
-    :raises UsageError: the hand model does not speak this dialect.
+    :raises UsageError: the dialect is not one of the hand model.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class DialectMap(ABC):
     ) -> None:
         for spec in specs.values():
             if spec.model != dialect.model:
-                raise UsageError(f"a {spec.model} does not speak {dialect.name}")
+                raise UsageError(f"a {spec.model} has no dialect {dialect.name}")
         self.dialect = dialect
         self.fill = fill
         self._specs = dict(specs)

@@ -219,7 +219,7 @@ class StateEstimator:
             joint.measure(float(state.q[i]), now)
 
     def predict(self, now: float) -> HandState | None:
-        """The state at ``now``: q and dq predicted, the rest as last measured; None before
+        """The state at ``now``: q and dq predicted, all else as last measured; None before
         the first measurement.
         """
         last = self._last

@@ -111,12 +111,12 @@ class LocalHand:
         spec = self._core.spec
         failure = self._service.failure
         if failure is not None:
-            raise DexkitError(f"the {spec.side} hand is not driven any more: {failure}")
+            raise DexkitError(f"the {spec.side} hand is no longer driven: {failure}")
         view = self._core.view() if self._running else None
         if view is None or not self._core.connected:
             raise HandLost(
                 f"the {spec.side} {spec.model} is not connected",
-                hint="look at its cable and supply; it is opened again by itself",
+                hint="check its cable and supply; it is opened again automatically",
             )
         bits = [fault & ~_LINK for fault in view.fault]
         if view.missed and any(bits):
@@ -151,16 +151,16 @@ def position_command(hand: HandModel, q: ArrayLike) -> HandCommand:
 
 
 class NoTopics:
-    """A :class:`~dexkit.service.service.Node` on which nobody is."""
+    """A :class:`~dexkit.service.service.Node` without other participants."""
 
     def writer(self, topic: str, type_name: str, *, user_data: bytes = b"") -> _Nobody:
-        """A writer that nobody reads."""
+        """A writer without readers."""
         return _Nobody()
 
     def reader(
         self, topic: str, type_name: str, *, on_data: Callable[[], object] | None = None
     ) -> _Nobody:
-        """A reader to which nobody writes."""
+        """A reader without writers."""
         return _Nobody()
 
     def endpoints(self) -> Sequence[Any]:

@@ -234,7 +234,7 @@ class HandService:
         :raises TopicConflict: another program publishes the state topic (unless ``force``).
         """
         if self._started:
-            raise UsageError("a service starts once")
+            raise UsageError("a service cannot be started twice")
         self._started = True
         try:
             self._start()
@@ -450,7 +450,7 @@ class HandService:
             self._log_once(remark.counter, remark.text)
 
     def _log_once(self, kind: str, text: str) -> None:
-        """Log what is odd about a command, each kind only once."""
+        """Log the remarks about a command, each kind only once."""
         if kind not in self._logged:
             self._logged.add(kind)
             log.warning("%s: a command was odd (counted, logged once): %s", self.cmd_topic, text)
@@ -703,7 +703,7 @@ class HandService:
             self._count_publish_error(error)
             return False
         if not written:
-            self._count_publish_error(TimeoutError("a reliable reader does not keep up"))
+            self._count_publish_error(TimeoutError("a reliable reader is too slow"))
         return written
 
     def _count_publish_error(self, error: Exception) -> None:

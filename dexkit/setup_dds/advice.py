@@ -1,4 +1,6 @@
-"""Text for people: what to install on which system, and what the output of a failed build means."""
+"""Texts for users: the packages to install on each system, and the meaning of a failed build's
+output.
+"""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def carry_out(
     *,
     install: bool = True,
 ) -> Installed:
-    """Do what a plan says, and try the result.
+    """Carry out a plan, and test the result.
 
     :param wheel_folder: where the wheel is also kept.
     :param install: False makes the wheel, and leaves the environment alone.
@@ -124,7 +124,7 @@ class _Task:
             self._run(command, environment, "CycloneDDS cannot be built")
         library = library_at(prefix, "source", self._interpreter.processor)
         if library is None:
-            raise DdsBuildFailed(f"the build of {action.folder} makes no libddsc.so")
+            raise DdsBuildFailed(f"the build of {action.folder} did not make libddsc.so")
         files = {
             f"{pinned_wheel.LIBRARY_FOLDER}/{library.file}": (
                 Path(library.folder, library.file).read_bytes()
@@ -136,7 +136,7 @@ class _Task:
             except OSError as error:
                 raise DdsBuildFailed(
                     f"{action.folder} has no {name}: {error.strerror}",
-                    hint="the licence belongs into the wheel; use a complete checkout",
+                    hint="the wheel must contain the licence; use a complete checkout",
                 ) from error
             files[f"dist-info/licenses/cyclonedds/{name}"] = text
         return library, files
@@ -187,7 +187,7 @@ class _Task:
         return self._pip
 
     def install(self, wheel: Path) -> None:
-        """Install the wheel; what it depends on before that, so that it is the last step."""
+        """Install the wheel as the last step, after its dependencies."""
         python = self._interpreter.executable
         if self._interpreter.pip:
             begin, again = [python, "-m", "pip", "install", *_PIP], ["--force-reinstall"]
@@ -212,7 +212,7 @@ class _Task:
         )
 
     def check(self, folder: str, state: str) -> Installed:
-        """Try what is installed, or unpacked in ``folder``."""
+        """Test the installed package, or the one unpacked in ``folder``."""
         command = probe.command(self._interpreter.executable, folder, send=True)
         done = self._runner.run(command)
         return check(probe.result_of(done.code, done.output), state)
@@ -238,13 +238,13 @@ def _failure(what: str, done: Done, machine: Machine) -> DdsBuildFailed:
         last = [line.strip() for line in done.output.splitlines() if line.strip()][-1:]
         return DdsBuildFailed(
             f"{what}: {last[0] if last else f'exit code {done.code}'}",
-            hint="the log has all that was printed",
+            hint="the whole output is in the log",
         )
     return DdsBuildFailed(f"{what}: {cause.message}", hint=cause.hint)
 
 
 def check(found: Installed, state: str) -> Installed:
-    """Judge what the child process found.
+    """Judge the findings of the child process.
 
     :param state: what the error adds: whether something was installed.
     :raises DdsBuildFailed: it cannot be used.

@@ -170,7 +170,7 @@ def _check_interpreter(interpreter: Interpreter) -> None:
     if interpreter.processor not in ("x86_64", "aarch64"):
         raise InterpreterRefused(
             f"this Python is for the processor {interpreter.processor or 'of an unknown kind'}; "
-            "DDS was tried on x86_64 and aarch64",
+            "DDS was tested on x86_64 and aarch64",
             hint="on a 64-bit machine, install a 64-bit Python",
         )
 
@@ -182,7 +182,8 @@ def _installed_problem(machine: Machine, options: Options) -> str:
         if not options.replace:
             raise InterpreterRefused(
                 f"cyclonedds {installed.version} is installed in this environment. A program that "
-                "uses it crashes every CycloneDDS 0.10 program that it meets, the robot's included",
+                "uses it crashes every CycloneDDS 0.10 program on its network, the robot's "
+                "included",
                 hint=f"'dexkit setup-dds --replace' puts {BINDING} in its place; if another "
                 "package here needs the newer one, give dexkit an environment of its own: "
                 "python3 -m venv env",

@@ -29,7 +29,7 @@ from typing import NamedTuple, TypeAlias
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointMode, Side
-from dexkit.models import DEX1_1, Dialect, ModeByte, dialect, model
+from dexkit.models import DEX1_1, Dialect, dialect, model
 
 __all__ = [
     "LEAD",
@@ -243,7 +243,7 @@ class TeleopClient(ABC):
         return {s: "every q is exactly 0" for s in self._awaited if not any(latest[s])}
 
     def begin_again(self) -> None:
-        """Forget every state, and what was made of them; the operator's targets stay.
+        """Discard every state and the values derived from them; the operator's targets stay.
 
         For after a pause of the caller. The genuine client does not; it is restarted.
         """
@@ -284,15 +284,9 @@ class TeleopClient(ABC):
         """A command to hold the pose, with motors locked where the dialect has a mode for it."""
         hand = model(self.dialect.model)
         return tuple(
-            JointCommand(self._mode(i, JointMode.BRAKE), q, hand.client_dq, 0.0, kp, kd)
+            JointCommand(self.dialect.mode(i, JointMode.BRAKE), q, hand.client_dq, 0.0, kp, kd)
             for i, (q, (kp, kd)) in enumerate(zip(pose, hand.gains, strict=True))
         )
-
-    def _mode(self, index: int, status: JointMode) -> int:
-        """The mode byte of a motor."""
-        if self.dialect.mode_byte is ModeByte.RIS:
-            return index | status << 4
-        return int(status) if self.dialect.mode_byte is ModeByte.STATUS else 0
 
     @abstractmethod
     def _control(
@@ -420,7 +414,7 @@ class FingerClient(TeleopClient):
             self._targets = {s: value for s, value in given.items() if value is not None}
         return {
             s: tuple(
-                JointCommand(self._mode(i, JointMode.FOC), q, self._dq, 0.0, kp, kd)
+                JointCommand(self.dialect.mode(i, JointMode.FOC), q, self._dq, 0.0, kp, kd)
                 for i, (q, (kp, kd)) in enumerate(zip(self._targets[s], self._gains, strict=True))
             )
             for s in self.sides
@@ -428,7 +422,7 @@ class FingerClient(TeleopClient):
 
 
 class RightHandClient(FingerClient):
-    """A client that looks at the right hand alone to see whether states come
+    """A client that waits for states of the right hand only
     (docs/sources/unitree-dex.md#j2).
     """
 

@@ -226,7 +226,7 @@ class LiveClient:
         self._watch.restart()
 
     def leave(self) -> None:
-        """Leave the hands at rest: what the genuine client does not do.
+        """Leave the hands at rest, which the genuine client does not do.
 
         The genuine one just stops sending. A Dex1-1's service then brakes within a second; a
         Dex3-1 keeps its last position for ever. Here each hand is commanded for a quarter of a

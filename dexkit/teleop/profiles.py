@@ -38,7 +38,7 @@ Closing = Callable[[float], Pose | None]
 
 @dataclass(frozen=True)
 class Profile:
-    """One thing that operators do.
+    """One pattern of an operator's motion.
 
     :param lead_in: seconds at the beginning without tracking data.
     :param period: seconds after which it repeats.

@@ -40,7 +40,7 @@ _LAG_LEAST = 1.0  # seconds of steady motion needed for it
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the operator, and what a joint made of it.
+    """One step of the operator, and the joint's response.
 
     :param at: seconds.
     :param begin: where the joint was, rad.
@@ -135,7 +135,7 @@ def _maximum(values: Sequence[float]) -> float:
 
 
 def steps_of(grid: Floats, position: Floats, goal: Floats, stroke: float) -> list[Step]:
-    """The operator's jumps, and what the joint made of each until the operator moves again."""
+    """The operator's jumps, and the joint's response to each until the operator moves again."""
     jumps = np.flatnonzero(np.abs(np.diff(goal)) > _JUMP * stroke) + 1
     # a first target where there was none is a step as well
     appears = np.flatnonzero(np.isnan(goal[:-1]) & ~np.isnan(goal[1:])) + 1

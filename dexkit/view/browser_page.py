@@ -1,4 +1,4 @@
-"""The page of ``dexkit view``: a server on this machine, and what it shows."""
+"""The page of ``dexkit view``: a server on this machine, and the contents of the page."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Page:
         self.close()
 
     def run(self, stop: threading.Event) -> None:
-        """Show until ``stop`` is set: 30 pictures a second, none while nobody looks."""
+        """Show until ``stop`` is set: 30 pictures a second, none while the page is not open."""
         period = 1.0 / _RATE
         due = time.monotonic()
         while not stop.is_set():
@@ -130,7 +130,7 @@ class Page:
             stop.wait(max(0.0, due - time.monotonic()) if looked_at else _IDLE)
 
     def step(self, now: float) -> None:
-        """Take what has come, and show the moment that is due.
+        """Take new samples, and show the moment that is due.
 
         :param now: monotonic clock, seconds.
         """

@@ -60,7 +60,7 @@ class Viewer(Protocol):
     """Somebody else's viewer."""
 
     def show(self, time_ns: int, moments: Sequence[Moment]) -> None:
-        """Show what was at a time, ns since the epoch."""
+        """Show the state of a time, ns since the epoch."""
         ...
 
 

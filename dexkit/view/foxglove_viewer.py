@@ -65,7 +65,7 @@ class FoxgloveViewer:
         self._server.stop()
 
     def show(self, time_ns: int, moments: Sequence[Moment]) -> None:
-        """Send a moment to whoever is connected."""
+        """Send a moment to every connected client."""
         stamp = fg.Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)
         entities = [self._entity(m, stamp) for m in moments]
         self._scene.log(fg.SceneUpdate(entities=entities), log_time=time_ns)

@@ -1,4 +1,4 @@
-"""The viewer beside another command: a process of its own, which takes none of that one's time."""
+"""The viewer beside another command, in a separate process, which takes none of that one's time."""
 
 from __future__ import annotations
 

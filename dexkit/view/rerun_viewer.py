@@ -46,7 +46,7 @@ class RerunViewer:
         self._stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the buffered data."""
         self._stream.flush()
         self._stream.disconnect()
         if self._file is not None and self._part is not None:

@@ -87,7 +87,7 @@ class Figure:
         self._elements = self._balls(f"{name}/elements", elements, 0.0045) if elements else None
         bottom = -0.85 if self._drawing.robot else -0.05 - 0.026 * row
         turn = mount * np.array([1.0, -1.0, -1.0, -1.0])  # labels are placed upright
-        self._upright = scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
+        scene.add_frame(f"{name}/upright", wxyz=turn, show_axes=False)
         self._label = scene.add_label(
             f"{name}/upright/title", title, position=(0.0, 0.0, bottom), anchor="top-center"
         )
@@ -116,7 +116,7 @@ class Figure:
         )
 
     def update(self, view: SubjectView) -> None:
-        """Show another state; what has not changed is not sent."""
+        """Show another state; only changes are sent."""
         drawn = self._drawing.at(view)
         self._place(self._bodies, "bodies", drawn.bodies)
         if len(drawn.pins):

@@ -17,7 +17,7 @@ HISTORY = 60.0
 
 
 class Source(Protocol):
-    """One of the things that a page shows side by side."""
+    """A live domain or a recording that a page shows, beside others."""
 
     @property
     def title(self) -> str:
@@ -59,7 +59,7 @@ class Live:
         return self.listener.collector
 
     def poll(self) -> float:
-        """Take what has come; returns now."""
+        """Take new samples; returns now."""
         self.listener.poll()
         return max(0.0, self.collector.seconds(time.time_ns()))
 

@@ -62,7 +62,7 @@ class Transport:
             self.paused = True
 
     def toggle(self) -> None:
-        """Pause, or go on; a recording at its end begins anew."""
+        """Pause, or go on; a recording at its end starts again."""
         self.paused = not self.paused
         if not self.live and not self.paused and self.at >= self.end:
             self.at = self.begin

@@ -1,4 +1,4 @@
-"""Collect what is on the wire, sans IO: samples and endpoints in, a picture of any moment out.
+"""Collect the traffic on DDS, sans IO: samples and endpoints in, a picture of any moment out.
 
 ::
 

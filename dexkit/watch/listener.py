@@ -5,7 +5,6 @@ from __future__ import annotations
 import fnmatch
 import threading
 from collections.abc import Iterable
-from types import TracebackType
 
 from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, Reader
 from dexkit.errors import DdsError, UsageError
@@ -46,12 +45,7 @@ class Listener:
     def __enter__(self) -> Listener:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -67,7 +61,7 @@ class Listener:
         return sum(r.refused for r in self._readers.values())
 
     def poll(self) -> int:
-        """Pass on what has come since the last call; returns the number of samples.
+        """Pass on the samples since the last call; returns their number.
 
         :raises DdsError: DDS no longer works.
         """

@@ -14,6 +14,7 @@ from enum import IntEnum
 import fastcrc
 
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
+from dexkit.wire.frame_buffer import FrameBuffer
 
 __all__ = [
     "ALERT",
@@ -264,7 +265,7 @@ def decode(data: bytes) -> Packet:
     if len(data) < length + _OVERHEAD:
         raise TruncatedError(f"{len(data)} bytes of a packet of {length + _OVERHEAD}")
     if len(data) > length + _OVERHEAD:
-        raise WireError(f"{len(data) - length - _OVERHEAD} bytes behind the packet")
+        raise WireError(f"{len(data) - length - _OVERHEAD} bytes after the packet")
     packet = _packet(data)
     if not packet.crc_ok:
         raise ChecksumError(
@@ -282,7 +283,7 @@ def _packet(frame: bytes) -> Packet:
     return Packet(packet_id, instruction, params, crc_ok)
 
 
-class PacketParser:
+class PacketParser(FrameBuffer):
     """Finds packets in a stream of bytes that may arrive in any pieces, with garbage between them.
 
     :param keep_bad: also return packets whose CRC does not match, marked ``crc_ok=False``.
@@ -296,22 +297,15 @@ class PacketParser:
     """
 
     def __init__(self, *, keep_bad: bool = False) -> None:
+        super().__init__()
         self.keep_bad = keep_bad
-        self.skipped = 0
         self.crc_errors = 0
-        self._buffer = bytearray()
-
-    @property
-    def pending(self) -> int:
-        """Bytes held that may be the beginning of a packet."""
-        return len(self._buffer)
 
     def reset(self) -> None:
-        """Forget a packet begun: what a servo does after 1.5 ms of silence
+        """Discard a packet begun: what a servo does after 1.5 ms of silence
         (docs/sources/mx64-ezgripper.md#a1).
         """
-        self.skipped += len(self._buffer)
-        self._buffer.clear()
+        super().reset()
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take ``data`` and return the packets that are now complete."""

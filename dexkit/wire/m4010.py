@@ -26,6 +26,7 @@ from typing import NamedTuple, TypeAlias
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
 from dexkit.models import DEX1_1
 from dexkit.wire.crc32 import crc32_words
+from dexkit.wire.frame_buffer import FrameBuffer
 from dexkit.wire.ris import (
     BROADCAST_ID,
     MOTOR_VOLTAGE,
@@ -177,7 +178,7 @@ class Setpoint(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """What a motor measures, at the joint: rad, rad/s, N·m."""
+    """Measurements of a motor, at the joint: rad, rad/s, N·m."""
 
     q: float
     dq: float
@@ -500,7 +501,7 @@ _KINDS: dict[str, type[MotorCmd] | type[MotorData]] = {
 }
 
 
-class FrameParser:
+class FrameParser(FrameBuffer):
     """Finds frames in a stream of bytes that may arrive in any pieces, with garbage between them.
 
     :param kinds: of frames that may come: :data:`COMMAND` at the motor's end, :data:`DATA` at the
@@ -515,22 +516,11 @@ class FrameParser:
     """
 
     def __init__(self, kinds: Iterable[Structure] = (DATA,)) -> None:
+        super().__init__()
         self.kinds = tuple(kinds)
         self.frames = 0
-        self.skipped = 0
         self.crc_errors = 0
-        self._buffer = bytearray()
         self._firsts = bytes(kind.head[0] for kind in self.kinds)
-
-    @property
-    def pending(self) -> int:
-        """Bytes held that may be the beginning of a frame."""
-        return len(self._buffer)
-
-    def reset(self) -> None:
-        """Forget a frame begun."""
-        self.skipped += len(self._buffer)
-        self._buffer.clear()
 
     def feed(self, data: Bytes) -> list[Frame]:
         """Take ``data`` and return the frames that are now complete."""

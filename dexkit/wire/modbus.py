@@ -18,6 +18,7 @@ from enum import IntEnum
 from fastcrc import crc16
 
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
+from dexkit.wire.frame_buffer import FrameBuffer
 
 __all__ = [
     "MOST_READ",
@@ -45,7 +46,7 @@ _CRC = 2
 
 
 class Function(IntEnum):
-    """What a request does."""
+    """Modbus function codes."""
 
     READ_HOLDING = 3
     READ_INPUT = 4
@@ -244,7 +245,7 @@ class Adu:
         return cls(data[0], bytes(data[1:-_CRC]))
 
 
-class TcpParser:
+class TcpParser(FrameBuffer):
     """Finds frames in the bytes of a TCP connection, which may arrive in any pieces.
 
     TCP loses nothing within a connection, so there is no resynchronisation: after an invalid head
@@ -254,20 +255,13 @@ class TcpParser:
     """
 
     def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.skipped = 0
+        super().__init__()
         self.damaged = 0
         self.broken = False
 
-    @property
-    def pending(self) -> int:
-        """Bytes held that may be the beginning of a frame."""
-        return len(self._buffer)
-
     def reset(self) -> None:
         """Discard buffered bytes, for a new connection."""
-        self.skipped += len(self._buffer)
-        self._buffer.clear()
+        super().reset()
         self.broken = False
 
     def feed(self, data: bytes) -> list[Adu]:
@@ -292,7 +286,7 @@ class TcpParser:
         return found
 
 
-class RtuParser:
+class RtuParser(FrameBuffer):
     """Finds frames in the bytes of a serial line, which may arrive in any pieces, among garbage.
 
     After bytes that are no frame the search continues at the next byte, so that frames among them
@@ -304,20 +298,9 @@ class RtuParser:
     """
 
     def __init__(self, *, answers: bool) -> None:
+        super().__init__()
         self._answers = answers
-        self._buffer = bytearray()
-        self.skipped = 0
         self.damaged = 0
-
-    @property
-    def pending(self) -> int:
-        """Bytes held that may be the beginning of a frame."""
-        return len(self._buffer)
-
-    def reset(self) -> None:
-        """Forget a frame begun."""
-        self.skipped += len(self._buffer)
-        self._buffer.clear()
 
     def feed(self, data: bytes) -> list[Adu]:
         """Take ``data`` and return the frames that are now complete."""

@@ -18,6 +18,7 @@ from enum import IntEnum, IntFlag
 
 from dexkit.errors import ChecksumError, EncodeError, OversizeError, TruncatedError, WireError
 from dexkit.hand import MotorError
+from dexkit.wire.frame_buffer import FrameBuffer
 
 __all__ = [
     "BAUD_RATE",
@@ -191,7 +192,7 @@ def numbers(data: bytes) -> tuple[int, ...]:
     return struct.unpack(f"<{len(data) // 2}h", data)
 
 
-class FrameParser:
+class FrameParser(FrameBuffer):
     """Finds frames in a stream of bytes that may arrive in any pieces, with garbage between them.
 
     After a frame that cannot be read the search continues at the next byte, so that frames within
@@ -203,20 +204,9 @@ class FrameParser:
     """
 
     def __init__(self, *, answers: bool) -> None:
+        super().__init__()
         self._head = _HEADS[answers]
-        self._buffer = bytearray()
-        self.skipped = 0
         self.damaged = 0
-
-    @property
-    def pending(self) -> int:
-        """Bytes held that may be the beginning of a frame."""
-        return len(self._buffer)
-
-    def reset(self) -> None:
-        """Forget a frame begun."""
-        self.skipped += len(self._buffer)
-        self._buffer.clear()
 
     def feed(self, data: bytes) -> list[Frame]:
         """Take ``data`` and return the frames that are now complete."""

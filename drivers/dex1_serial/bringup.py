@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dexkit.backends import BackendOptions
-from dexkit.bringup.bench import Drive, JointChoice, Plan, Reading, Snapshot, Zero
+from dexkit.bringup.bench import Drive, Plan, Reading, Snapshot, gripper_choices
 from dexkit.bringup.findings import Findings
 from dexkit.bringup.settings_file import SettingsFile
 from dexkit.drivers.dex1_serial.discovery import list_ports
@@ -40,29 +40,11 @@ Exchange = Callable[[MotorCmd], MotorData]
 def plan_of(side: Side) -> Plan:
     """Plan the bring-up of a Dex1-1: which motor on the line belongs to this side."""
     return Plan(
-        tuple(_choice(each, wanted=each is side) for each in Side),
+        gripper_choices(DEX1_1, side, _RATIOS, travel=STROKE, first=1),
         GEAR_RATIO,
         part="gripper",
         nudge=0.5,
         speed=0.5,
-    )
-
-
-def _choice(side: Side, *, wanted: bool) -> JointChoice:
-    spec = DEX1_1.joints[side][0]
-    return JointChoice(
-        str(side),
-        spec.q_min,
-        spec.q_max,
-        "opened",
-        "closed",
-        _RATIOS,
-        "closed",
-        first=1,
-        stops=(spec.q_min, spec.q_min + STROKE),
-        zero_from=Zero.LOW_STOP,
-        measured=True,
-        wanted=wanted,
     )
 
 

@@ -117,7 +117,7 @@ def _not_found(
     who = f"motor {number}" if side is None else f"motor {number} (the {side} one)"
     if not ports:
         return HandNotFound(
-            f"no port to look for {who}: nothing matches {', '.join(settings.ports)}",
+            f"no port to search for {who}: nothing matches {', '.join(settings.ports)}",
             hint="is the USB adapter plugged in? Otherwise say where: --device PATH",
         )
     return HandNotFound(

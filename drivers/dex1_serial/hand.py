@@ -9,18 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.bringup.settings_file import SettingsFile
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex1_serial.discovery import find_motor
 from dexkit.drivers.dex1_serial.line import LATE, LineStatistics, MotorLine
-from dexkit.drivers.dex1_serial.settings import (
-    SETTINGS,
-    Dex1Settings,
-    from_options,
-    with_stored,
-)
+from dexkit.drivers.dex1_serial.settings import SETTINGS, Dex1Settings, from_options, with_stored
 from dexkit.drivers.serial_port import find_device
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side
@@ -316,7 +311,7 @@ class Dex1Serial:
             self._forget_offset()
         if abs(q - position) > _CALIBRATION_TOLERANCE:
             raise HandRefused(
-                f"motor {self.id} says that it is calibrated, but is at {q:.2f} rad",
+                f"motor {self.id} reports that it is calibrated, but is at {q:.2f} rad",
                 hint="hold the jaws still, switch its supply off and on, and try again",
             )
         return q
@@ -368,4 +363,5 @@ backend = Backend(
     needs="--device PATH or USB serial number, if the port is not to be looked for",
     settings=SETTINGS,
     bringup=Lazy("dexkit.drivers.dex1_serial.bringup:bench"),
+    emulator=Emulator(("dex1-motor", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

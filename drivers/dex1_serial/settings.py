@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import platformdirs
 
 from dexkit.backends import BackendOptions
+from dexkit.drivers.setting_parsers import Parsers, parse_settings
 from dexkit.errors import UsageError
 from dexkit.wire import m4010
 from dexkit.wire.mounting import Mounting
@@ -103,7 +104,7 @@ def _parse_sign(text: str) -> int:
     return 1 if text == "+" else -1
 
 
-_PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
+_PARSERS: Parsers = {
     "ports": (
         _parse_patterns,
         f"where to look without --device, patterns with commas (default {','.join(PORTS)})",
@@ -132,7 +133,7 @@ def from_options(options: BackendOptions) -> Dex1Settings:
 
     :raises UsageError: a value cannot be parsed or is out of range.
     """
-    values = {"config": default_path()} | _parse_values(options.settings)
+    values = {"config": default_path()} | parse_settings(options.settings, _PARSERS)
     given = frozenset(options.settings)
     return Dex1Settings(device=options.device, given=given, **values)  # type: ignore[arg-type]
 
@@ -151,22 +152,7 @@ def with_stored(settings: Dex1Settings, texts: Mapping[str, str]) -> Dex1Setting
                 hint=f"known: {', '.join(OF_THE_HAND)}",
             )
     chosen = {name: text for name, text in texts.items() if name not in settings.given}
-    values = _parse_values(chosen)
+    values = parse_settings(chosen, _PARSERS)
     if settings.device is None and "ports" not in settings.given and "adapter" in values:
         values["device"] = values["adapter"]
     return replace(settings, **values)  # type: ignore[arg-type]
-
-
-def _parse_values(texts: Mapping[str, str]) -> dict[str, object]:
-    """Fields of :class:`Dex1Settings`.
-
-    :raises UsageError: a value cannot be parsed.
-    """
-    values: dict[str, object] = {}
-    for name, text in texts.items():
-        parse, meaning = _PARSERS[name]
-        try:
-            values[name] = parse(text)
-        except ValueError as error:
-            raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
-    return values

@@ -8,17 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import Backend, BackendOptions, Emulator
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
-from dexkit.drivers.dex3_usb.settings import (
-    SETTINGS,
-    Dex3Settings,
-    from_options,
-    with_stored,
-)
+from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options, with_stored
 from dexkit.drivers.dex3_usb.stored import Store, record_key
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError, WireError
 from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
@@ -412,4 +407,6 @@ backend = Backend(
     settings=SETTINGS,
     bringup=Lazy("dexkit.drivers.dex3_usb.bringup:bench"),
     udev_rules=Lazy("dexkit.systemd_units:usb_rules"),
+    emulator=Emulator(("dex3-usb", "--port", "0"), linked=False),
+    usb_requirements=True,
 )

@@ -221,7 +221,7 @@ class UsbLink:
         return answer
 
     def resynchronise(self) -> None:
-        """Discard what the device has sent, before the next command."""
+        """Discard pending data of the device before the next command."""
         self._drain_first = True
 
     # -- details

@@ -32,7 +32,6 @@ Wire = Callable[[bytes], bytes]
 """Sends a frame and returns the answer; raises :class:`~dexkit.errors.HandTimeout` without one."""
 
 Place = tuple[int, int]
-Packets = Mapping[Place, MotorCmd] | Iterable[MotorCmd]
 
 HEADS = (COMMAND_HEAD, b"\xfc\xfd", b"\xeb\x90")
 """Heads of the command frame that are tried: by analogy, as in the state frame, and of a public
@@ -119,7 +118,7 @@ def probe(wire: Wire) -> Found:
         )
     raise HandRefused(
         "the hand answers, and no motor obeys: " + "; ".join(tried),
-        hint="keep this line: the frame differs from all readings of the manual",
+        hint="please report this line: the frame differs from all readings of the manual",
     )
 
 

@@ -13,6 +13,7 @@ import platformdirs
 
 from dexkit.backends import BackendOptions
 from dexkit.drivers.dex3_usb.discovery import Server, parse_server
+from dexkit.drivers.setting_parsers import Parsers, parse_settings
 from dexkit.errors import UsageError, WireError
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX3_1
@@ -226,7 +227,7 @@ def format_places(places: tuple[tuple[int, int], ...]) -> str:
     return ",".join(f"{bus}.{number}" for bus, number in places)
 
 
-_PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
+_PARSERS: Parsers = {
     "timeout": (_parse_seconds, "seconds to wait for an answer (default 0.1)"),
     "send_timeout": (
         _parse_seconds,
@@ -314,13 +315,7 @@ def _parse_values(texts: Mapping[str, str], bus_map: BusMap = DEFAULT_BUS_MAP) -
 
     :raises UsageError: a value cannot be parsed.
     """
-    values: dict[str, object] = {}
-    for name, text in texts.items():
-        parse, meaning = _PARSERS[name]
-        try:
-            values[name] = parse(text)
-        except ValueError as error:
-            raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
+    values = parse_settings(texts, _PARSERS)
     for name in ("motors", "sensors"):
         if name in values:
             try:
@@ -346,7 +341,7 @@ def _parse_location(options: BackendOptions) -> dict[str, object]:
     if device is not None and "://" in device:
         other, number = parse_server(device)
         if server not in (None, other) or usb == "system":
-            raise UsageError(f"--device {device} and usb={usb} are two places")
+            raise UsageError(f"--device {device} and usb={usb} name different places")
         server, device = other, number
     if serial is not None and device not in (None, serial):
         raise UsageError(f"serial number {device} or {serial}?")

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dexkit.backends import BackendOptions
-from dexkit.bringup.bench import Drive, JointChoice, Plan, Reading, Snapshot, Zero
+from dexkit.bringup.bench import Drive, Plan, Reading, Snapshot, gripper_choices
 from dexkit.bringup.findings import Findings
 from dexkit.bringup.script import travel_key
 from dexkit.bringup.settings_file import SettingsFile
@@ -18,7 +18,7 @@ from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import ServoBus
 from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.discovery import find_device, find_servos, latency_warning
-from dexkit.drivers.ezgripper.options import GripperSettings, parse_settings, stored_device
+from dexkit.drivers.ezgripper.options import GripperSettings, settings_of, stored_device
 from dexkit.drivers.ezgripper.recovery import motor_error
 from dexkit.drivers.ezgripper.scaling import (
     CURRENT_LIMIT,
@@ -49,7 +49,16 @@ _WIDEST = 1.2
 def plan_of(side: Side) -> Plan:
     """Plan the bring-up: which servos move this side's gripper, and where it is closed."""
     return Plan(
-        tuple(_choice(each, wanted=each is side) for each in Side),
+        gripper_choices(
+            DEX1_1,
+            side,
+            (STROKES[0] / STROKE, _WIDEST),
+            # closed first: whether there is a stop at the open end is not documented, and a tendon
+            # must not be wound up the other way
+            first=-1,
+            most_travel=_WIDEST * DEX1_1.joints[side][0].stroke,
+            motors=2,
+        ),
         1.0,
         part="gripper",
         nudge=0.5,
@@ -57,28 +66,6 @@ def plan_of(side: Side) -> Plan:
         torque=round(0.15 * CURRENT_LIMIT * _JOINT_TORQUE, 2),
         most_torque=round(0.30 * CURRENT_LIMIT * _JOINT_TORQUE, 2),
         speed=0.5,
-    )
-
-
-def _choice(side: Side, *, wanted: bool) -> JointChoice:
-    spec = DEX1_1.joints[side][0]
-    return JointChoice(
-        str(side),
-        spec.q_min,
-        spec.q_max,
-        "opened",
-        "closed",
-        (STROKES[0] / STROKE, _WIDEST),
-        "closed",
-        # closed first: whether there is a stop at the open end is not documented, and a tendon must
-        # not be wound up the other way
-        first=-1,
-        most_travel=_WIDEST * spec.stroke,
-        stops=(spec.q_min, spec.q_max),
-        zero_from=Zero.LOW_STOP,
-        measured=True,
-        motors=2,
-        wanted=wanted,
     )
 
 
@@ -243,8 +230,8 @@ class EZGripperBench:
         return found
 
     def settings(self, findings: Findings) -> dict[str, str]:
-        """Settings that follow from the findings; for two servos only the ids, the file holds the
-        rest.
+        """Settings that follow from the findings; for two servos only the ids; the others are in
+        the file.
         """
         records = self.records(findings)
         if not records:
@@ -281,6 +268,6 @@ class EZGripperBench:
 
 def bench(options: BackendOptions) -> EZGripperBench:
     """The bench of ``dexkit bringup ezgripper``."""
-    configuration = parse_settings(options)
+    configuration = settings_of(options)
     device = options.device or stored_device(Store(configuration.config), options.side)
     return EZGripperBench(device, options.side, configuration)

@@ -125,7 +125,7 @@ class DevicePort:
         self._opened().reset_input_buffer()
 
     def flush(self) -> None:
-        """Wait until the kernel has handed over what was written."""
+        """Wait until the kernel has passed on the written bytes."""
         self._opened().flush()
 
     def read(self, deadline: float) -> bytes:
@@ -222,7 +222,7 @@ class ServoBus:
             raise open_failed(self.path, error) from error
 
     def drain(self) -> None:
-        """Wait until what was written has left the adapter's buffer.
+        """Wait until the written bytes have left the adapter's buffer.
 
         :raises HandLost: the port has gone away.
         """

@@ -242,7 +242,7 @@ def find_zero(
     if not closing.stopped:
         _stop_current(drive, closing.end)
         raise CalibrationFailed(
-            f"the servo turned {reach} ticks closing and met no stop",
+            f"the servo turned {reach} ticks closing and reached no stop",
             hint="are the tendons attached?",
         )
     zero = closing.end.position
@@ -356,7 +356,8 @@ def _line(times: Sequence[tuple[float, float]]) -> DistanceResult:
     slope = sum((x - mean_x) * (y - mean_y) for x, y in times) / spread if spread else 0.0
     if slope <= 0:
         raise CalibrationFailed(
-            "longer moves do not take longer", hint="give several distances; try again"
+            "the time of a move does not grow with its distance",
+            hint="give several distances; try again",
         )
     return DistanceResult(1.0 / slope, mean_y - slope * mean_x, tuple(times))
 
@@ -440,7 +441,7 @@ def measure_current(
     if not track.stopped:
         _stop_current(drive, track.end)
         raise CalibrationFailed(
-            "the gripper closed without meeting anything",
+            "the gripper closed without touching anything",
             hint="put the gauge between the fingers",
         )
     goal = Goal(base, current_of_effort(effort), profile_velocity(SPEED))

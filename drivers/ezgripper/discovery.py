@@ -75,7 +75,7 @@ def find_servo(
                 old.append(f"id {candidate} (model {model}) at {rate} baud")
     if old:
         raise HandRefused(
-            f"a servo on {bus.path} speaks Protocol 1.0: {', '.join(old)}", hint=_UPGRADE
+            f"a servo on {bus.path} uses Protocol 1.0: {', '.join(old)}", hint=_UPGRADE
         )
     who = "any id" if servo_id is None else f"id {servo_id}"
     tried = ", ".join(str(rate) for rate in rates)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexkit.backends import Backend, BackendOptions
+from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE, WriteDeadline
 from dexkit.drivers.ezgripper import calibration
@@ -29,21 +29,12 @@ from dexkit.drivers.ezgripper.options import (
     Calibrate,
     GripperSettings,
     ZeroGains,
-    parse_settings,
+    settings_of,
     stored_device,
 )
 from dexkit.drivers.ezgripper.restart import GripperStatistics, Restart
-from dexkit.drivers.ezgripper.scaling import (
-    STROKE,
-    joint_of_ticks,
-    joint_speed,
-)
-from dexkit.drivers.ezgripper.servo import (
-    Servo,
-    ServoGroup,
-    ServoStatistics,
-    line_time,
-)
+from dexkit.drivers.ezgripper.scaling import STROKE, joint_of_ticks, joint_speed
+from dexkit.drivers.ezgripper.servo import Servo, ServoGroup, ServoStatistics, line_time
 from dexkit.drivers.ezgripper.unit import Unit
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.errors import HandError, HandLost, HandRefused, UsageError
@@ -344,8 +335,8 @@ class EZGripper:
             return self._found[unit.key]
         if not may_move:
             raise HandRefused(
-                f"the gripper {unit.key} has no zero: calibration is not repeated by itself",
-                hint="see that it is empty and start again",
+                f"the gripper {unit.key} has no zero: calibration is not repeated automatically",
+                hint="check that it is empty, and start again",
             )
         if configuration.calibrate is not Calibrate.YES and unit.record.zero is not None:
             return unit.record.zero
@@ -506,13 +497,16 @@ class EZGripper:
 
 
 def _create_hand(options: BackendOptions) -> EZGripper:
-    configuration = parse_settings(options)
+    configuration = settings_of(options)
     store = Store(configuration.config)
     device = options.device or stored_device(store, options.side)
     if not options.device and not {"id", "ids"} & options.settings.keys():
         configuration = replace(configuration, ids=store.servo_ids(options.side))
     return EZGripper(device, options.side, configuration)
 
+
+_EMULATED_ZERO = "1510"
+"""Encoder tick of an emulated servo's zero; the driver gets it as well, and need not calibrate."""
 
 backend = Backend(
     summary="SAKE EZGripper with an MX-64 servo (Protocol 2.0) on a serial port",
@@ -522,4 +516,9 @@ backend = Backend(
     "calibration file",
     settings={name: meaning for name, (_, meaning) in PARSERS.items()},
     bringup=Lazy("dexkit.drivers.ezgripper.bringup:bench"),
+    emulator=Emulator(
+        ("mx64", "--closed-at", _EMULATED_ZERO),
+        linked=True,
+        settings={**SHARED_MACHINE, "zero": _EMULATED_ZERO},
+    ),
 )

@@ -14,6 +14,7 @@ from dexkit.drivers.ezgripper.config import Store
 from dexkit.drivers.ezgripper.control import ControlSettings
 from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE, ForceTable
 from dexkit.drivers.ezgripper.scaling import STROKE, STROKES
+from dexkit.drivers.setting_parsers import parse_settings
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.wire import mx64
@@ -23,7 +24,7 @@ __all__ = [
     "Calibrate",
     "GripperSettings",
     "ZeroGains",
-    "parse_settings",
+    "settings_of",
     "stored_device",
 ]
 
@@ -31,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class ZeroGains(str, Enum):
-    """What a command without gains (kp = kd = dq = tau = 0) does."""
+    """Effect of a command without gains (kp = kd = dq = tau = 0)."""
 
     LIMP = "limp"
     POSITION = "position"
@@ -195,18 +196,12 @@ PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
 }
 
 
-def parse_settings(options: BackendOptions) -> GripperSettings:
+def settings_of(options: BackendOptions) -> GripperSettings:
     """Build the settings from command-line options.
 
     :raises UsageError: a value cannot be parsed or is out of range, or two contradict each other.
     """
-    values: dict[str, object] = {}
-    for name, text in options.settings.items():
-        parse, meaning = PARSERS[name]
-        try:
-            values[name] = parse(text)
-        except (ValueError, OSError) as error:
-            raise UsageError(f"{name}={text}: {error}", hint=f"{name} is {meaning}") from error
+    values = parse_settings(options.settings, PARSERS)
     if "id" in values and "ids" in values:
         raise UsageError("give id of one servo, or ids of two, not both")
     if "sign" in values:

@@ -106,7 +106,7 @@ def hold_here(bus: ServoBus, servo_id: int, watchdog: int = 0) -> None:
 
 
 def apply_settings(bus: ServoBus, servo_id: int, *, mirrored: bool = False) -> ServoLimits:
-    """Write the registers of a servo to what the driver needs. No motion.
+    """Write the values that the driver needs to the registers of a servo. No motion.
 
     :param mirrored: the fingers close while the encoder's position rises: the servo counts the
         other way (Drive Mode), so that closing is toward smaller ticks for everything else.

@@ -67,7 +67,7 @@ class Dex3Hands:
         seed: int = 0,
     ) -> None:
         if not sides or len(set(sides)) != len(sides):
-            raise UsageError("one hand a side, and at least one")
+            raise UsageError("give one hand for each side, and at least one")
         if len(serials) > len(sides):
             raise UsageError(f"{len(serials)} serial numbers for {len(sides)} hand(s)")
         plan = [parse_fault(spec, DEX3_FAULTS) for spec in faults]
@@ -99,7 +99,7 @@ class Dex3Hands:
 
     @property
     def url(self) -> str:
-        """What a driver opens: ``usbip://HOST:PORT``."""
+        """URL for drivers: ``usbip://HOST:PORT``."""
         return self._server.url
 
     @property
@@ -179,7 +179,7 @@ def _write_log(
 
 
 class Dex3Process(EmulatorProcess):
-    """``dexkit emulate dex3-usb`` in a process of its own.
+    """``dexkit emulate dex3-usb`` in its own process.
 
     :param arguments: of that command.
     :raises EmulatorError: it did not become ready.

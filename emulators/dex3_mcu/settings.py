@@ -58,7 +58,7 @@ class Firmware:
 
     def __post_init__(self) -> None:
         if self.queue < 1:
-            raise UsageError("a hand that answers keeps at least one answer")
+            raise UsageError("the queue holds at least one answer")
         if self.command_timeout <= 0 or self.answer_time < 0:
             raise UsageError("a time must not be negative, nor a time-out 0")
         if not 0 <= self.model_code <= 0xFF:

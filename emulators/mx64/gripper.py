@@ -58,7 +58,7 @@ class EmulatedThread:
 
 
 class EmulatedProcess(EmulatorProcess):
-    """A gripper in a process of its own: ``dexkit emulate mx64``.
+    """A gripper in its own process: ``dexkit emulate mx64``.
 
     :param arguments: of that command, without ``--link``.
     :param link: where to put the link; None for a name in a temporary directory.

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Law:
-    """What the motors do: each gives ``bias - kp q - kd dq``, up to its largest torque.
+    """The law of the motors: each gives ``bias - kp q - kd dq``, up to its largest torque.
 
     :param bias: shape (n,), N·m: ``tau + kp q_des + kd dq_des``.
     :param kp: shape (n,), N·m/rad.

@@ -126,7 +126,7 @@ class EmulatedRobot:
     def start(self) -> EmulatedRobot:
         """Publish states and obey commands from now on.
 
-        :raises TopicConflict: somebody else publishes the state (unless ``force``).
+        :raises TopicConflict: another program publishes the state (unless ``force``).
         :raises DdsError: the topics cannot be made.
         """
         if self._writer is not None:
@@ -197,7 +197,7 @@ class EmulatedRobot:
         self._heard = True
         sole.check()
         raise TopicConflict(  # it has gone meanwhile, or is not discovered
-            f"somebody already publishes {model.state_topic} on domain {self.domain}",
+            f"another program already publishes {model.state_topic} on domain {self.domain}",
             hint="stop the other robot, choose another --domain, or add --force",
         )
 
@@ -284,7 +284,7 @@ def run_robot(
     """Run a robot until ``stop`` is set.
 
     :param ready: set when its topics are up.
-    :raises TopicConflict: somebody else publishes the state (unless ``force``).
+    :raises TopicConflict: another program publishes the state (unless ``force``).
     :raises DdsError: the topics cannot be made, or writing to them failed.
     """
     with EmulatedRobot(
@@ -296,4 +296,4 @@ def run_robot(
             if isinstance(robot.failure, TopicConflict):
                 raise robot.failure
             if robot.failure is not None:
-                raise DdsError(f"the {model.name} died: {robot.failure}") from robot.failure
+                raise DdsError(f"the {model.name} failed: {robot.failure}") from robot.failure

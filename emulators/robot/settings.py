@@ -61,7 +61,7 @@ class Settings:
         if not 0 <= self.ambient <= 127 or not 0 <= self.heating <= 127 - self.ambient:
             raise UsageError("a motor's temperature must stay between 0 and 127 degrees")
         if not 0 <= self.charge <= 100:
-            raise UsageError(f"a battery is charged by 0 to 100 %, not {self.charge}")
+            raise UsageError(f"the charge of a battery is 0 to 100 %, not {self.charge}")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Remote:
                     f"the remote has no stick {name!r}", hint=f"sticks: {', '.join(self.STICKS)}"
                 )
             if not -1 <= value <= 1:
-                raise UsageError(f"a stick stands between -1 and 1, not at {value}")
+                raise UsageError(f"the position of a stick is -1 to 1, not {value}")
 
     @classmethod
     def parse(cls, text: str) -> Remote:
@@ -114,7 +114,7 @@ class Remote:
                 sticks[name] = float(value)
             except ValueError:
                 raise UsageError(
-                    f"{word!r}: where does the stick stand?", hint="for example lx=0.5"
+                    f"{word!r}: no position of the stick is given", hint="for example lx=0.5"
                 ) from None
         return cls(frozenset(keys), sticks)
 

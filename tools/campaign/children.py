@@ -64,7 +64,7 @@ def wait_gone(pids: list[int], timeout: float) -> list[int]:
 
 
 def sweep() -> list[str]:
-    """End every process below this one; what there was."""
+    """End every process below this one; returns their descriptions."""
     reap()
     left = descendants()
     names = [f"{pid}: {command_of(pid)}" for pid in left]

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.backends import backend as find_backend
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import Server
@@ -24,15 +25,16 @@ from dexkit.drivers.ezgripper.gripper import EZGripper, GripperSettings
 from dexkit.emulators.dex3_mcu import emulated_dex3
 from dexkit.emulators.m4010 import Dex1Motors
 from dexkit.emulators.mx64 import emulated_ezgripper
-from dexkit.hand import Side
-from dexkit.messages import encode, unitree_go, unitree_hg
-from dexkit.models import dialect
+from dexkit.hand import JointMode, Side
+from dexkit.models import Dialect, model
 from dexkit.service import HandService
 from dexkit.service.hand_core import HandCore
+from dexkit.teleop.client import JointCommand
+from dexkit.teleop.client_codec import ClientWire
 from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.rig import LocalNode, WaitTimeout, open_files, until
 
-__all__ = ["Bench", "bench_of", "cases"]
+__all__ = ["DEVICES", "M4010", "Bench", "DeviceBench", "Dex3", "Mx64", "cases", "command"]
 
 SIDE = Side.LEFT
 _PAUSES = (0.02, 0.06, 0.15, 0.4, 0.9)
@@ -41,21 +43,53 @@ _WATCHED = 0.4
 """Seconds after the return in which nothing may move."""
 
 
-class Bench:
-    """A device with a driver that can be asked for.
+def command(dialect: Dialect, part: float) -> bytes:
+    """A client's command for the left hand.
 
-    :ivar low: and ``high``: goals within the hand's range, in the dialect's radians.
-    :ivar still: what counts as not moved, in units of :meth:`position`.
-    :ivar coast: how far it may run on after it was found again, in the same units.
+    :param part: of each joint's range, from its lower limit.
+    """
+    hand = model(dialect.model)
+    motors = [
+        JointCommand(
+            dialect.mode(i, JointMode.FOC), j.q_min + part * j.stroke, hand.client_dq, 0.0, kp, kd
+        )
+        for i, (j, (kp, kd)) in enumerate(zip(hand.joints[SIDE], hand.gains, strict=True))
+    ]
+    ((_, payload),) = ClientWire(dialect).encode({SIDE: motors})
+    return payload
+
+
+class Bench:
+    """A backend that is served, and a client's commands for its hand.
+
+    :param backend: its name; by default the class's own.
+    :ivar low: and ``high``: goals, parts of each joint's range.
+    :ivar still: what counts as not moved, in units of :meth:`DeviceBench.position`.
     """
 
-    dialect_name = "unitree_go"
-    low, high = 1.0, 4.0
+    backend = ""
+    low, high = 0.2, 0.75
     still = 0.05
-    coast = 0.0
 
-    def __init__(self, scratch: Path) -> None:
+    def __init__(self, scratch: Path, backend: str = "") -> None:
         self.scratch = scratch
+        self.backend = backend or self.backend
+        self.dialect = model(find_backend(self.backend).model).dialects[0]
+
+    def message(self, part: float) -> bytes:
+        """A command."""
+        return command(self.dialect, part)
+
+
+class DeviceBench(Bench):
+    """One whose device is emulated in this process, and whose driver can be asked for.
+
+    :cvar name: of the device, and of its link in the scratch folder.
+    :cvar coast: how far it may run on after it was found again, in units of :meth:`position`.
+    """
+
+    name = ""
+    coast = 0.0
 
     @contextlib.contextmanager
     def device(self) -> Iterator[Any]:
@@ -66,58 +100,81 @@ class Bench:
         """A driver for it."""
         raise NotImplementedError
 
+    def options(self, device: Any) -> list[str]:
+        """The options with which ``dexkit serve`` finds it."""
+        return ["--device", str(self.scratch / self.name)]
+
     def position(self, device: Any) -> float:
-        """Where the device itself is."""
+        """The position of the device itself."""
         raise NotImplementedError
 
     def unplug(self, device: Any, seconds: float) -> None:
         """Pull the cable, and put it back."""
         device.inject(f"unplug:for={seconds * 1000:.0f}ms")
 
-    def message(self, q: float) -> bytes:
-        """A command."""
-        motor = unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05)
-        return encode(unitree_go.MotorCmds_([motor]))
+
+_ZERO = 1510  # encoder tick
+_STROKE = 2520  # ticks
 
 
-class _Mx64(Bench):
-    still = 0.02 * 2520  # ticks: 2 % of the stroke
+class Mx64(DeviceBench):
+    """An EZGripper."""
+
+    name, backend = "mx64", "ezgripper"
+    still = 0.02 * _STROKE
     # The driver switches the torque off when it opens the servo again; the fingers run on for some
     # 0.2 s. A command from before would take them through the other half of the stroke.
-    coast = 0.08 * 2520
+    coast = 0.08 * _STROKE
 
     @contextlib.contextmanager
     def device(self) -> Iterator[Any]:
+        """The emulated servo with its fingers."""
         with emulated_ezgripper(
-            link=self.scratch / "mx64", closed_at=1510, latency_timer=0.0, check_baudrate=False
+            link=self.scratch / self.name,
+            closed_at=_ZERO,
+            latency_timer=0.0,
+            check_baudrate=False,
         ) as gripper:
             yield gripper
 
     def hand(self) -> Any:
-        settings = GripperSettings(zero=1510, config=self.scratch / "ezgripper.json")
-        return EZGripper(str(self.scratch / "mx64"), SIDE, settings)
+        """Its driver."""
+        settings = GripperSettings(zero=_ZERO, config=self.scratch / "ezgripper.json")
+        return EZGripper(str(self.scratch / self.name), SIDE, settings)
+
+    def options(self, device: Any) -> list[str]:
+        """Its link and its zero."""
+        return [*super().options(device), "--set", f"zero={_ZERO}"]
 
     def position(self, device: Any) -> float:
+        """Position of the encoder, ticks."""
         return float(device.servo.drive.encoder)
 
 
-class _M4010(Bench):
+class M4010(DeviceBench):
+    """The motor of a Dex1-1."""
+
+    name, backend = "m4010", "dex1-serial"
+
     @contextlib.contextmanager
     def device(self) -> Iterator[Any]:
-        with Dex1Motors((SIDE,), links={SIDE: self.scratch / "m4010"}) as motors:
+        """The emulated motor with its jaws."""
+        with Dex1Motors((SIDE,), links={SIDE: self.scratch / self.name}) as motors:
             yield motors
 
     def hand(self) -> Any:
-        return Dex1Serial(SIDE, Dex1Settings(device=str(self.scratch / "m4010"), timeout=0.1))
+        """Its driver."""
+        return Dex1Serial(SIDE, Dex1Settings(device=str(self.scratch / self.name), timeout=0.1))
 
     def position(self, device: Any) -> float:
+        """Opening of the jaws, rad."""
         return float(device.motors[SIDE].q)
 
 
-class _Dex3(Bench):
-    dialect_name = "dex3"
-    low, high = 0.2, 0.8
-    still = 0.05
+class Dex3(DeviceBench):
+    """A Dex3-1 behind a USB/IP server, on the same port after a restart."""
+
+    name, backend = "dex3", "dex3-usb"
 
     def __init__(self, scratch: Path) -> None:
         super().__init__(scratch)
@@ -125,49 +182,26 @@ class _Dex3(Bench):
 
     @contextlib.contextmanager
     def device(self) -> Iterator[Any]:
+        """The emulated hand."""
         with emulated_dex3(port=self._port) as hands:
             self._port = hands.port
             yield hands
 
     def hand(self) -> Any:
+        """Its driver."""
         return Dex3Usb(SIDE, Dex3Settings(server=Server("127.0.0.1", self._port)))
 
+    def options(self, device: Any) -> list[str]:
+        """Its server."""
+        return ["--usb", device.url]
+
     def position(self, device: Any) -> float:
+        """Sum of the joints' positions without sign, rad."""
         return float(np.abs(device.device(SIDE).mechanics.q).sum())
 
-    def message(self, q: float) -> bytes:
-        from dexkit.models import DEX3_1
 
-        motors = []
-        for number, joint in enumerate(DEX3_1.joints[SIDE]):
-            goal = joint.q_min + q * joint.stroke
-            mode = number | 1 << 4
-            motors.append(unitree_hg.MotorCmd_(mode=mode, q=goal, kp=1.5, kd=0.2))
-        return encode(unitree_hg.HandCmd_(motor_cmd=motors))
-
-
-class _Dex5(Bench):
-    """Without a device: only the commands of a client."""
-
-    dialect_name = "dex5"
-    low, high = 0.2, 0.8
-
-    def message(self, q: float) -> bytes:
-        from dexkit.models import DEX5_1
-
-        motors = [
-            unitree_hg.MotorCmd_(mode=1, q=joint.q_min + q * joint.stroke, kp=1.5, kd=0.2)
-            for joint in DEX5_1.joints[SIDE]
-        ]
-        return encode(unitree_hg.HandCmd_(motor_cmd=motors))
-
-
-_BENCHES: dict[str, type[Bench]] = {"mx64": _Mx64, "m4010": _M4010, "dex3": _Dex3, "dex5": _Dex5}
-
-
-def bench_of(name: str) -> type[Bench]:
-    """What knows the device called ``name``."""
-    return _BENCHES[name]
+DEVICES: tuple[type[DeviceBench], ...] = (Mx64, M4010, Dex3)
+"""Every device that is unplugged, and whose driver is served."""
 
 
 class DeviceCase(Case):
@@ -180,11 +214,11 @@ class DeviceCase(Case):
     lane = Lane.LIVE
     limit = 400.0
 
-    def __init__(self, name: str, bench: type[Bench], *, restart: bool, aim: int) -> None:
+    def __init__(self, bench: type[DeviceBench], *, restart: bool, aim: int) -> None:
         self.unit = "restarts" if restart else "unplugs"  # type: ignore[misc]
         what = "started again" if restart else "unplugged and put back"
-        self.name = f"{'restart' if restart else 'unplug'}:{name}"
-        self.what = f"the emulated {name}, {what} in motion"
+        self.name = f"{'restart' if restart else 'unplug'}:{bench.name}"
+        self.what = f"the emulated {bench.name}, {what} in motion"
         self.aim = aim
         self._bench, self._restart = bench, restart
 
@@ -210,10 +244,9 @@ class DeviceCase(Case):
         if (now := threading.active_count()) > threads:
             batch.found("threads leak", self.name, str([t.name for t in threading.enumerate()]))
 
-    def _rounds(self, batch: Batch, bench: Bench, count: int) -> None:
+    def _rounds(self, batch: Batch, bench: DeviceBench, count: int) -> None:
         node = LocalNode()
-        spoken = dialect(bench.dialect_name)
-        topic = spoken.topics(SIDE)[0]
+        topic = bench.dialect.topics(SIDE)[0]
         with contextlib.ExitStack() as power:
             device = power.enter_context(bench.device())
             service = HandService(bench.hand(), node=node, state_rate=100.0, soft_start=False)
@@ -227,7 +260,7 @@ class DeviceCase(Case):
     def _round(
         self,
         batch: Batch,
-        bench: Bench,
+        bench: DeviceBench,
         service: HandService,
         node: LocalNode,
         topic: str,
@@ -280,7 +313,7 @@ class DeviceCase(Case):
 
     @staticmethod
     def _send_for(
-        bench: Bench,
+        bench: DeviceBench,
         node: LocalNode,
         topic: str,
         goal: float,
@@ -299,7 +332,7 @@ class DeviceCase(Case):
 
     @staticmethod
     def _drive(
-        bench: Bench, node: LocalNode, topic: str, goal: float, moved: Callable[[], bool]
+        bench: DeviceBench, node: LocalNode, topic: str, goal: float, moved: Callable[[], bool]
     ) -> None:
         """Command until the device has moved; it may be at the goal already, then the other way."""
         message, began, other = bench.message(goal), time.monotonic(), False
@@ -317,8 +350,7 @@ class DeviceCase(Case):
 def cases() -> list[Case]:
     """Every device, unplugged and restarted."""
     found: list[Case] = []
-    for name in ("mx64", "m4010", "dex3"):
-        bench = bench_of(name)
-        found.append(DeviceCase(name, bench, restart=False, aim=270))
-        found.append(DeviceCase(name, bench, restart=True, aim=70))
+    for bench in DEVICES:
+        found.append(DeviceCase(bench, restart=False, aim=270))
+        found.append(DeviceCase(bench, restart=True, aim=70))
     return found

@@ -1,4 +1,4 @@
-"""Hands out batches to worker processes, watches them, collects what they found."""
+"""Gives batches to worker processes, watches them, collects their findings."""
 
 from __future__ import annotations
 

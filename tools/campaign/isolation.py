@@ -29,7 +29,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True)
 class Isolation:
-    """What is the campaign's own."""
+    """The namespaces that the campaign has."""
 
     network: bool
     mounts: bool

@@ -18,12 +18,12 @@ from typing import Any
 from dexkit.doctor import rtps
 from dexkit.doctor.rtps import Locator
 from dexkit.messages import encode, message_type, message_types, unitree_go, unitree_hg
-from dexkit.models import dialect
+from dexkit.models import Dialect
 from tools.campaign.case import Batch, Case
 from tools.campaign.fuzz.messages import announcements, filled
 from tools.campaign.mutate import mutator
 from tools.campaign.process import Program, traceback_in
-from tools.campaign.programs import SIDE, Client, Scene, Spec, robots_and_hands
+from tools.campaign.programs import SIDE, Scene, Spec, robots_and_hands
 from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["cases"]
@@ -79,16 +79,15 @@ class HostilePeer:
 class _Messages:
     """Commands that are wrong in themselves, by a participant in good order."""
 
-    def __init__(self, domain: int, spoken: str, rng: random.Random) -> None:
+    def __init__(self, domain: int, dialect: Dialect, rng: random.Random) -> None:
         from dexkit.dds import DdsNode
 
-        chosen = dialect(spoken)
         self.node = DdsNode(domain, "lo")
         self._rng = rng
-        topic = chosen.topics(SIDE)[0]
-        self._writer = self.node.writer(topic, chosen.cmd_type)
-        kind = message_type(chosen.cmd_type)
-        good = [kind.encode(filled(chosen.cmd_type, rng)) for _ in range(3)]
+        topic = dialect.topics(SIDE)[0]
+        self._writer = self.node.writer(topic, dialect.cmd_type)
+        kind = message_type(dialect.cmd_type)
+        good = [kind.encode(filled(dialect.cmd_type, rng)) for _ in range(3)]
         good.append(kind.encode(kind.cls()))
         if kind.cls is unitree_go.MotorCmds_:
             nan = unitree_go.MotorCmd_(q=float("nan"), kp=5.0)
@@ -100,7 +99,7 @@ class _Messages:
         self._damaged = mutator(good, rng)
         self._good = good
         # another type on the same topic
-        other = rng.choice([m.name for m in message_types() if m.name != chosen.cmd_type])
+        other = rng.choice([m.name for m in message_types() if m.name != dialect.cmd_type])
         self._foreign = self.node.writer(topic, other)
         self._foreign_data = message_type(other).encode(filled(other, rng))
 
@@ -126,11 +125,11 @@ class PeerCase(Case):
     unit = "hostile messages"
     limit = 300.0
 
-    def __init__(self, spec: Spec, spoken: str) -> None:
+    def __init__(self, spec: Spec) -> None:
         self.name = f"peers:{spec.name}"
         self.what = f"{spec.name}, among hostile peers"
         self.aim = 40_000
-        self._spec, self._spoken = spec, spoken
+        self._spec = spec
 
     def run(self, batch: Batch) -> None:
         logging.disable()
@@ -161,7 +160,7 @@ class PeerCase(Case):
             program.wait_for(self._spec.ready)
         self._spec.works(scene, program)
         count = 200 if batch.sample else 2500
-        with _open(batch, self._spoken) as ways:
+        with _open(batch, scene.bench.dialect if scene.bench else None) as ways:
             for number in range(count):
                 batch.random.choice(ways)()
                 batch.units += 1
@@ -181,7 +180,7 @@ class PeerCase(Case):
         client, bench = scene.client, scene.bench
         assert client is not None
         assert bench is not None
-        state = message_type(dialect(bench.dialect_name).state_type)
+        state = message_type(bench.dialect.state_type)
 
         def q() -> float:
             if client.newest is None:
@@ -202,7 +201,7 @@ class PeerCase(Case):
 
 
 @contextlib.contextmanager
-def _open(batch: Batch, spoken: str) -> Iterator[list[Callable[[], Any]]]:
+def _open(batch: Batch, dialect: Dialect | None) -> Iterator[list[Callable[[], Any]]]:
     hostile_peer = HostilePeer(batch.domain, batch.random)
     ways: list[Callable[[], Any]] = [
         hostile_peer.malformed,
@@ -211,8 +210,8 @@ def _open(batch: Batch, spoken: str) -> Iterator[list[Callable[[], Any]]]:
     ]
     with contextlib.ExitStack() as stack:
         stack.callback(hostile_peer.close)
-        if spoken:
-            messages = _Messages(batch.domain, spoken, batch.random)
+        if dialect is not None:
+            messages = _Messages(batch.domain, dialect, batch.random)
             stack.callback(messages.close)
             ways += [messages.send] * 3
         yield ways
@@ -220,6 +219,4 @@ def _open(batch: Batch, spoken: str) -> Iterator[list[Callable[[], Any]]]:
 
 def cases() -> list[Case]:
     """Those that listen to the network."""
-    spoken = {"serve-sim-dex1": "unitree_go", "serve-sim-dex3": "dex3", "serve-sim-dex5": "dex5"}
-    _ = Client
-    return [PeerCase(spec, spoken.get(spec.name, "")) for spec in robots_and_hands()]
+    return [PeerCase(spec) for spec in robots_and_hands()]

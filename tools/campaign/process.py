@@ -106,7 +106,7 @@ class Program:
 
     @property
     def output(self) -> str:
-        """What it printed so far."""
+        """Its output so far."""
         return self._output.read_text(errors="replace")
 
     @property

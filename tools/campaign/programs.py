@@ -15,16 +15,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import encode, unitree_go
-from dexkit.models import dialect
+from dexkit.models import BUILT_IN, DEX1_1, Dialect
+from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import sweep
 from tools.campaign.case import Batch, Case
-from tools.campaign.devices import Bench, bench_of
+from tools.campaign.devices import DEVICES, M4010, Bench, DeviceBench, Dex3, Mx64, command
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.rig import WaitTimeout, until
 
@@ -38,18 +40,17 @@ _SETTLED = 0.2
 class Client:
     """A client on DDS in this process: commands at 100 Hz while it has a goal; reads states.
 
-    :param spoken: name of its dialect.
+    :param dialect: that it speaks; ``message`` makes a command of a goal.
     """
 
-    def __init__(self, domain: int, spoken: str, message: Callable[[float], bytes]) -> None:
+    def __init__(self, domain: int, dialect: Dialect, message: Callable[[float], bytes]) -> None:
         from dexkit.dds import DdsNode
 
         self._message = message
-        chosen = dialect(spoken)
-        command, state = chosen.topics(SIDE)
+        command, state = dialect.topics(SIDE)
         self.node = DdsNode(domain, "lo")
-        self._writer = self.node.writer(command, chosen.cmd_type)
-        self._reader = self.node.reader(state, chosen.state_type)
+        self._writer = self.node.writer(command, dialect.cmd_type)
+        self._reader = self.node.reader(state, dialect.state_type)
         self.states = 0
         self.newest: Any = None
         self.goal: float | None = None
@@ -85,7 +86,7 @@ class Client:
 
 @dataclass
 class Scene:
-    """What a program works with in a batch.
+    """The devices and clients of a program in a batch.
 
     :ivar client: a client, where the program has one.
     :ivar device: the emulated device, where it drives one, and ``bench`` what knows it.
@@ -104,12 +105,12 @@ class Scene:
 
     @property
     def scratch(self) -> Path:
-        """A folder of its own."""
+        """The folder of the batch."""
         return self.batch.scratch
 
     def position(self) -> float | None:
         """Where the device is, or None."""
-        if self.bench is None or self.device is None:
+        if not isinstance(self.bench, DeviceBench) or self.device is None:
             return None
         return self.bench.position(self.device)
 
@@ -119,7 +120,7 @@ Stage = Callable[[Scene], "contextlib.AbstractContextManager[None]"]
 
 @dataclass(frozen=True)
 class Spec:
-    """A program and how it is known to work.
+    """A program with the test that it works.
 
     :param command: its arguments behind ``python -m``.
     :param stage: what must be there for it.
@@ -146,39 +147,33 @@ def _nothing(scene: Scene) -> Iterator[None]:
     yield
 
 
-def _go(q: float) -> bytes:
-    return encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=q, kp=5.0, kd=0.05)]))
-
-
-def _with_client(spoken: str, bench: str = "") -> Stage:
+def _with_client(make: Callable[[Path], Bench]) -> Stage:
     @contextlib.contextmanager
     def stage(scene: Scene) -> Iterator[None]:
         with contextlib.ExitStack() as stack:
-            scene.bench = bench_of(bench or _BENCH[spoken])(scene.scratch)
-            if bench:
-                scene.device = stack.enter_context(scene.bench.device())
-            scene.client = Client(scene.batch.domain, spoken, scene.bench.message)
+            scene.bench = bench = make(scene.scratch)
+            if isinstance(bench, DeviceBench):
+                scene.device = stack.enter_context(bench.device())
+            scene.client = Client(scene.batch.domain, bench.dialect, bench.message)
             stack.callback(scene.client.close)
             yield
 
     return stage
 
 
-_BENCH = {"unitree_go": "m4010", "dex3": "dex3", "dex5": "dex5"}
-
-
 @contextlib.contextmanager
-def _talk(scene: Scene, client: str = "unitree_go", *, states: bool = True) -> Iterator[None]:
-    """A program that publishes commands in one dialect, and states in the present one."""
+def _talk(scene: Scene, *, states: bool = True) -> Iterator[None]:
+    """A program that publishes commands for a Dex1-1, and states of it."""
     from dexkit.dds import DdsNode
 
     stop = threading.Event()
-    spoken, today = dialect(client), dialect("unitree_go")
+    dialect = DEX1_1.dialects[0]
+    command_topic, state_topic = dialect.topics(SIDE)
     with DdsNode(scene.batch.domain, "lo") as node:
-        writers = [(node.writer(spoken.topics(SIDE)[0], spoken.cmd_type), _go(1.0))]
+        writers = [(node.writer(command_topic, dialect.cmd_type), command(dialect, 0.2))]
         if states:
             state = encode(unitree_go.MotorStates_([unitree_go.MotorState_(q=1.0)]))
-            writers.append((node.writer(today.topics(SIDE)[1], today.state_type), state))
+            writers.append((node.writer(state_topic, dialect.state_type), state))
 
         def run() -> None:
             while not stop.wait(0.005):
@@ -230,36 +225,35 @@ def _robot_state(name: str) -> tuple[str, str]:
     return "rt/lowstate", robot(name).state_type
 
 
-def _answers(name: str) -> Callable[[Scene, Program], None]:
+def _answers(scene: Scene, program: Program) -> None:
     """A driver can open the emulated device and exchange with it."""
-
-    def works(scene: Scene, program: Program) -> None:
-        from dexkit.hand import HandCommand
-
-        assert scene.bench is not None
-
-        def once() -> bool:
-            assert scene.bench is not None
-            hand = scene.bench.hand()
-            try:
-                hand.open()
-                hand.exchange(HandCommand.brake(hand.spec.n_joints))
-                return True
-            except DexkitError as error:
-                scene.extra["error"] = error
-                return False
-            finally:
-                hand.close()
-
-        until(once, f"{program!r} to answer a driver")
-
-    return works
+    bench = scene.bench
+    assert isinstance(bench, DeviceBench)
+    _wait_for_exchange(scene, program, bench.hand)
 
 
-def _emulated(name: str) -> Stage:
+def _wait_for_exchange(scene: Scene, program: Program, make: Callable[[], Any]) -> None:
+    from dexkit.hand import HandCommand
+
+    def once() -> bool:
+        hand = make()
+        try:
+            hand.open()
+            hand.exchange(HandCommand.brake(hand.spec.n_joints))
+            return True
+        except DexkitError as error:
+            scene.extra["error"] = error
+            return False
+        finally:
+            hand.close()
+
+    until(once, f"{program!r} to answer a driver")
+
+
+def _emulated(make: Callable[[Path], Bench]) -> Stage:
     @contextlib.contextmanager
     def stage(scene: Scene) -> Iterator[None]:
-        scene.bench = bench_of(name)(scene.scratch)
+        scene.bench = make(scene.scratch)
         yield
 
     return stage
@@ -311,20 +305,27 @@ def _output_grows(scene: Scene, program: Program) -> None:
 # --- the programs
 
 
-def _serve(backend: str, *options: str) -> Callable[[Scene], list[str]]:
+def _serve(backend: str) -> Callable[[Scene], list[str]]:
     def command(scene: Scene) -> list[str]:
-        words = ["dexkit", "serve", backend, "--side", "left", "--domain", scene.domain, *options]
-        if backend == "ezgripper":
-            words += ["--device", str(scene.scratch / "mx64"), "--set", "zero=1510"]
-        elif backend == "dex1-serial":
-            words += ["--device", str(scene.scratch / "m4010")]
-        elif backend == "dex3-usb":
-            words += ["--usb", scene.device.url]
-        if scene.device is not None:
+        words = ["dexkit", "serve", backend, "--side", "left", "--domain", scene.domain]
+        if isinstance(scene.bench, DeviceBench):
+            words += scene.bench.options(scene.device)
             words.append("--wait-for-device")  # on a busy machine it may answer late
         return words
 
     return command
+
+
+def _served() -> dict[str, Callable[[Path], Bench]]:
+    """The benches of ``serve``, by backend: simulated hands with torque control, emulated
+    devices.
+    """
+    found: dict[str, Callable[[Path], Bench]] = {
+        m.simulator: partial(Bench, backend=m.simulator)
+        for m in BUILT_IN
+        if m.simulator and not m.dialects[0].position_servo
+    }
+    return found | {bench.backend: bench for bench in DEVICES}
 
 
 def _sample() -> str:
@@ -335,6 +336,7 @@ def _sample() -> str:
 
 def specs() -> list[Spec]:
     """Every program that runs until it is asked to end."""
+    source, target = DEX1_1.dialects[:2]
 
     def emulate(*words: str) -> Callable[[Scene], list[str]]:
         return lambda scene: [
@@ -346,29 +348,19 @@ def specs() -> list[Spec]:
     def on_domain(*words: str) -> Callable[[Scene], list[str]]:
         return lambda scene: ["dexkit", *words, "--domain", scene.domain]
 
-    served = [
-        ("sim-dex1", "unitree_go", ""),
-        ("sim-dex3", "dex3", ""),
-        ("sim-dex5", "dex5", ""),
-        ("ezgripper", "unitree_go", "mx64"),
-        ("dex1-serial", "unitree_go", "m4010"),
-        ("dex3-usb", "dex3", "dex3"),
-    ]
     found = [
-        Spec(f"serve-{backend}", _serve(backend), _with_client(spoken, bench), works=_states)
-        for backend, spoken, bench in served
+        Spec(f"serve-{backend}", _serve(backend), _with_client(bench), works=_states)
+        for backend, bench in _served().items()
     ]
     found += [
         Spec(
             "bridge",
             lambda s: [
-                "dexkit", "bridge", "--from", "unitree_go", "--to", "unitree_hg",
+                "dexkit", "bridge", "--from", source.name, "--to", target.name,
                 "--side", "left", "--domain", s.domain, "--to-domain", str(s.batch.domain + 1),
             ],
-            lambda scene: _talk(scene, "unitree_go", states=False),
-            works=_topic_flows(
-                lambda: (dialect("unitree_hg").topics(SIDE)[0], dialect("unitree_hg").cmd_type), 1
-            ),
+            lambda scene: _talk(scene, states=False),
+            works=_topic_flows(lambda: (target.topics(SIDE)[0], target.cmd_type), 1),
         ),
         Spec(
             "record",
@@ -383,23 +375,21 @@ def specs() -> list[Spec]:
             "replay",
             lambda s: [
                 "dexkit", "replay", _sample(), "--loop", "--no-wait", "--domain", s.domain,
-                "--topic", "rt/dex1/left/cmd",
+                "--topic", source.topics(SIDE)[0],
             ],
             _nothing,
             ready="",
             codes=(0, 1, 130),
-            works=_topic_flows(
-                lambda: (dialect("unitree_go").topics(SIDE)[0], dialect("unitree_go").cmd_type)
-            ),
+            works=_topic_flows(lambda: (source.topics(SIDE)[0], source.cmd_type)),
         ),
         Spec("emulate-mx64", emulate("mx64", "--link", "SCRATCH/mx64", "--any-baudrate"),
-             _emulated("mx64"), works=_answers("mx64")),
+             _emulated(Mx64), works=_answers),
         Spec("emulate-dex1-motor", emulate("dex1-motor", "--link", "SCRATCH/m4010"),
-             _emulated("m4010"), works=_answers("m4010")),
+             _emulated(M4010), works=_answers),
         Spec(
             "emulate-dex3-usb",
             lambda s: ["dexkit", "emulate", "dex3-usb", "--port", str(4000 + s.batch.domain)],
-            _emulated("dex3"),
+            _emulated(Dex3),
             works=_usb_answers,
         ),
         Spec("emulate-h1", on_domain("emulate", "h1"), _nothing,
@@ -436,22 +426,10 @@ def specs() -> list[Spec]:
 def _usb_answers(scene: Scene, program: Program) -> None:
     from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
     from dexkit.drivers.dex3_usb.discovery import Server
-    from dexkit.hand import HandCommand
 
     server = Server("127.0.0.1", 4000 + scene.batch.domain)
-
-    def once() -> bool:
-        hand = Dex3Usb(SIDE, Dex3Settings(server=server, timeout=1.0))
-        try:
-            hand.open()
-            hand.exchange(HandCommand.brake(7))
-            return True
-        except DexkitError:
-            return False
-        finally:
-            hand.close()
-
-    until(once, f"{program!r} to answer a driver")
+    settings = Dex3Settings(server=server, timeout=1.0)
+    _wait_for_exchange(scene, program, lambda: Dex3Usb(SIDE, settings))
 
 
 class _Runs(Case):
@@ -684,12 +662,7 @@ def cases() -> list[Case]:
 
 def robots_and_hands() -> list[Spec]:
     """The programs that read from any peer on a domain."""
-    names: tuple[str, ...] = (
-        "serve-sim-dex1",
-        "serve-sim-dex3",
-        "serve-sim-dex5",
-        "bridge",
-        "record",
-    )
-    names += ("emulate-h1", "emulate-g1", "doctor-watch")
+    devices = {f"serve-{bench.backend}" for bench in DEVICES}
+    names = {f"serve-{backend}" for backend in _served()} - devices
+    names |= {f"emulate-{robot}" for robot in ROBOTS} | {"bridge", "record", "doctor-watch"}
     return [spec for spec in specs() if spec.name in names]

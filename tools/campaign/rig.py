@@ -72,7 +72,7 @@ class _Writer:
 
 
 class LocalNode:
-    """What a service needs of DDS, within one process.
+    """The part of DDS that a service needs, within one process.
 
     :ivar states: by topic how many were published, and the newest.
     """

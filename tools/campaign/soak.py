@@ -13,9 +13,11 @@ import os
 import signal
 import time
 from dataclasses import dataclass, field
+from functools import partial
 
+from dexkit.models import DEX1_1
 from tools.campaign.case import Batch, Case, Lane
-from tools.campaign.devices import bench_of
+from tools.campaign.devices import Bench, command
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.programs import Client
 from tools.campaign.rig import WaitTimeout
@@ -97,10 +99,11 @@ class SoakCase(Case):
     def run(self, batch: Batch) -> None:
         logging.disable()
         domain, beside = str(batch.domain), str(batch.domain + 1)
+        target, _, source = DEX1_1.dialects
         commands = {
             "serve": ["serve", "sim-dex1", "--side", "left", "--domain", domain],
             "record": ["record", str(batch.scratch / "soak.mcap"), "--domain", domain],
-            "bridge": ["bridge", "--from", "unitree_actuator", "--to", "unitree_go", "--side",
+            "bridge": ["bridge", "--from", source.name, "--to", target.name, "--side",
                        "left", "--domain", beside, "--to-domain", domain],
         }  # fmt: skip
         programs: dict[str, Program] = {}
@@ -109,9 +112,8 @@ class SoakCase(Case):
             for name, words in commands.items():
                 programs[name] = Program(batch, ["dexkit", *words])
                 programs[name].wait_for("ready:")
-            bench = bench_of("m4010")(batch.scratch)
-            client = Client(batch.domain + 1, "unitree_actuator", bench.message)
-            client.goal = bench.low
+            client = Client(batch.domain + 1, source, partial(command, source))
+            client.goal = Bench.low
             client.wait_states()
             watched = [WatchedProcess(name, p.process.pid) for name, p in programs.items()]
             began = looked = time.monotonic()
@@ -119,7 +121,7 @@ class SoakCase(Case):
                 time.sleep(0.5)
                 now = time.monotonic()
                 if int(now - began) % 4 == 0:
-                    client.goal = bench.low + bench.high - client.goal
+                    client.goal = Bench.low + Bench.high - client.goal
                 if now - looked >= (1.0 if batch.sample else _PERIOD):
                     looked = now
                     for one in watched:

@@ -294,6 +294,6 @@ BLOCKS: dict[str, Callable[[], str]] = {
 
 
 def files() -> dict[Path, str]:
-    """The page with every block made anew."""
+    """The page with every block generated."""
     text = PAGE.read_text(encoding="utf-8")
     return {PAGE: _BLOCK.sub(lambda m: f"{m[1]}\n{BLOCKS[m[2]]()}\n\n{m[3]}", text)}

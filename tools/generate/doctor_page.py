@@ -29,6 +29,6 @@ def _cell(text: str) -> str:
 
 
 def files() -> dict[Path, str]:
-    """The page with the table made anew."""
+    """The page with the table generated."""
     page = DOCS / "doctor.md"
     return {page: _TABLE.sub(lambda _: table(), page.read_text(encoding="utf-8"))}

@@ -130,7 +130,7 @@ def _judged_from(requirement: Requirement) -> str:
 
 
 def files() -> dict[Path, str]:
-    """The pages with their catalogues made anew."""
+    """The pages with their catalogues generated."""
     made = {}
     for layer, name in PAGES.items():
         text = (DOCS / name).read_text(encoding="utf-8")

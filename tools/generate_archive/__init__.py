@@ -19,17 +19,17 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from dexkit.conformance.requirements import catalogue
+from dexkit.hand import Side
 from dexkit.messages import message_type
+from dexkit.models import HandModel, model
+from dexkit.topics import roles
 from dexkit.traces import open_trace, sample_path
 
 __all__ = ["ANSWERS", "FAULTS", "Answer", "Fault", "Session", "generate"]
 
 ANSWERS = "answers.json"
-_SAMPLES = {
-    "dex1_pick_place": "DEX1",
-    "dex1_idle_then_startle": "DEX1",
-    "dex3_pinch": "DEX3",
-}
+_SAMPLES = ("dex1_pick_place", "dex1_idle_then_startle", "dex3_pinch")
 _FIRST = 1_790_000_000_000_000_000  # ns: September 2026
 _DAY_NS = 86_400 * 10**9
 _ROBOTS, _OPERATORS = 5, 4
@@ -70,18 +70,20 @@ def _member(message: Any, name: str) -> Any:
 
 @dataclass
 class Session:
-    """A session in memory.
+    """A session of one hand model in memory."""
 
-    :param prefix: how ids of its model's requirements begin.
-    """
-
-    prefix: str
+    model: HandModel
     topics: dict[str, Topic]
 
     @property
     def joints(self) -> int:
         """Joints of a hand."""
-        return 7 if self.prefix == "DEX3" else 1
+        return len(self.model.joints[Side.LEFT])
+
+    def ids(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Ids of requirements of its model, of their names without the prefix (``RATE-03``)."""
+        prefix = catalogue(self.model.name)[0].id.partition("-")[0]
+        return tuple(f"{prefix}-{name}" for name in names)
 
     def topic(self, side: str, what: str) -> Topic:
         """The states or commands of a side."""
@@ -123,12 +125,18 @@ def load(sample: str, seconds: float) -> Session:
         topics[name] = Topic(
             name, samples.type_name, log, publish, payloads.reshape(len(samples), -1).copy()
         )
-    session = Session(_SAMPLES[sample], topics)
+    session = Session(_model_of(topics), topics)
     missing = seconds * 1e9 - (trace.last_ns - trace.first_ns)
     if missing > 0.0:
         begin, end = _loop(session)
         _repeat(session, begin, end, round(missing / (end - begin)))
     return session
+
+
+def _model_of(topics: Mapping[str, Topic]) -> HandModel:
+    """The model whose topics these are."""
+    found = [r for name, t in topics.items() for r in roles(name, t.type_name)]
+    return model(found[0].dialect.model)
 
 
 def _loop(session: Session) -> tuple[int, int]:
@@ -169,7 +177,7 @@ Random = np.random.Generator
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault, and what an audit must say of a file that has it.
+    """A fault, and the expected result of an audit of a file that has it.
 
     :param apply: changes a session, on one side; for a fault of the file, its bytes.
     :param find: requirements of which at least one must fail or warn, without the prefix.
@@ -311,7 +319,7 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Answer:
-    """What is true of a generated file.
+    """The known facts of a generated file.
 
     :param find: ids of which one must fail or warn, on ``side``; ``also`` may fail, too.
     """
@@ -333,7 +341,7 @@ def generate(
     *,
     seconds: float = 60.0,
     seed: int = 1,
-    samples: Sequence[str] = tuple(_SAMPLES),
+    samples: Sequence[str] = _SAMPLES,
 ) -> list[Answer]:
     """Write the files and their answers; the same arguments write the same files.
 
@@ -382,7 +390,7 @@ def _varied(base: Session, begin: int, random: Random) -> Session:
         topics[name] = replace(
             topic, log=log, publish=topic.publish + begin, payloads=topic.payloads.copy(), cut={}
         )
-    return Session(base.prefix, topics)
+    return Session(base.model, topics)
 
 
 def _answer(answer: Answer, fault: Fault, session: Session, random: Random) -> Answer:
@@ -390,7 +398,5 @@ def _answer(answer: Answer, fault: Fault, session: Session, random: Random) -> A
     if fault.apply is None:
         return replace(answer, fault=fault.name, state=fault.state)
     fault.apply(session, side, random)
-    find, also = (
-        tuple(f"{session.prefix}-{n}" for n in names) for names in (fault.find, fault.also)
-    )
+    find, also = session.ids(fault.find), session.ids(fault.also)
     return replace(answer, fault=fault.name, side=side, find=find, also=also)

@@ -1,4 +1,4 @@
-"""Compare an audit with what is true of a generated archive."""
+"""Compare an audit with the known facts of a generated archive."""
 
 from __future__ import annotations
 

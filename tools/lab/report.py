@@ -28,7 +28,7 @@ forks of one process that has imported their modules before, so their start take
 
 @dataclass(frozen=True)
 class Case:
-    """One thing that was tried.
+    """One trial.
 
     :ivar group: what it is about: ``dex3``, ``ezgripper``, ``dex1``, ...
     :ivar status: ``passed``, ``failed``, or ``skipped``.

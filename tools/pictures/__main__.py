@@ -164,7 +164,7 @@ def animate(browser: Browser, go_to: Callable[[float], None], begin: float) -> N
 
 
 def report(path: Path) -> None:
-    """Say what was written."""
+    """Print the written files."""
     print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB")
 
 

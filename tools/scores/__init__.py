@@ -27,35 +27,36 @@ from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
-from dexkit.models import model
+from dexkit.models import BUILT_IN, model
 
-__all__ = ["HANDS", "SEED", "Counts", "Task", "as_text", "entries_of", "tasks"]
+__all__ = ["SEED", "Counts", "Task", "as_text", "counts_of", "entries_of", "scored_models", "tasks"]
 
 SEED = 1
 Counts = Mapping[tuple[RunKind, Setting], int]
 """How many hands are tried, by kind and setting of their runs."""
-HANDS: Mapping[str, Counts] = {
-    "dex1-1": {
-        (RunKind.QUICK, Setting.WHOLE): 40,
-        (RunKind.QUICK, Setting.EXTERNAL): 40,
-        (RunKind.DEFAULT, Setting.WHOLE): 40,
-        (RunKind.DEFAULT, Setting.EXTERNAL): 40,
-        (RunKind.THOROUGH, Setting.WHOLE): 20,
-    },
-    "dex3-1": {
-        (RunKind.QUICK, Setting.WHOLE): 40,
-        (RunKind.DEFAULT, Setting.WHOLE): 40,
-        (RunKind.THOROUGH, Setting.WHOLE): 10,
-    },
-    "dex5-1": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
-    "brainco-revo2": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
-    "inspire-dfx": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
-    "inspire-ftp": {(RunKind.QUICK, Setting.WHOLE): 20, (RunKind.DEFAULT, Setting.WHOLE): 20},
-}
-"""By model, so many hands are generated and tried. A run of a kind that is not there has no
-score. ``--hands`` tries fewer; the file says how many each entry has."""
 _NOT_OURS = frozenset({"shutdown", "service-restart"})
 """Phases that there are only where the kit has started the service."""
+
+
+def scored_models() -> tuple[str, ...]:
+    """Names of the models whose runs have scores: those of dexkit itself."""
+    return tuple(m.name for m in BUILT_IN)
+
+
+def counts_of(model_name: str) -> Counts:
+    """How many hands are generated and tried, as the model's profile says.
+
+    ``--hands`` tries fewer; the file says how many each entry has.
+    """
+    number = model(model_name).scored_hands
+    found = {
+        (RunKind.QUICK, Setting.WHOLE): number.quick,
+        (RunKind.QUICK, Setting.EXTERNAL): number.external,
+        (RunKind.DEFAULT, Setting.WHOLE): number.default,
+        (RunKind.DEFAULT, Setting.EXTERNAL): number.external,
+        (RunKind.THOROUGH, Setting.WHOLE): number.thorough,
+    }
+    return {key: n for key, n in found.items() if n}
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,12 @@ class Task:
 
 
 def tasks(model_name: str, hands: Counts | None = None, *, most: int | None = None) -> list[Task]:
-    """What is tried of a model.
+    """The trials of a model.
 
-    :param hands: how many; None for those of :data:`HANDS`.
+    :param hands: how many; None for those of :func:`counts_of`.
     :param most: not more hands than that in any kind of run.
     """
-    counts = HANDS[model_name] if hands is None else hands
+    counts = counts_of(model_name) if hands is None else hands
     return [
         Task(model_name, run, setting, n if most is None else min(n, most))
         for (run, setting), n in counts.items()

@@ -11,13 +11,14 @@ from pathlib import Path
 
 from dexkit.conformance.scores import FILE, catalogue_digest, entries
 from dexkit.documents import write_file
-from tools.scores import HANDS, as_text, entries_of
+from tools.scores import as_text, entries_of, scored_models
 
 
 def main() -> int:
     """Try hands, or compare; returns the exit code, 1 if ``--check`` found changed requirements."""
+    names = scored_models()
     parser = argparse.ArgumentParser(prog="python -m tools.scores", description=__doc__)
-    parser.add_argument("--model", action="append", choices=list(HANDS), help="only this model")
+    parser.add_argument("--model", action="append", choices=names, help="only this model")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument("--hands", type=int, help="not more hands than that in any kind of run")
     parser.add_argument(
@@ -33,12 +34,12 @@ def main() -> int:
         for name in sorted(old):
             print(f"the requirements of {name} have changed: run python -m tools.scores")
         return 1 if old else 0
-    for name in options.model or HANDS:
+    for name in options.model or names:
         found = entries_of(
             name, most=options.hands, keep=options.resume, jobs=options.jobs, report=print
         )
         kept = [e for e in kept if e.model != name] + found
-        kept.sort(key=lambda e: list(HANDS).index(e.model))
+        kept.sort(key=lambda e: names.index(e.model))
         write_file(FILE, as_text(kept))
         for entry in found:
             print(f"{entry.model} {entry.run} ({entry.setting}): {entry.score.sentence()}")

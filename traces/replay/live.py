@@ -70,7 +70,7 @@ class LiveReplay:
 
     @property
     def unsubscribed(self) -> list[str]:
-        """Command topics that nobody reads."""
+        """Command topics without a reader."""
         return [topic for topic, writer in self._writers.items() if not writer.matched]
 
     def advice(self) -> str:

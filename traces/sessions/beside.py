@@ -132,8 +132,8 @@ def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
     poor = correlation < LEAST_CORRELATION or apart > _APART
     if poor or found.confidence < LEAST_CONFIDENCE:
         raise SessionError(
-            f"the episode is not in the recording for certain: {found}; actions and commands are "
-            f"apart by {apart:.2f} of their motion"
+            f"the episode was not found in the recording with certainty: {found}; actions and "
+            f"commands differ by {apart:.2f} of their motion"
         )
     return found
 
@@ -276,7 +276,8 @@ def _ascending(anchors: Floats) -> NDArray[np.intp]:
 def write_beside(
     session: Session, trace: Trace, out: Path, *, embed: bool = False, overwrite: bool = False
 ) -> tuple[int, FrameTimes]:
-    """Write an episode with its recording: hands from the recording, the rest at its true time.
+    """Write an episode with its recording: hands from the recording, all other data at its true
+    time.
 
     :returns: the number of messages, and where the episode lies.
     :raises SessionError: as :func:`find_times`, or most of the episode is not in the recording.

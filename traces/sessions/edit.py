@@ -42,7 +42,7 @@ class Span:
 
     def __post_init__(self) -> None:
         if self.end_ns <= self.begin_ns:
-            raise UsageError("a span must end after its begin")
+            raise UsageError("the end must be later than the begin")
 
 
 @dataclass(frozen=True)

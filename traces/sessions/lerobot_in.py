@@ -224,7 +224,7 @@ class Dataset:
             ) from error
         found = safe_path(self.root, name)
         if found is None:
-            raise SessionError(f"{self.root}/meta/info.json leads out of the dataset: {name!r}")
+            raise SessionError(f"{self.root}/meta/info.json points outside the dataset: {name!r}")
         return found
 
     # -- columns -------------------------------------------------------------------------------

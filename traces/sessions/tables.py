@@ -274,7 +274,7 @@ def _import_topic(
 ) -> tuple[Definition, list[tuple[int, int, bytes]]]:
     name = str(entry.get("file", ""))
     if Path(name).name != name or not name:
-        raise SessionError(f"{source / _ABOUT} leads out of its folder: {name!r}")
+        raise SessionError(f"{source / _ABOUT} points outside its folder: {name!r}")
     path = source / name
     topic = str(entry.get("topic", ""))
     header, columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)

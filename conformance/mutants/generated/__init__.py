@@ -147,7 +147,7 @@ def parse(name: str) -> Generated:
     of = model(match[1])
     spoken = dialect(match[2])
     if spoken not in of.dialects:
-        raise UsageError(f"{of.name} does not speak {spoken.name}")
+        raise UsageError(f"{of.name} has no dialect {spoken.name}")
     return Generated(spoken, tuple(_fault(text, of) for text in match[3].split("+")))
 
 
@@ -176,7 +176,7 @@ def _fault(text: str, of: HandModel) -> Fault:
 def dialects(model_name: str | None = None, dialect_name: str | None = None) -> tuple[Dialect, ...]:
     """The dialects of a model, one of them, or those of all models.
 
-    :raises UsageError: there is none of that name, or the model does not speak it.
+    :raises UsageError: there is none of that name, or it is not one of the model.
     """
     of = [model(model_name)] if model_name else list(MODELS.values())
     found = tuple(
@@ -184,7 +184,7 @@ def dialects(model_name: str | None = None, dialect_name: str | None = None) -> 
     )
     if not found:
         raise UsageError(
-            f"{model_name or 'no model'} does not speak {dialect_name}",
+            f"{model_name or 'no model'} has no dialect {dialect_name}",
             hint=", ".join(d.name for m in of for d in m.dialects),
         )
     return found

@@ -236,7 +236,7 @@ class Campaign:
                 ) from error
             if seed != self.seed:
                 raise UsageError(
-                    f"{self.file} is of seed {seed}, not {self.seed}", hint="give its seed"
+                    f"{self.file} has the seed {seed}, not {self.seed}", hint="give its seed"
                 )
             if run != str(self.kind):
                 raise UsageError(

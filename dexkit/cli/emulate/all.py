@@ -17,8 +17,8 @@ import click
 from dexkit.child_processes import READY_TIMEOUT, Tool
 from dexkit.cli.emulate.lerobot import LOOPBACK, parse_ports, ports_option
 from dexkit.cli.options import (
-    DIALECT,
     dds_options,
+    dialect_option,
     duration_option,
     force_option,
     quiet_option,
@@ -27,7 +27,7 @@ from dexkit.cli.options import (
 )
 from dexkit.cli.status_line import STATUS_LINES, StatusLine
 from dexkit.errors import DexkitError, EmulatorError
-from dexkit.models import MODELS
+from dexkit.models import DEX1_1, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.view.process import viewer
@@ -37,7 +37,7 @@ __all__ = ["emulate_all"]
 _HANDS = {hand.short_name: hand for hand in MODELS.values() if hand.simulator}
 _POLL = 0.05  # seconds between looks whether all parts live
 _XR, _LEROBOT = "xr_teleoperate", "lerobot"
-_XR_HANDS, _LEROBOT_HANDS = "dex3", "dex1"  # each client's own default
+_XR_HANDS, _LEROBOT_HANDS = DEX3_1.short_name, DEX1_1.short_name  # each client's own default
 
 
 @click.command("all", context_settings={"show_default": True})
@@ -54,13 +54,9 @@ _XR_HANDS, _LEROBOT_HANDS = "dex3", "dex1"  # each client's own default
 @click.option(
     "--hands",
     type=click.Choice([*_HANDS, "none"]),
-    help="Which hands, both sides.  [default: dex3; dex1 for lerobot]",
+    help=f"Which hands, both sides.  [default: {_XR_HANDS}; {_LEROBOT_HANDS} for lerobot]",
 )
-@click.option(
-    "--dialect",
-    type=DIALECT,
-    help="Topics, types and units of the hands.  [default: the hand model's first]",
-)
+@dialect_option("Topics, types and units of the hands.  [default: the hand model's first]")
 @set_option(
     "Setting of the hands, e.g. object=40; right.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."
@@ -101,13 +97,15 @@ def emulate_all(
     hands = hands or (_LEROBOT_HANDS if for_lerobot else _XR_HANDS)
     domain = domain if domain is not None else 0 if for_lerobot else 1
     if for_lerobot and not ROBOTS[robot].lerobot_name:
-        raise click.UsageError(f"LeRobot does not know the {robot}")
+        raise click.UsageError(f"LeRobot does not support the {robot}")
     if for_lerobot and interface != "lo":
-        raise click.UsageError("--for lerobot is on loopback: --interface does not go with it")
+        raise click.UsageError(
+            "--for lerobot uses loopback only; it cannot be combined with --interface"
+        )
     if ports is not None and not for_lerobot:
-        raise click.UsageError("--ports is for --for lerobot")
+        raise click.UsageError("--ports needs --for lerobot")
     if hands == "none" and (dialect or settings):
-        raise click.UsageError("--dialect and --set are for hands, and there are none")
+        raise click.UsageError("--dialect and --set need hands")
     common = ["--domain", str(domain), "--interface", interface]
     common += ["--force"] * force + ["--quiet"] * quiet
     parts = {robot: ("emulate", robot, *common)}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
-from dexkit.cli.emulate.serving import line_options, serve
-from dexkit.cli.options import Number, object_option, side_option, start_option
+from dexkit.cli.emulate.serving import line_options, line_settings, serve
+from dexkit.cli.options import Number, object_option, side_option, start_option, wiring_option
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
@@ -35,12 +37,7 @@ __all__ = ["emulate_dex1_motor"]
     metavar="RAD",
     help="Report the position too large by this, until it is calibrated.",
 )
-@click.option(
-    "--wiring",
-    type=click.IntRange(0),
-    metavar="SEED",
-    help="Random ids, directions, offsets and gear ratios, to test a bring-up.",
-)
+@wiring_option("Random ids, directions, offsets and gear ratios, to test a bring-up.")
 @line_options(
     "motor",
     baudrate=m4010.BAUD_RATE,
@@ -54,14 +51,8 @@ def emulate_dex1_motor(
     start: float,
     zero_error: float,
     wiring: int | None,
-    baudrate: int,
-    line_time: bool,
-    answer_time: float,
-    latency_timer: float,
-    faults: tuple[str, ...],
     faults_from_stdin: bool,
-    seed: int,
-    any_baudrate: bool,
+    **line: Any,
 ) -> None:
     """Emulate the motor of a Dex1-1 (Unitree M4010) with the gripper on its shaft.
 
@@ -70,6 +61,8 @@ def emulate_dex1_motor(
     """
     from dexkit.emulators.m4010 import Dex1Motors, Firmware, Wiring
 
+    on_line = line_settings(line)
+    firmware = Firmware(baudrate=on_line.pop("baudrate"), answer_time=on_line.pop("answer_time"))
     with (
         stop_on_signals() as request,
         Dex1Motors(
@@ -79,12 +72,8 @@ def emulate_dex1_motor(
             start_pct=start,
             zero_error=zero_error,
             wiring=None if wiring is None else Wiring.random(wiring),
-            firmware=Firmware(baudrate=baudrate, answer_time=answer_time * 1e-3),
-            line_time=line_time,
-            latency_timer=latency_timer * 1e-3,
-            faults=faults,
-            seed=seed,
-            check_baudrate=not any_baudrate,
+            firmware=firmware,
+            **on_line,
         ) as motors,
     ):
         serve(motors, request, faults_from_stdin=faults_from_stdin)
@@ -98,7 +87,8 @@ def _places(links: tuple[str, ...], sides: tuple[Side, ...]) -> dict[Side, str]:
         name, _, path = text.partition("=")
         if name not in [str(side) for side in sides] or Side(name) in places or not path:
             raise UsageError(
-                f"--link {text}: which line is it?", hint="--link left=PATH --link right=PATH"
+                f"--link {text} is not left=PATH or right=PATH of a hand that is emulated",
+                hint="--link left=PATH --link right=PATH",
             )
         places[Side(name)] = path
     if set(places) != set(sides):

@@ -18,6 +18,7 @@ from dexkit.cli.options import (
     seed_option,
     side_option,
     start_option,
+    wiring_option,
 )
 from dexkit.errors import EmulatorError
 from dexkit.escaping import one_line
@@ -65,12 +66,9 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
 @click.option(
     "--in-endpoint", callback=_endpoint, default="0x81", metavar="EP", help="Bulk IN endpoint."
 )
-@click.option(
-    "--wiring",
-    type=click.IntRange(0, 2**32 - 1),
-    metavar="SEED",
-    help="Random bus addresses of motors and sensors, and random directions, offsets and gear "
-    "ratios.  [default: as dexkit assumes]",
+@wiring_option(
+    "Random bus addresses of motors and sensors, and random directions, offsets and gear "
+    "ratios.  [default: as dexkit assumes]"
 )
 @click.option(
     "--polled-sensors",

@@ -88,7 +88,7 @@ def emulate_lerobot_g1(
             status.show(f"{text}; {served.counters.forwarded} commands forwarded", text)
         status.clear()
         if served.failure is not None:
-            raise EmulatorError(f"LeRobot's ports died: {served.failure}") from served.failure
+            raise EmulatorError(f"LeRobot's ports failed: {served.failure}") from served.failure
     counted = dataclasses.asdict(served.counters)
     click.echo(f"stopped: {', '.join(f'{number} {what}' for what, number in counted.items())}")
 

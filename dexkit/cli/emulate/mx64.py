@@ -20,6 +20,7 @@ from dexkit.cli.options import (
     object_option,
     seed_option,
     start_option,
+    wiring_option,
 )
 from dexkit.clock import RealClock
 from dexkit.errors import EmulatorError, UsageError
@@ -64,12 +65,9 @@ __all__ = ["emulate_mx64"]
     metavar="TICK",
     help="Encoder tick at which the fingers are closed.",
 )
-@click.option(
-    "--wiring",
-    type=click.IntRange(0),
-    metavar="SEED",
-    help="One or two grippers, dual or quad, with random ids, directions, closed positions and "
-    "strokes, to test a bring-up; replaces --id and the options of a gripper.",
+@wiring_option(
+    "One or two grippers, dual or quad, with random ids, directions, closed positions and "
+    "strokes, to test a bring-up; replaces --id and the options of a gripper."
 )
 @line_time_option()
 @latency_timer_option(1.0)
@@ -134,7 +132,7 @@ def emulate_mx64(
     grippers = [(number, mechanics) for number in ids]
     if wiring is not None:
         _refuse_gripper_options(
-            "--wiring says it", "bare", "ids", "object_pct", "start", "closed_at"
+            "--wiring sets it", "bare", "ids", "object_pct", "start", "closed_at"
         )
         sides = Wiring.random(wiring).servos.values()
         grippers = [pair for servos_of in sides for pair in servos_of.items()]
@@ -200,7 +198,7 @@ def _refuse_gripper_options(why: str, *names: str) -> None:
     for name in names:
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
             option = next(p.opts[0] for p in context.command.params if p.name == name)
-            raise click.UsageError(f"{option} is of a gripper, and {why}")
+            raise click.UsageError(f"{option} describes a gripper, and {why}")
 
 
 class _EepromFile:

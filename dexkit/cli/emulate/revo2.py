@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
-from dexkit.cli.emulate.serving import line_options, serve
+from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
 from dexkit.cli.options import object_option, side_option, start_option
-from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import revo2
@@ -35,14 +36,8 @@ def emulate_revo2(
     object_pct: float | None,
     start: float | None,
     number: int | None,
-    baudrate: int,
-    line_time: bool,
-    answer_time: float,
-    latency_timer: float,
-    faults: tuple[str, ...],
     faults_from_stdin: bool,
-    seed: int,
-    any_baudrate: bool,
+    **line: Any,
 ) -> None:
     """Emulate a BrainCo Revo2 hand on its serial line (Modbus RTU).
 
@@ -51,23 +46,15 @@ def emulate_revo2(
     """
     from dexkit.emulators.revo2 import Revo2Hand
 
-    if len(sides) != 1:
-        raise UsageError("a line has one hand", hint="run one emulator for each side")
     with (
         stop_on_signals() as request,
         Revo2Hand(
-            sides[0],
+            one_side(sides),
             link=link,
             number=number,
             object_pct=object_pct,
             start_pct=start,
-            baudrate=baudrate,
-            answer_time=answer_time * 1e-3,
-            line_time=line_time,
-            latency_timer=latency_timer * 1e-3,
-            faults=faults,
-            seed=seed,
-            check_baudrate=not any_baudrate,
+            **line_settings(line),
         ) as hand,
     ):
         serve(hand, request, faults_from_stdin=faults_from_stdin)

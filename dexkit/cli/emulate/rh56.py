@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
-from dexkit.cli.emulate.serving import line_options, serve
+from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
 from dexkit.cli.options import object_option, side_option, start_option
 from dexkit.errors import UsageError
 from dexkit.hand import Side
@@ -51,14 +53,8 @@ def emulate_rh56(
     object_pct: float | None,
     start: float | None,
     number: int,
-    baudrate: int,
-    line_time: bool,
-    answer_time: float,
-    latency_timer: float,
-    faults: tuple[str, ...],
     faults_from_stdin: bool,
-    seed: int,
-    any_baudrate: bool,
+    **line: Any,
 ) -> None:
     """Emulate an Inspire RH56 hand on its serial line, or with --modbus-tcp on the network.
 
@@ -67,42 +63,34 @@ def emulate_rh56(
     """
     from dexkit.emulators.rh56 import Rh56Hand, Rh56TcpHand
 
-    if len(sides) != 1:
-        raise UsageError("a line has one hand", hint="run one emulator for each side")
+    side, on_line = one_side(sides), line_settings(line)
     if (link is None) == (tcp is None):
         raise UsageError(
-            "where is the hand to be?", hint="--link PATH for a serial line, or --modbus-tcp PORT"
+            "no place for the hand is given",
+            hint="--link PATH for a serial line, or --modbus-tcp PORT",
         )
     with stop_on_signals() as request:
         hand: Rh56Hand | Rh56TcpHand
         if tcp is not None:
             _refuse_serial_options()
             hand = Rh56TcpHand(
-                sides[0],
+                side,
                 port=tcp,
                 object_pct=object_pct,
                 start_pct=start,
                 tactile=tactile,
-                answer_time=answer_time * 1e-3,
-                faults=faults,
-                seed=seed,
+                **{name: on_line[name] for name in ("answer_time", "faults", "seed")},
             )
         else:
             if tactile:
-                raise UsageError("--tactile is of a hand on the network", hint="--modbus-tcp PORT")
+                raise UsageError("--tactile needs --modbus-tcp", hint="--modbus-tcp PORT")
             hand = Rh56Hand(
-                sides[0],
+                side,
                 link=link,
                 number=number,
                 object_pct=object_pct,
                 start_pct=start,
-                baudrate=baudrate,
-                answer_time=answer_time * 1e-3,
-                line_time=line_time,
-                latency_timer=latency_timer * 1e-3,
-                faults=faults,
-                seed=seed,
-                check_baudrate=not any_baudrate,
+                **on_line,
             )
         with hand:
             serve(hand, request, faults_from_stdin=faults_from_stdin)
@@ -118,5 +106,5 @@ def _refuse_serial_options() -> None:
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
             option = next(p.opts[0] for p in context.command.params if p.name == name)
             raise UsageError(
-                f"{option} is of a serial line, and --modbus-tcp has none", hint="leave it out"
+                f"{option} applies to a serial line, not to --modbus-tcp", hint="leave it out"
             )

@@ -93,7 +93,7 @@ def _command(model: RobotModel) -> click.Command:
         if isinstance(robot.failure, TopicConflict):
             raise robot.failure
         if robot.failure is not None:
-            raise DdsError(f"the {chosen.name} died: {robot.failure}") from robot.failure
+            raise DdsError(f"the {chosen.name} failed: {robot.failure}") from robot.failure
         if not as_json:
             click.echo(f"stopped: {robot.robot.counters.summary() or 'no state was published'}")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 import click
@@ -17,10 +17,11 @@ from dexkit.cli.options import (
     line_time_option,
     seed_option,
 )
-from dexkit.errors import EmulatorError
+from dexkit.errors import EmulatorError, UsageError
+from dexkit.hand import Side
 from dexkit.stop_signals import StopRequest
 
-__all__ = ["Served", "line_options", "serve"]
+__all__ = ["Served", "line_options", "line_settings", "one_side", "serve"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -54,6 +55,7 @@ def line_options(
     device: str, *, baudrate: int, most: int, faults: str, latency_timer: float = 0.0
 ) -> Callable[[F], F]:
     """The options of a device on a serial line, from ``--baudrate`` to ``--any-baudrate``.
+    :func:`line_settings` makes the device's arguments of them.
 
     :param device: what the help calls it.
     :param baudrate: its own; ``most`` that can be given.
@@ -89,8 +91,33 @@ def line_options(
     return add
 
 
+def line_settings(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of :func:`line_options` as arguments of an emulated device: milliseconds become
+    seconds; without those that :func:`serve` uses.
+    """
+    return {
+        "baudrate": given["baudrate"],
+        "answer_time": given["answer_time"] * 1e-3,
+        "line_time": given["line_time"],
+        "latency_timer": given["latency_timer"] * 1e-3,
+        "faults": given["faults"],
+        "seed": given["seed"],
+        "check_baudrate": not given["any_baudrate"],
+    }
+
+
+def one_side(sides: Sequence[Side]) -> Side:
+    """The side of a device that is alone on its line.
+
+    :raises UsageError: both sides are given.
+    """
+    if len(sides) != 1:
+        raise UsageError("a line has one hand", hint="run one emulator for each side")
+    return sides[0]
+
+
 def serve(device: Served, request: StopRequest, *, faults_from_stdin: bool) -> None:
-    """Serve until a stop is requested; then close the device and say what was seen.
+    """Serve until a stop is requested; then close the device and print its counters.
 
     :raises EmulatorError: its service ended, or it failed inside.
     """

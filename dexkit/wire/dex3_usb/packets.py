@@ -331,7 +331,7 @@ def scan_bus(
 def parse_bus(
     data: Bytes, kinds: Sequence[Structure] = FROM_HAND, bus: int = 0
 ) -> tuple[list[Packet], list[Problem]]:
-    """The packets of a bus buffer, and what was lost. See :func:`scan_bus`."""
+    """The packets of a bus buffer, and the losses. See :func:`scan_bus`."""
     data = bytes(data)
     found, problems = scan_bus(data, kinds, bus)
     return [_packet(kind, data, offset) for offset, kind in found], problems

@@ -32,7 +32,9 @@ class Difference(Exception):
 
 
 class Hang(BaseException):
-    """An input takes too long; not an Exception, so that nothing takes it for one of its own."""
+    """An input takes too long; not an Exception, so that no handler of the code under test catches
+    it.
+    """
 
 
 @dataclass

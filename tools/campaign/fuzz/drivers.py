@@ -45,7 +45,9 @@ _BLOCK = 100
 
 
 def _spoilt(rnd: random.Random, data: bytes, seal: Callable[[bytes], bytes]) -> bytes:
-    """An honest reply; often of other content but whole, sometimes damaged, cut or in company."""
+    """A valid reply; often with other content, sometimes damaged, cut or with other bytes around
+    it.
+    """
     chance = rnd.random()
     if chance < 0.3 or len(data) < 12:
         return data

@@ -158,7 +158,7 @@ def _bridge(rng: random.Random, scratch: Path) -> Target:
         (a, b)
         for a in DIALECTS.values()
         for b in DIALECTS.values()
-        if a.model == b.model == "dex1-1" and a is not b
+        if a.model == b.model and a is not b
     ]
     source, target = rng.choice(pairs)
     states = States(target, source, list(Side))

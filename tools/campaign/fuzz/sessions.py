@@ -56,7 +56,7 @@ def _spoiled(rng: random.Random, base: Generated, seconds: float) -> bytes:
     if rng.random() < 0.1:
         del topics[rng.choice(list(topics))]
     kinds = (CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD)
-    return Generated(base.prefix, topics).write(rng.choice(kinds), {"robot": "r"})
+    return Generated(base.model, topics).write(rng.choice(kinds), {"robot": "r"})
 
 
 def _spoil(rng: random.Random, topic: Topic) -> None:
