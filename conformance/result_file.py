@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable
 from functools import cache
@@ -90,18 +91,28 @@ def _validator(schema: str) -> Any:
     return jsonschema.Draft202012Validator(json.loads(text))
 
 
+_VALID: set[tuple[str, bytes]] = set()
+"""Schema and digest of each document that was found valid: some commands read one twice."""
+
+
 def validate(data: Any, path: object, schema: str = SCHEMA, page: str = "docs/reports.md") -> None:
     """Validate a document against a schema that is published with dexkit.
+
+    A document that was found valid before is not validated again.
 
     :param path: what to call the document.
     :param schema: file beside the reports.
     :param page: where the document is described.
     :raises UsageError: naming the first place that does not match.
     """
+    about = schema, hashlib.sha256(json.dumps(data).encode()).digest()
+    if about in _VALID:
+        return
     from jsonschema.exceptions import relevance
 
     error = min(_validator(schema).iter_errors(data), key=relevance, default=None)
     if error is None:
+        _VALID.add(about)
         return
     while error.context:  # of several alternatives: the error of the nearest
         error = min(error.context, key=relevance)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import Enum
 from functools import cache
@@ -40,13 +41,16 @@ class RunKind(str, Enum):
 
 
 @cache
-def length(model_name: str, phases: frozenset[str]) -> float:
-    """Duration of these phases, s, with hands or a robot that reach every goal at once."""
+def length(model_name: str, phases: frozenset[str], at_most: float = math.inf) -> float:
+    """Duration of these phases, s, with hands or a robot that reach every goal at once.
+
+    :param at_most: s; of phases that are longer it is only some number above this.
+    """
     if model_name in ROBOTS:
         plan = Plan(robot_dialect(model_name), (ROBOT,), phases=phases)
-        return script_class(model_name)(plan).length()
+        return script_class(model_name)(plan).length(at_most)
     dialect = model(model_name).dialects[0]
-    return script_class(model_name)(Plan(dialect, tuple(Side), phases=phases)).length()
+    return script_class(model_name)(Plan(dialect, tuple(Side), phases=phases)).length(at_most)
 
 
 def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
@@ -65,9 +69,12 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
                     needs.setdefault(own, []).append(r.id)
         budget = (ROBOTS.get(name) or model(name)).quick_seconds
         least = length(name, frozenset()) - 0.1  # s; requirements that need no stimulus come first
+        lengths = {own: length(name, own, budget) for own in needs}
+        # what is too long alone fits in with nothing
+        short = [own for own in needs if lengths[own] <= budget]
         phases: frozenset[str] = frozenset()
-        for own in sorted(needs, key=lambda o: (length(name, o) - least) / len(needs[o])):
-            if length(name, phases | own) <= budget:
+        for own in sorted(short, key=lambda o: (lengths[o] - least) / len(needs[o])):
+            if length(name, phases | own, budget) <= budget:
                 phases |= own
         chosen |= {id_ for own, ids in needs.items() if own <= phases for id_ in ids}
     return tuple(r for r in requirements if r.id in chosen)

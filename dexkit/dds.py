@@ -51,10 +51,10 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from html import escape
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape, quoteattr
 
 from dexkit import interface_filter
 from dexkit.child_processes import process_id
@@ -502,7 +502,7 @@ def _config(interface: str, more: str = "", peers: Sequence[str] = ()) -> str:
     return (
         "<CycloneDDS><Domain>"
         "<General><Interfaces>"
-        f'<NetworkInterface name={quoteattr(interface)} priority="default" multicast="default"/>'
+        f'<NetworkInterface name="{escape(interface)}" priority="default" multicast="default"/>'
         f"</Interfaces>{unicast}</General>"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANT_INDEX}</MaxAutoParticipantIndex>"

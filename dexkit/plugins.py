@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 import traceback
+from functools import lru_cache
 from importlib.machinery import PathFinder
 from typing import TYPE_CHECKING
 
@@ -58,14 +59,21 @@ def _may_register(group: str) -> bool:
     return False
 
 
+@lru_cache(maxsize=64)
+def _registrant(dist: metadata.Distribution) -> tuple[str, str]:
+    """Name and version of a distribution, whose metadata is parsed once."""
+    about = dist.metadata
+    return str(about["Name"]), str(about["Version"])
+
+
 def origin(entry: metadata.EntryPoint) -> str:
     """Name and version of the distribution that registered it."""
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "unknown"
+    return " ".join(_registrant(entry.dist)) if entry.dist else "unknown"
 
 
 def is_own(entry: metadata.EntryPoint) -> bool:
     """Whether dexkit itself registered it."""
-    return entry.dist is not None and entry.dist.name.lower() == _OWN_DISTRIBUTION
+    return entry.dist is not None and _registrant(entry.dist)[0].lower() == _OWN_DISTRIBUTION
 
 
 def where(error: BaseException) -> str:

@@ -20,7 +20,7 @@ settings.load_profile("dexkit")
 
 
 # What is made while modules are imported and tests collected stays: to look through it again and
-# again would take each worker seconds.
+# again would take 1.5 of 5.2 s of processor time, in each worker.
 gc.disable()
 
 

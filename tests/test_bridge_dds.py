@@ -22,6 +22,7 @@ from dexkit.messages import unitree_go
 from dexkit.models import DEX1_1, Dialect, dialect
 from tests.cli_helpers import Process, running
 from tests.dds_helpers import dds_domain, dds_node, free_domain, wait_until
+from tests.slow_hand import SLOW
 
 __all__ = ["dds_domain", "dds_node"]
 
@@ -106,7 +107,7 @@ def test_a_client_drives_grippers_of_another_dialect(
     spoken: Dialect, served: Dialect, domains: tuple[int, int]
 ) -> None:
     near, far = domains
-    serve = ("serve", "sim-dex1", "--side", "both", "--dialect", served.name, "--domain", far)
+    serve = ("serve", *SLOW, "--side", "both", "--dialect", served.name, "--domain", far)
     with (
         running(*serve, "--quiet") as grippers,
         bridging(spoken, served, "--domain", near, "--to-domain", far) as bridge,

@@ -23,6 +23,8 @@ INTERNAL = re.compile(
     r"|\bF [A-G]\b(?! [A-G0-9]{1,2}\b)|\bD \d{1,2}\b|\((?:D10 \d+|[A-F]\d{1,2})[):;,]"
 )
 """Fact sheets, numbered documents and bare section codes: of no use to anyone outside."""
+LIKELY = re.compile(r"[fsSA-G(](?:acts?[ /]|act sheet|eed \d|00\d|\.\d| [A-G\d]|D10 \d|[A-F]\d)")
+"""What any of these has, without looking behind: found in a twentieth of the time."""
 
 PROSE = (".py", ".toml", ".md", ".idl", ".c", ".h", ".sh", ".yml", ".yaml", ".html", "Makefile")
 MESSAGES = re.compile(r"@final struct \w+ \{.*")  # IDL in tests, whose struct is called F
@@ -87,9 +89,9 @@ def test_no_citation_names_an_internal_document() -> None:
     for name, text in texts().items():
         if name.startswith("docs/sources/") or not name.endswith(PROSE):
             continue
-        plain = MESSAGES.sub("", text)
-        for line, match in places(INTERNAL, plain):
-            found.append(f"{name}:{line}: {match.group()}")
+        for number, line in enumerate(text.split("\n"), 1):
+            if LIKELY.search(line) and (match := INTERNAL.search(MESSAGES.sub("", line))):
+                found.append(f"{name}:{number}: {match.group()}")
     assert not found, "\n".join(found)
 
 

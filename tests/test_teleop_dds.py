@@ -27,16 +27,17 @@ from dexkit.models import DIALECTS
 from dexkit.teleop import profile
 from dexkit.traces import open_trace
 from tests.dds_helpers import free_domain, take_until
+from tests.slow_hand import SLOW, SLOW_DEX3
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 TELEOP = command_line("teleop")
 
 
 @contextmanager
-def served(backend: str, side: str) -> Iterator[int]:
+def served(backend: tuple[str, ...], side: str) -> Iterator[int]:
     """A domain on which ``dexkit serve`` serves a simulated hand."""
     domain = free_domain()
-    arguments = command_line("serve", backend, "--side", side, "--state-rate", "100", "--quiet")
+    arguments = command_line("serve", *backend, "--side", side, "--quiet")
     with subprocess.Popen(
         [*arguments, "--domain", str(domain)],
         stdout=subprocess.PIPE,
@@ -52,16 +53,16 @@ def served(backend: str, side: str) -> Iterator[int]:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Callable[[str], int]]:
+def server() -> Iterator[Callable[[tuple[str, ...]], int]]:
     """Serves a Dex1-1 pair or a left Dex3-1, one at a time; returns its domain."""
-    running: dict[str, int] = {}
+    running: dict[tuple[str, ...], int] = {}
     with ExitStack() as stack:
 
-        def serve(backend: str) -> int:
+        def serve(backend: tuple[str, ...]) -> int:
             if backend not in running:
                 stack.close()
                 running.clear()
-                side = "both" if backend == "sim-dex1" else "left"
+                side = "both" if backend is SLOW else "left"
                 running[backend] = stack.enter_context(served(backend, side))
             return running[backend]
 
@@ -69,13 +70,13 @@ def server() -> Iterator[Callable[[str], int]]:
 
 
 @pytest.fixture
-def dex1(server: Callable[[str], int]) -> int:
-    return server("sim-dex1")
+def dex1(server: Callable[[tuple[str, ...]], int]) -> int:
+    return server(SLOW)
 
 
 @pytest.fixture
-def dex3(server: Callable[[str], int]) -> int:
-    return server("sim-dex3")
+def dex3(server: Callable[[tuple[str, ...]], int]) -> int:
+    return server(SLOW_DEX3)
 
 
 def teleop(*arguments: object) -> Result:
@@ -83,7 +84,7 @@ def teleop(*arguments: object) -> Result:
 
 
 def test_missing_side_is_named_with_a_hint() -> None:
-    with served("sim-dex1", "left") as domain:
+    with served(SLOW, "left") as domain:
         result = teleop("steps", "--domain", domain, "--wait", 1.5)
         assert "waiting for state of right ..." in result.stderr
         assert isinstance(result.exception, DexkitError)

@@ -531,24 +531,26 @@ def _document(name: str) -> Mapping[str, Any]:
 
 
 @cache
-def _homes() -> Mapping[str, tuple[str, Mapping[str, Any]]]:
-    """File and entry, as it is written, of each requirement of dexkit's own, by id."""
+def _written(file: str) -> Mapping[str, Mapping[str, Any]]:
+    """The entries of a file of dexkit's own, as they are written, by id."""
+    prefix = str(_document(file).get("prefix", ""))
     found = {}
-    for file in _own_files():
-        prefix = str(_document(file).get("prefix", ""))
-        for entry in _document(file)["requirement"]:
-            like = entry.get("like", "")
-            inferred = renamed(like, like.partition("-")[0], prefix)
-            found[str(entry.get("id", inferred))] = file, entry
+    for entry in _document(file)["requirement"]:
+        like = entry.get("like", "")
+        inferred = renamed(like, like.partition("-")[0], prefix)
+        found[str(entry.get("id", inferred))] = entry
     return found
 
 
 def _ancestors(entry: Mapping[str, Any]) -> dict[str, Any]:
     """The entries that this one is like, the nearest last, each with all that it takes."""
     name = str(entry.get("like", ""))
-    if name not in _homes():
+    if not name:
         return {}
-    file, theirs = _homes()[name]
+    file = next((file for file in _own_files() if name in _written(file)), None)
+    if file is None:
+        return {}
+    theirs = _written(file)[name]
     found = _ancestors(theirs)
     document = {**_document(file), "requirement": [theirs]}
     return {**found, name: _entries(document, found, file)[0]}

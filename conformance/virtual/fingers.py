@@ -174,16 +174,14 @@ class FingerHand:
         """
         part = dt / self.inertia
         slip = part * self.coulomb
-        q_, dq_, tau_, contact_ = [], [], [], []
-        for q, dq, tau, kp, kd, low, high, most in zip(
-            self.q, self.dq, pull, self.law_kp, self.law_kd, *self.stops, strict=True
+        # of a joint that stays at rest, only the contact is new
+        q_, dq_, tau_, contact_ = self.q.copy(), [0.0] * len(pull), pull.copy(), pull.copy()
+        for i, (q, dq, tau, kp, kd, low, high, most) in enumerate(
+            zip(self.q, self.dq, pull, self.law_kp, self.law_kd, *self.stops, strict=True)
         ):
             contact = self.stiffness * ((low if q < low else high if q > high else q) - q)
+            contact_[i] = contact
             if dq == 0.0 and -self.coulomb < tau + contact < self.coulomb:
-                q_.append(q)
-                dq_.append(0.0)
-                tau_.append(tau)
-                contact_.append(contact)
                 continue
             damping = kd + dt * kp
             new = (dq + part * (tau + contact)) / (1.0 + part * (damping + self.viscous))
@@ -192,10 +190,9 @@ class FingerHand:
                 tau = most if tau > most else -most
                 new = (dq + part * (tau + contact)) / (1.0 + part * self.viscous)
             new = new - slip if new > slip else new + slip if new < -slip else 0.0
-            q_.append(q + dt * new)
-            dq_.append(new)
-            tau_.append(tau)
-            contact_.append(contact)
+            q_[i] = q + dt * new
+            dq_[i] = new
+            tau_[i] = tau
         self.q, self.dq, self.contact = q_, dq_, contact_
         self.tau = [t if on else 0.0 for t, on in zip(tau_, self.law_on, strict=True)]
 
@@ -232,12 +229,7 @@ class Dex3Hand(FingerHand):
         if not self.touches:
             return _UNTOUCHED
         felt = np.array(_UNTOUCHED)
-        pressed = [1e4 * abs(c) for c in self.contact]
-        for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
-            finger, _, part = sensor.place.partition(" ")
-            joints = _PRESSED_BY.get(finger)
-            value = 0.0 if joints is None else pressed[joints[part == "pad"]]
-            row[list(sensor.slots)] = value
+        felt[_PRESSED] = 1e4 * np.abs(self.contact)[_PRESSING]
         return felt
 
 
@@ -248,7 +240,22 @@ def _untouched() -> Floats:
     return felt
 
 
+def _pressed() -> tuple[tuple[Ints, Ints], Ints]:
+    """Rows and columns of the values that a joint presses, in :data:`_UNTOUCHED`, and the joint of
+    each.
+    """
+    found = []
+    for row, sensor in enumerate(DEX3_1.sensors):
+        finger, _, part = sensor.place.partition(" ")
+        if finger in _PRESSED_BY:
+            joint = _PRESSED_BY[finger][part == "pad"]
+            found += [(row, column, joint) for column in sensor.slots]
+    rows, columns, joints = np.array(found).T
+    return (rows, columns), joints
+
+
 _UNTOUCHED = _untouched()
+_PRESSED, _PRESSING = _pressed()
 
 
 class FingerService(Service):
@@ -281,6 +288,7 @@ class FingerService(Service):
         self._sent: dict[tuple[Side, ...], tuple[object, bytes]] = {}
         units = dialect.torque_units or (1.0,) * self.codec.joints
         self.torque_units: Floats = np.array(units)
+        self.scaled = any(unit != 1.0 for unit in units)
 
     def take_over(self, before: TopicDevice) -> None:
         """Find the hands where the service before it has left them."""
@@ -330,7 +338,7 @@ class FingerService(Service):
         motors["mode"] = hand.mode[:n]
         before, dt = hand.gained
         ddq = [(a - b) / dt for a, b in zip(hand.dq, before, strict=True)]
-        tau = np.array(hand.tau) / self.torque_units
+        tau = np.array(hand.tau) / self.torque_units if self.scaled else hand.tau
         motors["values"] = np.array((hand.q, hand.dq, ddq, tau)).T[:n]
 
     def pressures(self, hand: FingerHand) -> Floats:

@@ -129,8 +129,8 @@ class _Player:
 
     def _take(self, samples: Iterable[Sample]) -> None:
         """Record published states, and note the first one for a late reader."""
+        log_ns = log_time_ns(self.now) + 100_000
         for sample in samples:
-            log_ns = log_time_ns(self.now) + 100_000
             sent_ns = log_time_ns(sample.sent)
             self.trace.put(sample.topic, sample.type_name, log_ns, sent_ns, sample.payload)
             sides = self._sides.get(sample.topic)

@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from pathlib import Path
 
 from dexkit.errors import UsageError
 
@@ -400,10 +400,8 @@ def parse(text: str) -> dict[str, Struct]:
 def load() -> dict[str, Struct]:
     """All structs of the package's ``.idl`` files by DDS name."""
     structs: dict[str, Struct] = {}
-    folder = resources.files("dexkit.messages") / "idl"
-    for file in sorted(folder.iterdir(), key=lambda f: f.name):
-        if file.name.endswith(".idl"):
-            structs.update(parse(file.read_text(encoding="ascii")))
+    for file in sorted((Path(__file__).parent / "idl").glob("*.idl")):
+        structs.update(parse(file.read_text(encoding="ascii")))
     return structs
 
 
