@@ -48,7 +48,7 @@ def _backend(base: Any, wrong: Callable[[Any], Any]) -> Backend:
         made: Hand = hand(options.side)
         return made
 
-    return Backend(summary=wrong.__name__, model=base.model.name, make=make)
+    return Backend(summary=f"wrong {base.model.title}", model=base.model.name, make=make)
 
 
 brainco_reversed = _backend(SimBrainCo, reversed_scale)

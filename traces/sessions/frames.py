@@ -81,7 +81,8 @@ class Source:
     @property
     def measured(self) -> dict[str, float]:
         """Hz of each topic, from its usual period."""
-        found = {s.topic: _rate(s.times_ns) for s in (*self.streams, *self.pressures)}
+        found = {s.topic: _rate(s.times_ns) for s in self.streams}
+        found |= {felt.topic: _rate(felt.times_ns) for felt in self.pressures}
         found |= {p.camera: _rate(p.times_ns) for p in self.pictures}
         return {name: rate for name, rate in found.items() if rate}
 
@@ -142,7 +143,8 @@ def open_source(trace: Trace) -> Source:
             lost.append(f"{stream.topic}: a single sample")
     if not streams:
         raise SessionError(f"{trace.path} has no joints of a known hand, robot or session")
-    pressures, problems = [], []
+    pressures: list[Pressure] = []
+    problems = []
     for felt in pressures_of(trace, streams):
         if felt.unusable:
             text = (
@@ -153,7 +155,7 @@ def open_source(trace: Trace) -> Source:
             pressures.append(felt)
         else:
             lost.append(f"{felt.topic}: {'a single' if len(felt) else 'no usable'} sample")
-    known = {s.topic for s in (*streams, *pressures)}
+    known = {s.topic for s in streams} | {felt.topic for felt in pressures}
     for channel in trace.channels:
         if channel.message_count and channel.topic not in known | _session_topics(trace):
             lost.append(f"{channel.topic}: no joints in it")
@@ -218,8 +220,8 @@ def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
 
     :raises SessionError: there is no time at which all streams have values.
     """
-    parts = (*source.streams, *source.pressures, *source.pictures)
-    every = [part.times_ns for part in parts]
+    every = [s.times_ns for s in source.streams] + [p.times_ns for p in source.pictures]
+    every += [felt.times_ns for felt in source.pressures]
     begin = max(int(t[0]) for t in every)
     end = min(int(t[-1]) for t in every)
     name = source.trace.path.name

@@ -151,7 +151,8 @@ def pressures_of(trace: Trace, streams: Sequence[Stream]) -> list[Pressure]:
     found = [felt for s in streams if (felt := s.felt) is not None]
     topics = {c.topic for c in trace.channels if c.message_count}
     touch = [t for t in sorted(topics) if any(r.kind == "touch" for r in roles(t))]
-    for topic, samples in trace.load(touch, decode=True).items() if touch else ():
+    loaded = trace.load(touch, decode=True) if touch else {}
+    for topic, samples in loaded.items():
         for role in roles(topic, samples.type_name):
             if not samples.problem:
                 found += [_touch(topic, samples, role, side) for side in role.sides]
