@@ -21,7 +21,7 @@ from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.mutants.servos import ReversedScale
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
-from dexkit.conformance.virtual.inspire import FtpService
+from dexkit.conformance.virtual.inspire import FtpHand, FtpService
 from dexkit.emulators.sim_inspire import SimInspireFtp, sim_inspire_ftp
 from dexkit.errors import EncodeError, OversizeError, TruncatedError
 from dexkit.hand import HandCommand, HandState, MotorError, Side
@@ -279,3 +279,19 @@ def test_emulated_hands_meet_every_requirement() -> None:
     assert not bad, "\n".join(bad)
     passed = {r.requirement.id for r in result.results if r.verdict is Verdict.PASS}
     assert passed == {r.id for r in catalogue("inspire-ftp")}
+
+
+@pytest.mark.soak
+def test_a_hand_that_is_as_fast_as_its_manual_says_is_not_blamed() -> None:
+    """The profile has the 0.8 s of the DFX for the full travel, the manual 0.6 s."""
+
+    class Quick(FtpHand):
+        def __init__(self, side: Side, touch: float | None = None) -> None:
+            super().__init__(side, touch)
+            self.full = np.full(N, 1.0 / 0.6)
+
+    class Service(FtpService):
+        hand = Quick
+
+    result = run_mutant(Service, plan_for("inspire_ftp"))
+    assert {r.verdict for r in result.results} == {Verdict.PASS, Verdict.NOT_APPLICABLE}

@@ -365,3 +365,69 @@ def test_recordings_without_joints_are_refused(tmp_path: Path) -> None:
         dexkit("export", tmp_path / "a.mcap", "--to", "csv", "--out", tmp_path / "d", "--fps", 3)[0]
         == 2
     )
+
+
+# -- touch ---------------------------------------------------------------------------------------
+
+
+def touched(out: Path, *, lost: range = range(0), short: bool = False) -> Path:
+    """Two seconds of an FTP session.
+
+    :param lost: right touch messages that are left out, counted from the start.
+    :param short: leave an element out of the first area of the left hand's tenth message.
+    """
+    trace, seen = open_trace(sample_path("inspire_ftp_grip")), {"l": 0, "r": 0}
+    begin = trace.first_ns + 3 * 10**9
+    with RecordingWriter(out) as writer:
+        numbers = {key: writer.add_channel(d) for key, d in trace.definitions.items()}
+        for m in trace.messages():
+            if not begin <= m.log_time_ns < begin + 2 * 10**9:
+                continue
+            data, side = m.data, m.topic[-1]
+            if "/touch/" in m.topic:
+                seen[side] += 1
+                if side == "r" and seen[side] in lost:
+                    continue
+                if short and (side, seen[side]) == ("l", 10):
+                    mt = message_type(m.type_name)
+                    message = mt.decode(data)
+                    message.fingerone_tip_touch = message.fingerone_tip_touch[:-1]
+                    data = mt.encode(message)
+            writer.put(numbers[m.topic, m.type_name], data, m.log_time_ns, m.publish_time_ns)
+    return out
+
+
+def test_touch_is_in_datasets_and_episodes(tmp_path: Path) -> None:
+    source = touched(tmp_path / "a.mcap")
+    for form in ("lerobot", "episodes"):
+        code, output = dexkit("export", source, "--to", form, "--out", tmp_path / form, "--fps", 30)
+        assert (code, "rt/inspire_hand/touch" in output) == (0, False), output
+    info, table = read(tmp_path / "lerobot")
+    names = info["features"]["observation.pressure"]["names"]
+    assert (len(names), names[0]) == (2 * 1062, "left_hand_pinky_tip_0")
+    made = vectors(table, "observation.pressure")
+    sent = list(open_trace(source).messages(["rt/inspire_hand/touch/r"]))
+    mt = message_type("inspire::inspire_hand_touch")
+    index = [mt.decode(m.data).fingerfour_top_touch for m in sent]
+    column = names.index("right_hand_index_top_0")
+    start = int(info["dexkit"]["sessions"]["0"]["start_ns"])
+    at = np.array([m.log_time_ns - start for m in sent], dtype=np.float64)
+    frames = np.round(np.arange(len(made)) * 1e9 / 30)
+    for i in range(96):
+        expected = np.interp(frames, at, [row[i] for row in index])
+        assert np.abs(made[:, column + i] - expected).max() < 0.01
+    assert made[:, column : column + 96].max() > 100  # it presses on the object
+    back = json.loads((tmp_path / "episodes" / "episode_0000" / "data.json").read_text())
+    assert back["info"]["tactile_names"]["right_ee"][column - 1062] == "index_top_0"
+    right = np.array([item["tactiles"]["right_ee"] for item in back["data"]])
+    assert np.abs(right - made[:, 1062:]).max() < 0.01
+
+
+def test_no_frame_lies_in_a_gap_of_touch_and_short_lists_are_told(tmp_path: Path) -> None:
+    source = touched(tmp_path / "a.mcap", lost=range(20, 60), short=True)
+    code, output = dexkit("export", source, "--to", "lerobot", "--out", tmp_path / "d")
+    assert code == 1
+    assert "rt/inspire_hand/touch/l: 1 messages whose lists are not as long" in output
+    assert "it is written as 2 episodes" in output
+    _, table = read(tmp_path / "d")
+    assert np.isfinite(vectors(table, "observation.pressure")).all()

@@ -25,7 +25,7 @@ from dexkit.traces.sessions.lerobot_out import Result
 from dexkit.traces.sessions.model import REST_TOPIC
 from dexkit.traces.sessions.pictures import parse_picture, safe_path
 from dexkit.traces.sessions.resample import hold, interpolate
-from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Stream
+from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Pressure, Stream
 
 __all__ = ["export_episodes"]
 
@@ -101,7 +101,7 @@ def _episodes(trace: Trace, fps: int | None, task: str | None, result: Result) -
     runs, told = sample(source, rate)
     lost = ["times of the recording: the rate stands in info.image.fps, the start in info.dexkit"]
     lost += [f"{trace.path.name}: {text}" for text in source.lost]
-    result.problems += [f"{trace.path.name}: {text}" for text in told]
+    result.problems += [f"{trace.path.name}: {text}" for text in (*source.problems, *told)]
     result.lost += [text for text in lost if text not in result.lost]
     parts = sorted({s.part for s in source.streams})
     for frames in runs:
@@ -138,7 +138,7 @@ def _episodes(trace: Trace, fps: int | None, task: str | None, result: Result) -
 
 def _info(source: Source, rate: int, result: Result, start_ns: int) -> dict[str, Any]:
     joints = {_name(s.part): list(s.names) for s in source.streams}
-    elements = {_name(s.part): list(s.elements) for s in source.streams if s.elements}
+    elements = {_name(felt.part): list(felt.elements) for felt in source.pressures}
     return {
         "version": "1.0.0",
         "date": "",
@@ -210,6 +210,8 @@ def _as_it_was(
         else:
             _fill(s, items, name)
     if _ALIGNED in record:
+        for felt in source.pressures:
+            _feel(felt, items, str(names.get(felt.part, felt.part)))
         for t, item in items.items():
             item["timestamp_ns"] = t
     pictures: list[tuple[str, bytes]] = []
@@ -243,14 +245,11 @@ def _at_frames(stream: Stream, times: Sequence[int]) -> Stream:
     method = hold if stream.kind == COMMAND else interpolate
     values = {f: method(stream.times_ns, v, at) for f, v in stream.values.items()}
     good = np.isfinite(values["q"]).all(axis=1)
-    pressure = stream.pressure
-    if pressure is not None:
-        pressure = interpolate(stream.times_ns, pressure, at)[good]
     return replace(
         stream,
         times_ns=at[good],
         values={f: v[good] for f, v in values.items()},
-        pressure=pressure,
+        pressure=None,
         samples=None,
     )
 
@@ -270,6 +269,14 @@ def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> Non
             for column, table in columns.items():
                 row: list[float] = np.asarray(table[i]).tolist()
                 entry[column] = row
-        if stream.pressure is not None and isinstance(items[t].get("tactiles") or {}, dict):
+
+
+def _feel(felt: Pressure, items: Mapping[int, dict[str, Any]], name: str) -> None:
+    """Insert what a hand feels, but in gaps."""
+    for suffix in (f"_{STATE}", f"_{COMMAND}"):
+        name = name.removesuffix(suffix)
+    times = np.array(sorted(items), dtype=np.int64)
+    for t, known, row in zip(times.tolist(), felt.is_known(times), felt.at(times), strict=True):
+        if known and isinstance(items[t].get("tactiles") or {}, dict):
             pressed = items[t]["tactiles"] = items[t].get("tactiles") or {}
-            pressed[name] = np.nan_to_num(stream.pressure[i]).tolist()
+            pressed[name] = np.nan_to_num(row).tolist()

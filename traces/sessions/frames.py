@@ -23,14 +23,21 @@ from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.model import REST_TOPIC
 from dexkit.traces.sessions.pictures import read_picture
 from dexkit.traces.sessions.resample import gap_of, hold, interpolate, period_of
-from dexkit.traces.sessions.streams import COMMAND, FIELDS, Stream, streams_of
+from dexkit.traces.sessions.streams import (
+    COMMAND,
+    FIELDS,
+    Pressure,
+    Stream,
+    pressures_of,
+    streams_of,
+)
 
 __all__ = ["RULE", "Frames", "Pictures", "Source", "open_source", "sample"]
 
 RULE = (
-    "states are interpolated between their neighbours, commands and pictures are the newest at the "
-    "time of the frame (zero-order hold); no frame lies in a gap of any of them, which is ten "
-    "usual periods, at least 0.1 s"
+    "states and touch are interpolated between their neighbours, commands and pictures are the "
+    "newest at the time of the frame (zero-order hold); no frame lies in a gap of any of them, "
+    "which is ten usual periods, at least 0.1 s"
 )
 _LEAST = 2  # frames of a run
 
@@ -54,12 +61,14 @@ class Source:
     """A recording to be sampled.
 
     :param streams: those with at least two samples.
+    :param pressures: what the hands feel, likewise.
     :param lost: data that frames cannot represent.
     :param problems: data that cannot be read.
     """
 
     trace: Trace
     streams: list[Stream]
+    pressures: list[Pressure]
     pictures: list[Pictures]
     lost: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -73,6 +82,7 @@ class Source:
     def measured(self) -> dict[str, float]:
         """Hz of each topic, from its usual period."""
         found = {s.topic: _rate(s.times_ns) for s in self.streams}
+        found |= {felt.topic: _rate(felt.times_ns) for felt in self.pressures}
         found |= {p.camera: _rate(p.times_ns) for p in self.pictures}
         return {name: rate for name, rate in found.items() if rate}
 
@@ -133,7 +143,19 @@ def open_source(trace: Trace) -> Source:
             lost.append(f"{stream.topic}: a single sample")
     if not streams:
         raise SessionError(f"{trace.path} has no joints of a known hand, robot or session")
-    known = {s.topic for s in streams}
+    pressures: list[Pressure] = []
+    problems = []
+    for felt in pressures_of(trace, streams):
+        if felt.unusable:
+            text = (
+                f"{felt.topic}: {felt.unusable} messages whose lists are not as long as the areas"
+            )
+            problems.append(text)
+        if len(felt) >= _LEAST:
+            pressures.append(felt)
+        else:
+            lost.append(f"{felt.topic}: {'a single' if len(felt) else 'no usable'} sample")
+    known = {s.topic for s in streams} | {felt.topic for felt in pressures}
     for channel in trace.channels:
         if channel.message_count and channel.topic not in known | _session_topics(trace):
             lost.append(f"{channel.topic}: no joints in it")
@@ -143,7 +165,7 @@ def open_source(trace: Trace) -> Source:
     commands = [s for s in streams if s.kind == COMMAND]
     if there := [f for f in FIELDS[COMMAND][1:] if any(f in s.values for s in commands)]:
         lost.append(f"{', '.join(there)} of the commands")
-    return Source(trace, streams, pictures, lost)
+    return Source(trace, streams, pressures, pictures, lost, problems)
 
 
 def _session_topics(trace: Trace) -> set[str]:
@@ -199,6 +221,7 @@ def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
     :raises SessionError: there is no time at which all streams have values.
     """
     every = [s.times_ns for s in source.streams] + [p.times_ns for p in source.pictures]
+    every += [felt.times_ns for felt in source.pressures]
     begin = max(int(t[0]) for t in every)
     end = min(int(t[-1]) for t in every)
     name = source.trace.path.name
@@ -215,8 +238,9 @@ def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
             values[s.part, s.kind, f] = made = method(s.times_ns, table, grid)
             if f == "q":
                 good &= np.isfinite(made).all(axis=1)
-        if s.pressure is not None:
-            pressure[s.part] = interpolate(s.times_ns, s.pressure, grid)
+    for felt in source.pressures:
+        pressure[felt.part] = felt.at(grid)
+        good &= felt.is_known(grid)
     shown: dict[str, NDArray[np.intp]] = {}
     for p in source.pictures:
         places = np.arange(len(p.times_ns), dtype=np.float64)[:, None]

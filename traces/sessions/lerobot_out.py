@@ -371,12 +371,10 @@ def _scheme(source: Source) -> _Scheme:
             continue
         members = tuple(s.part for s in own)
         features.append(_Feature(column, kind, name, members, _names(own)))
-    states = by_kind[STATE]
-    pressed = [s for s in states if s.pressure is not None]
-    if pressed:
-        names = tuple(f"{s.part}_{e}" for s in pressed for e in s.elements)
+    if pressed := source.pressures:
+        names = tuple(name for felt in pressed for name in felt.names)
         features.append(
-            _Feature(PRESSURE, STATE, "pressure", tuple(s.part for s in pressed), names)
+            _Feature(PRESSURE, STATE, "pressure", tuple(felt.part for felt in pressed), names)
         )
     parts: dict[str, dict[str, Any]] = {}
     for feature in features:

@@ -14,17 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.hand import Floats
+from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import MODELS, model
 from dexkit.robots import ROBOTS
-from dexkit.topics import roles
+from dexkit.topics import Role, roles
 from dexkit.traces.names import SESSION
 from dexkit.traces.reader import SampleArray, Trace
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.imported import RECORD, absent_fields
+from dexkit.traces.sessions.resample import interpolate
 
-__all__ = ["COMMAND", "FIELDS", "HAND", "STATE", "Stream", "streams_of"]
+__all__ = ["COMMAND", "FIELDS", "HAND", "STATE", "Pressure", "Stream", "pressures_of", "streams_of"]
 
 Times = NDArray[np.int64]
 
@@ -86,6 +87,13 @@ class Stream:
             return tuple(f"{self.part.removesuffix(HAND)}_{j}" for j in self.joints)
         return self.joints
 
+    @property
+    def felt(self) -> Pressure | None:
+        """What the sensors in the states feel; None without sensors."""
+        if self.pressure is None:
+            return None
+        return Pressure(self.part, self.elements, self.times_ns, self.pressure, self.topic)
+
     def between(self, begin_ns: int, end_ns: int) -> Stream:
         """The samples received in [begin, end)."""
         a, b = np.searchsorted(self.times_ns, [begin_ns, end_ns])
@@ -96,6 +104,77 @@ class Stream:
             pressure=None if self.pressure is None else self.pressure[a:b],
             samples=None,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Pressure:
+    """What the sensors of a hand feel, of its states or of its touch topic.
+
+    :param part: ``left_hand``, ``right_hand``.
+    :param elements: a name for each column.
+    :param times_ns: reception, ns since the epoch, ascending, shape (n,).
+    :param values: as in the messages, shape (n, n_elements).
+    :param unusable: messages of a touch topic that are left out, as a list is not as long as its
+        area.
+    """
+
+    part: str
+    elements: tuple[str, ...]
+    times_ns: Times
+    values: Floats
+    topic: str
+    unusable: int = 0
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the elements that are unique in the recording."""
+        return tuple(f"{self.part}_{e}" for e in self.elements)
+
+    def at(self, times_ns: Times) -> Floats:
+        """Interpolated, shape (len(times_ns), n_elements); NaN outside of the data and in gaps."""
+        return interpolate(self.times_ns, self.values, times_ns)
+
+    def is_known(self, times_ns: Times) -> NDArray[np.bool_]:
+        """Whether each time lies in the data, and in no gap."""
+        here = np.zeros((len(self), 1))
+        return np.isfinite(interpolate(self.times_ns, here, times_ns))[:, 0]
+
+
+def pressures_of(trace: Trace, streams: Sequence[Stream]) -> list[Pressure]:
+    """What the hands of a recording feel, by part.
+
+    :param streams: of the recording: the states of some hands have sensors in them.
+    """
+    found = [felt for s in streams if (felt := s.felt) is not None]
+    topics = {c.topic for c in trace.channels if c.message_count}
+    touch = [t for t in sorted(topics) if any(r.kind == "touch" for r in roles(t))]
+    loaded = trace.load(touch, decode=True) if touch else {}
+    for topic, samples in loaded.items():
+        for role in roles(topic, samples.type_name):
+            if not samples.problem:
+                found += [_touch(topic, samples, role, side) for side in role.sides]
+    return sorted(found, key=lambda p: p.part)
+
+
+def _touch(topic: str, samples: SampleArray, role: Role, side: Side) -> Pressure:
+    columns, areas = _columns(samples), model(role.dialect.model).areas
+    whole = np.ones(len(samples.log_time_ns), dtype=np.bool_)
+    for area in areas:
+        whole &= columns.count(area.member) == area.elements
+    table = columns.table([f"{a.member}[{i}]" for a in areas for i in range(a.elements)])
+    return Pressure(
+        part=f"{side}{HAND}",
+        elements=tuple(
+            f"{a.place.replace(' ', '_')}_{i}" for a in areas for i in range(a.elements)
+        ),
+        times_ns=samples.log_time_ns[whole],
+        values=table[whole],
+        topic=topic,
+        unusable=int(np.count_nonzero(~whole)),
+    )
 
 
 def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream]:
