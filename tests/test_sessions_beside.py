@@ -163,6 +163,24 @@ def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
     assert code == 1  # without its pictures, which are missing
 
 
+def test_frames_in_a_gap_of_the_wire_have_no_values_and_are_counted(tmp_path: Path) -> None:
+    folder, at = beside(tmp_path / "e", "dex3_pinch", rate=28)
+    wire = tmp_path / "wire.mcap"
+    gap = int(at[60]), int(at[70])
+    spans = [Span(int(at[0]) - 10**9, gap[0]), Span(gap[1], int(at[-1]) + 10**9)]
+    cut(open_trace(sample_path("dex3_pinch")), wire, spans=spans)
+    dexkit("import", folder, tmp_path / "m.mcap", "--wire", wire)
+    code, output = dexkit(
+        "export", tmp_path / "m.mcap", "--to", "episodes", "--out", tmp_path / "t"
+    )
+    assert code == 1
+    assert "of 140 frames lie in gaps of the recording and have no states" in output
+    back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())["data"]
+    assert len(back) == 140
+    assert "qpos" not in back[65]["states"]["left_ee"]
+    assert len(back[30]["states"]["left_ee"]["qpos"]) == 7
+
+
 def test_an_episode_of_another_session_is_refused(tmp_path: Path) -> None:
     folder, _ = beside(tmp_path / "e", "dex1_pick_place", rate=28)
     for other, why in (
