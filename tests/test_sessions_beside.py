@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.episodes import read_episode
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.resample import hold, interpolate
-from dexkit.traces.sessions.streams import COMMAND, STATE, streams_of
+from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 from tests.session_helpers import document, episode, streamed
 from tests.test_sessions_import import dexkit, streams
 
@@ -31,6 +32,17 @@ def pick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def wire_of(name: str, repeated: int = 1) -> list[Stream]:
+    """The streams of a sample; each command is sent ``repeated`` times instead of the next ones."""
+    found = []
+    for stream in streams_of(open_trace(sample_path(name))):
+        if stream.kind == COMMAND:
+            sent = np.arange(len(stream)) // repeated * repeated
+            stream = replace(stream, values={k: v[sent] for k, v in stream.values.items()})
+        found.append(stream)
+    return found
+
+
 def beside(
     folder: Path,
     name: str,
@@ -40,15 +52,21 @@ def beside(
     seconds: float = 5.0,
     noise: float = 0.0,
     end: bool = True,
+    repeated: int = 1,
+    stall: float = 0.0,
 ) -> Made:
     """An episode of a recorded session as xr_teleoperate would have written it, and the true times.
 
     It takes its actions from the commands at that time, at less than the nominal 30 Hz, unevenly.
+
+    :param repeated: as for :func:`wire_of`.
+    :param stall: seconds that each frame of the second quarter takes longer.
     """
     random = np.random.default_rng(1)
     trace = open_trace(sample_path(name))
-    wire = {(s.part, s.kind): s for s in streams_of(trace)}
+    wire = {(s.part, s.kind): s for s in wire_of(name, repeated)}
     periods = 1 / rate + np.abs(random.normal(0, 0.003, int(seconds * rate)))
+    periods[len(periods) // 4 : len(periods) // 2] += stall
     at = trace.first_ns + ((begin + np.cumsum(periods)) * 1e9).astype(np.int64)
     found = document(len(at), wire["left_hand", COMMAND].model, cameras=1)
     for side in ("left", "right"):
@@ -77,6 +95,26 @@ def test_the_true_times_are_found(tmp_path: Path, name: str, rate: float, noise:
     assert found.matched == (0.0 if noise else 1.0)
     assert found.rate == pytest.approx((len(at) - 1) * 1e9 / (at[-1] - at[0]), rel=0.02)
     assert (np.diff(found.times_ns) > 0).all()
+
+
+@pytest.mark.parametrize("name", ["dex1_pick_place", "dex3_pinch"])
+def test_commands_that_a_client_repeats_tell_the_time(tmp_path: Path, name: str) -> None:
+    """xr_teleoperate sends a Dex1-1's commands at 200 Hz, and changes them at 30 Hz."""
+    folder, at = beside(tmp_path / "e", name, rate=29, repeated=7)
+    found = find_times(read_episode(folder), wire_of(name, 7))
+    error = np.abs(found.times_ns - at) / 1e6
+    assert np.median(error) < 8
+    assert np.percentile(error, 90) < 60
+    assert found.matched == 1.0
+
+
+def test_a_loop_that_becomes_slow_is_followed(tmp_path: Path) -> None:
+    folder, at = beside(tmp_path / "e", "dex3_pinch", rate=29, seconds=4.0, stall=0.05)
+    found = find_times(read_episode(folder), wire_of("dex3_pinch"))
+    error = np.abs(found.times_ns - at) / 1e6
+    assert np.median(error) < 8
+    assert error.max() < 60
+    assert found.matched == 1.0
 
 
 def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
@@ -123,6 +161,24 @@ def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
     assert np.abs(made - written).max() < 0.1
     code, _ = dexkit("export", tmp_path / "m.mcap", "--to", "lerobot", "--out", tmp_path / "d")
     assert code == 1  # without its pictures, which are missing
+
+
+def test_frames_in_a_gap_of_the_wire_have_no_values_and_are_counted(tmp_path: Path) -> None:
+    folder, at = beside(tmp_path / "e", "dex3_pinch", rate=28)
+    wire = tmp_path / "wire.mcap"
+    gap = int(at[60]), int(at[70])
+    spans = [Span(int(at[0]) - 10**9, gap[0]), Span(gap[1], int(at[-1]) + 10**9)]
+    cut(open_trace(sample_path("dex3_pinch")), wire, spans=spans)
+    dexkit("import", folder, tmp_path / "m.mcap", "--wire", wire)
+    code, output = dexkit(
+        "export", tmp_path / "m.mcap", "--to", "episodes", "--out", tmp_path / "t"
+    )
+    assert code == 1
+    assert "of 140 frames lie in gaps of the recording and have no states" in output
+    back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())["data"]
+    assert len(back) == 140
+    assert "qpos" not in back[65]["states"]["left_ee"]
+    assert len(back[30]["states"]["left_ee"]["qpos"]) == 7
 
 
 def test_an_episode_of_another_session_is_refused(tmp_path: Path) -> None:

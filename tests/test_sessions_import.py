@@ -641,6 +641,7 @@ def of_states(path: Path, payload: bytes = b"") -> Path:
     [
         ("UPDATE messages SET data = 'text' WHERE id = 2", "that are no bytes"),
         ("UPDATE messages SET timestamp = -5 WHERE id = 2", "without a time"),
+        ("DELETE FROM messages WHERE id = 2", "that its metadata counts are not in the bag"),
     ],
     ids=str,
 )

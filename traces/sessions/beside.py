@@ -2,8 +2,8 @@
 
 xr_teleoperate writes no times. The actions of its frames are the commands that it sent, so the
 recorded commands give their times. Cross-correlation finds the episode's place in the recording and
-the error of its rate. Then each frame whose action equals a recorded command in float32 gets the
-time of that command; the other frames are interpolated.
+the error of its rate. A frame whose action equals a recorded command in float32 lies between that
+command and the next other one, and its state narrows that. The other frames are interpolated.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dexkit.traces.sessions.model import (
     record_of,
 )
 from dexkit.traces.sessions.resample import hold
-from dexkit.traces.sessions.streams import COMMAND, Stream, streams_of
+from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 from dexkit.traces.writer import RecordingWriter
 
 __all__ = ["LEAST_CONFIDENCE", "FrameTimes", "find_times", "write_beside"]
@@ -51,8 +51,14 @@ _SLOWEST, _FASTEST = 2.2, 0.95
 _CHUNK, _COARSE = 40.0, 0.05
 # Seconds around its expected time within which a frame's command is searched.
 _WINDOW = 0.5
-# Largest number of consecutive equal commands that still gives a time.
-_RUN = 4
+# Longest run of equal commands, in periods of the frames, that still gives a time.
+_LONGEST_RUN = 1.5
+# Seconds by which a hand's command may be published after the other's, and after its frame.
+_DISORDER = 0.005
+# Seconds for which a client has a state after the next one: it polls and runs at 100 to 200 Hz.
+_LAG = 0.01
+# Least share of frames whose command was sent only once; with fewer, stalls are not followed.
+_FOLLOWED = 0.1
 # Smallest share of frames that must lie within the recording.
 _COVERED = 0.9
 # Seconds of the recording that are kept before the first and after the last frame.
@@ -93,7 +99,7 @@ class FrameTimes:
 
 
 Pairs = Sequence[tuple[Floats, Stream]]
-"""The actions of a hand, and its recorded commands."""
+"""The actions of a hand, and its recorded commands; or its states on both sides."""
 
 
 def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
@@ -104,23 +110,18 @@ def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
     :raises SessionError: the recording has no commands of the session's hands, they do not move,
         or the session is not in it for certain.
     """
-    commands = {s.part: s for s in wire if s.kind == COMMAND}
-    pairs = [
-        (p.values[COMMAND]["q"], commands[p.name])
-        for p in session.parts
-        if COMMAND in p.values
-        and p.name in commands
-        and len(p.joints) == len(commands[p.name].joints)
-        and p.model is not None
-        and p.model.name == commands[p.name].model
-    ]
+    pairs = _pairs(session, wire, COMMAND)
     if not pairs:
         raise SessionError("the recording has no commands of a hand of the episode")
     nominal = (session.times_ns - session.times_ns[0]) / 1e9
     begin, period, elsewhere = _coarse(pairs, nominal)
     begin, period = _refine(pairs, nominal, begin, period)
     expected = begin + period * nominal
-    times, matched = _match(pairs, expected)
+    sent = [_Runs(actions, stream) for actions, stream in pairs]
+    had = [_Runs(q, stream, _LAG) for q, stream in _pairs(session, wire, STATE)]
+    frame = period / session.rate
+    expected = _follow(sent, expected, frame)
+    times, matched = _match(sent, had, expected, frame)
     correlation, apart = _agreement(pairs, times)
     found = FrameTimes(
         times_ns=(times * 1e9).astype(np.int64),
@@ -136,6 +137,19 @@ def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
             f"commands differ by {apart:.2f} of their motion"
         )
     return found
+
+
+def _pairs(session: Session, wire: Sequence[Stream], kind: str) -> Pairs:
+    streams = {s.part: s for s in wire if s.kind == kind}
+    return [
+        (p.values[kind]["q"], streams[p.name])
+        for p in session.parts
+        if kind in p.values
+        and p.name in streams
+        and len(p.joints) == len(streams[p.name].joints)
+        and p.model is not None
+        and p.model.name == streams[p.name].model
+    ]
 
 
 def _coarse(pairs: Pairs, nominal: Floats) -> tuple[float, float, float]:
@@ -216,29 +230,83 @@ def _agreement(pairs: Pairs, times: Floats) -> tuple[float, float]:
     return covariance / power, float(np.sqrt(apart / power_b))
 
 
-def _match(pairs: Pairs, expected: Floats) -> tuple[Floats, float]:
-    """Times of the frames by their commands, and the share of frames that have one."""
-    anchors = np.full(len(expected), np.nan)
-    matched = np.zeros(len(expected), dtype=np.bool_)
-    for actions, stream in pairs:
+class _Runs:
+    """The runs of equal values of a recorded stream, and where each frame's value occurs in them.
+
+    :param rows: the value of each frame, shape (n, joints); compared in float32.
+    :param lag: seconds for which a frame may have a value after the next one was received.
+    """
+
+    def __init__(self, rows: Floats, stream: Stream, lag: float = 0.0) -> None:
         wire = stream.q.astype(np.float32)
-        mine = actions.astype(np.float32)
-        known: dict[bytes, list[int]] = {}
-        for i, row in enumerate(wire):
-            known.setdefault(row.tobytes(), []).append(i)
+        new = np.ones(len(wire), dtype=np.bool_)
+        new[1:] = (wire[1:] != wire[:-1]).any(axis=1)
+        first = np.flatnonzero(new)
         at = stream.times_ns / 1e9
-        for i, row in enumerate(mine):
-            places = known.get(row.tobytes())
-            if places is None:
+        self.begins = at[first]
+        self.ends = np.append(at[first[1:]], at[-1:]) + lag
+        places: dict[bytes, list[int]] = {}
+        for k, row in enumerate(wire[first]):
+            places.setdefault(row.tobytes(), []).append(k)
+        none = np.zeros(0, dtype=np.intp)
+        known = {row: np.array(found, dtype=np.intp) for row, found in places.items()}
+        self.of_frame = [known.get(row.tobytes(), none) for row in rows.astype(np.float32)]
+
+    def once(self, longest: float) -> Floats:
+        """The middle of the only run with a frame's value; NaN: none, several, or a longer one."""
+        found = np.full(len(self.of_frame), np.nan)
+        for i, runs in enumerate(self.of_frame):
+            if len(runs) == 1 and self.ends[runs[0]] - self.begins[runs[0]] <= longest:
+                found[i] = (self.begins[runs[0]] + self.ends[runs[0]]) / 2
+        return found
+
+    def near(self, frame: int, expected: float) -> tuple[float, float] | None:
+        """Begin and end of the run with a frame's value that is nearest to its expected time."""
+        runs = self.of_frame[frame]
+        if not len(runs):
+            return None
+        away = np.maximum(self.begins[runs] - expected, expected - self.ends[runs])
+        best = int(np.argmin(away))
+        if away[best] > _WINDOW:
+            return None
+        return float(self.begins[runs[best]]), float(self.ends[runs[best]])
+
+
+def _follow(commands: Sequence[_Runs], expected: Floats, period: float) -> Floats:
+    """The expected times, bent to the stalls of the loop by values that were sent only once."""
+    once = np.full(len(expected), np.nan)
+    for runs in commands:
+        once = np.where(np.isnan(once), runs.once(_LONGEST_RUN * period), once)
+    kept = _ascending(once)
+    if len(kept) < max(2, _FOLLOWED * len(expected)):
+        return expected
+    late = np.interp(np.arange(len(expected)), kept, once[kept] - expected[kept])
+    return expected + late
+
+
+def _match(
+    commands: Sequence[_Runs], states: Sequence[_Runs], expected: Floats, period: float
+) -> tuple[Floats, float]:
+    """Times of the frames by their commands, and the share of frames that have one.
+
+    A frame lies within the run of its command, of both hands. Its state, which changes more often,
+    narrows that.
+    """
+    begins, ends = np.full(len(expected), -np.inf), np.full(len(expected), np.inf)
+    matched = np.zeros(len(expected), dtype=np.bool_)
+    for source in (*commands, *states):
+        for i in range(len(expected)):
+            run = source.near(i, expected[i])
+            if run is None:
                 continue
-            found = at[places]
-            near = found[np.abs(found - expected[i]) <= _WINDOW]
-            if not len(near):
-                continue
-            matched[i] = True
-            if len(near) <= _RUN:
-                nearest = near[np.argmin(np.abs(near - expected[i]))]
-                anchors[i] = np.nanmax([anchors[i], nearest])
+            matched[i] |= source in commands
+            begin, end = max(begins[i], run[0]), min(ends[i], run[1])
+            # a state alone tells nothing: it may repeat
+            if matched[i] and begin - end <= _DISORDER:
+                begins[i], ends[i] = begin, end
+    anchors = np.full(len(expected), np.nan)
+    short = ends - begins <= _LONGEST_RUN * period
+    anchors[short] = (begins[short] + ends[short]) / 2
     kept = _ascending(anchors)
     if len(kept) < 2:
         return expected, float(matched.mean())
@@ -351,7 +419,7 @@ def _aligned(
         **session.about,
         "aligned": str(found),
         "alignment_confidence": f"{found.confidence:.3f}",
-        "clock_note": "times of frames are those of the recorded commands, to one of their periods",
+        "clock_note": "each frame lies within the recorded command and state that it repeats",
     }
     return replace(
         session,

@@ -206,7 +206,13 @@ def _as_it_was(
     for s in source.streams:
         name = str(names.get(s.part, s.part))
         if _ALIGNED in record and s.samples is not None and s.model:
-            _fill(_at_frames(s, ordered), items, name)
+            found = _at_frames(s, ordered)
+            _fill(found, items, name)
+            if len(found) < len(ordered):
+                result.problems.append(
+                    f"{trace.path.name}: {name}: {len(ordered) - len(found)} of {len(ordered)} "
+                    f"frames lie in gaps of the recording and have no {_KEYS[s.kind]}"
+                )
         else:
             _fill(s, items, name)
     if _ALIGNED in record:

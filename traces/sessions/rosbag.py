@@ -8,7 +8,7 @@ that of 2024) are converted to the present one, with a note.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +80,7 @@ def import_bag(
                         channels[connection.id] = (writer.add_channel(channel), convert)
                 wanted = [c for c in reader.connections if c.id in channels]
                 if wanted:
-                    _copy(reader.messages(wanted), channels, writer, problems)
+                    _copy(wanted, reader.messages(wanted), channels, writer, problems)
                 _write_metadata(writer, reader, source, problems, corrections)
         except DexkitError:
             raise
@@ -95,12 +95,15 @@ def import_bag(
 
 
 def _copy(
+    wanted: Sequence[Connection],
     messages: Iterable[tuple[Connection, int, object]],
     channels: dict[int, tuple[int, Convert | None]],
     writer: RecordingWriter,
     problems: Problems,
 ) -> None:
+    missing = {c.id: c.msgcount for c in wanted}
     for connection, time_ns, data in messages:
+        missing[connection.id] -= 1
         number, convert = channels[connection.id]
         if not isinstance(data, bytes | bytearray | memoryview):  # SQLite gives what is there
             problems.add(
@@ -123,6 +126,12 @@ def _copy(
                 )
                 continue
         writer.put(number, payload, time_ns)
+    for connection in wanted:
+        if missing[connection.id] > 0:
+            problems.add(
+                f"{connection.topic}: messages that its metadata counts are not in the bag",
+                f"{missing[connection.id]} of {connection.msgcount}",
+            )
 
 
 def _channel(
