@@ -748,8 +748,8 @@ def test_options_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     source = tmp_path / "session.mcap"
     for arguments, text in (
         ((source, "--report", tmp_path / "x.html"), "add --rehearse"),
-        ((source, "--as-recorded", "--gains", "model"), "--gains is not for"),
-        ((source, "--no-wait", "--resample", 100), "--resample is not for"),
+        ((source, "--as-recorded", "--gains", "model"), "--gains does not apply"),
+        ((source, "--no-wait", "--resample", 100), "--resample does not apply"),
         ((source, "--check", "--side", "right"), "nothing to play on the right hand"),
         ((source, "--hand", "dex9"), "no hand model"),
         ((tmp_path, "--check"), "holds no session"),
