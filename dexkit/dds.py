@@ -51,7 +51,6 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from html import escape
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -61,6 +60,7 @@ from dexkit.child_processes import process_id
 from dexkit.dds_library import loaded_here
 from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
+from dexkit.escaping import html
 from dexkit.interface_names import find_interface, resolve_peers
 from dexkit.messages import MessageType, layout, message_type
 from dexkit.open_file_limit import require_open_files
@@ -466,7 +466,7 @@ def interfaces() -> list[str]:
 def _trace(verbosity: str, path: str) -> str:
     return (
         f"<Tracing><Verbosity>{verbosity}</Verbosity><AppendToFile>true</AppendToFile>"
-        f"<OutputFile>{escape(path)}</OutputFile></Tracing>"
+        f"<OutputFile>{html(path)}</OutputFile></Tracing>"
     )
 
 
@@ -502,7 +502,7 @@ def _config(interface: str, more: str = "", peers: Sequence[str] = ()) -> str:
     return (
         "<CycloneDDS><Domain>"
         "<General><Interfaces>"
-        f'<NetworkInterface name="{escape(interface)}" priority="default" multicast="default"/>'
+        f'<NetworkInterface name="{html(interface)}" priority="default" multicast="default"/>'
         f"</Interfaces>{unicast}</General>"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>{_MAX_PARTICIPANT_INDEX}</MaxAutoParticipantIndex>"

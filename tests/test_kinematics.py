@@ -213,7 +213,7 @@ def test_a_bad_urdf_is_refused(tmp_path: Path) -> None:
         ("<html/>", "is no URDF"),
         ('<!DOCTYPE x [<!ENTITY e "e">]><robot/>', "entities"),
         ('<robot name="x"/>', "none of the hand's joints"),
-        (f"<robot>{ring}</robot>", "ring"),
+        (f"<robot>{ring}</robot>", "loop"),
         ('<robot><joint name="gripper" type="revolute"><parent link="a"/><child link="b"/>'
          '<origin xyz="0 0"/></joint></robot>', "three numbers"),
         ('<robot><joint name="gripper" type="revolute"><parent link="a"/><child link="b"/>'

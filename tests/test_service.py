@@ -348,7 +348,10 @@ class TestStop:
 
     def test_a_service_starts_once(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
-        with serve(hand, node) as service, pytest.raises(UsageError, match="once"):
+        with (
+            serve(hand, node) as service,
+            pytest.raises(UsageError, match="cannot be started twice"),
+        ):
             service.start()
 
     def test_a_hanging_backend_does_not_hang_the_stop(

@@ -254,7 +254,7 @@ def test_info_and_check_answer_damage_with_an_exit_code(
     assert "damage" not in capsys.readouterr().out
     assert exit_code("check", path) == 2
     out, err = capsys.readouterr()
-    assert "the verdict is of what is left" in err
+    assert "the verdict covers the readable part only" in err
     assert "MUST" in out
     assert "is damaged" in err
 
