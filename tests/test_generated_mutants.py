@@ -348,7 +348,7 @@ def test_the_documented_example_is_tried(tmp_path: Path, spoken: str) -> None:
         example = example.replace("expects=", 'dialects="unitree_go", expects=')
     (tmp_path / "grippers.py").write_text(example)
     path = tmp_path / "verdicts.json"
-    arguments = ["--from", str(tmp_path / "grippers.py"), "--json", str(path)]
+    arguments = ["--from", str(tmp_path / "grippers.py"), "--json", str(path), "--jobs", "1"]
     run = CliRunner().invoke(command, arguments)
     assert run.exit_code == 0, run.output
     found = {h["name"]: h for h in json.loads(path.read_text())["hands"]}

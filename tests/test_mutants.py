@@ -29,7 +29,8 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         pytest.param("unitree_go", LEFT, marks=pytest.mark.soak),
         ("unitree_hg", LEFT),  # the pair is one in each dialect; both hands are in the first
         pytest.param("unitree_hg", BOTH, marks=pytest.mark.soak),
-        ("unitree_actuator", LEFT),
+        # the same service as in unitree_go, in other units, which test_dialects compares
+        pytest.param("unitree_actuator", LEFT, marks=pytest.mark.soak),
         pytest.param("unitree_actuator", BOTH, marks=pytest.mark.soak),
         ("dex3", LEFT),  # both hands of many joints take long
         pytest.param("dex3", BOTH, marks=pytest.mark.soak),

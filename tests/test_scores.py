@@ -248,7 +248,9 @@ def test_a_long_list_of_requirements_is_cut() -> None:
 # ---------------------------------------------------------------------------- real recordings
 
 
-@pytest.mark.parametrize("run", [RunKind.QUICK, RunKind.DEFAULT])
+@pytest.mark.parametrize(
+    "run", [RunKind.QUICK, pytest.param(RunKind.DEFAULT, marks=pytest.mark.soak)]
+)
 def test_a_good_gripper_in_a_complete_run_has_the_score_of_the_file(run: RunKind) -> None:
     wanted = run.requirements(catalogue("dex1-1"))
     result = run_mutant(model("dex1-1").reference.load(), plan_for(run=run), wanted)
