@@ -276,7 +276,9 @@ def _follow(commands: Sequence[_Runs], expected: Floats, period: float) -> Float
     """The expected times, bent to the stalls of the loop by values that were sent only once."""
     once: Floats = np.full(len(expected), np.nan)
     for runs in commands:
-        once = np.where(np.isnan(once), runs.once(_LONGEST_RUN * period), once)
+        found = runs.once(_LONGEST_RUN * period)
+        unknown = np.isnan(once)
+        once[unknown] = found[unknown]
     kept = _ascending(once)
     if len(kept) < max(2, _FOLLOWED * len(expected)):
         return expected
