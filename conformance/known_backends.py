@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from dexkit.backends import Emulator, backend
+from typing import TYPE_CHECKING
+
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
+
+if TYPE_CHECKING:  # reports import this module, and need no backend
+    from dexkit.backends import Backend, Emulator
 
 __all__ = ["EXTERNAL", "ROBOT_EMULATORS", "SIMULATED", "emulator_of", "has_usb_requirements"]
 
@@ -22,7 +26,8 @@ def emulator_of(name: str) -> Emulator | None:
 
     :raises BackendError: there is no such backend, or it cannot be loaded.
     """
-    return None if _is_no_hand(name) else backend(name).emulator
+    found = _hand(name)
+    return None if found is None else found.emulator
 
 
 def has_usb_requirements(name: str) -> bool:
@@ -30,8 +35,14 @@ def has_usb_requirements(name: str) -> bool:
 
     :raises BackendError: there is no such backend, or it cannot be loaded.
     """
-    return not _is_no_hand(name) and backend(name).usb_requirements
+    found = _hand(name)
+    return found is not None and found.usb_requirements
 
 
-def _is_no_hand(name: str) -> bool:
-    return name == EXTERNAL or name in ROBOT_EMULATORS
+def _hand(name: str) -> Backend | None:
+    """The backend of that name; None where the kit starts none, or it is a robot."""
+    if name == EXTERNAL or name in ROBOT_EMULATORS:
+        return None
+    from dexkit.backends import backend
+
+    return backend(name)

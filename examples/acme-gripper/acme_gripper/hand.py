@@ -54,7 +54,7 @@ class AcmeGripper:
             device.close()
 
     def exchange(self, command: HandCommand) -> HandState:
-        """Say where to go, hear where it is."""
+        """Send a command, get a state."""
         if command.is_brake:
             answer = self._ask("STOP")
         elif command.kp[0] == 0:  # zero gains: a client that lets go
@@ -70,7 +70,7 @@ class AcmeGripper:
             dq=speed * RADIANS,
             tau_est=force * NEWTON_METRES,
             temperature=celsius,
-            mode=int(command.mode[0]),  # it brakes, or is driven, as it was told
+            mode=int(command.mode[0]),  # brake or drive, as in the command
             stamp=time.monotonic(),
         )
 
