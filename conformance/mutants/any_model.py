@@ -204,7 +204,11 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX5-GAIN-03", "DFX-SIDE-01"), whole=True)
+@wrong_hand(
+    ("DEX1-FRESH-01", "DEX3-FRESH-01"),
+    also=("DEX3-GAIN-03", "DEX5-GAIN-03", "DFX-SIDE-01"),
+    whole=True,
+)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -785,7 +789,7 @@ class QueuesCommands(Service):
 
 @wrong_hand(
     ("DEX1-SAFE-07", "DEX3-SAFE-08"),
-    also=("DEX1-LOAD-01", "DEX3-LOAD-01", "DEX3-LOAD-02"),
+    also=("DEX1-LOAD-01", "DEX3-LOAD-01", "DEX1-LOAD-02", "DEX3-LOAD-02"),
 )
 class StopsInABurst(Service):
     """Receives in its publishing thread: each waiting command delays the next state."""
@@ -1122,6 +1126,7 @@ class ParksWhenItEnds(Service):
         "DEX1-CMD-01",
         "DEX3-CMD-01",
         "DEX1-WDOG-03",
+        "DEX1-LOAD-02",
     ),
 )
 class WaitsForRest(Service):

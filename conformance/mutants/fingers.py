@@ -688,7 +688,7 @@ class _GainsOfFirst(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02")
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-GAIN-03",))
 @wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18"))
 class GainsOfFirstMotor(FingerService):
     """Uses the gains of its first motor for all."""
@@ -1167,7 +1167,8 @@ class _LatchesWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
-@wrong_hand("DEX3-WDOG-03")
+@wrong_hand("DEX3-WDOG-03", also=("DEX3-MOVE-08",))
+@wrong_hand(("DEX5-WDOG-03", "BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"))
 class StuckAfterSilence(FingerService):
     """Obeys no command after a silence without protection."""
 
@@ -1343,7 +1344,7 @@ class _NotDriven(FingerHand):
         self.status = np.where(self.guarded, 0, self.status)
 
 
-@wrong_hand("DEX3-MODE-05")
+@wrong_hand("DEX3-MODE-05", also=("DEX3-GAIN-03",))
 class ProtectedIsNotDriven(Dex3Service):
     """Locks a motor whose time-out bit is set: its status is looked up by the whole byte."""
 
@@ -1403,7 +1404,8 @@ class _ForEver(FingerHand):
             self.tripped_at = self.now
 
 
-@wrong_hand("DEX3-GUARD-04", whole=True)
+# what it ignores in that time is not driven in the silence that follows
+@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-WDOG-03"), whole=True)
 class SlowToClear(FingerService):
     """Stays tripped for 2 s after it was cleared."""
 

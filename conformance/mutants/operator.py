@@ -83,7 +83,9 @@ class SaturatingGain(ReferenceService):
 
 # what it leaves of each step shows in steps of every kind
 @wrong_hand(
-    "DEX3-OPER-02", also=("DEX3-ABUSE-01", "DEX3-CMD-01", "DEX3-MODE-07"), where=obeys_gains
+    "DEX3-OPER-02",
+    also=("DEX3-ABUSE-01", "DEX3-CMD-01", "DEX3-MODE-07", "DEX5-LOAD-02"),
+    where=obeys_gains,
 )
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""

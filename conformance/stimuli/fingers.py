@@ -397,7 +397,14 @@ class FingerScript(HandScript):
             yield from self._silence("guard", self._model.command_timeout + 0.5)
             yield from self._latch_and_clear(splits)
             return
-        yield from self._drive("drive", sides, {})
+        yield from self._silent_by_motion({})
+
+    def _silent_by_motion(self, guarded: Mapping[Side, frozenset[int]]) -> Steps:
+        """No commands to moving hands, then a step.
+
+        :param guarded: the joints with time-out protection.
+        """
+        yield from self._drive("drive", self.plan.sides, {}, guarded=guarded)
         yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._to("resume", CLOSED - 5.0)
 
@@ -791,17 +798,21 @@ class FingerScript(HandScript):
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
 
     def _each_silent(self) -> Steps:
-        """No commands to each hand alone."""
+        """No commands to each hand alone, then to all hands without protection.
+
+        In the silences before the last one, some joints of each hand had protection.
+        """
         sides = self.plan.sides
-        if len(sides) == 1 and "guard" in self.plan.phases:
-            yield from self._drive("drive", sides, {}, guarded=self._once_more())
-            yield from self._silence("silence", self._model.command_timeout + 0.7)
-            yield from self._to("resume", CLOSED - 5.0)
+        guards = "guard" in self.plan.phases
+        if len(sides) == 1 and guards:
+            yield from self._silent_by_motion(self._once_more())
         if len(sides) > 1 and "silence" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 home = self._motors(side, self._home(side))
                 rejected = [replace(m, q=bad) for m in home]
                 yield from self._silent_alone(side, rejected if self._codec.holds_nan else [])
+        if guards:
+            yield from self._silent_by_motion({})
         yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})
 
 
