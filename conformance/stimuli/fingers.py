@@ -408,20 +408,24 @@ class FingerScript(HandScript):
         yield from self._silence("silence", self._model.command_timeout + 0.7)
         yield from self._to("resume", CLOSED - 5.0)
 
-    def _silent_alone(self, side: Side, rejected: Motors) -> Steps:
+    def _silent_alone(
+        self, side: Side, rejected: Motors, guarded: Mapping[Side, frozenset[int]]
+    ) -> Steps:
         """No command to one side but rejected ones, while it moves and the other is commanded.
 
-        Where motors have time-out protection, some have it: it must trip more than once. The first
-        step afterwards closes that hand, away from where a hand that begins at 0 would go.
+        The first step afterwards closes that hand, away from where a hand that begins at 0 would
+        go.
+
+        :param guarded: the joints with time-out protection.
         """
         self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
-        yield from self._drive("drive", (side,), {}, guarded=self._once_more())
+        yield from self._drive("drive", (side,), {}, guarded=guarded)
         yield from self._silence_alone("silence", side, {side: rejected} if rejected else {})
         poses = {s: self._pose(s, CLOSED - 5.0 if s is side else OPEN) for s in self.plan.sides}
         yield from self._everyone("resume", poses, most=1.5)
 
     def _once_more(self) -> dict[Side, frozenset[int]]:
-        """The joints with time-out protection in a silence of one side."""
+        """The joints with time-out protection in a further silence."""
         return self._next_splits() if "guard" in self.plan.phases else {}
 
     def _crossed(self, side: Side, motors: Motors) -> Motors:
@@ -798,21 +802,22 @@ class FingerScript(HandScript):
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
 
     def _each_silent(self) -> Steps:
-        """No commands to each hand alone, then to all hands without protection.
+        """No commands to each hand alone.
 
-        In the silences before the last one, some joints of each hand had protection.
+        Some joints have time-out protection, which must trip more than once; and once none has, as
+        a hand may latch only then. A hand that is alone gets both silences, of two hands each gets
+        one: a service rarely has a fault of time in one hand alone.
         """
         sides = self.plan.sides
-        guards = "guard" in self.plan.phases
-        if len(sides) == 1 and guards:
+        if len(sides) == 1 and "guard" in self.plan.phases:
             yield from self._silent_by_motion(self._once_more())
+            yield from self._silent_by_motion({})
         if len(sides) > 1 and "silence" in self.plan.phases:
             for side, bad in zip(sides, (math.nan, math.inf), strict=True):
                 home = self._motors(side, self._home(side))
-                rejected = [replace(m, q=bad) for m in home]
-                yield from self._silent_alone(side, rejected if self._codec.holds_nan else [])
-        if guards:
-            yield from self._silent_by_motion({})
+                rejected = [replace(m, q=bad) for m in home] if self._codec.holds_nan else []
+                guarded = self._once_more() if side is sides[0] else {}
+                yield from self._silent_alone(side, rejected, guarded)
         yield from self._bad_at_once({s: self._not_finite(s)[-1] for s in sides})
 
 
