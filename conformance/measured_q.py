@@ -399,9 +399,9 @@ def _noise(joints: Sequence[_Joint]) -> Observation:
             (loaded if held else free).append(spread)
         shown.append(_middle(free) > _NOISE if len(free) > 1 else None)
         floors += free
-    text = f"{_middle(floors):.1e} of the stroke free"
+    text = f"{_middle(floors):.2g} of the stroke free"
     if loaded:
-        text += f", {_middle(loaded):.1e} held off its goal"
+        text += f", {_middle(loaded):.2g} held off its goal"
     found = _counted("noise", what, shown, text)
     return found if len(joints) == 1 or not floors else replace(found, figure=text)
 
