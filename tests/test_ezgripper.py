@@ -89,7 +89,7 @@ from tests.patience import waits_of
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command's grippers get the time that :func:`configured` gives those of the tests."""
     monkeypatch.setattr(
-        "dexkit.cli.calibrate.GripperSettings", partial(GripperSettings, timeout=0.2)
+        "dexkit.cli.calibrate.GripperSettings", partial(GripperSettings, timeout=1.0)
     )
 
 
