@@ -36,7 +36,7 @@ _WINDOW = 0.05
 """Seconds over which a position is taken."""
 _STAYS = 0.5
 """Seconds for which a position is commanded until the joint has arrived, or is stopped."""
-_AWAY = 0.05
+_AWAY = 0.03
 """Part of the stroke: a joint that rests farther from its goal has not arrived."""
 _THERE = 0.02
 """Part of the stroke: a joint that rests nearer to its goal has arrived."""
@@ -223,8 +223,12 @@ class _Joint:
         self.spec: JointSpec = hand.joints[index]
         self.stroke = self.spec.stroke
         self.gains = recording.dialect.gains_are_used
-        stimulus = recording.stimulus
-        self.object_at = stimulus.objects.get(hand.side) if stimulus and not index else None
+        # a joint that closes on the object is commanded beyond it in these phases
+        closes = self.spec.closing != 0
+        phases = recording.phases("squeeze", hand.side) if closes else []
+        self.squeezes = [
+            (recording.seconds(p.begin_ns), recording.seconds(p.end_ns)) for p in phases
+        ]
         states, commands = hand.states, hand.commands
         self.t, self.q, self.tau = states.t, states.q[:, index], states.tau[:, index]
         self._sent = commands.t
@@ -291,22 +295,23 @@ def _counted(name: str, what: str, joints: Sequence[bool | None], extra: str = "
 def _object(joints: Sequence[_Joint]) -> Observation:
     """Joints that stop short of a goal, while they arrive at others."""
     what = "an object stops q short of its goal; free, the same joint arrives"
-    shown = tried = 0
-    through = 0
+    shown = 0
     deepest = 0.0
+    pressed: list[float] = []
     for joint in joints:
         ends = [(abs(h.q - h.goal) / joint.stroke, h) for h in joint.driven]
-        stopped = [part for part, _ in ends if part >= _AWAY]
+        squeezing = [
+            part
+            for part, h in ends
+            if any(begin <= h.begin <= end for begin, end in joint.squeezes)
+        ]
+        stopped = [part for part in squeezing if part >= _AWAY]
         arrived = [part for part, _ in ends if part <= _THERE]
         if stopped and arrived:
             shown += 1
             deepest = max(deepest, *stopped)
-        touch = joint.object_at
-        if touch is not None:
-            into = [part for part, h in ends if h.goal < touch - 2 * _AWAY * joint.stroke]
-            tried += bool(into)
-            through += bool(into) and max(into) <= _THERE
-    if through:
+        pressed += squeezing
+    if pressed and max(pressed) <= _THERE:
         return Observation(
             "object", what, Finding.CONTRADICTS, "q goes through the object to its goal"
         )
@@ -315,7 +320,7 @@ def _object(joints: Sequence[_Joint]) -> Observation:
         return Observation(
             "object", what, Finding.SHOWS, f"up to {deepest:.0%} of the stroke short{where}"
         )
-    return Observation("object", what, Finding.NO_SIGN if tried else Finding.NOT_TRIED)
+    return Observation("object", what, Finding.NO_SIGN if pressed else Finding.NOT_TRIED)
 
 
 def _changes(joint: _Joint) -> list[tuple[_Hold, _Hold]]:

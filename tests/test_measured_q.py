@@ -73,6 +73,15 @@ def test_echoed_command_is_not_taken_for_a_measurement() -> None:
     assert findings(gripping)["object"] is Finding.CONTRADICTS
 
 
+def test_locked_fingers_of_an_empty_hand_are_not_taken_for_stopped_ones() -> None:
+    phases = frozenset({"step", "squeeze", "lock", "mixed"})
+    plan = replace(plan_for("dex3", sides=tuple(Side)), phases=phases)
+    trace = run_virtual(plan, parse("dex3-1/dex3:latency-5").service())
+    empty, gripping = measured_q(recording_of(trace, "dex3", plan.sides))
+    assert findings(empty)["object"] is Finding.NOT_TRIED
+    assert findings(gripping)["object"] is Finding.SHOWS
+
+
 def test_recording_that_no_run_of_the_kit_made_has_no_finding() -> None:
     assert measured_q(replace(recorded(GOOD), stimulus=None)) == ()
 
