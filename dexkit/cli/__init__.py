@@ -117,6 +117,8 @@ def main(argv: list[str] | None = None) -> int:
     0 success, 1 a negative result or a failed operation, 2 wrong usage or an unusable file or
     device, 130 interrupted, 141 the reader of the output has closed the pipe.
     """
+    # a service has small matrices only: BLAS's threads would take a sixth of each start, and stay
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with guarded():
             code = _run(argv)
