@@ -34,7 +34,7 @@ LEFT, BOTH = (Side.LEFT,), (Side.LEFT, Side.RIGHT)
         pytest.param("unitree_actuator", BOTH, marks=pytest.mark.soak),
         ("dex3", LEFT),  # both hands of many joints take long
         pytest.param("dex3", BOTH, marks=pytest.mark.soak),
-        ("dex5", LEFT),
+        pytest.param("dex5", LEFT, marks=pytest.mark.soak),
         pytest.param("dex5", BOTH, marks=pytest.mark.soak),
         pytest.param("brainco", BOTH, marks=pytest.mark.soak),
         pytest.param("inspire_dfx", BOTH, marks=pytest.mark.soak),
