@@ -4,7 +4,7 @@ A check is a function of a :class:`Context` that returns an :class:`Outcome`. It
 without evidence, and takes every limit from its requirement's tolerances, so that hand models can
 share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.velocity`,
-:mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.firmness`, :mod:`~.safety`,
+:mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.firmness`, :mod:`~.grip`, :mod:`~.safety`,
 :mod:`~.afterwards`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers`,
 :mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints, :mod:`~.touch` for a topic of
 tactile areas, :mod:`~.servos` for position servos, and :mod:`~.client` for the client that drives
@@ -44,7 +44,7 @@ __all__ = [
 _HAND = (
     *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "velocity"),
     *("drive", "safety", "lifecycle", "tracking", "fingers", "each_joint", "pressure"),
-    *("operator", "uncommanded", "servos", "touch", "firmness", "afterwards"),
+    *("operator", "uncommanded", "servos", "touch", "firmness", "grip", "afterwards"),
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),

@@ -12,8 +12,8 @@ from dexkit.hand import Floats
 
 __all__: list[str] = []
 
-_AFTER_ABUSE = ("recover", "resume", "restart", "service-restart")
-_RESTARTED = ("restart", "service-restart")
+_AFTER_ABUSE = ("recover", "resume", "company", "restart", "service-restart")
+_RESTARTED = ("company", "restart", "service-restart")
 _AT_A_STOP = 0.05
 """Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
 _AT_REST_PART = 0.01
@@ -87,8 +87,10 @@ def _duration(step: Step) -> float | None:
 
 
 def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
-    """The failure of a hand whose steps after bad commands or a restart have lost speed."""
-    # after a restart the first step may begin softly
+    """The failure of a hand whose steps after bad commands, after a restart or with a second client
+    have lost speed.
+    """
+    # the first step for another client, and after a restart, may begin softly
     later = [p for name in _RESTARTED for p in ctx.phases(name)[1:]]
     for phase in (*ctx.phases("recover"), *later):
         if not obeyed_before(ctx, phase):

@@ -209,10 +209,13 @@ def as_commanded(ctx: Context) -> Outcome:
 
 @check("DEX3-FORCE-05")
 def joints_as_commanded(ctx: Context) -> Outcome:
-    """The smallest tau_est of pressing joints, relative to kp times the distance to the goal."""
+    """The smallest and largest tau_est of pressing joints, relative to kp times the distance to the
+    goal.
+    """
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, int, float, float, float, float] | None = None
+    worst: tuple[float, int, float, float, float, float, bool] | None = None
+    least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
@@ -224,25 +227,31 @@ def joints_as_commanded(ctx: Context) -> Outcome:
         q, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
         goal, kp = (np.median(a[given], axis=0) for a in (ctx.commands.q, ctx.commands.kp))
         for joint, spec in enumerate(ctx.joints):
-            asked = min(float(kp[joint] * (goal[joint] - q[joint])) * spec.closing, spec.tau_max)
-            if not spec.closing or asked < ctx.tolerance("min_asked_nm"):
+            asked = float(kp[joint] * (goal[joint] - q[joint])) * spec.closing
+            if not spec.closing or min(asked, spec.tau_max) < ctx.tolerance("min_asked_nm"):
                 continue
             felt = abs(float(tau[joint]))  # its sign is judged by DEX3-FORCE-01
-            found = (felt / asked, joint, felt, asked, begin, end)
-            worst = found if worst is None or found < worst else worst
+            few, many = least * min(asked, spec.tau_max), most * asked
+            for ratio, limit, over in (
+                (felt / many, many, True),
+                (few / max(felt, 1e-9), few, False),
+            ):
+                found = (ratio, joint, felt, limit, begin, end, over)
+                worst = found if worst is None or found > worst else worst
     if worst is None:
         return ctx.skipped("no joint was held back by the object")
-    part, joint, felt, asked, begin, end = worst
+    ratio, joint, felt, limit, begin, end, over = worst
+    asked = limit / (most if over else least)
+    part = felt / asked
     text = ctx.named(
         f"tau_est of {felt:.2f} N m in contact, where kp times the distance is {asked:.2f} N m",
         joint,
     )
-    limit = ctx.tolerance("min_part")
-    if part >= limit:
+    if ratio <= 1.0:
         met = ctx.passed(f"{part:.0%}", text, part=part)
-        return met.pressed(felt, limit * asked, at_least=True)
+        return met.pressed(felt, limit, at_least=not over)
     outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
-    return outcome.about(joint).pressed(felt, limit * asked, at_least=True)
+    return outcome.about(joint).pressed(felt, limit, at_least=not over)
 
 
 # ----------------------------------------------------------------------- commands: torque, gains

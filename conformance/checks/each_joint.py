@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks.grip import torque_scales
 from dexkit.conformance.checks.motion import Step, own_speed, steps
 from dexkit.conformance.checks.safety import stays
 from dexkit.hand import Floats, JointMode
@@ -258,7 +259,8 @@ def keeps_gripping(ctx: Context) -> Outcome:
         quiet = [p for p in ctx.phases("guard") if p.begin_ns >= phase.end_ns]
         until = ctx.span(quiet[0])[0] + 0.7 if quiet else end
         then, since = _first_force(ctx, begin + _FORCE_S, end - _FORCE_S)
-        pressing = np.flatnonzero(then >= ctx.tolerance("min_tau_nm")).tolist()
+        least = ctx.tolerance("min_tau_nm")
+        pressing = np.flatnonzero(then / torque_scales(ctx, least) >= least).tolist()
         later = np.arange(begin + 2 * _FORCE_S, end - _FORCE_S, _FORCE_S).tolist()
         spans = [*((at, at + _FORCE_S) for at in later), (end - _FORCE_S, end)]
         spans.append((until - _FORCE_S, until))

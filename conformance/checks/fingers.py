@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.force import squeezes
+from dexkit.conformance.checks.grip import torque_scales
 from dexkit.conformance.checks.motion import (
     half_way,
     least_half_way,
@@ -45,6 +46,10 @@ def low_rate_topic(ctx: Context) -> Outcome:
         return ctx.failed("no topic", f"no process publishes {topic} with {dialect.state_type}")
     rate = found[0].message_count / max(ctx.recording.duration, 1e-9)
     text = f"{found[0].message_count} samples on {topic}, {rate:.1f} Hz"
+    if rate < ctx.tolerance("min_rate_hz"):
+        return ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate).because(
+            "The period has another unit, or a state is copied only now and then."
+        )
     if rate <= ctx.tolerance("max_rate_hz"):
         return ctx.passed(f"{rate:.0f} Hz", text, rate_hz=rate)
     return ctx.failed(f"{rate:.0f} Hz", text, rate_hz=rate).because(
@@ -698,6 +703,48 @@ def _grips_on(ctx: Context, silence: _Silence) -> Outcome:
         return ctx.passed("grips on", text, tau_nm=float(still[joint]))
     place = ctx.at(ctx.states.topic, late, end)
     return ctx.failed("lets go", text, place, tau_nm=float(still[joint])).about(joint)
+
+
+@check("DEX5-WDOG-04")
+def all_alike(ctx: Context) -> Outcome:
+    """Which joints that pressed when the commands ended still press after the time-out."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    least = ctx.tolerance("min_tau_nm")
+    scales = torque_scales(ctx, least)
+    squeezed = [p.end_ns for p in ctx.phases("squeeze")]
+    judged = False
+    for phase in ctx.phases():
+        if not any(0 <= phase.begin_ns - end < 1e9 for end in squeezed):
+            continue  # it pressed on nothing before
+        begin, end = ctx.span(phase)
+        sent = ctx.commands.t[ctx.commands.t <= begin + 0.05]
+        last = float(sent[-1]) if len(sent) else begin
+        late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+        before, after = (
+            np.abs(ctx.states.tau[ctx.states.between(a, b)]) / scales
+            for a, b in ((last - 0.2, last), (late, end))
+        )
+        if len(before) < 3 or len(after) < 3:
+            continue
+        had, left = np.median(before, axis=0), np.median(after, axis=0)
+        pressed = np.flatnonzero(had >= least).tolist()
+        judged |= bool(pressed)
+        part = {j: float(left[j] / had[j]) for j in pressed}
+        on = [j for j in pressed if part[j] >= ctx.tolerance("min_part")]
+        off = [j for j in pressed if part[j] <= ctx.tolerance("max_part")]
+        if on and off:
+            names = ctx.joints[on[0]].name, ctx.joints[off[0]].name
+            text = (
+                f"{late - last:.1f} s after the last command {len(on)} joints still press, "
+                f"{names[0]} with {part[on[0]]:.0%} of its force, and {len(off)} do not, "
+                f"{names[1]} with {part[off[0]]:.0%}"
+            )
+            place = ctx.at(ctx.states.topic, late, end)
+            return ctx.failed(f"{len(on)} of {len(pressed)}", text, place).about(*on, *off)
+    if not judged:
+        return ctx.skipped("no joint pressed on the object when the commands ended")
+    return ctx.passed("all alike", "all joints that pressed go on, or none does")
 
 
 # ------------------------------------------------------------------------------------- safety

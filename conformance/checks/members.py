@@ -198,10 +198,33 @@ def temperature(ctx: Context) -> Outcome:
     """Motor temperatures in degrees Celsius."""
     paths = _motors(ctx, "temperature")
     wrong = _outside(ctx, paths, ctx.tolerance("low"), ctx.tolerance("high"))
+    wrong = wrong or _hot_at_start(ctx, paths)
     figure = _span(ctx, paths)
     if not wrong and figure == "0":
         return ctx.absent("temperature is not filled (0 throughout)")
     return wrong or ctx.passed(f"{figure} C", f"temperature {figure} C")
+
+
+def _hot_at_start(ctx: Context, paths: list[str]) -> Outcome | None:
+    """The failure of a hand whose motors are too hot before the first command."""
+    columns, limit = ctx.states.columns, ctx.tolerance("max_at_start")
+    assert columns is not None
+    first = float(ctx.commands.t[0]) if len(ctx.commands) else np.inf
+    rows = ctx.states.t[columns.ok] < first
+    for path in paths:
+        if columns.extremes(path)[1] <= limit:
+            continue
+        values = _values(ctx, path)
+        hot = (values > limit).any(axis=1) & rows
+        if hot.any():
+            row = int(np.argmax(hot))
+            value = float(values[row].max())
+            return ctx.failed(
+                f"{value:g} C",
+                f"{path} = {value:g} before the first command",
+                ctx.at(ctx.states.topic, _at(ctx, row)),
+            ).shown_by(Plot.of_member(path), PlotKind.POSITION)
+    return None
 
 
 @check("DEX1-FIELD-09")

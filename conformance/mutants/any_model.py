@@ -636,6 +636,38 @@ class WeakAfterNan(Service):
         super().motors(side, motors)
 
 
+@wrong_hand(("DEX1-ABUSE-01", "DEX3-ABUSE-01"), sides=BOTH, whole=True)
+class SlowForASecondClient(Service):
+    """Moves by 15 % of the range in a second for 4 s when a second client has come."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.known: set[int] = set()
+        self.slow_until = -math.inf
+        self.goals: dict[Side, tuple[float, tuple[float, ...]]] = {}
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if client not in self.known:
+            self.known.add(client)
+            if len(self.known) > 1:
+                self.slow_until = self.now + 4.0
+        super().receive(topic, payload, client)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if self.now < self.slow_until and all(math.isfinite(m.q) for m in motors):
+            at, goals = self.goals.get(side, (self.now, self.positions(side)))
+            steps = [0.15 * j.stroke * (self.now - at) for j in joints_of(self.dialect, side)]
+            goals = tuple(
+                q + min(max(m.q - q, -step), step)
+                for m, q, step in zip(motors, goals, steps, strict=False)
+            )
+            self.goals[side] = self.now, goals
+            motors = tuple(replace(m, q=q) for m, q in zip(motors, goals, strict=False))
+        else:
+            self.goals.pop(side, None)
+        super().motors(side, motors)
+
+
 @wrong_hand("DEX3-ABUSE-01", also=("DEX3-HOLD-01",), where=obeys_gains, whole=True)
 class WeakWhenRestarted(Service):
     """Uses two fifths of the stiffness after a restart of its service, as settings are lost."""

@@ -18,6 +18,7 @@ import numpy as np
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import BOTH, obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Sample
+from dexkit.conformance.virtual.dex5 import Dex5Service
 from dexkit.conformance.virtual.fingers import (
     Dex3Service,
     FingerHand,
@@ -46,6 +47,13 @@ class LowRateIsFull(Dex3Service):
     """Publishes the low-rate copy at the rate of the state."""
 
     low_period = Dex3Service.period
+
+
+@wrong_hand("DEX3-TOPIC-03", brief=True)
+class LowRateIsSlow(Dex3Service):
+    """Publishes the low-rate copy twice a second: a timer has another unit."""
+
+    low_period = 0.5
 
 
 @wrong_hand("DEX3-TOPIC-04", brief=True)
@@ -259,6 +267,27 @@ class Kelvin(_Filled):
     """Publishes its motors' temperatures in kelvins."""
 
     motor = ("temperature", (303, 313))
+
+
+@wrong_hand("DEX3-FIELD-06", brief=True)
+class HotAtStart(FingerService):
+    """Publishes 120 degrees Celsius until it gets its first command."""
+
+    hot = True
+
+    def message(self, count: int) -> Any:
+        message = super().message(count)
+        if self.hot:
+            for motor in message.motor_state:
+                motor.temperature = (120, 120)
+        return message
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        super().motors(side, motors)
+        if self.hot:
+            self.hot = False
+            self._blank.clear()
+            self._sent.clear()
 
 
 @wrong_hand("DEX3-FIELD-07", brief=True)
@@ -968,6 +997,136 @@ class Tires(Dex3Service):
     """Limits the torque of one joint after a second and a half of a firm grip."""
 
     hand_fault = _Tires
+
+
+@wrong_hand("DEX3-FORCE-05", sides=BOTH)
+class ForceOfLargerMotor(Dex3Service):
+    """Publishes two and a half times the torque: the torque constant is that of another motor."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= 2.5
+
+
+class _OtherInContact(FingerHand):
+    joints: tuple[int, ...]
+    factor: float
+
+    def move(self, dt: float, pull: list[float]) -> None:
+        if self.touches:
+            pull = list(pull)
+            for i in self.joints:
+                if abs(self.contact[i]) > 0.005:
+                    pull[i] *= self.factor
+        super().move(dt, pull)
+
+
+class _Boosts(_OtherInContact):
+    factor = 2.5
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.most = self.most.copy()
+        self.most[list(self.joints)] *= 3.0
+        self.changed()
+
+
+class _BoostsIndex(_Boosts):
+    joints = (5, 6)
+
+
+@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-05",), sides=BOTH)
+class OneFingerBoosts(Dex3Service):
+    """Its index finger presses with two and a half times the torque where it is blocked."""
+
+    hand_fault = _BoostsIndex
+
+
+class _BoostsLittle(_Boosts):
+    joints = (13, 14, 15)
+
+
+@wrong_hand("DEX5-FORCE-08", sides=BOTH)
+class LittleFingerBoosts(Dex5Service):
+    """Its little finger presses with two and a half times the torque where it is blocked."""
+
+    hand_fault = _BoostsLittle
+
+
+class _WeakThumb(_OtherInContact):
+    joints = (1, 2)
+    factor = 0.35
+
+
+@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-05",), sides=BOTH)
+class ThumbGivesIn(Dex3Service):
+    """Its thumb presses with a third of the torque where it is blocked."""
+
+    hand_fault = _WeakThumb
+
+
+class _WeakRing(_OtherInContact):
+    joints = (9, 10, 11)
+    factor = 0.35
+
+
+@wrong_hand("DEX5-FORCE-08", sides=BOTH)
+class RingFingerGivesIn(Dex5Service):
+    """Its ring finger presses with a third of the torque where it is blocked."""
+
+    hand_fault = _WeakRing
+
+
+class _FadingGrip(FingerHand):
+    pressed = 0.0
+
+    def step(self, dt: float) -> None:
+        self.rests = False
+        super().step(dt)
+        touches = self.touches and any(abs(c) > 0.005 for c in self.contact)
+        self.pressed = self.pressed + dt if touches else 0.0
+
+    def move(self, dt: float, pull: list[float]) -> None:
+        super().move(dt, [0.3 * p for p in pull] if self.pressed > 0.9 else pull)
+
+
+@wrong_hand("DEX5-FORCE-06", also=("DEX5-FORCE-03",), sides=BOTH, whole=True)
+class GripFades(Dex5Service):
+    """Presses with a third of the torque after 0.9 s of contact: a limit of the mean current."""
+
+    hand_fault = _FadingGrip
+
+
+class _OwnTimeouts(FingerHand):
+    joints: tuple[int, ...]
+    """Those without a time-out."""
+
+    def expire(self) -> None:
+        status = self.status.copy()
+        super().expire()
+        self.status[list(self.joints)] = status[list(self.joints)]
+
+
+class _FingersGoOn(_OwnTimeouts):
+    joints = tuple(range(16))
+
+
+@wrong_hand("DEX5-WDOG-04", sides=BOTH, whole=True)
+class FingersGoOn(Dex5Service):
+    """Only its thumb releases without commands; the fingers press on."""
+
+    hand_fault = _FingersGoOn
+
+
+class _OneGoesOn(_OwnTimeouts):
+    joints = (15,)
+
+
+@wrong_hand("DEX5-WDOG-04", sides=BOTH, whole=True)
+class OneJointGoesOn(Dex5Service):
+    """The last joint of its little finger presses on without commands."""
+
+    hand_fault = _OneGoesOn
 
 
 @wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-MOVE-09"), sides=BOTH)

@@ -335,6 +335,14 @@ class HotByte(_Filled):
     member, value = "temperature", 200
 
 
+@wrong_hand("DEX1-FIELD-08")
+class HotAtStart(_Fields):
+    """Publishes 120 degrees Celsius until it gets its first command."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return fields if self.hands[side].goal else {**fields, "temperature": 120}
+
+
 @wrong_hand("DEX1-FIELD-09")
 class UnsetLost(_Filled):
     """Publishes uninitialised memory as the count of lost packets."""
@@ -797,6 +805,41 @@ class BoostsWhereItIsBlocked(ReferenceService):
     """Presses with twice the torque that it was commanded."""
 
     hand = _Boosts
+
+
+class _BoostsMore(ReferenceHand):
+    def motor_torque(self) -> float:
+        tau = super().motor_torque()
+        return 2.6 * tau if self.contact() > 0.0 else tau
+
+
+@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH)
+class BoostsByItsOwnGains(ReferenceService):
+    """Presses with two and a half times the torque of its own gains where it is blocked."""
+
+    hand = _BoostsMore
+
+
+class _HoldingCurrent(ReferenceHand):
+    still = 0.0
+
+    def motor_torque(self) -> float:
+        tau = super().motor_torque()
+        return 0.3 * tau if self.still > 0.3 else tau
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        if self.touch is None or self.q > self.touch + 0.3:
+            self.still = 0.0
+        elif self.contact() > 0.0:
+            self.still += dt
+
+
+@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH)
+class HoldingCurrent(ReferenceService):
+    """Holds an object with a third of the torque from 0.3 s on, as the driver of a stepper does."""
+
+    hand = _HoldingCurrent
 
 
 class _WeakAgain(ReferenceHand):
