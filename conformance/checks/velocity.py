@@ -165,3 +165,67 @@ def at_rest(ctx: Context) -> Outcome:
     place = ctx.at(ctx.states.topic, at - (count - 2) * cell, at + cell)
     text = ctx.named(f"at {at:.2f} s dq is {speed:.2f} {ctx.unit}/s while q stands", joint)
     return ctx.failed(f"{speed:.2f} {ctx.unit}/s", text, place).about(joint)
+
+
+_NEWEST = 3
+"""A state may show the newest command or one of the two before it."""
+_SAME = 1e-6
+"""Part of the range within which two numbers of single precision are the same."""
+
+
+@check("DEX1-FIELD-21", "DEX3-FIELD-20")
+def not_the_command(ctx: Context) -> Outcome:
+    """The farthest way that dq shows while q is exactly the commanded q.
+
+    A measurement is that for a moment only, while the joint moves.
+    """
+    if not filled(ctx):
+        return ctx.absent("dq is not filled (0 throughout)")
+    commands = ctx.commands
+    if len(commands) < 2:
+        return ctx.skipped("no commands to this hand")
+    worst: tuple[float, float, int, float, float] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        t, q, dq = _series(ctx, joint)
+        if len(t) < _FEW:
+            continue
+        goals = np.clip(commands.q[:, joint], spec.q_min, spec.q_max)
+        newest = np.searchsorted(commands.t, t, "right") - 1
+        same = np.zeros(len(t), dtype=np.bool_)
+        with np.errstate(invalid="ignore"):
+            for back in range(_NEWEST):
+                rows = newest - back
+                off = np.abs(q - goals[np.maximum(rows, 0)])
+                same |= (rows >= 0) & (off <= _SAME * spec.stroke)
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], same.view(np.int8), [0]))))
+        for first, last in zip(edges[::2], edges[1::2], strict=True):
+            # dq may still be that of the motion which has led there
+            begin = int(np.searchsorted(t, t[first] + ctx.tolerance("settle_s")))
+            if last - begin < 2:
+                continue
+            steps = np.diff(t[begin:last])
+            said = np.concatenate(
+                ([0.0], np.cumsum(0.5 * steps * (dq[begin : last - 1] + dq[begin + 1 : last])))
+            )
+            beyond = said - (q[begin:last] - q[begin])
+            for at in np.arange(
+                float(t[begin]), float(t[last - 1]), ctx.tolerance("window_s")
+            ).tolist():
+                piece = beyond[
+                    slice(*np.searchsorted(t[begin:last], (at, at + ctx.tolerance("window_s"))))
+                ]
+                way = float(np.ptp(piece)) if len(piece) else 0.0
+                found = (way / spec.stroke, way, joint, at, at + ctx.tolerance("window_s"))
+                worst = found if worst is None or found > worst else worst
+    if worst is None:
+        return ctx.passed("never", "q is nowhere exactly the commanded q for long")
+    _, way, joint, begin_s, end_s = worst
+    limit = ctx.tolerance("max_way_stroke", joint)
+    text = ctx.named(
+        f"q is exactly the commanded q while dq shows {way:.3f} {ctx.unit} of another way", joint
+    )
+    if way <= limit:
+        return ctx.passed(f"{way:.3f} {ctx.unit}", text, motion_rad=way).placed(way, limit)
+    place = ctx.at(ctx.states.topic, begin_s, end_s)
+    outcome = ctx.failed(f"{way:.3f} {ctx.unit}", text, place, motion_rad=way)
+    return outcome.about(joint).placed(way, limit)

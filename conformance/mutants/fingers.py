@@ -262,6 +262,19 @@ class _Filled(FingerService):
         return message
 
 
+@wrong_hand("DEX3-FIELD-20", also=("DEX3-FIELD-16", "DEX3-FIELD-19", "DEX3-FIELD-05"))
+class ShowsTheGoalNearIt(FingerService):
+    """Publishes the commanded q of one joint within a tenth of its range from it."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        joint = 3
+        if len(motors) > joint and hand.newest:
+            goal = float(np.clip(hand.newest[joint].q, hand.low[joint], hand.high[joint]))
+            if abs(goal - hand.q[joint]) < 0.1 * (hand.high[joint] - hand.low[joint]):
+                motors["q"][joint] = goal
+
+
 @wrong_hand("DEX3-FIELD-06", brief=True)
 class Kelvin(_Filled):
     """Publishes its motors' temperatures in kelvins."""
