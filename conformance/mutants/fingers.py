@@ -1022,15 +1022,20 @@ class ForceOfLargerMotor(Dex3Service):
 
 
 class _OtherInContact(FingerHand):
+    """Applies another torque in contact, until the next command."""
+
     joints: tuple[int, ...]
     factor: float
+    blocked: frozenset[int] = frozenset()
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        self.blocked = frozenset()
+        super().take(rows, mode)
 
     def move(self, dt: float, pull: list[float]) -> None:
         if self.touches:
-            pull = list(pull)
-            for i in self.joints:
-                if abs(self.contact[i]) > 0.005:
-                    pull[i] *= self.factor
+            self.blocked |= {i for i in self.joints if abs(self.contact[i]) > 0.005}
+            pull = [self.factor * p if i in self.blocked else p for i, p in enumerate(pull)]
         super().move(dt, pull)
 
 
@@ -1097,7 +1102,11 @@ class _FadingGrip(FingerHand):
         self.rests = False
         super().step(dt)
         touches = self.touches and any(abs(c) > 0.005 for c in self.contact)
-        self.pressed = self.pressed + dt if touches else 0.0
+        self.pressed += dt if touches else 0.0
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        self.pressed = 0.0
+        super().take(rows, mode)
 
     def move(self, dt: float, pull: list[float]) -> None:
         super().move(dt, [0.3 * p for p in pull] if self.pressed > 0.9 else pull)

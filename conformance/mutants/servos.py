@@ -12,6 +12,7 @@ from dexkit.conformance.mutants.any_model import ChokesOnThousands
 from dexkit.conformance.mutants.registry import BOTH, takes_floats, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
+from dexkit.conformance.virtual.inspire import FtpService
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
 from dexkit.hand import Floats, Side
 from dexkit.models import HandModel, model
@@ -230,7 +231,7 @@ class _LetsGo(ServoHand):
 
 @wrong_hand(
     "BRAINCO-GRIP-01",
-    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09"),
+    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09", "FTP-FORCE-06"),
     sides=BOTH,
     whole=True,
 )
@@ -257,6 +258,30 @@ class SilentUnderLoad(ServoService):
         if self.now > self.free + 1.2 and self.now > self.quiet[1] + 5.0:
             self.quiet = self.now, self.now + 0.5
         return [] if self.quiet[0] <= self.now < self.quiet[1] else super().publish()
+
+
+class _Vanishes(ServoHand):
+    pressed = 0.0
+
+    def step(self, dt: float) -> None:
+        self.rests = False
+        super().step(dt)
+        touches = self.touches and any(abs(c) > 0.01 for c in self.contact)
+        self.pressed += dt if touches else 0.0
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        self.pressed = 0.0
+        super().take(rows, mode)
+
+    def move(self, dt: float, pull: list[float]) -> None:
+        super().move(dt, [0.05 * p for p in pull] if self.pressed > 1.0 else pull)
+
+
+@wrong_hand("FTP-FORCE-06", also=("FTP-SENS-09",), sides=BOTH, whole=True)
+class ForceVanishes(FtpService):
+    """Presses with a twentieth of the force after a second of contact, and does not open."""
+
+    hand_fault = _Vanishes
 
 
 # --------------------------------------------------------------------------- silence
