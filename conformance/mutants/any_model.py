@@ -638,7 +638,7 @@ class WeakAfterNan(Service):
 
 @wrong_hand(("DEX1-ABUSE-01", "DEX3-ABUSE-01"), sides=BOTH, whole=True)
 class SlowForASecondClient(Service):
-    """Moves by 15 % of the range in a second for 4 s when a second client has come."""
+    """Moves by 20 % of the range in a second for 4 s when a second client has come."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
@@ -656,7 +656,7 @@ class SlowForASecondClient(Service):
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         if self.now < self.slow_until and all(math.isfinite(m.q) for m in motors):
             at, goals = self.goals.get(side, (self.now, self.positions(side)))
-            steps = [0.15 * j.stroke * (self.now - at) for j in joints_of(self.dialect, side)]
+            steps = [0.2 * j.stroke * (self.now - at) for j in joints_of(self.dialect, side)]
             goals = tuple(
                 q + min(max(m.q - q, -step), step)
                 for m, q, step in zip(motors, goals, steps, strict=False)
