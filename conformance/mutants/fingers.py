@@ -262,7 +262,10 @@ class _Filled(FingerService):
         return message
 
 
-@wrong_hand("DEX3-FIELD-20", also=("DEX3-FIELD-16", "DEX3-FIELD-19", "DEX3-FIELD-05"))
+@wrong_hand(
+    "DEX3-FIELD-20",
+    also=("DEX3-FIELD-05", "DEX3-FIELD-19", "DEX3-GAIN-03", "DEX3-GAIN-05", "DEX3-SAFE-06"),
+)
 class ShowsTheGoalNearIt(FingerService):
     """Publishes the commanded q of one joint within a tenth of its range from it."""
 
