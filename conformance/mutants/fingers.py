@@ -266,6 +266,7 @@ class _Filled(FingerService):
     "DEX3-FIELD-20",
     also=("DEX3-FIELD-05", "DEX3-FIELD-19", "DEX3-GAIN-03", "DEX3-GAIN-05", "DEX3-SAFE-06"),
 )
+@wrong_hand("DEX5-FIELD-20", also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-05"))
 class ShowsTheGoalNearIt(FingerService):
     """Publishes the commanded q of one joint within a tenth of its range from it."""
 
@@ -1017,11 +1018,11 @@ class Tires(Dex3Service):
 
 @wrong_hand("DEX3-FORCE-05", sides=BOTH)
 class ForceOfLargerMotor(Dex3Service):
-    """Publishes two and a half times the torque: the torque constant is that of another motor."""
+    """Publishes 1.9 times the torque: the torque constant is that of another motor."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        motors["tau_est"] *= 2.5
+        motors["tau_est"] *= 1.9
 
 
 class _OtherInContact(FingerHand):

@@ -37,13 +37,13 @@ class NanVelocity(_Fields):
         return fields if fields["dq"] else {**fields, "dq": math.nan}
 
 
-@wrong_hand("DEX1-FIELD-21")
+@wrong_hand("DEX1-FIELD-21", also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-GAIN-03"))
 class ShowsTheGoalNearIt(_Fields):
-    """Publishes the commanded q within a twentieth of the stroke from it."""
+    """Publishes the commanded q within 3.5 % of the stroke from it."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
         goal = self.hands[side].goal
-        near = goal is not None and abs(goal.q - fields["q"]) < 0.05 * self.hands[side].stroke
+        near = goal is not None and abs(goal.q - fields["q"]) < 0.035 * self.hands[side].stroke
         return {**fields, "q": goal.q} if goal is not None and near else fields
 
 
