@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
@@ -38,7 +39,7 @@ _LAGS_S = tuple(0.002 * i for i in range(21))
 # ------------------------------------------------------------------------- hands of several joints
 
 
-def _law(ctx: Context, rows: Rows) -> tuple[Floats, Floats]:
+def _law(ctx: Context, rows: Rows) -> tuple[Floats, NDArray[np.bool_]]:
     """The torque of each joint by the newest command at these states, N m, and whether a joint is
     driven by it, both shape (n, joints).
     """
