@@ -16,6 +16,7 @@ from dexkit import child_processes
 from dexkit.backends import Emulator
 from dexkit.backends import backend as find_backend
 from dexkit.conformance.known_backends import EXTERNAL, ROBOT_EMULATORS, SIMULATED, emulator_of
+from dexkit.conformance.run_queue import Watched
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side, Subject
 from dexkit.models import Dialect
@@ -105,6 +106,7 @@ class Rig:
         self._stop = stop
         self._stack = contextlib.ExitStack()
         self.tools: list[Tool] = []
+        self._watched: dict[Tool, Watched] = {}
         self._services: list[Tool] = []
         self._ended: set[Tool] = set()
         self._poses: Path | None = None
@@ -138,7 +140,7 @@ class Rig:
         tools = {}
         for s in options.hands:
             command = emulator.command(s, folder / f"hand-{s}")
-            tools[s] = self._tool(*command, *_object(options, s))
+            tools[s] = self._tool(f"the emulated {s} device", [s], *command, *_object(options, s))
         for s, tool in tools.items():
             tool.wait_ready(self._stop)
             self.devices[s] = str(folder / f"hand-{s}") if emulator.linked else tool.place
@@ -159,7 +161,8 @@ class Rig:
             tool.wait_ready(self._stop)
 
     def _start_robot(self, emulator: str) -> Tool:
-        return self._tool("emulate", emulator, "--quiet", *self._place_on_dds)
+        arguments = ("emulate", emulator, "--quiet", *self._place_on_dds)
+        return self._tool("the emulated robot", self.options.sides, *arguments)
 
     def _start_hands(self) -> list[Tool]:
         options = self.options
@@ -210,17 +213,29 @@ class Rig:
                     own.append(f"{place}pose={keep / f'{side}.json'}")
         for setting in own:
             arguments += ["--set", setting]
+        of = f"the {sides[0]} hand" if len(sides) == 1 else "both hands"
         return self._tool(
+            f"the service of {of}",
+            sides,
             *arguments,
             *("--dialect", options.dialect.name),
             *self._place_on_dds,
         )
 
-    def _tool(self, *arguments: str) -> Tool:
+    def _tool(self, what: str, subjects: Sequence[Subject], *arguments: str) -> Tool:
         tool = Tool(*arguments)
         self._stack.enter_context(tool)
         self.tools.append(tool)
+        self._watched[tool] = Watched(what, tool.pid, tuple(subjects))
         return tool
+
+    def watched(self) -> list[Watched]:
+        """The processes that the hands or the robot consist of, as far as the kit started them."""
+        found = [w for tool, w in self._watched.copy().items() if tool not in self._ended]
+        emulator = self.options.emulator
+        if emulator is not None and emulator.linked:
+            found.append(Watched("the kernel's terminals", 0, self.options.hands))
+        return found
 
     def dead(self) -> Tool | None:
         """A process that has ended unasked, or None."""

@@ -127,7 +127,7 @@ def _judge_one(
     requirement = judgement.requirement
     return judgement.run_check(
         lambda: context.in_unit(layer.refine(context, check_of(requirement)(context))),
-        lambda outcome: excuse(context.recording, requirement, outcome, whole),
+        lambda outcome: excuse(context.recording, requirement, outcome, judgement.subject, whole),
         lambda outcome: _weighed(context.recording, outcome, whole),
     )
 
@@ -138,13 +138,19 @@ def _weighed(recording: Any, outcome: Outcome, whole: tuple[float, float] | None
 
 
 def _harness(recording: Recording) -> dict[str, float]:
-    """Load and timer jitter of the machine that the kit ran on; empty without a stimulus record."""
+    """Load and timer jitter of the machine that the kit ran on, and how long the hands' processes
+    waited there; empty without a stimulus record.
+    """
     if recording.stimulus is None:
         return {}
     figures = {"starved": recording.starved(0.0, recording.duration)}
     late = recording.lateness(0.0, recording.duration)
     if late is not None:
         figures |= {"jitter_p50_ms": late[0] * 1e3, "jitter_p99_ms": late[1] * 1e3}
+    waited = [recording.starvation(s, 0.0, recording.duration) for s in recording.judged]
+    if known := [w for w in waited if w is not None]:
+        figures["waited"] = max(w.worst.part for w in known)
+        figures["longest_wait_ms"] = max(w.longest for w in known) * 1e3
     return figures
 
 

@@ -8,6 +8,7 @@ the stimulus begins.
 from __future__ import annotations
 
 import contextlib
+import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -25,6 +26,7 @@ from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.phased_script import play
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.robot import codec_for
+from dexkit.conformance.run_queue import RunQueue, Watched
 from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.run_record import run_record
 from dexkit.conformance.stimuli import (
@@ -164,6 +166,7 @@ def record_run(
         plan = options.plan()
         script = script_for(plan, report)
         heart = stack.enter_context(Heartbeat())
+        queue = stack.enter_context(RunQueue(lambda: _processes(rig, recorder_node)))
         player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
         _wait_for_endpoints(recorder_node, plan)
@@ -171,6 +174,7 @@ def record_run(
         finished = player.play_script(script, stop)
         recording.stop()
         player.close()
+        queue.stop()
         rig.stop()
         # last output of the services and emulated devices, with their counters
         recorder.add_metadata(TOOLS, {repr(tool): tool.last_lines for tool in rig.tools})
@@ -180,6 +184,7 @@ def record_run(
             stalls=heart.stalls,
             beats=heart.beats,
             calibration=calibration,
+            waits=queue.waits,
             planned=Planned(plan.phases, plan.rounds),
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
@@ -198,11 +203,35 @@ def _judge_usb(
         for side, where in rig.devices.items()
     }
     report(f"the {' and the '.join(map(str, devices))} hand on USB")
-    return run(devices, recorder, report=report, stop=stop)
+    return run(devices, recorder, report=report, stop=stop, processes=rig.watched)
 
 
 def _node(options: RigOptions) -> DdsNode:
     return DdsNode(domain=options.domain, interface=options.interface)
+
+
+def _processes(rig: Rig, node: DdsNode) -> list[Watched]:
+    """The processes on this machine that the hands consist of.
+
+    Those that the kit has started; of an external hand those that publish its state.
+    """
+    if rig.options.backend != EXTERNAL:
+        return rig.watched()
+    dialect, sides = rig.options.dialect, rig.options.sides
+    host = socket.gethostname()
+    here = {
+        p.key: p for p in node.discovery.participants() if p.pid and p.host == host and not p.own
+    }
+    subjects: dict[int, set[Subject]] = {}
+    for endpoint in node.endpoints():
+        if endpoint.kind == "writer" and endpoint.participant in here:
+            found = subjects.setdefault(here[endpoint.participant].pid, set())
+            found.update(s for s in sides if dialect.topics(s)[1] == endpoint.topic)
+    return [
+        Watched("the service", pid, tuple(s for s in sides if s in whose))
+        for pid, whose in subjects.items()
+        if whose
+    ]
 
 
 def _require_hand(node: DdsNode, options: LiveOptions) -> None:

@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.lost import Lost
 from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.run_record import RECORD as RUN
-from dexkit.conformance.stimulus_record import RECORD, Lost, Phase, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.touch import Touch
 from dexkit.conformance.usb import RECORD as USB_RECORD
+from dexkit.conformance.waits import Starvation
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.messages.columns import Columns
@@ -346,6 +348,12 @@ class Recording:
         if self.stimulus is None:
             return None
         return self.stimulus.beats.lost(self.log_time(begin), self.log_time(end))
+
+    def starvation(self, subject: Subject, begin: float, end: float) -> Starvation | None:
+        """How long the hand's processes waited for a processor in [begin, end]; None if unknown."""
+        if self.stimulus is None or self.stimulus.waits is None:
+            return None
+        return self.stimulus.waits.starvation(subject, self.log_time(begin), self.log_time(end))
 
 
 def detect_dialect(trace: TraceLike) -> Dialect:

@@ -157,8 +157,8 @@ class Load(str, Enum):
 class Disturbance:
     """The load of the recording machine during a failure, and how much of it the load explains.
 
-    :param late_s: by how much the kit's own timer was late at the failure's place, seconds; None
-        if it was not measured.
+    :param late_s: by how much the kit's own timer was late at the failure's place, or for how long
+        the hand's processes waited for a processor, seconds; None if it was not measured.
     :param explained_s: delay of a conforming hand that this load can cause, seconds.
     :param failure_s: delay of a conforming hand that would cause this failure, seconds; None if
         no delay can.
@@ -314,7 +314,8 @@ class RunResult:
     :param notes: remarks on the recording.
     :param harness: how fair the kit's own machine was, where it made the run: ``jitter_p50_ms``
         and ``jitter_p99_ms``, by which it was late itself, and ``starved``, the part of the run,
-        0 to 1, in which programs waited for a processor.
+        0 to 1, in which programs waited for a processor; ``waited``, that in which a process of a
+        hand waited for one, and ``longest_wait_ms``, for how long at once.
     :param claims: by unit, whether the vendor claims it; None without claims.
     :param catalogue: how many requirements there are for such a run, selected or not; 0 if it is
         not known.

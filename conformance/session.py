@@ -25,6 +25,7 @@ from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import RunResult
 from dexkit.conformance.robot import robot_dialect
+from dexkit.conformance.run_queue import MOST_FILES
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.recorded_session import Session
@@ -46,7 +47,8 @@ if TYPE_CHECKING:
 __all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "selection"]
 
 T = TypeVar("T")
-_FILES = 48  # descriptors of a run: DDS, recording, the pipes of its processes
+# descriptors of a run: DDS, recording, the pipes of its processes; and what watches these
+_FILES = 48 + MOST_FILES
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.sums import mean, total
+from dexkit.conformance.lost import Lost
+from dexkit.conformance.waits import Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import ROBOT, Floats, Side, Subject
 
 __all__ = [
     "CALIBRATION_TOPIC",
-    "IDLE",
     "RECORD",
     "Beats",
     "Calibration",
-    "Lost",
     "Phase",
     "Planned",
     "Stall",
@@ -42,8 +41,6 @@ _EARLIER_ROBOT = "body"
 """The name of the subject ``robot`` in recordings of earlier versions."""
 CALIBRATION_TOPIC = "rt/dexkit/calibration"
 """The topic on which the kit measures itself; no hand's and no robot's."""
-IDLE = 1e-3
-"""Seconds by which timers are late on an idle machine."""
 
 
 @dataclass
@@ -105,22 +102,6 @@ class Stall:
     end_ns: int
 
 
-@dataclass(frozen=True)
-class Lost:
-    """Lateness of the kit's timer in an interval, beyond that on an idle machine.
-
-    :param total: all of it, seconds: what one thing that happened then may have waited.
-    :param mean: of each time, seconds: what a thing that happens again and again waited.
-    :param p99: 99th percentile, seconds: what one in a hundred waited.
-    :param best: of the best quarter, seconds: machines are busy by fits.
-    """
-
-    total: float
-    mean: float
-    p99: float
-    best: float = 0.0
-
-
 @dataclass
 class Beats:
     """Lateness of the kit's timer over the whole run.
@@ -156,11 +137,7 @@ class Beats:
 
     def lost(self, begin_ns: int, end_ns: int) -> Lost | None:
         """Lateness in [begin, end] beyond that of an idle machine; None if it is not known."""
-        there = np.maximum(self._in(begin_ns, end_ns) - IDLE, 0.0)
-        if not len(there):
-            return None
-        best, p99 = np.percentile(there, [25, 99])
-        return Lost(total(there), mean(there), float(p99), float(best))
+        return Lost.beyond_idle(self._in(begin_ns, end_ns))
 
     def _in(self, begin_ns: int, end_ns: int) -> Floats:
         """Lateness, seconds, of the beats that were due before the end and came after the begin."""
@@ -218,6 +195,8 @@ class Stimulus:
     :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
     :param calibration: the kit measured against itself; None in a run without.
+    :param waits: how long the hands' processes waited for a processor; None where it was not
+        measured.
     :param virtual: whether the run was on a virtual clock, which is never late.
     :param planned: which stimuli the run was to apply; None in recordings of earlier versions.
     """
@@ -227,6 +206,7 @@ class Stimulus:
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
     calibration: Calibration | None = None
+    waits: Waits | None = None
     virtual: bool = False
     planned: Planned | None = None
 
@@ -267,6 +247,7 @@ class Stimulus:
             "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
             "beats": json.dumps(asdict(self.beats)),
             **({"calibration": json.dumps(asdict(self.calibration))} if self.calibration else {}),
+            **({"waits": self.waits.as_text()} if self.waits is not None else {}),
             **({"clock": _VIRTUAL} if self.virtual else {}),
             **({"planned": self.planned.as_text()} if self.planned is not None else {}),
         }
@@ -304,6 +285,7 @@ class Stimulus:
                 stalls=parse_stalls(record["stalls"]),
                 beats=Beats.parse(record.get("beats", "{}")),
                 calibration=Calibration.parse(record.get("calibration", "")),
+                waits=Waits.parse(record["waits"]) if "waits" in record else None,
                 virtual=record.get("clock") == _VIRTUAL,
                 planned=Planned.parse(record["planned"]) if "planned" in record else None,
             )

@@ -23,7 +23,13 @@ late while it was judged:
    A larger one is the hand's, and its result says what the machine does not explain. A run that
    fails by nothing but such results is done again as well, and then believed.
 
-7. Apart from load, a MUST that fails by less than the kit's measurement error
+7. Where the hand's processes run on this machine, what they waited for a processor is measured as
+   well (:mod:`~dexkit.conformance.run_queue`), and explains a failure by itself: up to
+   :data:`AGAIN` times what they waited at its place; a single event up to :data:`HOPS` times their
+   longest wait. To wait is not to compute: a process that is slow by itself is not excused. This
+   holds for motion that is not of real time, too: there a failure without a size is as large as its
+   place is long.
+8. Apart from load, a MUST that fails by less than the kit's measurement error
    (:mod:`~dexkit.conformance.measure`) is *blocked* as well: its figure is nearer to the limit than
    the kit can tell. A pass by less than that remains a pass, and says so.
 
@@ -38,12 +44,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from dexkit.conformance.checks import Outcome
+from dexkit.conformance.checks import Late, Outcome
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.lost import IDLE, Lost
 from dexkit.conformance.measure import Measure
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
-from dexkit.conformance.stimulus_record import IDLE, Lost
+from dexkit.conformance.waits import Starvation
 from dexkit.hand import Subject
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]
@@ -55,6 +62,16 @@ BUSY_SHARE = 0.5
 """Part of a failure's time with programs waiting for a processor that makes a machine busy."""
 OVERLOADED = 3e-3
 """Seconds by which the kit's own timer, of 10 ms, is late on average on an overloaded machine."""
+AGAIN = 2.0
+"""Largest delay of a hand as a multiple of what its processes waited: a thread that is late finds
+its turn gone, and waits for the next one, or asks its device again."""
+HOPS = 6
+"""Times that a hand waits for a processor from a command to the state that shows it: to receive it,
+to pass it to the device, there, to pass the answer back, to read it, to publish. A single event is
+late by so many of the longest wait at most, however often there are short ones."""
+AFTERMATH = 1.0
+"""Seconds before a failure from which a wait can still show: in a motion that began late, or in
+that of a driver that has to reach its device again."""
 _STILL = ("nothing", "endpoints", "state")
 """Needs of requirements that a hand cannot fail for lack of processor time, unless they are
 real-time requirements."""
@@ -84,6 +101,10 @@ class Machine(Protocol):
         """Lateness of the kit's own timer in it, s; None if unknown."""
         ...
 
+    def starvation(self, subject: Subject, begin: float, end: float) -> Starvation | None:
+        """How long the subject's processes waited for a processor in it; None if unknown."""
+        ...
+
 
 @dataclass(frozen=True)
 class Excuse:
@@ -108,32 +129,67 @@ def excuse(
     machine: Machine,
     requirement: Requirement,
     outcome: Outcome,
+    subject: Subject,
     whole: tuple[float, float] | None = None,
 ) -> Excuse:
     """Decide whether load of the machine that the kit ran on can have caused a failure.
 
+    :param subject: whose failure it is.
     :param whole: the run, for failures that have no place.
     """
-    overloaded = _overloaded(machine, whole)
-    if not requirement.realtime:
-        return overloaded if overloaded and requirement.needs not in _STILL else Excuse()
+    if requirement.needs in _STILL and not requirement.realtime:
+        return Excuse()
     spans = [
         (e.time_s, e.end_s) if e.end_s is not None else (e.time_s - SHORT, e.time_s)
         for e in outcome.evidence
     ]
     if whole is not None and not spans:
         spans = [whole]
-    sizes = _sizes(outcome, spans)
-    how = outcome.late.how if outcome.late else "total"
-    best = outcome.late.best if outcome.late else 0.0
-    found = [_at(machine, size, best, how, *s) for size, s in zip(sizes, spans, strict=True)]
-    if not found:
-        return Excuse()
-    # the place that is hardest to explain decides
-    least = min(found, key=lambda e: e.excused)
-    if overloaded and not least.final:
-        return overloaded
-    return least
+    failures = [
+        _Failure(size, outcome.late, *span)
+        for size, span in zip(_sizes(outcome, spans), spans, strict=True)
+    ]
+    overloaded = _overloaded(machine, whole)
+    if requirement.realtime:
+        by_timer = _least([_late(machine, f) for f in failures])
+        if overloaded and not by_timer.final:
+            by_timer = overloaded
+    else:
+        by_timer = overloaded or Excuse()
+    if by_timer.excused:
+        return by_timer
+    by_waits = _least([_starved(machine, subject, f) for f in failures])
+    return by_waits if by_waits.excused or not by_timer.text else by_timer
+
+
+def _least(found: Sequence[Excuse]) -> Excuse:
+    """The excuse of all places of a failure: the one of that which is hardest to explain."""
+    return min(found, key=lambda e: e.excused, default=Excuse())
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """A failure at one of its places.
+
+    :param size: the delay, seconds, that would make a correct hand fail in the same way.
+    """
+
+    size: float
+    late: Late | None
+    begin: float
+    end: float
+
+    @property
+    def how(self) -> str:
+        return self.late.how if self.late else "total"
+
+    @property
+    def best(self) -> float:
+        return self.late.best if self.late else 0.0
+
+    @property
+    def finite(self) -> float | None:
+        return self.size if math.isfinite(self.size) else None
 
 
 def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse | None:
@@ -159,33 +215,70 @@ def _sizes(outcome: Outcome, spans: Sequence[tuple[float, float]]) -> Sequence[f
 _HOW = {"total": "in all", "mean": "each time", "p99": "one time in a hundred"}
 
 
-def _at(machine: Machine, size: float, best: float, how: str, begin: float, end: float) -> Excuse:
+def _late(machine: Machine, failure: _Failure) -> Excuse:
+    """Whether what the kit's own timer was late by explains a failure."""
+    begin, end, size, how, best = (
+        failure.begin,
+        failure.end,
+        failure.size,
+        failure.how,
+        failure.best,
+    )
     lost = machine.lost(begin, end)
     share = min(machine.starved(begin, end), 1.0)
     if lost is None:
         return Excuse()
-    measured = {"total": lost.total, "mean": lost.mean, "p99": lost.p99}[how]
+    measured = lost.of(how)
     harder = HARDEST * (1.0 + share)
     explained = harder * measured
-    failure_s = size if math.isfinite(size) else None
     was = f"the kit's own timer was late by {_ms(measured)} {_HOW[how]} there"
     by_fits = best > IDLE + harder * lost.best
     if not by_fits and measured > 0 and explained >= size:
         return Excuse(
-            Disturbance(Load.TOO_BUSY, measured, explained, failure_s),
+            Disturbance(Load.TOO_BUSY, measured, explained, failure.finite),
             f"{_TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(size)} late; run again",
         )
-    final = by_fits or failure_s is None
+    final = by_fits or failure.finite is None
     if not (share >= BUSY_SHARE or explained >= NOTABLE * size):
         return Excuse(final=final)
     if by_fits:
         why = f"by fits, and the hand is {_ms(best)} late in its best quarter, too"
-    elif failure_s is None:
+    elif failure.finite is None:
         why = "no delay makes a good hand look like this"
     else:
         why = f"{was}, which explains at most {_ms(explained)} of {_ms(size)}"
-    disturbance = Disturbance(Load.BUSY, measured, explained, failure_s)
+    disturbance = Disturbance(Load.BUSY, measured, explained, failure.finite)
     return Excuse(disturbance, f"{_BUSY}, but {why}", final)
+
+
+def _starved(machine: Machine, subject: Subject, failure: _Failure) -> Excuse:
+    """Whether the time that the hand's processes waited for a processor explains a failure."""
+    # what happens once can be the end of what was held up before
+    before = AFTERMATH if failure.how == "total" else 0.0
+    there = machine.starvation(subject, failure.begin - before, failure.end)
+    if there is None:
+        return Excuse()
+    measured = there.lost.of(failure.how)
+    explained = AGAIN * measured
+    if failure.how == "total":
+        explained = min(explained, HOPS * there.longest)
+    worst = there.worst
+    was = (
+        f"{worst.process} waited for a processor for {worst.part:.0%} of the time there, up to "
+        f"{_ms(worst.longest)} at once"
+    )
+    by_fits = failure.best > IDLE + AGAIN * there.lost.best
+    if not by_fits and measured > 0 and explained >= failure.size:
+        return Excuse(
+            Disturbance(Load.TOO_BUSY, measured, explained, failure.finite),
+            f"{_TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(failure.size)} late; "
+            "close other programs or use another machine",
+        )
+    if failure.finite is None or explained < NOTABLE * failure.size:
+        return Excuse()
+    why = f"which explains at most {_ms(explained)} of {_ms(failure.size)}"
+    disturbance = Disturbance(Load.BUSY, measured, explained, failure.finite)
+    return Excuse(disturbance, f"{_BUSY}: {was}, {why}")
 
 
 def _ms(seconds: float) -> str:
@@ -209,7 +302,7 @@ class Judgement:
         client: Sequence[Result] = (),
     ) -> None:
         self.requirement = requirement
-        self._subject = subject
+        self.subject = subject
         self._claimed = claims.claimed(requirement)
         self._found = found
         self._client = client
@@ -226,7 +319,7 @@ class Judgement:
         cause = outcome.cause or self.requirement.cause
         return Result(
             requirement=self.requirement,
-            side=str(self._subject),
+            side=str(self.subject),
             verdict=verdict,
             figure=outcome.figure,
             observed=outcome.observed,

@@ -151,6 +151,11 @@ class Tool:
         self.ready.set()  # nothing more will come
 
     @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
     def running(self) -> bool:
         """Whether it has not ended."""
         return self._process.poll() is None

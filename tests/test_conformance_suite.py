@@ -213,6 +213,13 @@ def run_live(
 def test_reference_hand_passes_on_dds(tmp_path: Path) -> None:
     result = run_live(ReferenceService, "DEX1-LIFE-01", tmp_path, sides=(Side.LEFT,))
     assert str(result.overall) == "pass"
+    if Path("/proc/self/schedstat").exists():
+        # the hand's process is on this machine: this one
+        stimulus = Recording.decode(open_trace(tmp_path / "run.mcap")).stimulus
+        assert stimulus is not None
+        assert stimulus.waits is not None
+        assert {p.pid for p in stimulus.waits.processes} == {os.getpid()}
+        assert {p.subjects for p in stimulus.waits.processes} == {(Side.LEFT,)}
 
 
 def test_hand_that_waits_for_commands_fails_on_dds(tmp_path: Path) -> None:

@@ -16,16 +16,17 @@ from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.judge import judge
+from dexkit.conformance.lost import Lost
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.operator import LateState
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Evidence, Load, Result, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
-from dexkit.conformance.stimulus_record import Beats, Lost
+from dexkit.conformance.stimulus_record import Beats
 from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
 from dexkit.conformance.virtual import run_virtual
-from dexkit.hand import Side
+from dexkit.hand import Side, Subject
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 from tests.dds_helpers import wait_until
 from tests.each import each
@@ -56,6 +57,9 @@ class Machine:
 
     def lost(self, begin: float, end: float) -> Lost | None:
         return self._lost
+
+    def starvation(self, subject: Subject, begin: float, end: float) -> None:
+        return None
 
 
 PRESSED = Machine(IDLE, starved=1.0)
@@ -115,14 +119,14 @@ def gap(seconds: float) -> Outcome:
 def test_machine_load_excuses_only_failures_it_can_cause(
     requirement: Requirement, outcome: Outcome, machine: Machine, excused: bool
 ) -> None:
-    found = excuse(machine, requirement, outcome)
+    found = excuse(machine, requirement, outcome, Side.LEFT)
     assert found.excused is excused
     assert found.text.startswith("the machine was too busy") is excused
     assert (found.disturbance.load is Load.TOO_BUSY) is excused
 
 
 def test_failure_on_busy_machine_states_unexplained_part() -> None:
-    found = excuse(BUSY_ONE, RATE, rate(50.0))
+    found = excuse(BUSY_ONE, RATE, rate(50.0), Side.LEFT)
     assert found.text == (
         "the machine was busy, but the kit's own timer was late by 1 ms each time there, which "
         "explains at most 4 ms of 15 ms"
@@ -130,7 +134,7 @@ def test_failure_on_busy_machine_states_unexplained_part() -> None:
     shown = found.disturbance
     assert (shown.load, shown.late_s, shown.explained_s) == (Load.BUSY, 0.001, 0.004)
     assert shown.failure_s == pytest.approx(0.015)
-    assert not excuse(Machine(IDLE), RATE, rate(50.0)).text
+    assert not excuse(Machine(IDLE), RATE, rate(50.0), Side.LEFT).text
 
 
 @given(lost=st.floats(0, 1), share=st.floats(0, 1), size=st.floats(0.001, 2), more=st.floats(0, 1))
@@ -138,7 +142,9 @@ def test_larger_failure_needs_more_lateness_to_be_excused(
     lost: float, share: float, size: float, more: float
 ) -> None:
     machine = Machine(Lost(lost, lost, lost), share)
-    small, large = (excuse(machine, GAP, failure(2.0).if_late(x)) for x in (size, size + more))
+    small, large = (
+        excuse(machine, GAP, failure(2.0).if_late(x), Side.LEFT) for x in (size, size + more)
+    )
     assert small.excused >= large.excused
     assert small.excused <= (lost > 0)
 
@@ -148,8 +154,8 @@ def test_failure_is_excused_only_at_all_its_places() -> None:
         def lost(self, begin: float, end: float) -> Lost | None:
             return LATE if end < 3 else IDLE
 
-    assert excuse(Once(None), GAP, failure(2.0).if_late(0.1)).excused
-    assert not excuse(Once(None), GAP, failure(2.0, 4.0).if_late(0.1, 0.1)).excused
+    assert excuse(Once(None), GAP, failure(2.0).if_late(0.1), Side.LEFT).excused
+    assert not excuse(Once(None), GAP, failure(2.0, 4.0).if_late(0.1, 0.1), Side.LEFT).excused
 
 
 def test_places_beyond_the_shown_ones_count() -> None:
@@ -171,8 +177,8 @@ def test_places_beyond_the_shown_ones_count() -> None:
 
 def test_failure_without_place_needs_lateness_over_the_run() -> None:
     outcome = Outcome(False).if_late(0.01, how="p99")
-    assert not excuse(BUSY_ONE, GAP, outcome).excused
-    assert excuse(BUSY_ONE, GAP, outcome, (0.0, 10.0)).excused
+    assert not excuse(BUSY_ONE, GAP, outcome, Side.LEFT).excused
+    assert excuse(BUSY_ONE, GAP, outcome, Side.LEFT, (0.0, 10.0)).excused
 
 
 def test_gap_within_the_kits_lateness_is_blocked() -> None:

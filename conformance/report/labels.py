@@ -175,6 +175,11 @@ def about_harness(result: RunResult) -> str:
         )
     if "starved" in figures:
         parts.append(f"programs waited for a processor in {figures['starved']:.1%} of the run")
+    if "waited" in figures and "longest_wait_ms" in figures:
+        parts.append(
+            f"a process of the hand in {figures['waited']:.1%}, up to "
+            f"{figures['longest_wait_ms']:.3g} ms at once"
+        )
     return "; ".join(parts)
 
 

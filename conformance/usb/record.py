@@ -17,6 +17,7 @@ from typing import Any
 
 from dexkit.conformance.stimulus_record import Beats, Stall, parse_stalls, parse_time
 from dexkit.conformance.usb import RECORD
+from dexkit.conformance.waits import Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
@@ -141,11 +142,14 @@ class UsbRecord:
 
     :param stalls: when programs waited for a processor.
     :param beats: how late the kit's own timer was.
+    :param waits: how long the processes of an emulated device waited for a processor; None where
+        it was not measured.
     """
 
     sides: dict[Side, SideRecord] = field(default_factory=dict)
     stalls: list[Stall] = field(default_factory=list)
     beats: Beats = field(default_factory=Beats)
+    waits: Waits | None = None
 
     def to_metadata(self) -> dict[str, str]:
         """Encode it for the metadata: JSON by side."""
@@ -162,6 +166,8 @@ class UsbRecord:
             record[str(side)] = json.dumps(plain)
         record["stalls"] = json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls])
         record["beats"] = json.dumps(asdict(self.beats))
+        if self.waits is not None:
+            record["waits"] = self.waits.as_text()
         return record
 
     @classmethod
@@ -179,6 +185,7 @@ class UsbRecord:
             found = cls(
                 stalls=parse_stalls(record["stalls"]),
                 beats=Beats.parse(record.get("beats", "{}")),
+                waits=Waits.parse(record["waits"]) if "waits" in record else None,
             )
             for side in Side:
                 if str(side) in record:

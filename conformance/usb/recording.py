@@ -11,7 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.stimulus_record import Beats, Lost, Stall
+from dexkit.conformance.lost import Lost
+from dexkit.conformance.stimulus_record import Beats, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -22,7 +23,8 @@ from dexkit.conformance.usb.record import (
     UsbRecord,
     topic,
 )
-from dexkit.hand import JointSpec, Side
+from dexkit.conformance.waits import Starvation, Waits
+from dexkit.hand import JointSpec, Side, Subject
 from dexkit.models import DEX3_1
 from dexkit.traces import ChannelInfo, SampleArray
 
@@ -229,6 +231,7 @@ class UsbRecording:
     sides: Mapping[Side, UsbSide]
     stalls: Sequence[Stall] = field(default_factory=tuple)
     beats: Beats = field(default_factory=Beats)
+    waits: Waits | None = None
 
     @classmethod
     def decode(cls, trace: TraceLike) -> UsbRecording | None:
@@ -263,12 +266,13 @@ class UsbRecording:
             {s: UsbSide(s, part, transfers[s], origin_ns) for s, part in record.sides.items()},
             record.stalls,
             record.beats,
+            record.waits,
         )
 
     def since(self, origin_ns: int) -> UsbRecording:
         """Return a copy with another second 0."""
         sides = {s: replace(side, origin_ns=origin_ns) for s, side in self.sides.items()}
-        return UsbRecording(origin_ns, sides, self.stalls, self.beats)
+        return UsbRecording(origin_ns, sides, self.stalls, self.beats, self.waits)
 
     def log_time(self, seconds: float) -> int:
         """The log time, nanoseconds, of a second of the recording."""
@@ -287,6 +291,12 @@ class UsbRecording:
             for s in self.stalls
         )
         return seconds / (end - begin)
+
+    def starvation(self, subject: Subject, begin: float, end: float) -> Starvation | None:
+        """How long the hand's processes waited for a processor in [begin, end]; None if unknown."""
+        if self.waits is None:
+            return None
+        return self.waits.starvation(subject, self.log_time(begin), self.log_time(end))
 
     def lateness(self, begin: float, end: float) -> tuple[float, float] | None:
         """Median and 99th percentile, seconds, by which the kit itself was late in [begin, end];

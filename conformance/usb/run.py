@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 from dexkit.clock import RealClock
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.phased_script import play
+from dexkit.conformance.run_queue import RunQueue, Watched
 from dexkit.conformance.stimuli.usb import (
     Action,
     Alone,
@@ -48,6 +49,7 @@ def run(
     *,
     report: Callable[[str], None] = lambda text: None,
     stop: threading.Event | None = None,
+    processes: Callable[[], Iterable[Watched]] = tuple,
 ) -> bool:
     """Play the script to all hands at the same time, and record their transfers.
 
@@ -55,6 +57,7 @@ def run(
         number, or empty for the only one of its side on this machine.
     :param report: called with progress messages for the user.
     :param stop: ends the run early when set; the recording so far is kept.
+    :param processes: those of emulated hands on this machine.
     :returns: False when it was ended early.
     :raises ConformanceError: a hand is not there, or cannot be opened.
     """
@@ -64,7 +67,11 @@ def run(
     try:
         for side, where in devices.items():
             hosts[side] = open_device(where, side)
-        with Heartbeat() as heart, ThreadPoolExecutor(len(hosts)) as pool:
+        with (
+            Heartbeat() as heart,
+            RunQueue(processes) as queue,
+            ThreadPoolExecutor(len(hosts)) as pool,
+        ):
             turn = threading.Lock()
             runs = {
                 side: pool.submit(
@@ -77,7 +84,7 @@ def run(
             except BaseException:
                 stop.set()  # end the other hand's script as well
                 raise
-        record.stalls, record.beats = heart.stalls, heart.beats
+        record.stalls, record.beats, record.waits = heart.stalls, heart.beats, queue.waits
         recorder.add_metadata(RECORD, record.to_metadata())
     finally:
         for host in hosts.values():

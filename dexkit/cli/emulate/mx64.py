@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -18,6 +19,7 @@ from dexkit.cli.options import (
     latency_timer_option,
     line_time_option,
     object_option,
+    real_time_option,
     seed_option,
     start_option,
     wiring_option,
@@ -83,6 +85,7 @@ __all__ = ["emulate_mx64"]
 @click.option("--fast-reads", is_flag=True, help="Firmware with Fast Sync and Fast Bulk Read.")
 @click.option("--backup", is_flag=True, help="Firmware with Control Table Backup.")
 @click.option("--protocol-1", is_flag=True, help="Old firmware with Protocol 1.0 only.")
+@real_time_option(default=False)
 def emulate_mx64(
     link: str,
     ids: tuple[int, ...],
@@ -102,6 +105,7 @@ def emulate_mx64(
     fast_reads: bool,
     backup: bool,
     protocol_1: bool,
+    real_time: bool,
 ) -> None:
     """Emulate a DYNAMIXEL MX-64 (Protocol 2.0) with an EZGripper on its shaft.
 
@@ -122,6 +126,7 @@ def emulate_mx64(
         Wiring,
     )
     from dexkit.emulators.mx64.protocol1 import Protocol1Servo
+    from dexkit.service.realtime import real_time as real_time_priority
 
     plan = [parse_fault(spec) for spec in faults]
     if bare:
@@ -138,7 +143,13 @@ def emulate_mx64(
         grippers = [pair for servos_of in sides for pair in servos_of.items()]
     firmware = Firmware(fast_reads=fast_reads, backup=backup)
     store = _EepromFile(eeprom) if eeprom is not None else None
-    with stop_on_signals() as request:
+    with (
+        # before the line's thread is started, which inherits it
+        real_time_priority() if real_time else nullcontext(True) as granted,
+        stop_on_signals() as request,
+    ):
+        if not granted:
+            click.echo("no real-time priority: this user has no rtprio limit", err=True)
         now = RealClock().now()
         servos = []
         if not protocol_1:

@@ -360,6 +360,8 @@ def _stimulus(rng: random.Random, scratch: Path) -> Target:
         }
     ]  # fmt: skip
     whole = {"phases": phases, "objects": {"left": 1.0}, "stalls": [[1, 2]], "beats": {}}
+    process = {"name": "a", "pid": 1, "subjects": ["left"], "waited_us": [2], "longest_us": [2]}
+    whole["waits"] = {"begin_ns": 1, "t_us": [1], "processes": [process]}
 
     def make() -> str:
         return damaged_json(whole, rng)

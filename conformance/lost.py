@@ -1,0 +1,45 @@
+"""What lateness adds up to in an interval: of the kit's timer, or of a hand's processes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dexkit.conformance.sums import mean, total
+from dexkit.hand import Floats
+
+__all__ = ["IDLE", "Lost"]
+
+IDLE = 1e-3
+"""Seconds by which timers are late on an idle machine."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Lateness of the kit's timer in an interval, beyond that on an idle machine.
+
+    :param total: all of it, seconds: what one thing that happened then may have waited.
+    :param mean: of each time, seconds: what a thing that happens again and again waited.
+    :param p99: 99th percentile, seconds: what one in a hundred waited.
+    :param best: of the best quarter, seconds: machines are busy by fits.
+    """
+
+    total: float
+    mean: float
+    p99: float
+    best: float = 0.0
+
+    def of(self, how: str) -> float:
+        """The figure of that kind: ``total``, ``mean`` or ``p99``."""
+        figures = {"total": self.total, "mean": self.mean, "p99": self.p99}
+        return figures[how]
+
+    @classmethod
+    def beyond_idle(cls, late: Floats) -> Lost | None:
+        """Of these times of lateness, seconds, each beyond :data:`IDLE`; None if there are none."""
+        if not len(late):
+            return None
+        beyond = np.maximum(late - IDLE, 0.0)
+        best, p99 = np.percentile(beyond, [25, 99])
+        return cls(total(beyond), mean(beyond), float(p99), float(best))

@@ -1,0 +1,181 @@
+"""Measure how long other processes of this machine wait for a processor.
+
+Linux counts for each thread the nanoseconds in which it could have run, and had no processor: the
+second number of ``/proc/PID/task/TID/schedstat``. A thread that sleeps, waits for its device or
+computes does not add to it. Where there is no such file (another system, a kernel without it,
+another user's process behind ``hidepid``), nothing is measured.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dexkit.clock import RealClock
+from dexkit.conformance.waits import ProcessWaits, Waits
+from dexkit.hand import Subject
+from dexkit.threads import Worker
+
+__all__ = ["MOST_FILES", "RunQueue", "Watched"]
+
+_SAMPLE = 0.01  # seconds between samples
+_SEARCH = 0.2  # seconds between searches for new processes and threads
+MOST_FILES = 96
+"""Files that are open at the same time, one for each thread: of more threads the rest is not
+watched."""
+_PROC = Path("/proc")
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A process to be watched.
+
+    :param name: what it is, for messages.
+    :param pid: its id; 0 for all of the kernel's workers that are bound to no processor: they pass
+        on what is written to a terminal.
+    :param subjects: whose hand it is a part of.
+    """
+
+    name: str
+    pid: int
+    subjects: tuple[Subject, ...]
+
+
+class RunQueue:
+    """Samples how long processes wait, in a thread of its own; a context manager.
+
+    :param processes: those that run now; asked again and again, as services are restarted.
+    """
+
+    def __init__(self, processes: Callable[[], Iterable[Watched]]) -> None:
+        self._processes = processes
+        self._begin_ns = time.time_ns()
+        self._t_us: list[int] = []
+        self._watched: dict[Watched, _Threads] = {}
+        self._stop = threading.Event()
+        self._thread = Worker("run queue", self._run)
+
+    @property
+    def waits(self) -> Waits | None:
+        """What was measured, once this has ended; None where nothing could be."""
+        found = [
+            ProcessWaits(w.name, w.pid, w.subjects, threads.waited_us, threads.longest_us)
+            for w, threads in self._watched.items()
+            if threads.seen
+        ]
+        return Waits(self._begin_ns, self._t_us, found) if found else None
+
+    def _run(self) -> None:
+        clock = RealClock()
+        due = search = clock.now()
+        while not self._stop.is_set():
+            if clock.now() >= search:
+                search = clock.now() + _SEARCH
+                for process in self._processes():
+                    if process not in self._watched:
+                        kind = _Threads if process.pid else _KernelWorkers
+                        self._watched[process] = kind(process.pid, len(self._t_us))
+                for threads in self._watched.values():
+                    threads.search(MOST_FILES - sum(t.files for t in self._watched.values()))
+            for threads in self._watched.values():
+                threads.sample()
+            self._t_us.append((time.time_ns() - self._begin_ns) // 1000)
+            due = max(due + _SAMPLE, clock.now())
+            clock.sleep_until(due)
+
+    def __enter__(self) -> RunQueue:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End the measurement. May be called twice."""
+        self._stop.set()
+        self._thread.join()
+        for threads in self._watched.values():
+            threads.close()
+
+
+class _Threads:
+    """The threads of one process.
+
+    :param before: samples before this process was known.
+    """
+
+    def __init__(self, pid: int, before: int) -> None:
+        self.waited_us = [0] * before
+        self.longest_us = [0] * before
+        self.seen = False
+        self._folder = _PROC / str(pid) / "task"
+        self._files: dict[str, int] = {}
+        self._last: dict[str, int] = {}
+
+    @property
+    def files(self) -> int:
+        """Number of open files."""
+        return len(self._files)
+
+    def search(self, most: int) -> None:
+        """Find new threads, and open so many files at most."""
+        for thread in self._new()[: max(most, 0)]:
+            with contextlib.suppress(OSError):
+                path = self._folder / thread / "schedstat"
+                self._files[thread] = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+
+    def _new(self) -> list[str]:
+        """The threads that are not watched yet."""
+        try:
+            return [t for t in os.listdir(self._folder) if t not in self._files]
+        except OSError:  # it has ended
+            return []
+
+    def sample(self) -> None:
+        """Add how long the threads have waited since the last sample."""
+        waited = longest = 0
+        for thread, file in list(self._files.items()):
+            try:
+                ns = int(os.pread(file, 80, 0).split()[1])
+            except (OSError, IndexError, ValueError):  # the thread has ended
+                os.close(self._files.pop(thread))
+                self._last.pop(thread, None)
+                continue
+            self.seen = True
+            # what it waited before it was found is not known to be of this time
+            new = ns - self._last.get(thread, ns)
+            self._last[thread] = ns
+            waited += new
+            longest = max(longest, new)
+        self.waited_us.append(waited // 1000)
+        self.longest_us.append(longest // 1000)
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files.values():
+            os.close(file)
+        self._files.clear()
+
+
+class _KernelWorkers(_Threads):
+    """The kernel's workers that are bound to no processor."""
+
+    def __init__(self, pid: int, before: int) -> None:
+        super().__init__(pid, before)
+        self._folder = _PROC
+        self._others: set[str] = set()
+
+    def _new(self) -> list[str]:
+        found = []
+        for name in super()._new():
+            if not name.isdecimal() or name in self._others:
+                continue
+            with contextlib.suppress(OSError, ValueError):
+                is_one = (_PROC / name / "comm").read_text().startswith("kworker/u")
+                (found.append if is_one else self._others.add)(name)
+        return found

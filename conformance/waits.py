@@ -1,0 +1,177 @@
+"""How long the hand's processes waited for a processor in a run, as data of its recording.
+
+:mod:`~dexkit.conformance.run_queue` measures it. A process that waits could have run: it is late by
+that time through no fault of its own. A process that computes does not wait, however long it takes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dexkit.conformance.lost import Lost
+from dexkit.conformance.rows import Rows
+from dexkit.conformance.sums import total
+from dexkit.documents import parse_json
+from dexkit.errors import TraceUnsupported
+from dexkit.hand import ROBOT, Floats, Side, Subject
+
+__all__ = ["ProcessWaits", "Starvation", "Waits", "Worst"]
+
+_LATEST = 2**62  # ns since 1970: the year 2116
+
+
+@dataclass(frozen=True)
+class ProcessWaits:
+    """How long one process waited, in each sample of :class:`Waits`.
+
+    :param name: what it is, for messages.
+    :param pid: its id; 0 for the kernel's workers together.
+    :param subjects: whose hand it is a part of.
+    :param waited_us: by all its threads together since the sample before, microseconds.
+    :param longest_us: by the thread that waited longest, likewise.
+    """
+
+    name: str
+    pid: int
+    subjects: tuple[Subject, ...]
+    waited_us: list[int] = field(default_factory=list)
+    longest_us: list[int] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return f"{self.name} (pid {self.pid})" if self.pid else self.name
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The process of a hand that waited most in an interval.
+
+    :param part: of the time, 0 to 1, in which it waited.
+    :param longest: of its waits, seconds.
+    """
+
+    process: ProcessWaits
+    part: float
+    longest: float
+
+
+@dataclass(frozen=True)
+class Starvation:
+    """How long a hand's processes waited for a processor in an interval.
+
+    :param lost: by how much they were delayed, sample by sample.
+    :param longest: of all waits, seconds.
+    :param worst: the process that waited most.
+    """
+
+    lost: Lost
+    longest: float
+    worst: Worst
+
+
+@dataclass(frozen=True)
+class Waits:
+    """How long the processes of a run waited for a processor.
+
+    A wait counts in the sample in which it ended.
+
+    :param begin_ns: log time of offset 0.
+    :param t_us: times of the samples, microseconds from there; rising.
+    """
+
+    begin_ns: int = 0
+    t_us: list[int] = field(default_factory=list)
+    processes: list[ProcessWaits] = field(default_factory=list)
+
+    @classmethod
+    def parse(cls, text: str) -> Waits:
+        """Parse the record's content.
+
+        :raises TypeError, ValueError, KeyError, TraceUnsupported: it is damaged.
+        """
+        found = parse_json(text, "the stimulus record", error=TraceUnsupported)
+        times = _numbers(found["t_us"])
+        processes = [
+            ProcessWaits(
+                name=str(p["name"]),
+                pid=_number(p["pid"]),
+                subjects=tuple(ROBOT if s == ROBOT.value else Side(s) for s in p["subjects"]),
+                waited_us=_numbers(p["waited_us"]),
+                longest_us=_numbers(p["longest_us"]),
+            )
+            for p in found["processes"]
+        ]
+        if any(len(x) != len(times) for p in processes for x in (p.waited_us, p.longest_us)):
+            raise ValueError("a process that was not looked at each time")
+        return cls(_number(found["begin_ns"]), times, processes)
+
+    def as_text(self) -> str:
+        """The record's content."""
+        processes = [
+            {
+                "name": p.name,
+                "pid": p.pid,
+                "subjects": [str(s) for s in p.subjects],
+                "waited_us": p.waited_us,
+                "longest_us": p.longest_us,
+            }
+            for p in self.processes
+        ]
+        record = {"begin_ns": self.begin_ns, "t_us": self.t_us, "processes": processes}
+        return json.dumps(record, separators=(",", ":"))
+
+    def starvation(self, subject: Subject, begin_ns: int, end_ns: int) -> Starvation | None:
+        """How long a hand's processes waited in [begin, end]; None if it is not known."""
+        if not self._of(subject):
+            return None
+        lost = Lost.beyond_idle(self.delays(subject, begin_ns, end_ns))
+        if lost is None:
+            return None
+        waited = [self._waited(p, begin_ns, end_ns) for p in self._of(subject)]
+        longest = max(w.longest for w in waited)
+        return Starvation(lost, longest, max(waited, key=lambda w: w.part))
+
+    def delays(self, subject: Subject, begin_ns: int, end_ns: int) -> Floats:
+        """By how much a hand's processes were delayed in each sample in [begin, end], seconds.
+
+        The processes wait for each other, so that their waits add up; to no more than the time
+        between two samples, unless a single wait was longer, for threads wait side by side, too. A
+        sample counts whose waits reach into the interval.
+        """
+        of_subject = self._of(subject)
+        waited = np.sum([p.waited_us for p in of_subject], axis=0, dtype=np.float64)
+        longest = np.max([p.longest_us for p in of_subject], axis=0, initial=0)
+        rows, spans = self._there(longest, begin_ns, end_ns)
+        return np.asarray(np.minimum(waited, spans)[rows] / 1e6)
+
+    def _waited(self, process: ProcessWaits, begin_ns: int, end_ns: int) -> Worst:
+        longest = np.array(process.longest_us, dtype=np.float64)
+        rows, spans = self._there(longest, begin_ns, end_ns)
+        waited = np.minimum(process.waited_us, spans)[rows]
+        seconds = max((end_ns - begin_ns) / 1e9, total(spans[rows]) / 1e6, 1e-9)
+        return Worst(
+            process, total(waited) / 1e6 / seconds, float(longest[rows].max(initial=0)) / 1e6
+        )
+
+    def _of(self, subject: Subject) -> list[ProcessWaits]:
+        return [p for p in self.processes if subject in p.subjects]
+
+    def _there(self, longest: Floats, begin_ns: int, end_ns: int) -> tuple[Rows, Floats]:
+        """The samples that reach into [begin, end], and how long each may have been waited."""
+        t = np.array(self.t_us, dtype=np.float64)
+        spans = np.maximum(np.diff(t, prepend=0.0), longest)
+        begin, end = (begin_ns - self.begin_ns) / 1e3, (end_ns - self.begin_ns) / 1e3
+        return np.flatnonzero((t >= begin) & (t - spans <= end)), spans
+
+
+def _number(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not -_LATEST <= value <= _LATEST:
+        raise ValueError(f"{value!r} is no whole number that a record may hold")
+    return value
+
+
+def _numbers(values: Sequence[object]) -> list[int]:
+    return [_number(v) for v in values]
