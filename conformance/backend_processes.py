@@ -107,6 +107,7 @@ class Rig:
         self._stack = contextlib.ExitStack()
         self.tools: list[Tool] = []
         self._watched: dict[Tool, Watched] = {}
+        self._on_terminals = False
         self._services: list[Tool] = []
         self._ended: set[Tool] = set()
         self._poses: Path | None = None
@@ -136,6 +137,7 @@ class Rig:
         emulator = options.emulator
         if emulator is None:
             return
+        self._on_terminals = emulator.linked
         folder = self._stack.enter_context(TemporaryFolder("hands"))
         tools = {}
         for s in options.hands:
@@ -232,8 +234,7 @@ class Rig:
     def watched(self) -> list[Watched]:
         """The processes that the hands or the robot consist of, as far as the kit started them."""
         found = [w for tool, w in self._watched.copy().items() if tool not in self._ended]
-        emulator = self.options.emulator
-        if emulator is not None and emulator.linked:
+        if self._on_terminals:
             found.append(Watched("the kernel's terminals", 0, self.options.hands))
         return found
 

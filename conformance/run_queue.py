@@ -29,6 +29,7 @@ MOST_FILES = 96
 """Files that are open at the same time, one for each thread: of more threads the rest is not
 watched."""
 _PROC = Path("/proc")
+_TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ class RunQueue:
         self._begin_ns = time.time_ns()
         self._t_us: list[int] = []
         self._watched: dict[Watched, _Threads] = {}
+        self._busy_us: list[int] = []
+        self._own_us: list[int] = []
         self._stop = threading.Event()
         self._thread = Worker("run queue", self._run)
 
@@ -68,11 +71,15 @@ class RunQueue:
             for w, threads in self._watched.items()
             if threads.seen
         ]
-        return Waits(self._begin_ns, self._t_us, found) if found else None
+        if not found:
+            return None
+        busy = self._busy_us if any(self._busy_us) else []
+        return Waits(self._begin_ns, self._t_us, found, busy, self._own_us if busy else [])
 
     def _run(self) -> None:
         clock = RealClock()
         due = search = clock.now()
+        processors = _Processors()
         while not self._stop.is_set():
             if clock.now() >= search:
                 search = clock.now() + _SEARCH
@@ -82,8 +89,12 @@ class RunQueue:
                         self._watched[process] = kind(process.pid, len(self._t_us))
                 for threads in self._watched.values():
                     threads.search(MOST_FILES - sum(t.files for t in self._watched.values()))
-            for threads in self._watched.values():
-                threads.sample()
+            own = 0
+            for process, threads in self._watched.items():
+                ran = threads.sample()
+                own += ran if process.pid else 0
+            self._own_us.append(own // 1000)
+            self._busy_us.append(processors.worked())
             self._t_us.append((time.time_ns() - self._begin_ns) // 1000)
             due = max(due + _SAMPLE, clock.now())
             clock.sleep_until(due)
@@ -115,7 +126,7 @@ class _Threads:
         self.seen = False
         self._folder = _PROC / str(pid) / "task"
         self._files: dict[str, int] = {}
-        self._last: dict[str, int] = {}
+        self._last: dict[str, tuple[int, int]] = {}
 
     @property
     def files(self) -> int:
@@ -136,30 +147,59 @@ class _Threads:
         except OSError:  # it has ended
             return []
 
-    def sample(self) -> None:
-        """Add how long the threads have waited since the last sample."""
-        waited = longest = 0
+    def sample(self) -> int:
+        """Add how long the threads have waited since the last sample; return how long they ran, ns,
+        all together.
+        """
+        waited = longest = ran = 0
         for thread, file in list(self._files.items()):
             try:
-                ns = int(os.pread(file, 80, 0).split()[1])
-            except (OSError, IndexError, ValueError):  # the thread has ended
+                ran_ns, ns = map(int, os.pread(file, 80, 0).split()[:2])
+            except (OSError, ValueError):  # the thread has ended
                 os.close(self._files.pop(thread))
                 self._last.pop(thread, None)
                 continue
             self.seen = True
             # what it waited before it was found is not known to be of this time
-            new = ns - self._last.get(thread, ns)
-            self._last[thread] = ns
+            ran_before, before = self._last.get(thread, (ran_ns, ns))
+            self._last[thread] = ran_ns, ns
+            ran += ran_ns - ran_before
+            new = ns - before
             waited += new
             longest = max(longest, new)
         self.waited_us.append(waited // 1000)
         self.longest_us.append(longest // 1000)
+        return ran
 
     def close(self) -> None:
         """Close the files."""
         for file in self._files.values():
             os.close(file)
         self._files.clear()
+
+
+class _Processors:
+    """The work of the machine's processors, as the kernel counts it."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._last: int | None = None
+
+    def worked(self) -> int:
+        """Microseconds that they have worked since the last call; counted every tenth call only,
+        as the file is long on a machine with many processors.
+        """
+        self._count += 1
+        if self._count % 10 != 1:
+            return 0
+        try:
+            with (_PROC / "stat").open() as file:
+                user, nice, system, _, _, *interrupts = map(int, file.readline().split()[1:9])
+        except (OSError, ValueError):
+            return 0
+        total = user + nice + system + sum(interrupts)
+        before, self._last = self._last, total
+        return 0 if before is None else round((total - before) * 1e6 / _TICKS)
 
 
 class _KernelWorkers(_Threads):

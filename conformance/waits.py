@@ -22,6 +22,7 @@ from dexkit.hand import ROBOT, Floats, Side, Subject
 __all__ = ["ProcessWaits", "Starvation", "Waits", "Worst"]
 
 _LATEST = 2**62  # ns since 1970: the year 2116
+_AROUND = 500_000_000  # ns before and after a place: the kernel counts work in steps of 10 ms
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Starvation:
     """How long a hand's processes waited for a processor in an interval.
 
     :param lost: by how much they were delayed, sample by sample.
-    :param longest: of all waits, seconds.
+    :param longest: of all waits, seconds; both as far as other programs were the reason.
     :param worst: the process that waited most.
     """
 
@@ -80,11 +81,16 @@ class Waits:
 
     :param begin_ns: log time of offset 0.
     :param t_us: times of the samples, microseconds from there; rising.
+    :param busy_us: time that the machine's processors worked since the sample before, all together;
+        empty where it is not known.
+    :param own_us: that which they worked for these processes.
     """
 
     begin_ns: int = 0
     t_us: list[int] = field(default_factory=list)
     processes: list[ProcessWaits] = field(default_factory=list)
+    busy_us: list[int] = field(default_factory=list)
+    own_us: list[int] = field(default_factory=list)
 
     @classmethod
     def parse(cls, text: str) -> Waits:
@@ -106,7 +112,10 @@ class Waits:
         ]
         if any(len(x) != len(times) for p in processes for x in (p.waited_us, p.longest_us)):
             raise ValueError("a process that was not looked at each time")
-        return cls(_number(found["begin_ns"]), times, processes)
+        busy, own = _numbers(found["busy_us"]), _numbers(found["own_us"])
+        if not len(busy) == len(own) in (0, len(times)):
+            raise ValueError("the work of processors was not looked at each time")
+        return cls(_number(found["begin_ns"]), times, processes, busy, own)
 
     def as_text(self) -> str:
         """The record's content."""
@@ -120,19 +129,39 @@ class Waits:
             }
             for p in self.processes
         ]
-        record = {"begin_ns": self.begin_ns, "t_us": self.t_us, "processes": processes}
+        record = {
+            "begin_ns": self.begin_ns,
+            "t_us": self.t_us,
+            "processes": processes,
+            "busy_us": self.busy_us,
+            "own_us": self.own_us,
+        }
         return json.dumps(record, separators=(",", ":"))
 
     def starvation(self, subject: Subject, begin_ns: int, end_ns: int) -> Starvation | None:
         """How long a hand's processes waited in [begin, end]; None if it is not known."""
         if not self._of(subject):
             return None
-        lost = Lost.beyond_idle(self.delays(subject, begin_ns, end_ns))
+        part = self.others(begin_ns, end_ns)
+        lost = Lost.beyond_idle(part * self.delays(subject, begin_ns, end_ns))
         if lost is None:
             return None
         waited = [self._waited(p, begin_ns, end_ns) for p in self._of(subject)]
-        longest = max(w.longest for w in waited)
+        longest = part * max(w.longest for w in waited)
         return Starvation(lost, longest, max(waited, key=lambda w: w.part))
+
+    def others(self, begin_ns: int, end_ns: int) -> float:
+        """Part of the processors' work in [begin, end] that was not for these processes, 0 to 1.
+
+        A hand that keeps all processors busy waits for itself. 1 where it is not known.
+        """
+        rows, _ = self._there(np.zeros(len(self.t_us)), begin_ns - _AROUND, end_ns + _AROUND)
+        if not self.busy_us or not len(rows):
+            return 1.0
+        busy, own = (
+            float(np.array(x, dtype=np.float64)[rows].sum()) for x in (self.busy_us, self.own_us)
+        )
+        return min(max((busy - own) / busy, 0.0), 1.0) if busy > 0 else 0.0
 
     def delays(self, subject: Subject, begin_ns: int, end_ns: int) -> Floats:
         """By how much a hand's processes were delayed in each sample in [begin, end], seconds.

@@ -118,6 +118,19 @@ def test_waits_excuse_only_failures_they_can_cause(
     assert excuse(Machine(found), requirement, outcome, Side.LEFT).excused is excused  # type: ignore[arg-type]
 
 
+def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
+    """Three of its threads compute on two processors: each waits for the others of its own."""
+    busy = [2 * SAMPLE_US] * 200
+    slow = failure(0.5, 1.5).if_late(0.004, how="mean")
+    own = replace(MANY_SHORT, busy_us=busy, own_us=[round(1.8 * SAMPLE_US)] * 200)
+    others = replace(MANY_SHORT, busy_us=busy, own_us=[SAMPLE_US // 5] * 200)
+    assert excuse(Machine(others), RATE, slow, Side.LEFT).excused
+    assert not excuse(Machine(own), RATE, slow, Side.LEFT).excused
+    assert own.others(0, 10**9) == pytest.approx(0.1)
+    assert replace(own, busy_us=[0] * 200).others(0, 10**9) == 0.0
+    assert MANY_SHORT.others(0, 10**9) == 1.0  # not known
+
+
 def test_excuse_says_what_happened_and_what_to_do() -> None:
     found = excuse(Machine(ONE_LONG), GAP, failure(1.1, 1.3).if_late(0.1), Side.LEFT)
     assert found.text == (
@@ -210,7 +223,8 @@ def test_reversed_hand_fails_on_a_busy_machine() -> None:
 
 
 def test_record_keeps_waits() -> None:
-    stimulus = Stimulus(waits=waits(1, 2, 30, begin_ns=5))
+    found = replace(waits(1, 2, 30, begin_ns=5), busy_us=[1, 0, 2], own_us=[0, 0, 1])
+    stimulus = Stimulus(waits=found)
     assert Stimulus.from_metadata(stimulus.to_metadata()).waits == stimulus.waits
     assert Stimulus.from_metadata(Stimulus().to_metadata()).waits is None
 
@@ -221,6 +235,7 @@ def test_record_keeps_waits() -> None:
         {"t_us": [1]},
         {"t_us": ["x", 2]},
         {"begin_ns": 2**63},
+        {"busy_us": [1]},
         {"processes": [{"name": "a"}]},
         {"processes": 3},
         {
@@ -240,12 +255,12 @@ def test_damaged_waits_are_refused(change: dict[str, object]) -> None:
 # ------------------------------------------------------------------------------ measurement
 
 
-def proc(folder: Path, pid: int, threads: dict[int, int]) -> None:
-    """Files of a process whose threads have waited so many nanoseconds."""
+def proc(folder: Path, pid: int, threads: dict[int, int], ran: int = 777) -> None:
+    """Files of a process whose threads have waited so many nanoseconds, and run."""
     for thread, ns in threads.items():
         path = folder / str(pid) / "task" / str(thread)
         path.mkdir(parents=True, exist_ok=True)
-        (path / "schedstat").write_text(f"777 {ns} 5\n")
+        (path / "schedstat").write_text(f"{ran} {ns} 5\n")
 
 
 def test_waits_of_all_threads_are_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -253,9 +268,9 @@ def test_waits_of_all_threads_are_added(tmp_path: Path, monkeypatch: pytest.Monk
     proc(tmp_path, 7, {7: 5_000_000, 8: 1_000})
     threads = run_queue._Threads(7, 2)
     threads.search(MOST_FILES)
-    threads.sample()  # what was before is not of this time
-    proc(tmp_path, 7, {7: 8_000_000, 8: 1_001_000})
-    threads.sample()
+    assert threads.sample() == 0  # what was before is not of this time
+    proc(tmp_path, 7, {7: 8_000_000, 8: 1_001_000}, ran=1777)
+    assert threads.sample() == 2000
     proc(tmp_path, 7, {9: 500_000_000})
     threads.search(MOST_FILES)
     threads.sample()
@@ -265,6 +280,20 @@ def test_waits_of_all_threads_are_added(tmp_path: Path, monkeypatch: pytest.Monk
     assert threads.seen
     assert threads.waited_us == [0, 0, 0, 4000, 0, 6]
     assert threads.longest_us == [0, 0, 0, 3000, 0, 6]
+
+
+def test_work_of_processors_is_read_now_and_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_queue, "_PROC", tmp_path)
+    monkeypatch.setattr(run_queue, "_TICKS", 100)
+    processors = run_queue._Processors()
+    assert processors.worked() == 0  # no such file
+    stat = tmp_path / "stat"
+    stat.write_text("cpu  10 20 30 4000 500 1 2 3 7 7\ncpu0 1 2 3\n")
+    assert [processors.worked() for _ in range(10)] == [0] * 10
+    stat.write_text("cpu  12 20 33 9000 900 1 2 4 9 9\ncpu0 1 2 3\n")
+    assert [processors.worked() for _ in range(10)] == [0] * 9 + [60_000]
 
 
 def test_number_of_files_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
