@@ -217,21 +217,15 @@ _HOW = {"total": "in all", "mean": "each time", "p99": "one time in a hundred"}
 
 def _late(machine: Machine, failure: _Failure) -> Excuse:
     """Whether what the kit's own timer was late by explains a failure."""
-    begin, end, size, how, best = (
-        failure.begin,
-        failure.end,
-        failure.size,
-        failure.how,
-        failure.best,
-    )
-    lost = machine.lost(begin, end)
-    share = min(machine.starved(begin, end), 1.0)
+    size, best = failure.size, failure.best
+    lost = machine.lost(failure.begin, failure.end)
+    share = min(machine.starved(failure.begin, failure.end), 1.0)
     if lost is None:
         return Excuse()
-    measured = lost.of(how)
+    measured = lost.of(failure.how)
     harder = HARDEST * (1.0 + share)
     explained = harder * measured
-    was = f"the kit's own timer was late by {_ms(measured)} {_HOW[how]} there"
+    was = f"the kit's own timer was late by {_ms(measured)} {_HOW[failure.how]} there"
     by_fits = best > IDLE + harder * lost.best
     if not by_fits and measured > 0 and explained >= size:
         return Excuse(
@@ -277,6 +271,8 @@ def _starved(machine: Machine, subject: Subject, failure: _Failure) -> Excuse:
     if failure.finite is None or explained < NOTABLE * failure.size:
         return Excuse()
     why = f"which explains at most {_ms(explained)} of {_ms(failure.size)}"
+    if by_fits:
+        why = f"but by fits, and the hand is {_ms(failure.best)} late in its best quarter, too"
     disturbance = Disturbance(Load.BUSY, measured, explained, failure.finite)
     return Excuse(disturbance, f"{_BUSY}: {was}, {why}")
 
