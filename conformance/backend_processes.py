@@ -235,7 +235,7 @@ class Rig:
         """The processes that the hands or the robot consist of, as far as the kit started them."""
         found = [w for tool, w in self._watched.copy().items() if tool not in self._ended]
         if self._on_terminals:
-            found.append(Watched("the kernel's terminals", 0, self.options.hands))
+            found.append(Watched("the kernel's terminal workers", 0, self.options.hands))
         return found
 
     def dead(self) -> Tool | None:

@@ -127,6 +127,8 @@ class _Threads:
         self._folder = _PROC / str(pid) / "task"
         self._files: dict[str, int] = {}
         self._last: dict[str, tuple[int, int]] = {}
+        self._left_out: set[str] = set()
+        self._searched = False
 
     @property
     def files(self) -> int:
@@ -134,18 +136,24 @@ class _Threads:
         return len(self._files)
 
     def search(self, most: int) -> None:
-        """Find new threads, and open so many files at most."""
-        for thread in self._new()[: max(most, 0)]:
+        """Find new threads, and open so many files at most; the rest is left out for good."""
+        new = self._new()
+        for thread in new[: max(most, 0)]:
             with contextlib.suppress(OSError):
                 path = self._folder / thread / "schedstat"
                 self._files[thread] = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+                if self._searched:  # it has begun since then
+                    self._last[thread] = 0, 0
+        self._left_out.update(new[max(most, 0) :])
+        self._searched = True
 
     def _new(self) -> list[str]:
         """The threads that are not watched yet."""
         try:
-            return [t for t in os.listdir(self._folder) if t not in self._files]
+            threads = os.listdir(self._folder)
         except OSError:  # it has ended
             return []
+        return [t for t in threads if t not in self._files and t not in self._left_out]
 
     def sample(self) -> int:
         """Add how long the threads have waited since the last sample; return how long they ran, ns,
@@ -160,7 +168,7 @@ class _Threads:
                 self._last.pop(thread, None)
                 continue
             self.seen = True
-            # what it waited before it was found is not known to be of this time
+            # what one waited that was there before is not of this time
             ran_before, before = self._last.get(thread, (ran_ns, ns))
             self._last[thread] = ran_ns, ns
             ran += ran_ns - ran_before
@@ -208,14 +216,13 @@ class _KernelWorkers(_Threads):
     def __init__(self, pid: int, before: int) -> None:
         super().__init__(pid, before)
         self._folder = _PROC
-        self._others: set[str] = set()
 
     def _new(self) -> list[str]:
         found = []
         for name in super()._new():
-            if not name.isdecimal() or name in self._others:
+            if not name.isdecimal():
                 continue
             with contextlib.suppress(OSError, ValueError):
                 is_one = (_PROC / name / "comm").read_text().startswith("kworker/u")
-                (found.append if is_one else self._others.add)(name)
+                (found.append if is_one else self._left_out.add)(name)
         return found

@@ -271,15 +271,16 @@ def test_waits_of_all_threads_are_added(tmp_path: Path, monkeypatch: pytest.Monk
     assert threads.sample() == 0  # what was before is not of this time
     proc(tmp_path, 7, {7: 8_000_000, 8: 1_001_000}, ran=1777)
     assert threads.sample() == 2000
-    proc(tmp_path, 7, {9: 500_000_000})
+    proc(tmp_path, 7, {9: 50_000})
     threads.search(MOST_FILES)
     threads.sample()
-    proc(tmp_path, 7, {9: 500_006_000})
+    proc(tmp_path, 7, {9: 56_000})
     threads.sample()
     threads.close()
     assert threads.seen
-    assert threads.waited_us == [0, 0, 0, 4000, 0, 6]
-    assert threads.longest_us == [0, 0, 0, 3000, 0, 6]
+    # the last thread has begun since the first search
+    assert threads.waited_us == [0, 0, 0, 4000, 50, 6]
+    assert threads.longest_us == [0, 0, 0, 3000, 50, 6]
 
 
 def test_work_of_processors_is_read_now_and_then(
@@ -302,6 +303,7 @@ def test_number_of_files_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     threads = run_queue._Threads(7, 0)
     threads.search(5)
     threads.search(-1)
+    threads.search(20)
     assert threads.files == 5
     threads.close()
 
