@@ -218,7 +218,7 @@ class _KernelWorkers(_Threads):
         self._folder = _PROC
 
     def _new(self) -> list[str]:
-        found = []
+        found: list[str] = []
         for name in super()._new():
             if not name.isdecimal():
                 continue
