@@ -31,8 +31,8 @@ class Lost:
     best: float = 0.0
 
     def of(self, how: str) -> float:
-        """The figure of that kind: ``total``, ``mean`` or ``p99``."""
-        figures = {"total": self.total, "mean": self.mean, "p99": self.p99}
+        """The figure for a delay of that kind; see :class:`~dexkit.conformance.checks.Late`."""
+        figures = {"total": self.total, "chain": self.total, "mean": self.mean, "p99": self.p99}
         return figures[how]
 
     @classmethod

@@ -212,7 +212,7 @@ def _sizes(outcome: Outcome, spans: Sequence[tuple[float, float]]) -> Sequence[f
     return sizes if len(sizes) == len(spans) else [max(sizes)] * len(spans)
 
 
-_HOW = {"total": "in all", "mean": "each time", "p99": "one time in a hundred"}
+_HOW = {"total": "in all", "chain": "in all", "mean": "each time", "p99": "one time in a hundred"}
 
 
 def _late(machine: Machine, failure: _Failure) -> Excuse:
@@ -248,7 +248,7 @@ def _late(machine: Machine, failure: _Failure) -> Excuse:
 def _starved(machine: Machine, subject: Subject, failure: _Failure) -> Excuse:
     """Whether the time that the hand's processes waited for a processor explains a failure."""
     # what happens once can be the end of what was held up before
-    before = AFTERMATH if failure.how == "total" else 0.0
+    before = AFTERMATH if failure.how in ("total", "chain") else 0.0
     there = machine.starvation(subject, failure.begin - before, failure.end)
     if there is None:
         return Excuse()

@@ -94,6 +94,9 @@ MANY_SHORT = waits(*[4_000] * 200)
         # many short waits make a single event late by a few of them
         (GAP, failure(1.0, 1.5).if_late(HOPS * 0.0039), MANY_SHORT, True),
         (GAP, failure(1.0, 1.5).if_late(HOPS * 0.0041), MANY_SHORT, False),
+        # but a task of many steps by all of them
+        (GAP, failure(1.0, 1.5).if_late(0.8, how="chain"), MANY_SHORT, True),
+        (GAP, failure(1.0, 1.5).if_late(1.0, how="chain"), MANY_SHORT, False),
         # they make each one late that happens again and again, also at its best
         (RATE, failure(0.5, 1.5).if_late(0.005, how="mean", best=0.004), MANY_SHORT, True),
         (RATE, failure(0.5, 1.5).if_late(0.007, how="mean", best=0.004), MANY_SHORT, False),

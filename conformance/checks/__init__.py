@@ -94,8 +94,10 @@ class Late:
     :param seconds: at each of the failure's places, or one for all of them; infinite where no delay
         causes such a failure. For a missing motion, the seconds that a conforming hand takes for
         it: :data:`STROKE_S` for a stroke.
-    :param how: ``total``: a single delay at that place; ``mean``: a repeated delay, as it lowers a
-        rate; ``p99``: in one of a hundred.
+    :param how: ``total``: a single delay at that place; ``chain``: many delays one after the other,
+        of a task with many steps, as the end of a process or a motion under a client that goes on
+        from each state; ``mean``: a repeated delay, as it lowers a rate; ``p99``: in one of a
+        hundred.
     :param best: the same for the best quarter of repeated events; 0 if unknown.
     """
 
