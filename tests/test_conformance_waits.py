@@ -21,7 +21,7 @@ from dexkit.conformance.checks import Outcome
 from dexkit.conformance.judge import judge
 from dexkit.conformance.lost import IDLE, Lost
 from dexkit.conformance.mutants import plan_for
-from dexkit.conformance.mutants.gripper import Inverted
+from dexkit.conformance.mutants.gripper import Inverted, NanVelocity, Percent
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Evidence, Load, RunResult, Verdict
@@ -29,6 +29,7 @@ from dexkit.conformance.run_queue import MOST_FILES, RunQueue, Watched
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.verdicts import AFTERMATH, HOPS, excuse
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
+from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.waits import ProcessWaits, Starvation, Waits
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side, Subject
@@ -215,13 +216,22 @@ def test_idle_waits_change_no_verdict() -> None:
     assert verdicts(judge(with_waits(trace, waits(*[900] * 2000)))) == verdicts(without)
 
 
-def test_reversed_hand_fails_on_a_busy_machine() -> None:
+@each(
+    ("service", "requirement"),
+    [
+        (Inverted, MOVE.id),
+        (Percent, "DEX1-FIELD-03"),
+        (NanVelocity, FIELD.id),
+    ],
+)
+def test_what_no_load_explains_fails_on_a_busy_machine(
+    service: type[ReferenceService], requirement: str
+) -> None:
     """Its process waits for half of the time, up to 20 ms at once."""
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step"}))
-    trace = run_virtual(plan, Inverted)
-    busy = with_waits(trace, waits(*[5_000, 20_000, 0] * 700))
+    busy = with_waits(run_virtual(plan, service), waits(*[5_000, 20_000, 0] * 700))
     result = judge(busy)
-    assert result_of(result, MOVE.id).verdict is Verdict.FAIL
+    assert result_of(result, requirement).verdict is Verdict.FAIL
     assert str(result.overall) == "fail"
 
 
