@@ -28,6 +28,8 @@ _SEARCH = 0.2  # seconds between searches for new processes and threads
 MOST_FILES = 96
 """Files that are open at the same time, one for each thread: of more threads the rest is not
 watched."""
+_LONG_US = 20_000
+"""Shortest wait of the kernel's workers that counts, microseconds: two samples."""
 _PROC = Path("/proc")
 _TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -211,11 +213,23 @@ class _Processors:
 
 
 class _KernelWorkers(_Threads):
-    """The kernel's workers that are bound to no processor."""
+    """The kernel's workers that are bound to no processor.
+
+    They do other work as well, and one of them at a time passes on what is written to a line. So
+    only the longest wait counts, and only where it is so long that a line shows it.
+    """
 
     def __init__(self, pid: int, before: int) -> None:
         super().__init__(pid, before)
         self._folder = _PROC
+
+    def sample(self) -> int:
+        """Add the longest wait of one of them."""
+        ran = super().sample()
+        if self.longest_us[-1] < _LONG_US:
+            self.longest_us[-1] = 0
+        self.waited_us[-1] = self.longest_us[-1]
+        return ran
 
     def _new(self) -> list[str]:
         found: list[str] = []

@@ -331,7 +331,12 @@ def test_kernel_workers_are_found_by_name(tmp_path: Path, monkeypatch: pytest.Mo
     workers = run_queue._KernelWorkers(0, 0)
     workers.search(MOST_FILES)
     assert workers.files == 1
+    workers.sample()
+    for ns in (5_000_003, 35_000_003):  # a short wait may be for other work
+        (tmp_path / "0" / "schedstat").write_text(f"1 {ns} 3\n")
+        workers.sample()
     workers.close()
+    assert workers.waited_us == workers.longest_us == [0, 0, 30_000]
 
 
 def test_nothing_is_measured_without_proc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
