@@ -147,7 +147,8 @@ def record_run(
         rig = stack.enter_context(Rig(rig_options, stop))
         if options.usb and not _judge_usb(rig, recorder, report, stop):
             return False
-        # before the services: what they wait when they start shows in their first states
+        # before the services: a busy machine shows in their first states already
+        heart = stack.enter_context(Heartbeat())
         queue = stack.enter_context(RunQueue(lambda: _processes(rig, recorder_node)))
         rig.serve()
         if stop.is_set():
@@ -167,7 +168,6 @@ def record_run(
         sole.search()
         plan = options.plan()
         script = script_for(plan, report)
-        heart = stack.enter_context(Heartbeat())
         player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
         _wait_for_endpoints(recorder_node, plan)
