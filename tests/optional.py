@@ -7,6 +7,7 @@ import importlib.util
 import shutil
 import subprocess
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NamedTuple
 
 from tools.browser import chromium
@@ -77,6 +78,7 @@ OPTIONAL = (
         namespaces,
         ("dds_multicast", "docs_run", "lan", "lerobot_soak", "networks"),
     ),
+    Optional("/proc/PID/schedstat", Path("/proc/self/schedstat").exists, ("conformance_waits",)),
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
     Optional(

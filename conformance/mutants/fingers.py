@@ -265,8 +265,9 @@ class _Filled(FingerService):
 @wrong_hand(
     "DEX3-FIELD-20",
     also=("DEX3-FIELD-05", "DEX3-FIELD-19", "DEX3-GAIN-03", "DEX3-GAIN-05", "DEX3-SAFE-06"),
+    whole=True,
 )
-@wrong_hand("DEX5-FIELD-20", also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-05"))
+@wrong_hand("DEX5-FIELD-20", also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-05"), whole=True)
 class ShowsTheGoalNearIt(FingerService):
     """Publishes the commanded q of one joint within a tenth of its range from it."""
 

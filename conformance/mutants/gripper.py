@@ -37,7 +37,7 @@ class NanVelocity(_Fields):
         return fields if fields["dq"] else {**fields, "dq": math.nan}
 
 
-@wrong_hand("DEX1-FIELD-21", also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-GAIN-03"))
+@wrong_hand("DEX1-FIELD-21", also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-GAIN-03"), whole=True)
 class ShowsTheGoalNearIt(_Fields):
     """Publishes the commanded q within 3.5 % of the stroke from it."""
 
@@ -823,7 +823,7 @@ class _BoostsMore(ReferenceHand):
         return 2.6 * tau if self.contact() > 0.0 else tau
 
 
-@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH)
+@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True)
 class BoostsByItsOwnGains(ReferenceService):
     """Presses with two and a half times the torque of its own gains where it is blocked."""
 
