@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
@@ -190,7 +190,6 @@ def test_five_joints_hold_no_command_and_more_than_six_do() -> None:
 
 
 @given(st.lists(st.floats(0, 1), min_size=N, max_size=N), st.sampled_from(Fill))
-@settings(max_examples=30, deadline=None)
 def test_state_has_six_motors_in_the_vendors_units(q: list[float], fill: Fill) -> None:
     state = HandState.from_values(q, dq=-0.5 * FULL, tau_est=0.3, stamp=0.0)
     sent = STATES.decode(mapping(fill).encode({LEFT: StateView(state, (0,) * N)}))

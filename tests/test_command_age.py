@@ -258,7 +258,6 @@ def clients(draw: st.DrawFn, begin: float, end: float) -> Client:
 
 
 @given(st.data())
-@settings(max_examples=40)
 def test_nothing_sent_before_a_pause_ends_moves_the_hand_after_it(data: st.DataObject) -> None:
     begin = 2.0
     end = begin + data.draw(st.floats(PAUSE + 0.02, 4.0), "pause")

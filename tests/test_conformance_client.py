@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.cli.check import command
@@ -318,7 +318,6 @@ def still(count: int, rate: float = 200.0, joints: int = 1) -> tuple[Floats, Flo
     return np.arange(count) / rate, np.zeros((count, joints))
 
 
-@settings(max_examples=30)
 @given(
     rate=st.floats(1.0, 1000.0),
     limit=st.sampled_from([25.0, 90.0, 180.0]),
@@ -331,7 +330,6 @@ def test_steady_client_passes_from_the_limit_on(rate: float, limit: float, windo
     assert least == pytest.approx(rate, rel=1e-6)
 
 
-@settings(max_examples=30)
 @given(pause=st.floats(0.01, 0.9), at=st.integers(100, 700))
 def test_stretch_of_few_commands_is_found_where_it_is(pause: float, at: int) -> None:
     t = np.arange(1000) / 200.0
@@ -343,7 +341,6 @@ def test_stretch_of_few_commands_is_found_where_it_is(pause: float, at: int) -> 
         assert begin <= t[at - 1] < t[at] <= end
 
 
-@settings(max_examples=30)
 @given(pause=st.floats(0.02, 0.95))
 def test_interval_is_a_gap_from_a_tenth_of_a_second_on(pause: float) -> None:
     t, q = still(400)
@@ -364,7 +361,6 @@ def test_longer_pause_separates_sessions_of_some_length(run: int, pause: float, 
     assert found[-1].stop == 400
 
 
-@settings(max_examples=30)
 @given(st.data())
 def test_any_value_that_is_not_finite_is_found(data: st.DataObject) -> None:
     t, q = still(50, joints=7)
@@ -386,7 +382,6 @@ def test_any_value_that_is_not_finite_is_found(data: st.DataObject) -> None:
     assert outcome.evidence[0].time_s == pytest.approx(t[row], abs=1e-4)
 
 
-@settings(max_examples=30)
 @given(st.integers(-1, 40))
 def test_only_the_dialects_length_passes(length: int) -> None:
     t, q = still(50, joints=7)
@@ -394,7 +389,6 @@ def test_only_the_dialects_length_passes(length: int) -> None:
     assert judged(ctx).met is (length == 7)
 
 
-@settings(max_examples=30)
 @given(q=st.floats(-10.0, 400.0), driven=st.booleans())
 def test_driven_q_is_within_stroke_and_margin(q: float, driven: bool) -> None:
     t, zero = still(50)
@@ -403,7 +397,6 @@ def test_driven_q_is_within_stroke_and_margin(q: float, driven: bool) -> None:
     assert outcome.met is (not driven or -0.25 <= q <= 5.65)
 
 
-@settings(max_examples=30)
 @given(st.floats(-1.0, 1.0))
 def test_step_from_the_states_is_at_most_a_fifth_of_a_radian(step: float) -> None:
     t, q = still(200)
@@ -417,7 +410,6 @@ def test_step_from_the_states_is_at_most_a_fifth_of_a_radian(step: float) -> Non
     assert outcome.met is (abs(step) <= 0.0371 * 5.4)
 
 
-@settings(max_examples=30)
 @given(st.floats(0.01, 100.0))
 def test_gains_are_within_the_factor(factor: float) -> None:
     t, q = still(100, joints=7)
@@ -433,7 +425,6 @@ def test_zero_gains_stop_a_joint_at_the_end_and_nowhere_else() -> None:
         assert judged(context("DEX1-CLIENT-09", t, q, kp=kp, kd=kd)).met is met
 
 
-@settings(max_examples=30)
 @given(st.integers(0, 255), st.integers(0, 6))
 def test_mode_byte_of_a_driven_motor_is_its_index_and_status_1(byte: int, joint: int) -> None:
     t, q = still(60, joints=7)
@@ -444,7 +435,6 @@ def test_mode_byte_of_a_driven_motor_is_its_index_and_status_1(byte: int, joint:
     assert outcome.met is (byte & 0x7F == 0x10 | joint)
 
 
-@settings(max_examples=30)
 @given(
     distance=st.floats(0.2, 3.0),
     first=st.integers(1, 3),
@@ -458,7 +448,6 @@ def test_two_clients_at_any_two_rates_are_noticed(distance: float, first: int, s
     assert judged(context("DEX1-CLIENT-11", t, q[:, None])).met is False
 
 
-@settings(max_examples=30)
 @given(speed=st.floats(-10.0, 10.0), hold=st.integers(1, 10))
 def test_one_client_at_full_speed_is_not_taken_for_two(speed: float, hold: int) -> None:
     t = np.arange(800) / 200.0

@@ -217,7 +217,7 @@ def test_exception_in_check_is_verdict_error(monkeypatch: pytest.MonkeyPatch) ->
 # --------------------------------------------------------------------------------- hostile
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), share=st.sampled_from([0.001, 0.05, 1.0]))
 def test_damaged_samples_raise_no_exception_in_checks(seed: int, share: float) -> None:
     """Any bytes give a verdict, never an error of the kit."""

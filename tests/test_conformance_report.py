@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.judge import judge, judge_layer
@@ -262,7 +262,6 @@ def test_usb_failure_shows_bytes_joints_or_descriptors() -> None:
 floats = st.floats(-1e6, 1e6)
 
 
-@settings(max_examples=60)
 @given(values=st.lists(floats, min_size=1, max_size=400), points=st.integers(10, 50))
 def test_thinned_curve_keeps_extremes_and_order(values: list[float], points: int) -> None:
     x, y = np.arange(len(values), dtype=float), np.array(values)
@@ -272,7 +271,6 @@ def test_thinned_curve_keeps_extremes_and_order(values: list[float], points: int
     assert (ys.min(), ys.max()) == (y.min(), y.max())
 
 
-@settings(max_examples=60)
 @given(low=floats, width=st.floats(1e-3, 1e6))
 def test_ticks_lie_within_and_are_few(low: float, width: float) -> None:
     ticks = nice_ticks(low, low + width)

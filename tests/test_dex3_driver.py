@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.backend.libusb1
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from usb.core import USBError, USBTimeoutError
 
@@ -117,7 +117,6 @@ class TestAddress:
         assert "usbip://" in caught.value.hint
 
     @given(st.text(max_size=30))
-    @settings(max_examples=50, deadline=None)
     def test_any_text_is_parsed_as_an_address_or_refused(self, text: str) -> None:
         for attempt in (text, "usbip://" + text):
             try:
@@ -233,7 +232,6 @@ class TestSettings:
             backend.create(self.options(baud="1"))
 
     @given(st.text(max_size=20))
-    @settings(max_examples=50, deadline=None)
     def test_any_bus_map_is_read_or_refused(self, text: str) -> None:
         try:
             places = parse_places(text)
@@ -1068,7 +1066,6 @@ class TestUsbIpClient:
             max_size=4,
         )
     )
-    @settings(max_examples=50, deadline=None)
     def test_any_server_data_raises_only_usb_errors(self, chunks: list[bytes]) -> None:
         connection, server = self.connected()
         server.sendall(b"".join(chunks))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
@@ -174,7 +174,6 @@ def test_sensors_measure_an_object() -> None:
 
 
 @pytest.mark.parametrize("side", SIDES)
-@settings(max_examples=30, deadline=None)
 @given(
     poses=st.lists(st.tuples(*[st.floats(0.0, 1.0)] * 7).map(np.array), min_size=1, max_size=4),
     seconds=st.floats(0.0, 0.3),
@@ -193,7 +192,6 @@ def test_answers_are_those_of_the_codec(
         )
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     q=st.tuples(*[st.floats(-3, 3)] * 7),
     kp=st.floats(0, 20),
@@ -298,7 +296,6 @@ _GOOD = HandCodec(DEX3_1.joints[Side.LEFT]).encode(
 )
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     data=st.one_of(
         st.binary(max_size=3000),
@@ -318,7 +315,6 @@ def test_invalid_input_moves_no_motor(data: bytes) -> None:
     assert state.q == pytest.approx(bench.rest, abs=1e-5)
 
 
-@settings(max_examples=50, deadline=None)
 @given(bit=st.integers(0, 8 * 20 - 1), sizes=st.lists(st.integers(0, 300), min_size=5, max_size=5))
 def test_damage_inside_a_good_frame_reaches_no_motor(bit: int, sizes: list[int]) -> None:
     bench = Bench()

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.dex3_mechanics import F_1515_108, F_1515_214, Dex3Mechanics
@@ -218,7 +218,6 @@ command = st.tuples(
     st.lists(st.tuples(command, st.integers(0, 40)), min_size=1, max_size=40),
     st.sampled_from([None, 25.0, 60.0]),
 )
-@settings(max_examples=40, deadline=None)
 def test_any_command_keeps_the_state_finite(
     side: Side,
     moves: list[tuple[tuple[int, int, float, float, float, float, float], int]],

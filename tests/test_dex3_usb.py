@@ -185,7 +185,6 @@ def test_packets_survive_a_round_trip(packet: Any) -> None:
     assert type(packet).parse(packet.pack()) == packet
 
 
-@settings(max_examples=50, deadline=None)
 @given(packets)
 def test_every_flipped_bit_is_noticed(packet: Any) -> None:
     data = bytearray(packet.pack())
@@ -240,7 +239,6 @@ def test_any_order() -> None:
     assert not problems
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.one_of(motor_states, sensor_states), max_size=5), st.data())
 def test_one_damaged_packet_is_lost_alone(packets: list[Any], data: st.DataObject) -> None:
     parts = [p.pack() for p in packets]
@@ -335,7 +333,6 @@ def test_state_frames_survive_a_round_trip() -> None:
     assert len(frame.sensors) == 5
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.lists(motor_cmds, max_size=7), min_size=5, max_size=5),
     st.sampled_from(d.COMMAND_LAYOUTS),
@@ -412,7 +409,6 @@ def test_a_damaged_packet_in_a_good_frame() -> None:
     assert [(p.bus, p.offset) for p in frame.problems] == [(0, 26)]
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     st.binary(max_size=400),
     st.lists(st.integers(0, 2**32 - 1), min_size=5, max_size=5),

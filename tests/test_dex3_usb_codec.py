@@ -138,7 +138,6 @@ modes = st.lists(st.integers(0, 7), min_size=7, max_size=7).map(lambda x: np.arr
 motor_places = st.permutations([(b, i) for b in range(4) for i in range(4)]).map(lambda x: x[:7])
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     st.builds(HandCommand, rows, rows, rows, rows, rows, modes),
     st.one_of(st.booleans(), flags),
@@ -355,7 +354,6 @@ def test_a_tripped_motor() -> None:
     assert codec.decode(d.pack_state(frame), 0.0).fault[0] == MotorError.MOTOR_SAW_HOST_TIMEOUT
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.sets(st.integers(0, 6)),
     st.sets(st.integers(0, 8)),
@@ -489,7 +487,6 @@ def test_nan_position_cannot_be_encoded_but_missing_sensors_can() -> None:
     assert decoded.supply == SupplyState(0.0, 0.0, 0.0, 0.0)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=300), st.integers(2, 1266), st.booleans())
 def test_any_bytes_decode_or_raise_a_typed_error(noise: bytes, at: int, sealed: bool) -> None:
     codec = d.HandCodec(JOINTS)

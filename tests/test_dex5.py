@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
@@ -171,7 +171,6 @@ def message(modes: list[int], **fields: float) -> unitree_hg.HandCmd_:
 
 
 @given(st.lists(st.integers(0, 255), min_size=N, max_size=N))
-@settings(max_examples=50, deadline=None)
 def test_only_mode_1_drives(modes: list[int]) -> None:
     command = mapping().command(message(modes), LEFT)
     assert command is not None
@@ -198,7 +197,6 @@ def test_torques_are_in_two_units() -> None:
 
 
 @given(st.lists(st.floats(-0.93, 0.93), min_size=N, max_size=N), st.sampled_from(Fill))
-@settings(max_examples=60, deadline=None)
 def test_state_has_twenty_joints_and_no_unknown_members(tau: list[float], fill: Fill) -> None:
     modes = [i % 2 for i in range(N)]
     state = HandState.from_values(DEX5_1.rest_q[LEFT], tau_est=tau, mode=modes, stamp=0.0)

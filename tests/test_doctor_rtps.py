@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.doctor import rtps
@@ -149,7 +149,6 @@ def test_final_heartbeat_is_not_answered() -> None:
 
 
 @given(st.integers(1, 2**40), st.sets(st.integers(0, 255), max_size=40))
-@settings(max_examples=60)
 def test_acknack_lists_missing_samples(base: int, offsets: set[int]) -> None:
     missing = sorted(base + o for o in offsets)
     packet = rtps.message(
@@ -172,7 +171,6 @@ _REAL = [
     st.lists(st.tuples(st.integers(0, 500), st.integers(0, 255)), min_size=1, max_size=8),
     st.integers(0, 600),
 )
-@settings(max_examples=100)
 def test_damaged_packet_is_ignored(
     packet: bytes, damage: list[tuple[int, int]], length: int
 ) -> None:

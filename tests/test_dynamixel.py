@@ -261,7 +261,6 @@ def test_any_flipped_bit_is_noticed(packet: Packet, data: st.DataObject) -> None
 
 
 @given(st.lists(packets(), max_size=5), st.data())
-@settings(max_examples=75, deadline=None)
 def test_parser_does_not_care_how_bytes_are_cut(sent: list[Packet], data: st.DataObject) -> None:
     stream = b"".join(dxl.encode(p.id, p.instruction, p.params) for p in sent)
     parser = PacketParser()

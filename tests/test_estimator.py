@@ -53,7 +53,6 @@ speeds = st.tuples(st.floats(0.5, 30.0), st.floats(0.5, 30.0))
 
 
 @given(speeds, st.floats(0.0, STROKE), events)
-@settings(max_examples=150, deadline=None)
 def test_estimate_never_jumps_overshoots_or_reverses(
     speed: tuple[float, float], start: float, script: list[Advance | Command | Measure]
 ) -> None:

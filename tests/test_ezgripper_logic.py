@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.drivers.ezgripper import block, calibration, config, scaling
@@ -23,13 +23,9 @@ from dexkit.wire import mx64
 from dexkit.wire.mx64 import HardwareError
 from tests.each import each
 
-fast = settings(max_examples=50, deadline=None)
-fewer = settings(max_examples=40, deadline=None)
-
 # --- scaling
 
 
-@fast
 @given(
     relative=st.integers(-798, 2500 + 797),
     zero=st.integers(0, 4095),
@@ -86,7 +82,6 @@ _tables = st.dictionaries(
 ).map(lambda d: dict(zip(sorted(d), sorted(d.values()), strict=True)))
 
 
-@fast
 @given(table=_tables, a=st.floats(0, 2000), b=st.floats(0, 2000))
 def test_force_never_falls_and_stays_within_the_table(
     table: dict[int, float], a: float, b: float
@@ -141,7 +136,6 @@ _samples = st.builds(
 )
 
 
-@fast
 @given(sample=_samples)
 def test_a_sample_is_read_as_the_table_encodes_it(sample: Sample) -> None:
     values = {
@@ -197,7 +191,6 @@ def _run(
     return None
 
 
-@fewer
 @given(
     speed=st.floats(MIN_FREE_SPEED, 220.0),
     closing=st.booleans(),
@@ -236,7 +229,6 @@ def test_pause_before_the_goal_is_written_is_not_contact() -> None:
         assert detector.update(2 * pause + 0.07, 1975, 2500) is None
 
 
-@fewer
 @given(
     speed=st.floats(MIN_FREE_SPEED, 220.0),
     exchanges=st.lists(
@@ -259,7 +251,6 @@ def test_late_answers_in_free_motion_are_never_contact(
             now = received
 
 
-@fewer
 @given(
     speed=st.floats(5.0, 220.0),
     stop=st.integers(100, 2300),
@@ -505,7 +496,6 @@ _commands = st.one_of(
 )
 
 
-@fast
 @given(
     steps=st.lists(
         st.tuples(_commands, st.integers(-50, 2550), st.floats(0, 0.3), st.integers(20, 85)),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from usbip.core import Stall
 
@@ -68,7 +68,6 @@ def test_divisors_of_a_high_speed_chip(rate: int, value: int, index: int) -> Non
 
 
 @given(st.integers(0, 0xFFFF), st.integers(0, 0xFFFF), st.sampled_from([FT232R, FT232H]))
-@settings(max_examples=60)
 def test_any_divisor_is_a_rate_of_the_chip(value: int, index: int, model: ChipModel) -> None:
     assert 180 < baudrate_of(model, value, index) <= (12_000_000 if model is FT232H else 3_000_000)
 
@@ -86,7 +85,6 @@ def ready(chip: FtdiChip, now: float) -> list[bytes]:
     st.sampled_from([FT232R, FT232H]),
     st.integers(1, 255),
 )
-@settings(max_examples=60)
 def test_every_byte_comes_once_in_order_and_no_later_than_the_timer(
     pieces: list[tuple[bytes, float]], model: ChipModel, latency: int
 ) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
@@ -154,7 +154,6 @@ def message(*q: float, **fields: float) -> unitree_go.MotorCmds_:
 
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=12, max_size=12))
-@settings(max_examples=30, deadline=None)
 def test_each_hand_gets_its_half_of_a_command(q: list[float]) -> None:
     sent = COMMANDS.decode(COMMANDS.encode(message(*q, dq=0.3, kp=2.0, tau=-1.0)))
     for side, half in ((RIGHT, q[:N]), (LEFT, q[N:])):
@@ -167,7 +166,6 @@ def test_each_hand_gets_its_half_of_a_command(q: list[float]) -> None:
 
 
 @given(st.lists(st.floats(0, 1, width=32), min_size=12, max_size=12), st.sampled_from(Fill))
-@settings(max_examples=30, deadline=None)
 def test_both_hands_are_in_one_state(q: list[float], fill: Fill) -> None:
     views = {
         side: StateView(HandState.from_values(half, stamp=0.0), (0,) * N)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
@@ -63,7 +63,6 @@ FRAMES = st.builds(
 
 
 @given(FRAMES, st.binary(max_size=20))
-@settings(max_examples=60, deadline=None)
 def test_frames_survive_packing_and_are_found_in_a_stream(frame: Frame, noise: bytes) -> None:
     data = frame.pack()
     assert Frame.parse(data) == frame
@@ -76,7 +75,6 @@ def test_frames_survive_packing_and_are_found_in_a_stream(frame: Frame, noise: b
 
 
 @given(st.binary(max_size=60))
-@settings(max_examples=60, deadline=None)
 def test_garbage_is_skipped(data: bytes) -> None:
     parser = FrameParser(answers=True)
     found = parser.feed(data)

@@ -279,7 +279,6 @@ def _cut(stream: bytes, draw: st.DataObject) -> list[bytes]:
     return [stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(data, max_size=6), st.data())
 def test_parser_does_not_care_how_bytes_are_cut(sent: list[MotorData], draw: st.DataObject) -> None:
     parser = FrameParser()
@@ -293,7 +292,6 @@ def test_parser_does_not_care_how_bytes_are_cut(sent: list[MotorData], draw: st.
     )
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(frames, max_size=6), st.data())
 def test_parser_separates_commands_and_data_of_all_motors(
     sent: list[MotorCmd | MotorData], draw: st.DataObject

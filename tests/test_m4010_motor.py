@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import serial
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.cli.emulate import command
@@ -307,7 +307,6 @@ def test_damaged_command_is_not_answered() -> None:
 
 
 @given(st.lists(st.binary(max_size=40), max_size=6))
-@settings(max_examples=50, deadline=None)
 def test_a_command_after_anything_is_answered(pieces: list[bytes]) -> None:
     host = Host(motor())
     for piece in pieces:
@@ -323,7 +322,6 @@ def test_a_command_after_anything_is_answered(pieces: list[bytes]) -> None:
     st.floats(0, 1e4),
     st.floats(0, 1e4),
 )
-@settings(max_examples=40, deadline=None)
 def test_any_command_keeps_it_finite_and_within_the_stops(
     q: float, dq: float, tau: float, kp: float, kd: float
 ) -> None:

@@ -82,7 +82,6 @@ def test_every_shortened_sample_is_truncated(pair: tuple[str, Any]) -> None:
             decode(name, data[:size])
 
 
-@settings(max_examples=150)
 @given(st.sampled_from(NAMES), st.binary(max_size=300), st.booleans())
 def test_random_bytes_raise_nothing_but_wire_errors(
     name: str, data: bytes, plausible: bool
@@ -95,7 +94,6 @@ def test_random_bytes_raise_nothing_but_wire_errors(
         pass
 
 
-@settings(max_examples=100)
 @given(any_message, st.data())
 def test_damaged_samples_raise_nothing_but_wire_errors(
     pair: tuple[str, Any], data: st.DataObject
@@ -128,7 +126,6 @@ def test_a_hostile_length_costs_no_memory() -> None:
     assert peak < 1_000_000  # the length asks for 120 GB
 
 
-@settings(max_examples=40)
 @given(st.data())
 def test_columns_agree_with_decoding_one_by_one(data: st.DataObject) -> None:
     name = "unitree_hg::msg::dds_::HandState_"

@@ -97,7 +97,6 @@ def test_requests_and_answers_survive_both_framings(
 
 
 @given(st.binary(max_size=60), st.booleans())
-@settings(max_examples=40, deadline=None)
 def test_garbage_is_skipped_and_a_frame_behind_it_is_found(noise: bytes, answers: bool) -> None:
     parser = RtuParser(answers=answers)
     found = parser.feed(noise)

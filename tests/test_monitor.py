@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.cli import cli
@@ -53,7 +53,6 @@ def test_a_joint_between_its_limits(q: float, target: float, expected: str) -> N
     assert found == expected
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     width=st.integers(3, 60),
     q=st.floats(allow_nan=True, allow_infinity=True),
@@ -91,7 +90,6 @@ def test_hidden_lines_are_counted_and_can_be_scrolled_to() -> None:
     assert any("index_1" in line for line in down)
 
 
-@settings(max_examples=40, deadline=None)
 @given(width=st.integers(1, 200), height=st.integers(1, 60), scroll=st.integers(0, 100))
 def test_any_size_is_filled(width: int, height: int, scroll: int) -> None:
     lines = text_of(HANDS, 0.1, width, height, scroll=scroll)

@@ -6,7 +6,7 @@ import json
 from importlib.util import find_spec
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.robot import MotionSwitcher
@@ -84,7 +84,6 @@ def test_errors(api: int, parameter: str, code: int) -> None:
 any_service = st.sampled_from(SERVICE_NAMES).flatmap(lambda n: st.tuples(st.just(n), messages(n)))
 
 
-@settings(max_examples=30)
 @given(any_service, st.data())
 def test_damaged_samples_raise_nothing_but_wire_errors(
     pair: tuple[str, Request_ | Response_], data: st.DataObject

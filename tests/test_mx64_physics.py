@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.mx64 import Firmware, Physics, Servo
@@ -270,7 +270,6 @@ def test_noise_on_current_is_seeded() -> None:
     st.integers(1, 1000),
     st.integers(0, 2000),
 )
-@settings(max_examples=50, deadline=None)
 def test_profile_arrives_exactly_and_keeps_its_limits(
     goal: float, velocity: int, acceleration: int
 ) -> None:

@@ -8,7 +8,7 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.mx64 import Firmware, Servo
@@ -51,7 +51,6 @@ def test_every_item_reads_with_its_initial_value() -> None:
 
 
 @given(st.integers(0, 700), st.integers(0, 700))
-@settings(max_examples=100, deadline=None)
 def test_read_answers_data_or_access_error(address: int, length: int) -> None:
     error, data = servo().read_block(address, length)
     covered = {a for i in mx64.TABLE.values() for a in range(i.address, i.end)}
@@ -81,7 +80,6 @@ def test_part_of_an_item_can_be_read_but_not_written() -> None:
 
 
 @given(st.integers(0, 700), st.binary(max_size=30), st.booleans())
-@settings(max_examples=100, deadline=None)
 def test_write_changes_all_or_no_bytes(address: int, data: bytes, torque: bool) -> None:
     target = servo()
     if torque:
@@ -760,7 +758,6 @@ class_items = st.sampled_from([i for i in mx64.TABLE.values() if i.writable and 
         max_size=25,
     )
 )
-@settings(max_examples=60, deadline=None)
 def test_any_instructions_keep_registers_within_table_limits(
     steps: list[tuple[Item | None, int]],
 ) -> None:

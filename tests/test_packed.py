@@ -47,7 +47,6 @@ def damaged(payload: bytes, at: int, value: int) -> bytes:
     return payload[:at] + bytes([value]) + payload[at + 1 :]
 
 
-@settings(max_examples=75, deadline=None)
 @given(st.lists(st.binary(max_size=9), max_size=12), st.data())
 def test_payloads_are_given_as_they_were_put_in(payloads: list[bytes], data: st.DataObject) -> None:
     cuts = data.draw(st.lists(st.integers(0, 12), max_size=4))
@@ -66,7 +65,7 @@ def test_payloads_are_given_as_they_were_put_in(payloads: list[bytes], data: st.
     assert [packed(payloads, cuts, order)[i] for i in range(len(wanted))] == wanted
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(st.sampled_from(sorted(PATHS)), st.data())
 def test_columns_of_packed_payloads_are_those_of_single_ones(
     name: str, data: st.DataObject

@@ -40,9 +40,7 @@ class Log:
         return [t for t, _ in self.rows]
 
 
-@settings(
-    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     times=st.lists(st.integers(0, 20_000), min_size=1, max_size=30).map(sorted),
     speed=st.sampled_from([0.25, 1.0, 2.0, 7.5]),

@@ -386,7 +386,6 @@ def test_a_session_that_moves_nothing_is_noted(tmp_path: Path) -> None:
     assert levels(prepare(session(tmp_path, gripper([2.0])))) == {"still": "note", "single": "note"}
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     steps=st.lists(
         st.tuples(st.sampled_from([0, 1, 5, 33, 400, 3000]), st.floats(-0.5, 6.0)),

@@ -200,7 +200,6 @@ def test_stop_constants(model: RobotModel) -> None:
 
 
 @both
-@settings(max_examples=60)
 @given(st.data(), st.sampled_from(FIELDS), st.sampled_from([math.nan, math.inf, -math.inf]))
 def test_non_finite_value_rejects_the_command(
     model: RobotModel, data: Any, field: str, value: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks import timing
@@ -19,7 +19,6 @@ def _same(ours: float, numpys: float) -> bool:
     return ours == numpys or (math.isnan(ours) and math.isnan(numpys))
 
 
-@settings(max_examples=60, deadline=None)
 @given(_COLUMNS.filter(bool), st.sampled_from([0.0, 25.0, 50.0, 99.0, 100.0]))
 def test_median_and_percentile(values: list[float], percent: float) -> None:
     column = np.array(values)

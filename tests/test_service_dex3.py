@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
@@ -238,7 +238,6 @@ class TestState:
 
     anything = st.floats(allow_nan=True, allow_infinity=True)
 
-    @settings(max_examples=50, deadline=None)
     @given(
         st.lists(anything, min_size=6, max_size=6),
         st.lists(st.integers(0, 2**32 - 1), min_size=N, max_size=N),

@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
@@ -150,7 +150,6 @@ def test_hard_stops_hold() -> None:
     st.floats(-15, 15),
     st.floats(-24, 24),
 )
-@settings(max_examples=60, deadline=None)
 def test_any_admitted_command_stays_finite_and_within_the_stops(
     q: float, kp: float, kd: float, tau: float, dq: float
 ) -> None:

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.recording import Recording
@@ -563,7 +563,6 @@ def test_hand_at_rest_has_infinite_stroke_time_and_no_lag() -> None:
     assert math.isnan(moving.lag_s)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))
 def test_figures_are_never_negative(values: list[float], goal: float) -> None:
     t: Floats = np.asarray(np.arange(len(values)) * 0.05)

@@ -40,7 +40,6 @@ from tests.trace_helpers import (
 )
 
 QUICK = settings(
-    max_examples=60,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

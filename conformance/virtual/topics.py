@@ -41,17 +41,29 @@ def log_time_ns(seconds: float) -> int:
     return ORIGIN_NS + round(seconds * 1e9)
 
 
+class _States:
+    """Decodes states; the last one of each side once, however often it is asked for."""
+
+    def __init__(self, codec: MotorCodec) -> None:
+        self._codec = codec
+        self._last: dict[Subject, tuple[bytes, tuple[Pose, Pose] | None]] = {}
+
+    def read(self, payload: bytes, side: Subject) -> tuple[Pose, Pose] | None:
+        """(q, dq) of a side's joints; None if the sequence is too short."""
+        last = self._last.get(side)
+        if last is None or last[0] is not payload:
+            last = self._last[side] = payload, self._codec.read_state(payload, side)
+        return last[1]
+
+
 class _Poses(Mapping[Subject, Pose]):
     """The newest poses (0) or velocities (1) of all sides, decoded only when they are read."""
 
-    def __init__(self, codec: MotorCodec, newest: Mapping[Subject, bytes], which: int) -> None:
-        self._codec, self._newest, self._which = codec, newest, which
-        self._read: dict[Subject, tuple[Pose, Pose] | None] = {}
+    def __init__(self, states: _States, newest: Mapping[Subject, bytes], which: int) -> None:
+        self._states, self._newest, self._which = states, newest, which
 
     def _state(self, side: Subject) -> tuple[Pose, Pose] | None:
-        if side not in self._read:
-            self._read[side] = self._codec.read_state(self._newest[side], side)
-        return self._read[side]
+        return self._states.read(self._newest[side], side)
 
     def __getitem__(self, side: Subject) -> Pose:
         state = self._state(side)
@@ -78,6 +90,7 @@ class _Player:
         self._service = service_class(plan.dialect, plan.sides, plan.objects)
         self.trace = MemoryTrace(endpoints=self._service.endpoints())
         self._codec = codec_for(plan.dialect)
+        self._states = _States(self._codec)
         self._topics = {s: self._codec.state_topics[s] for s in plan.sides}
         self._sides: dict[str, list[Subject]] = {}
         for side, topic in self._topics.items():
@@ -159,8 +172,8 @@ class _Player:
         return Observation(
             # the clock may be a fraction of a nanosecond short of what was waited for
             max(log_time_ns(self.now), self._waited_ns),
-            _Poses(self._codec, newest, 0),
-            _Poses(self._codec, newest, 1),
+            _Poses(self._states, newest, 0),
+            _Poses(self._states, newest, 1),
             dict(self._joined),
             dict(self._stopped),
             self._codec.machine,
