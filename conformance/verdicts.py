@@ -28,7 +28,8 @@ late while it was judged:
    :data:`AGAIN` times what they waited at its place; a single event up to :data:`HOPS` times their
    longest wait. To wait is not to compute: a process that is slow by itself is not excused. This
    holds for motion that is not of real time, too: there a failure without a size is as large as its
-   place is long.
+   place is long. Where they waited for :data:`OVERLOADED` in each sample on average over the whole
+   run, no requirement of real time can be told, but for what 4 refuses; which way a hand moves can.
 8. Apart from load, a MUST that fails by less than the kit's measurement error
    (:mod:`~dexkit.conformance.measure`) is *blocked* as well: its figure is nearer to the limit than
    the kit can tell. A pass by less than that remains a pass, and says so.
@@ -61,7 +62,8 @@ threads, and waits for its device."""
 BUSY_SHARE = 0.5
 """Part of a failure's time with programs waiting for a processor that makes a machine busy."""
 OVERLOADED = 3e-3
-"""Seconds by which the kit's own timer, of 10 ms, is late on average on an overloaded machine."""
+"""Seconds by which the kit's own timer, of 10 ms, is late on average on an overloaded machine; or
+for which a hand's processes wait on average in a sample of 10 ms."""
 AGAIN = 2.0
 """Largest delay of a hand as a multiple of what its processes waited: a thread that is late finds
 its turn gone, and waits for the next one, or asks its device again."""
@@ -152,6 +154,7 @@ def excuse(
     overloaded = _overloaded(machine, whole)
     if requirement.realtime:
         by_timer = _least([_late(machine, f) for f in failures])
+        overloaded = overloaded or _always_starved(machine, subject, whole)
         if overloaded and not by_timer.final:
             by_timer = overloaded
     else:
@@ -201,6 +204,20 @@ def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse |
         Disturbance(Load.TOO_BUSY, lost.mean),
         f"{_TOO_BUSY} to tell: the kit's own timer was late by {_ms(lost.mean)} each time, over "
         "the whole run; run again",
+    )
+
+
+def _always_starved(
+    machine: Machine, subject: Subject, whole: tuple[float, float] | None
+) -> Excuse | None:
+    """The excuse of a hand whose processes lacked a processor all the time; None if they had it."""
+    there = machine.starvation(subject, *whole) if whole is not None else None
+    if there is None or there.lost.mean < OVERLOADED:
+        return None
+    return Excuse(
+        Disturbance(Load.TOO_BUSY, there.lost.mean),
+        f"{_TOO_BUSY} to tell: {there.worst.process} waited for a processor for "
+        f"{there.worst.part:.0%} of the whole run; close other programs or use another machine",
     )
 
 

@@ -122,6 +122,27 @@ def test_waits_excuse_only_failures_they_can_cause(
     assert excuse(Machine(found), requirement, outcome, Side.LEFT).excused is excused  # type: ignore[arg-type]
 
 
+def test_real_time_is_open_where_the_processes_wait_all_the_time() -> None:
+    run = (0.0, 2.0)
+    late = failure(0.5, 1.5).if_late(0.5, how="p99")
+    fits = failure(0.5, 1.5).if_late(0.5, how="p99", best=0.4)
+
+    def excused(found: Waits, requirement: object, outcome: Outcome) -> bool:
+        return excuse(Machine(found), requirement, outcome, Side.LEFT, run).excused  # type: ignore[arg-type]
+
+    often = waits(*[4_100] * 200)
+    assert excused(often, RATE, late)
+    assert not excused(waits(*[3_900] * 200), RATE, late)
+    assert not excuse(Machine(often), RATE, late, Side.LEFT).excused  # not in the whole run
+    # late in its best quarter as well: the hand is slow
+    assert not excused(often, RATE, fits)
+    # which way it moves, and what it says, no wait changes
+    assert not excused(often, MOVE, failure(0.0, 2.0))
+    assert not excused(often, FIELD, failure(1.1, 1.2))
+    text = excuse(Machine(often), RATE, late, Side.LEFT, run).text
+    assert "the service (pid 42) waited for a processor for 41% of the whole run; close" in text
+
+
 def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
     """Three of its threads compute on two processors: each waits for the others of its own."""
     busy = [2 * SAMPLE_US] * 200
