@@ -517,7 +517,7 @@ backend = Backend(
     settings={name: meaning for name, (_, meaning) in PARSERS.items()},
     bringup=Lazy("dexkit.drivers.ezgripper.bringup:bench"),
     emulator=Emulator(
-        ("mx64", "--real-time", "--closed-at", _EMULATED_ZERO),
+        ("mx64", "--closed-at", _EMULATED_ZERO),
         linked=True,
         settings={**SHARED_MACHINE, "zero": _EMULATED_ZERO},
     ),
