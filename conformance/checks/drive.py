@@ -11,6 +11,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.grip import Press, worst_of
 from dexkit.conformance.checks.motion import (
     Step,
     half_way,
@@ -214,7 +215,7 @@ def joints_as_commanded(ctx: Context) -> Outcome:
     """
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, int, float, float, float, float, bool] | None = None
+    pieces = []
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -231,27 +232,19 @@ def joints_as_commanded(ctx: Context) -> Outcome:
             if not spec.closing or min(asked, spec.tau_max) < ctx.tolerance("min_asked_nm"):
                 continue
             felt = abs(float(tau[joint]))  # its sign is judged by DEX3-FORCE-01
-            few, many = least * min(asked, spec.tau_max), most * asked
-            for ratio, limit, over in (
-                (felt / many, many, True),
-                (few / max(felt, 1e-9), few, False),
-            ):
-                found = (ratio, joint, felt, limit, begin, end, over)
-                worst = found if worst is None or found > worst else worst
-    if worst is None:
+            limits = least * min(asked, spec.tau_max), most * asked
+            pieces.append(Press.within((felt, felt), limits, (begin, end), joint))
+    worst = worst_of(pieces)
+    if worst is None or worst.joint is None:
         return ctx.skipped("no joint was held back by the object")
-    ratio, joint, felt, limit, begin, end, over = worst
-    asked = limit / (most if over else least)
-    part = felt / asked
+    asked = worst.limit / (most if worst.over else least)
+    part = worst.felt / asked
     text = ctx.named(
-        f"tau_est of {felt:.2f} N m in contact, where kp times the distance is {asked:.2f} N m",
-        joint,
+        f"tau_est of {worst.felt:.2f} N m in contact, where kp times the distance is "
+        f"{asked:.2f} N m",
+        worst.joint,
     )
-    if ratio <= 1.0:
-        met = ctx.passed(f"{part:.0%}", text, part=part)
-        return met.pressed(felt, limit, at_least=not over)
-    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
-    return outcome.about(joint).pressed(felt, limit, at_least=not over)
+    return worst.outcome(ctx, f"{part:.0%}", text, part=part)
 
 
 # ----------------------------------------------------------------------- commands: torque, gains

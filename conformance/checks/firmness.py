@@ -12,6 +12,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.grip import Press, worst_of
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
@@ -147,7 +148,7 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
     stiffest = max(1.0, *(n.asked / n.way for n in shown))
     softest = min(1.0, *(n.asked / n.way for n in shown))
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
-    worst: tuple[float, float, float, float, float, bool] | None = None
+    pieces: list[Press] = []
     peaks: list[_Peak] = []
     for piece in contacts(ctx, touch):
         asked = piece.kp * (piece.q - piece.goal)
@@ -155,25 +156,17 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
             continue
         low = least * softest * min(asked, ctx.tolerance("max_asked_nm"))
         high = most * stiffest * asked
-        for part, limit, over in (
-            (piece.tau / high, high, True),
-            (low / max(piece.tau, 1e-6), low, False),
-        ):
-            if worst is None or part > worst[0]:
-                worst = part, piece.tau, limit, piece.begin, piece.end, over
-        felt = np.abs(ctx.states.tau[ctx.states.between(piece.begin, piece.end), 0])
+        span = piece.begin, piece.end
+        pieces.append(Press.within((piece.tau, piece.tau), (low, high), span))
+        felt = np.abs(ctx.states.tau[ctx.states.between(*span), 0])
         above = felt[felt > high]
-        peaks.append(_Peak(piece.begin, piece.end, len(felt), len(above), high, above))
+        peaks.append(_Peak(*span, len(felt), len(above), high, above))
+    worst = worst_of(pieces)
     if worst is None:
         return ctx.skipped("it never pressed on the object for long enough")
-    part, tau, limit, begin, end, over = worst
     text = (
-        f"tau_est of {tau:.2f} N m in contact, where {'at most' if over else 'at least'} "
-        f"{limit:.2f} N m follow from the stiffness that it shows in the free"
+        f"tau_est of {worst.felt:.2f} N m in contact, where {worst.bound} {worst.limit:.2f} N m "
+        "follow from the stiffness that it shows in the free"
     )
-    if part <= 1.0:
-        return _hammers(ctx, peaks) or ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau).pressed(
-            tau, limit, at_least=not over
-        )
-    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
-    return outcome.pressed(tau, limit, at_least=not over)
+    hammers = _hammers(ctx, peaks) if worst.part <= 1.0 else None
+    return hammers or worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)

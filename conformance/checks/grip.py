@@ -7,6 +7,7 @@ is compared with that law; a hand whose tau_est has another scale while it moves
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.rows import Rows
 from dexkit.hand import Floats, JointMode
 
-__all__ = ["torque_scales"]
+__all__ = ["Press", "torque_scales", "worst_of"]
 
 _FREE = ("joint", "step", "fingerprint", "stiff")
 """Phases in which the joints move without contact, by the client's gains."""
@@ -34,6 +35,65 @@ _MOST = 0.95
 """Quantile of a gripper's torque by distance that counts as its greatest stiffness."""
 _LAGS_S = tuple(0.002 * i for i in range(21))
 """Ages of commands with which a gripper's states are compared: 0 to 40 ms."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """The tau_est of a piece of contact against the nearer of its two limits.
+
+    :param part: of the limit, above 1 where it is not met.
+    :param felt: tau_est, N m.
+    :param over: whether ``limit`` (N m) is the upper one.
+    :param begin: of the piece, s, as ``end``.
+    :param joint: which one it is; None for a gripper.
+    """
+
+    part: float
+    felt: float
+    limit: float
+    over: bool
+    begin: float
+    end: float
+    joint: int | None = None
+
+    @classmethod
+    def within(
+        cls,
+        felt: tuple[float, float],
+        limits: tuple[float, float],
+        span: tuple[float, float],
+        joint: int | None = None,
+    ) -> Press:
+        """Compare with both limits.
+
+        :param felt: least and greatest tau_est of the piece, N m.
+        :param limits: the least and the greatest that it may be, N m.
+        """
+        (least, most), (low, high) = felt, limits
+        above = cls(most / high, most, high, True, *span, joint)
+        below = cls(low / max(least, 1e-6), least, low, False, *span, joint)
+        return above if above.part >= below.part else below
+
+    @property
+    def bound(self) -> str:
+        """Which limit it is, in words."""
+        return "at most" if self.over else "at least"
+
+    def outcome(self, ctx: Context, figure: str, text: str, **values: float) -> Outcome:
+        """The outcome of a check whose worst piece this is."""
+        if self.part <= 1.0:
+            outcome = ctx.passed(figure, text, **values)
+        else:
+            place = ctx.at(ctx.states.topic, self.begin, self.end)
+            outcome = ctx.failed(figure, text, place, **values)
+            if self.joint is not None:
+                outcome = outcome.about(self.joint)
+        return outcome.pressed(self.felt, self.limit, at_least=not self.over)
+
+
+def worst_of(pieces: Iterable[Press]) -> Press | None:
+    """The piece that is farthest beyond its limit, or nearest to it; None without pieces."""
+    return max(pieces, key=lambda p: p.part, default=None)
 
 
 # ------------------------------------------------------------------------- hands of several joints
@@ -114,50 +174,25 @@ def torque_scales(ctx: Context, least: float) -> Floats:
     return _once(ctx, least).scales
 
 
-@dataclass(frozen=True)
-class _Press:
-    """A joint that presses for a while; torques in N m, times in seconds.
-
-    :param part: of a limit, above 1 where it is exceeded.
-    """
-
-    part: float
-    joint: int
-    felt: float
-    limit: float
-    over: bool
-    begin: float
-    end: float
-
-
 @check("DEX3-FORCE-08")
 def presses_as_it_moves(ctx: Context) -> Outcome:
     """tau_est of each standing joint that presses on the object, relative to the law."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: _Press | None = None
-    for phase in (p for n in ("squeeze", "touch", "firmer") for p in ctx.phases(n)):
-        for found in _presses(ctx, *ctx.span(phase)):
-            worst = found if worst is None or found.part > worst.part else worst
-    if worst is None:
+    phases = [p for name in ("squeeze", "touch", "firmer") for p in ctx.phases(name)]
+    worst = worst_of(piece for phase in phases for piece in _presses(ctx, *ctx.span(phase)))
+    if worst is None or worst.joint is None:
         return ctx.skipped("no joint was held back by the object")
-    bound = "at most" if worst.over else "at least"
     text = ctx.named(
-        f"tau_est of {worst.felt:.3f} N m in contact, where {bound} {worst.limit:.3f} N m follow "
-        "from its command and from its torque in free motion",
+        f"tau_est of {worst.felt:.3f} N m in contact, where {worst.bound} {worst.limit:.3f} N m "
+        "follow from its command and from its torque in free motion",
         worst.joint,
     )
-    figure = f"{worst.felt:.2f} N m"
-    if worst.part <= 1.0:
-        met = ctx.passed(figure, text, tau_nm=worst.felt)
-        return met.pressed(worst.felt, worst.limit, at_least=not worst.over)
-    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
-    outcome = ctx.failed(figure, text, place, tau_nm=worst.felt).about(worst.joint)
-    return outcome.pressed(worst.felt, worst.limit, at_least=not worst.over)
+    return worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)
 
 
-def _presses(ctx: Context, begin: float, end: float) -> list[_Press]:
-    """Both limits of each joint in each piece in which it stands under an unchanged command."""
+def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
+    """Each joint in each piece in which it stands under an unchanged command."""
     least, window = ctx.tolerance("min_asked_nm"), ctx.tolerance("window_s")
     scales = torque_scales(ctx, least)
     factors = _once(ctx, least).factors / scales
@@ -185,13 +220,9 @@ def _presses(ctx: Context, begin: float, end: float) -> list[_Press]:
             own = factors[joint]
             floor = ctx.tolerance("min_part") * min(own, 1.0) * min(asked[joint], most[joint])
             ceiling = ctx.tolerance("max_part") * max(own, 1.0) * asked[joint]
-            for part, value, limit, over in (
-                (high[joint] / ceiling, high[joint], ceiling, True),
-                (floor / max(low[joint], 1e-6), low[joint], floor, False),
-            ):
-                found.append(
-                    _Press(float(part), joint, float(value), float(limit), over, at, at + window)
-                )
+            felt_there = float(low[joint]), float(high[joint])
+            limits = float(floor), float(ceiling)
+            found.append(Press.within(felt_there, limits, (at, at + window), joint))
     return found
 
 
@@ -286,31 +317,23 @@ def grips_as_it_moves(ctx: Context) -> Outcome:
         or spring.error > ctx.tolerance("max_error_part") * spring.stiffness
     ):
         return ctx.absent("its torque in free motion is not in proportion to the distance to q")
-    worst: tuple[float, float, float, float, float, bool] | None = None
     softest = min(spring.stiffness, spring.least)
     stiffest = max(spring.stiffness, spring.most)
+    pieces = []
     for piece in contacts(ctx, touch):
         depth = piece.q - piece.goal
         if stiffest * depth < ctx.tolerance("min_asked_nm"):
             continue
         low = ctx.tolerance("min_part") * min(softest * depth, ctx.tolerance("max_asked_nm"))
         high = ctx.tolerance("max_part") * stiffest * depth
-        for part, limit, over in (
-            (piece.tau / high, high, True),
-            (low / max(piece.tau, 1e-6), low, False),
-        ):
-            if worst is None or part > worst[0]:
-                worst = part, piece.tau, limit, piece.begin, piece.end, over
+        felt = piece.tau, piece.tau
+        pieces.append(Press.within(felt, (low, high), (piece.begin, piece.end)))
+    worst = worst_of(pieces)
     if worst is None:
         return ctx.skipped("it never pressed on the object for long enough")
-    part, tau, limit, begin, end, over = worst
     text = (
-        f"tau_est of {tau:.2f} N m in contact, where {'at most' if over else 'at least'} "
-        f"{limit:.2f} N m follow from the {stiffest if over else softest:.1f} N m/{ctx.unit} with "
-        "which it moves in the free"
+        f"tau_est of {worst.felt:.2f} N m in contact, where {worst.bound} {worst.limit:.2f} N m "
+        f"follow from the {stiffest if worst.over else softest:.1f} N m/{ctx.unit} with which it "
+        "moves in the free"
     )
-    if part <= 1.0:
-        met = ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
-        return met.pressed(tau, limit, at_least=not over)
-    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
-    return outcome.pressed(tau, limit, at_least=not over)
+    return worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)

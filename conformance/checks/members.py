@@ -65,10 +65,22 @@ def _at(ctx: Context, row: int) -> float:
 
 
 def _outside(
-    ctx: Context, paths: Iterable[str], low: float, high: float, *, or_zero: bool = False
+    ctx: Context,
+    paths: Iterable[str],
+    low: float,
+    high: float,
+    *,
+    or_zero: bool = False,
+    at_start: bool = False,
 ) -> Outcome | None:
-    """Failed if a value is not within [low, high]; None if all are."""
+    """Failed if a value is not within [low, high]; None if all are.
+
+    :param at_start: only in states before the first command.
+    """
     assert ctx.states.columns is not None
+    first = ctx.commands.t[0] if at_start and len(ctx.commands) else np.inf
+    late = ctx.states.t[ctx.states.columns.ok] >= first
+    when = " before the first command" if at_start else ""
     for path in paths:
         least, most = ctx.states.columns.extremes(path)
         if low <= least and most <= high:
@@ -76,13 +88,15 @@ def _outside(
         if _within(_distinct(ctx, path), low, high, or_zero).all():
             continue
         values = _values(ctx, path)
-        good = _within(values, low, high, or_zero)
+        good = _within(values, low, high, or_zero) | late[:, np.newaxis]
+        if good.all():
+            continue
         row, place = (int(i) for i in np.argwhere(~good)[0])
         name = path if values.shape[1] == 1 else f"{path}[{place}]"
         value = values[row, place]
         return ctx.failed(
             f"{value:g}",
-            f"{name} = {value:g} in {int((~good).any(axis=1).sum())} states",
+            f"{name} = {value:g} in {int((~good).any(axis=1).sum())} states{when}",
             ctx.at(ctx.states.topic, _at(ctx, row)),
         ).shown_by(Plot.of_member(name), PlotKind.POSITION)
     return None
@@ -198,33 +212,11 @@ def temperature(ctx: Context) -> Outcome:
     """Motor temperatures in degrees Celsius."""
     paths = _motors(ctx, "temperature")
     wrong = _outside(ctx, paths, ctx.tolerance("low"), ctx.tolerance("high"))
-    wrong = wrong or _hot_at_start(ctx, paths)
+    wrong = wrong or _outside(ctx, paths, -np.inf, ctx.tolerance("max_at_start"), at_start=True)
     figure = _span(ctx, paths)
     if not wrong and figure == "0":
         return ctx.absent("temperature is not filled (0 throughout)")
     return wrong or ctx.passed(f"{figure} C", f"temperature {figure} C")
-
-
-def _hot_at_start(ctx: Context, paths: list[str]) -> Outcome | None:
-    """The failure of a hand whose motors are too hot before the first command."""
-    columns, limit = ctx.states.columns, ctx.tolerance("max_at_start")
-    assert columns is not None
-    first = float(ctx.commands.t[0]) if len(ctx.commands) else np.inf
-    rows = ctx.states.t[columns.ok] < first
-    for path in paths:
-        if columns.extremes(path)[1] <= limit:
-            continue
-        values = _values(ctx, path)
-        hot = (values > limit).any(axis=1) & rows
-        if hot.any():
-            row = int(np.argmax(hot))
-            value = float(values[row].max())
-            return ctx.failed(
-                f"{value:g} C",
-                f"{path} = {value:g} before the first command",
-                ctx.at(ctx.states.topic, _at(ctx, row)),
-            ).shown_by(Plot.of_member(path), PlotKind.POSITION)
-    return None
 
 
 @check("DEX1-FIELD-09")
