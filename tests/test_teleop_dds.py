@@ -203,9 +203,11 @@ def test_after_a_pause_teleoperation_starts_at_the_present_position(
                 q = newest[-1].message.states[0].q
             writer.close()
             reader.take()
+            resumed = time.time_ns()
             process.send_signal(signal.SIGCONT)
             first = take_until(reader, bool, 60)[0]
-            assert first.message.cmds[0].q > 4.5
+            after = (first.source_timestamp_ns - resumed) / 1e6
+            assert first.message.cmds[0].q > 4.5, f"written {after:.1f} ms after SIGCONT"
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 130
             said.seek(0)
