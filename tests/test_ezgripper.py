@@ -57,7 +57,7 @@ from dexkit.errors import (
     HandTimeout,
     UsageError,
 )
-from dexkit.hand import HandCommand, JointMode, MotorError, Side
+from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
 from tests.dds_helpers import wait_until
@@ -405,7 +405,14 @@ def test_zero_gains_apply_no_torque_and_brake_holds(tmp_path: Path) -> None:
         assert gripper.servo.get(mx64.GOAL_CURRENT) == 0
         drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
         braked = travel(gripper)
-        held = drive_for(hand, BRAKE, 0.4)
+        at_rest = 0
+
+        def stopped(state: HandState) -> bool:
+            nonlocal at_rest
+            at_rest = at_rest + 1 if abs(float(state.dq[0])) < 0.01 else 0
+            return at_rest == 20
+
+        held = drive(hand, BRAKE, stopped)
         assert travel(gripper) < braked, "it comes to a stop, it does not go back"
         later = drive_for(hand, BRAKE, 0.3)
         assert float(later.q[0]) == pytest.approx(float(held.q[0]), abs=0.02)
