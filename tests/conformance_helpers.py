@@ -1,7 +1,8 @@
-"""Recordings in memory, made by the kit's virtual hands."""
+"""Recordings in memory, made by the kit's virtual hands, and how the suite is started."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -13,6 +14,10 @@ from dexkit.conformance.stimulus_record import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
+
+SUITE = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
+"""Starts the suite without what a user's environment lacks: Hypothesis would take a third of the
+processor time of a start."""
 
 
 @cache

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +32,7 @@ from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, Usage
 from dexkit.hand import Side
 from dexkit.models import dialect, model
 from dexkit.traces import Recorder, open_trace, sample_path
-from tests.conformance_helpers import failed
+from tests.conformance_helpers import SUITE, failed
 from tests.dds_helpers import DdsNode, free_domain
 from tests.reproduction_helpers import checked
 from tests.slow_hand import SLOW
@@ -43,7 +42,7 @@ ROOT = Path(__file__).parent.parent
 
 def suite(*arguments: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", *map(str, arguments)],
+        [*SUITE, "-q", *map(str, arguments)],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -311,7 +310,7 @@ def test_signal_to_suite_ends_the_service_cleanly(tmp_path: Path, signum: signal
     recording = tmp_path / "run.mcap"
     run = subprocess.Popen(
         [
-            *(sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "conformance/"),
+            *(*SUITE, "conformance/"),
             *("--backend", SLOW[0], "--side", "left", "--recording", str(recording)),
         ],
         cwd=ROOT,

@@ -20,6 +20,7 @@ from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.session import SuiteOptions
 from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
 from dexkit.hand import Hand, HandCommand, Side
+from tests.conformance_helpers import SUITE
 from tests.dds_helpers import free_domain
 
 if TYPE_CHECKING:
@@ -163,7 +164,7 @@ def judged(domain: int, folder: Path, *arguments: str) -> dict[str, str]:
     result = folder / "result.json"
     run = subprocess.run(
         [
-            *(sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q"),
+            *(*SUITE, "-q"),
             *("--pyargs", "dexkit.conformance", "--backend", "external", "--side", "left"),
             *("--domain", str(domain), "--json", str(result), *arguments),
         ],
@@ -216,7 +217,7 @@ def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
     )
     run = subprocess.run(
         [
-            *(sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "spoilt"),
+            *(*SUITE, "-p", "spoilt"),
             *("--pyargs", "dexkit.conformance", "--backend", "sim-dex1"),
         ],
         cwd=tmp_path,
@@ -241,7 +242,7 @@ def test_each_failure_is_printed_once_before_the_verdict(tmp_path: Path) -> None
         "def run_suite(options, *args): return judge(view, requirements=options.requirements)\n"
         "session.run_suite = run_suite\n"
     )
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "canned"]
+    command = [*SUITE, "-p", "canned"]
     command += ["--pyargs", "dexkit.conformance", "--backend", "external"]
     advice = next(r.advice for r in catalogue() if r.id == "DEX1-RATE-03")[:40]
     for more in (), ("-rf", "--tb=short"):
