@@ -409,11 +409,11 @@ def test_an_outsider_that_fails_is_an_error(tmp_path: Path) -> None:
 def test_a_hand_that_fails_leaves_the_others(tmp_path: Path) -> None:
     path = tmp_path / "hands.py"
     fails = "    def live(self, dt): raise RuntimeError('mine')\n"
-    deaf = "    def motors(self, side, motors): pass\n"
+    mute = "    def publish(self): return []\n"  # which ends its run at once
     path.write_text(
         _HEAD
         + f"@hand('good', dialects='unitree_go')\nclass A(ReferenceService):\n{fails}"
-        + f"@hand('must-breaking', dialects='unitree_go')\nclass B(ReferenceService):\n{deaf}"
+        + f"@hand('must-breaking', dialects='unitree_go')\nclass B(ReferenceService):\n{mute}"
     )
     out = tmp_path / "verdicts.json"
     run = CliRunner().invoke(command, ["--from", str(path), "--json", str(out), "--jobs", "1"])
