@@ -18,7 +18,7 @@ from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.command_age import PAUSE
 from dexkit.conformance.recording import Recording
-from dexkit.dds import DdsNode
+from dexkit.dds import DdsNode, Sample
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
@@ -205,7 +205,12 @@ def test_after_a_pause_teleoperation_starts_at_the_present_position(
             reader.take()
             resumed = time.time_ns()
             process.send_signal(signal.SIGCONT)
-            first = take_until(reader, bool, 60)[0]
+
+            def fresh(samples: list[Sample]) -> list[Sample]:
+                # one whose write was stopped half-way comes with its old time: no hand obeys it
+                return [s for s in samples if s.source_timestamp_ns >= resumed]
+
+            first = fresh(take_until(reader, lambda samples: bool(fresh(samples)), 60))[0]
             after = (first.source_timestamp_ns - resumed) / 1e6
             assert first.message.cmds[0].q > 4.5, f"written {after:.1f} ms after SIGCONT"
             process.send_signal(signal.SIGINT)
