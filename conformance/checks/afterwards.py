@@ -229,4 +229,6 @@ def in_force(ctx: Context) -> Outcome:
 
 
 def _speed(t: Floats, q: Floats) -> float:
-    return float(q[-1] - q[0]) / max(float(t[-1] - t[0]), 1e-3)
+    """Slope of the line through all of them, which noise changes little, rad/s."""
+    t = t - t.mean()
+    return float(t @ (q - q.mean())) / max(float(t @ t), 1e-9)

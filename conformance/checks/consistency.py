@@ -304,6 +304,8 @@ def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float,
     last = np.minimum(np.searchsorted(x.t, grid + step), len(x.t) - 1)
     span = x.t[last] - x.t[first]
     whole = (span > 0.5 * step) & (span < 2 * step)
+    for begin, end in _unstable(ctx):
+        whole[np.searchsorted(grid, begin - step) : np.searchsorted(grid, end)] = False
     c = x.said
     moved = np.where(whole, x.q[last] - x.q[first], 0.0)
     said = np.where(whole, c[last] - c[first], 0.0)

@@ -371,7 +371,8 @@ class _Releases(What):
     def torque(self, joint: int, tau: float, dt: float) -> float:
         if self.rig.driven(self.side):
             self.since_brake = None
-            self.last[joint] = tau
+            # all of it: tau is without the law's damping in a hand of several joints
+            self.last[joint] = self.rig.seen(self.side)[2][joint]
             return tau
         if self.since_brake is None:
             self.since_brake = self.rig.now
