@@ -90,7 +90,7 @@ class _Predicted(What):
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
         at, q, dq = self.measured.get(joint, (-math.inf, 0.0, 0.0))
-        if now - at >= self.period - 1e-9:
+        if now - at >= self.period - 0.5 * self.rig.tick:
             at, q, dq = now, values.q, values.dq
             self.measured[joint] = at, q, dq
         values.q, values.dq = q + dq * (now - at), dq
