@@ -11,10 +11,11 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import FOUGHT_OVER, filled
-from dexkit.conformance.rows import Rows, Selected
+from dexkit.conformance.rows import Rows, Selected, Times
 from dexkit.hand import Floats
 
 __all__: list[str] = []
@@ -142,7 +143,7 @@ def at_rest(ctx: Context) -> Outcome:
         if len(low) <= count:
             continue
         lows, highs, fulls, means = (
-            np.lib.stride_tricks.sliding_window_view(x, count + 1) for x in (low, high, full, mean)
+            sliding_window_view(x, count + 1) for x in (low, high, full, mean)
         )
         rest = fulls.all(axis=1)
         rest &= highs.max(axis=1) - lows.min(axis=1) <= ctx.tolerance("max_ripple_stroke", joint)
@@ -173,6 +174,34 @@ _SAME = 1e-6
 """Part of the range within which two numbers of single precision are the same."""
 
 
+def _sent_until(sent: Floats, t: Floats) -> Rows:
+    """How many commands were sent until each time."""
+    return np.asarray(np.searchsorted(sent, t, "right"))
+
+
+def _equal(q: Floats, goals: Floats, sent: Rows, most: float) -> Rows:
+    """The states whose q is that of one of the newest commands.
+
+    :param sent: how many commands were sent until each state.
+    :param most: by how much they may differ, rad.
+    """
+    padded = np.concatenate((np.full(_NEWEST, np.nan), goals))
+    recent = sliding_window_view(padded, _NEWEST)  # a row for each number of commands
+    # few states lie between the least and the greatest of them
+    low, high = np.fmin.reduce(recent.T) - 2 * most, np.fmax.reduce(recent.T) + 2 * most
+    likely = np.flatnonzero((q >= low.take(sent)) & (q <= high.take(sent)))
+    off = np.abs(q[likely, None] - recent[sent[likely]])
+    return np.asarray(likely[(off <= most).any(axis=1)])
+
+
+def _runs(rows: Rows) -> tuple[Rows, Rows]:
+    """The first row of each run of rows that follow each other, and the one after its last."""
+    if not len(rows):
+        return rows, rows
+    behind = np.flatnonzero(np.diff(rows) != 1) + 1
+    return rows[np.append(0, behind)], rows[np.append(behind, 0) - 1] + 1
+
+
 @check("DEX1-FIELD-21", "DEX3-FIELD-20")
 def not_the_command(ctx: Context) -> Outcome:
     """The farthest way that dq shows while q is exactly the commanded q.
@@ -190,17 +219,17 @@ def not_the_command(ctx: Context) -> Outcome:
         if len(t) < _FEW:
             continue
         goals = np.clip(commands.q[:, joint], spec.q_min, spec.q_max)
-        newest = np.searchsorted(commands.t, t, "right") - 1
-        same = np.zeros(len(t), dtype=np.bool_)
+        sent = _by_times(ctx, "sent", t, partial(_sent_until, commands.t, t))
         with np.errstate(invalid="ignore"):
-            for back in range(_NEWEST):
-                rows = newest - back
-                off = np.abs(q - goals[np.maximum(rows, 0)])
-                same |= (rows >= 0) & (off <= _SAME * spec.stroke)
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], same.view(np.int8), [0]))))
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
+            same = _equal(q, goals, sent, _SAME * spec.stroke)
+        firsts, lasts = _runs(same)
+        if ctx.once("clock", lambda: Times(ctx.states.clock)).rising:
+            # most are over before that
+            long = t[lasts - 2] >= t[firsts] + ctx.tolerance("settle_s")
+            firsts, lasts = firsts[long], lasts[long]
+        for start, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
             # dq may still be that of the motion which has led there
-            begin = int(np.searchsorted(t, t[first] + ctx.tolerance("settle_s")))
+            begin = int(np.searchsorted(t, t[start] + ctx.tolerance("settle_s")))
             if last - begin < 2:
                 continue
             steps = np.diff(t[begin:last])
