@@ -16,8 +16,8 @@ _SEGMENT = 1 << 16
 """Most samples whose changing words are kept in one table."""
 _FIRST = 1 << 18
 """Words of the first samples that get a table; those that are not filled cost no memory."""
-_COMPARED = 1 << 15
-"""Words of samples that are compared with the first one at once: they stay in the cache."""
+_COMPARED = 1 << 14
+"""Most words of samples that are compared with the first one at once."""
 _FOLDED = 16
 """Rows of changing words that are reduced as one."""
 
@@ -130,8 +130,8 @@ class Words:
         # nothing
         self._tables: list[NDArray[np.uint32]] = []
         self._begins: list[int] = []  # the first sample of each table
-        # samples that are like the first but for their changing words, for comparison
-        self._like_first = bytearray()
+        # some samples like the first one, their changing words 0, for comparison
+        self._constant = b""
         self._limits: dict[np.dtype[Any], tuple[NDArray[Any], NDArray[Any]]] = {}
 
     def __len__(self) -> int:
@@ -140,22 +140,36 @@ class Words:
     def put_alike(self, piece: NDArray[np.uint32]) -> bool:
         """Add samples in which only words change that have changed before.
 
+        :param piece: is overwritten if they are added.
         :returns: whether they are; if not, none is added.
         """
-        kept = piece.take(self._changing, axis=1)
+        kept = self._room(len(piece))
+        piece.take(self._changing, axis=1, out=kept, mode="clip")
         # comparing memory takes a tenth of the time that arrays of differences do
-        width = piece.shape[1]
-        step = max(1, _COMPARED // width)
-        if len(self._like_first) < 4 * width * min(step, len(piece)):
-            self._like_first = bytearray(np.tile(self._row, min(step, len(piece))).tobytes())
-        alike = np.frombuffer(self._like_first, dtype=np.uint32).reshape(-1, width)
+        piece[:, self._changing] = 0
+        step = max(1, _COMPARED // piece.shape[1])
+        if len(self._constant) < min(step, len(piece)) * piece.strides[0]:
+            row = self._row.copy()
+            row[self._changing] = 0
+            self._constant = np.tile(row, min(step, len(piece))).tobytes()
         for at in range(0, len(piece), step):
-            some = piece[at : at + step]
-            alike[: len(some), self._changing] = kept[at : at + step]
-            if not self._like_first.startswith(some.data):
+            if not self._constant.startswith(piece[at : at + step].data):
+                piece[:, self._changing] = kept
                 return False
         self._add(kept)
         return True
+
+    def _room(self, n: int) -> NDArray[np.uint32]:
+        """An array for the changing words of some samples: where :meth:`_add` is to put them, if
+        there is room. If they are not added, the next ones overwrite them.
+        """
+        k = len(self._changing)
+        if self._tables and self._tables[-1].shape[1] == k:
+            at = self._n - self._begins[-1]
+            place = self._tables[-1][at : at + n]
+            if len(place) == n:
+                return place
+        return np.empty((n, k), dtype=np.uint32)
 
     def changes(self, piece: NDArray[np.uint32]) -> NDArray[np.uint32]:
         """Which bits of each word differ from the first sample's, anywhere in ``piece``."""
@@ -174,6 +188,7 @@ class Words:
         if len(new):
             self._place |= {word: at for at, word in enumerate(new.tolist(), len(self._changing))}
             self._changing = np.concatenate([self._changing, new])
+            self._constant = b""
         self._add(piece.take(self._changing, axis=1))
 
     def _add(self, kept: NDArray[np.uint32]) -> None:
@@ -194,7 +209,8 @@ class Words:
                 self._begins.append(self._n)
                 at = 0
             some = min(len(kept), len(table) - at)
-            table[at : at + some] = kept[:some]
+            if kept.base is not table:  # they are not there yet
+                table[at : at + some] = kept[:some]
             self._n += some
             kept = kept[some:]
 
