@@ -108,17 +108,13 @@ def _measurements(ctx: Context, joint: int) -> Rows:
     q, dq = states.q[:, joint], states.dq[:, joint]
     good = ctx.known_states(joint, "q", "dq")
     t, q, dq = states.clock[good], q[good], dq[good]
-    rows = np.arange(len(states))[good]
+    new = np.ones(len(t), dtype=np.bool_)
     if len(t):
-        again = np.flatnonzero(q[1:] == q[:-1])
-        again = again[(dq[again + 1] == dq[again]) & (dq[again + 1] != 0)]
-        new = np.ones(len(t), dtype=np.bool_)
+        new[1:] = (q[1:] != q[:-1]) | (dq[1:] != dq[:-1]) | (dq[1:] == 0)
         if not ctx.once("clock", lambda: Times(states.clock)).advancing:
-            new[1:] = np.maximum.accumulate(t)[:-1] < t[1:]
-        new[again + 1] = False
-        if not new.all():
-            rows = rows[new]
-    return rows
+            new[1:] &= np.maximum.accumulate(t)[:-1] < t[1:]
+    rows = np.flatnonzero(new)
+    return rows if isinstance(good, slice) else np.flatnonzero(good)[rows]
 
 
 def _fastest(ctx: Context, joint: int) -> float:
