@@ -115,32 +115,36 @@ def _measure(
     if len(grid) * _GRID < ctx.tolerance("min_session_s") - search - 0.2:
         return f"the session is shorter than {ctx.tolerance('min_session_s'):g} s"
     at = rows.of_states(grid)
-    grid, at = grid[at >= 0], at[at >= 0]
-    q = ctx.states.q[:, joint][at]
-    goal = cq[rows.of_commands(grid, good)]
-    if not len(grid) or float(np.ptp(goal)) < ctx.tolerance("min_travel_stroke", joint):
+    if len(at) and at[0] < 0:
+        grid, at = grid[at >= 0], at[at >= 0]
+    if not len(grid):
         return "the commands hardly move in this recording"
-    free = _free(ctx, joint, at, goal) & np.isfinite(q)
-    if free.sum() * _GRID < 1.0:
-        return "the hand is blocked for nearly the whole session"
     # Delays are steps of the grid: the commands are sampled once, on a grid that begins earlier.
     most = round(search / _GRID)
     longer = np.concatenate([grid[0] - _GRID * np.arange(most, 0, -1), grid])
     asked = commanded = cq[rows.of_commands(longer, good)]
+    goal = commanded[most:]
+    if float(np.ptp(goal)) < ctx.tolerance("min_travel_stroke", joint):
+        return "the commands hardly move in this recording"
+    q = ctx.states.q[:, joint][at]
+    free = _free(ctx, joint, at, goal) & np.isfinite(q)
+    if free.sum() * _GRID < 1.0:
+        return "the hand is blocked for nearly the whole session"
     top_speed = _top_speed(ctx, joint)
     if top_speed is not None:
         asked = _within_reach(commanded, top_speed * _GRID)
     # sum of w (q - asked)^2 for every delay, as products of whole columns; small about the mean
     at_work = slice(None) if free.all() else np.flatnonzero(free)
     middle = mean(q[at_work])
-    seen, asked, commanded = np.where(free, q - middle, 0.0), asked - middle, commanded - middle
+    seen, asked, commanded = q - middle, asked - middle, commanded - middle
+    seen[~free] = 0.0
     n = len(grid)
-    late = sliding_window_view(asked, n)[::-1]  # by delay
     best = _best_delay(seen, asked, free)
+    reached = asked[most - best : most - best + n][at_work]
     # a hand that is sometimes faster than assumed lies between the reachable goal and the command
-    error = seen[at_work] - late[best][at_work]
+    error = seen[at_work] - reached
     if top_speed is not None:
-        reached, wanted = late[best][at_work], commanded[most - best : most - best + n][at_work]
+        wanted = commanded[most - best : most - best + n][at_work]
         low, high = np.minimum(reached, wanted), np.maximum(reached, wanted)
         error = seen[at_work] - np.clip(seen[at_work], low, high)
     error = np.abs(error)
@@ -153,7 +157,7 @@ def _measure(
         rms=math.sqrt(mean(error**2)),
         peak=float(error[worst]),
         peak_at=float(grid[at_work][worst]),
-        raw=math.sqrt(mean((seen - late[0])[at_work] ** 2)),
+        raw=math.sqrt(mean((seen - asked[most:])[at_work] ** 2)),
         blocked=float((~free).mean()),
     )
 
@@ -167,13 +171,15 @@ def _best_delay(seen: Floats, asked: Floats, free: NDArray[np.bool_]) -> int:
     """
     n, delays = len(seen), len(asked) - len(seen) + 1
     squared = asked**2
-    late, late2 = (sliding_window_view(a, n)[::-1] for a in (asked, squared))
+    late = sliding_window_view(asked, n)[::-1]  # by delay
     # einsum, for BLAS would start threads for this
     own = float(np.einsum("i,i", seen, seen))
     some = None if free.all() else free.astype(np.float64)
     if some is None:
         sums = np.concatenate(([0.0], np.cumsum(squared)))
         squares = (sums[n:] - sums[:-n])[::-1]
+    else:
+        late2 = sliding_window_view(squared, n)[::-1]
 
     def errors(of: slice) -> Floats:
         """The sums of squares at some delays; of two or more, for one alone adds up otherwise."""
