@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 
-__all__ = ["median", "percentile"]
+__all__ = ["median", "medians", "percentile"]
 
 
 def median(values: Floats) -> float:
@@ -21,6 +22,24 @@ def median(values: Floats) -> float:
         return float("nan")
     low, high = _ordered(values, (n - 1) // 2, n // 2)
     return high if n % 2 else (low + high) / 2
+
+
+def medians(values: Floats, rows: NDArray[np.intp]) -> Floats:
+    """The :func:`median` of each of many ranges of a column, ranges of one length at once.
+
+    :param rows: from the first to before the second, shape (n, 2).
+    """
+    first, lengths = rows[:, 0], rows[:, 1] - rows[:, 0]
+    found = np.full(len(rows), np.nan)
+    for n in np.unique(lengths[lengths > 0]).tolist():
+        some = np.flatnonzero(lengths == n)
+        table = values[first[some, None] + np.arange(n)]
+        ordered = np.partition(table, n // 2, axis=1)
+        middle = ordered[:, n // 2]
+        if n % 2 == 0:
+            middle = (ordered[:, : n // 2].max(axis=1) + middle) / 2
+        found[some] = np.where(np.isnan(table.max(axis=1)), np.nan, middle)
+    return found
 
 
 def percentile(values: Floats, percent: float) -> float:

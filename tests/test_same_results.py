@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks import timing
-from dexkit.conformance.median import median, percentile
+from dexkit.conformance.median import median, medians, percentile
 from dexkit.conformance.rows import finite_rows
 
 _COLUMNS = st.lists(st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 1e-300, math.nan]))
@@ -31,6 +31,17 @@ def test_percentile_of_long_columns() -> None:
     for n in range(100, 600, 7):
         column = random.exponential(0.002, n)
         assert percentile(column, 99) == np.percentile(column, 99), n
+
+
+def test_medians_of_ranges() -> None:
+    random = np.random.default_rng(3)
+    column = np.round(random.normal(size=3000), 1)
+    column[::97], column[5::31], column[7], column[8] = np.nan, -0.0, np.inf, -np.inf
+    rows = np.sort(random.integers(0, 3000, (400, 2)), axis=1)
+    rows[::2, 1] = np.minimum(rows[::2, 0] + random.integers(0, 12, 200), 3000)
+    rows[0] = 5, 5  # no values
+    one_by_one = [median(column[first:last]) for first, last in rows]
+    assert all(_same(*both) for both in zip(medians(column, rows), one_by_one, strict=True))
 
 
 def test_medians_of_rows() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
 from dexkit.conformance.checks.motion import obeyed_before
-from dexkit.conformance.median import median
+from dexkit.conformance.median import median, medians
 from dexkit.hand import Floats
 from dexkit.models import HandModel
 
@@ -370,12 +370,11 @@ def at_rest(ctx: Context) -> Outcome:
     rests &= _bounds(commands.kp[:, 0], asked)[0] > 0
     if known and ctx.object_at is not None:
         rests &= low > ctx.object_at + 0.1
-    taus: list[tuple[float, float]] = []
-    for i in np.flatnonzero(rests):
-        here, there = slice(*rows[i]), slice(*asked[i])
-        error = median(states.q[here, 0]) - median(commands.q[there, 0])
-        if abs(error) <= ctx.tolerance("max_error_stroke"):
-            taus.append((median(np.abs(states.tau[here, 0])), float(begins[i])))
+    rows, asked, begins = rows[rests], asked[rests], begins[rests]
+    errors = medians(states.q[:, 0], rows) - medians(commands.q[:, 0], asked)
+    near = np.abs(errors) <= ctx.tolerance("max_error_stroke")
+    sizes = medians(np.abs(states.tau[:, 0]), rows[near])
+    taus = list(zip(sizes.tolist(), begins[near].tolist(), strict=True))
     if not taus:
         return ctx.skipped("the gripper never rests at its target in this recording")
     # the median of all rests: one of them may be an unannounced contact
