@@ -46,6 +46,7 @@ ELSEWHERE = (
         r"(calibrate|selftest) dex1",
         "other devices: tests/test_dex1_serial.py, tests/test_inspire_modbus.py",
     ),
+    (r"ids[= ]1,2", "two servos on a line: tests/test_ezgripper_pair.py"),
     (r"^serve (dex1-serial|dex3-usb) --side (left|both)$", "looks for a device of this machine"),
     (r"^bringup (?!.*--dry-run)", "a person holds a key: tests/test_bringup_cli.py"),
     (r"--to (rerun|foxglove)", "other viewers: tests/test_view_forward.py"),
