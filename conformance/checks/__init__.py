@@ -7,8 +7,8 @@ share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.firmness`, :mod:`~.grip`, :mod:`~.safety`,
 :mod:`~.afterwards`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers`,
 :mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints, :mod:`~.touch` for a topic of
-tactile areas, :mod:`~.servos` for position servos, and :mod:`~.client` for the client that drives
-them.
+tactile areas, :mod:`~.servos` and :mod:`~.servo_force` for position servos, and
+:mod:`~.client` for the client that drives them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,16 @@ __all__ = [
 _HAND = (
     *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "velocity"),
     *("drive", "safety", "lifecycle", "tracking", "fingers", "each_joint", "pressure"),
-    *("operator", "uncommanded", "servos", "touch", "firmness", "grip", "afterwards"),
+    *(
+        "operator",
+        "uncommanded",
+        "servos",
+        "servo_force",
+        "touch",
+        "firmness",
+        "grip",
+        "afterwards",
+    ),
 )
 CHECK_MODULES: Mapping[str, Sequence[str]] = {
     "dds": tuple(f"{__name__}.{name}" for name in _HAND),

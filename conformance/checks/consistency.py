@@ -185,15 +185,25 @@ FOUGHT_OVER = (
 """Stimuli with bad or contradictory commands: a hand that obeys them may really oscillate."""
 
 
-def _noise(up: Floats, down: Floats) -> float:
-    """By how much q goes forth and back in most of the cells in which the joint stays, rad.
+def _noise(up: Floats, down: Floats, most: float) -> float:
+    """By how much q goes forth and back in nearly all of the cells in which the joint stays, rad.
 
     A sensor has its noise at rest as well as in motion; old values differ from fresh ones only
-    while the joint moves. 0 where it stays in fewer than half of the cells.
+    while the joint moves, in fewer of the cells: the median and the median deviation from it tell
+    how much noise makes. 0 where it stays in fewer than half of the cells.
+
+    :param most: way in a cell, rad, up to which noise alone may have made it.
     """
     back = np.minimum(up, down)
-    stays = (up > 0) & (down > 0) & (np.abs(up - down) <= 0.5 * back)
-    return float(np.median(back[stays])) if 2 * int(stays.sum()) >= len(back) else 0.0
+    stays = (up > 0) & (down > 0) & (np.abs(up - down) <= np.maximum(0.5 * back, most))
+    if 2 * int(stays.sum()) < len(back):
+        return 0.0
+    middle = float(np.median(back[stays]))
+    return middle + _SPREADS * float(np.median(np.abs(back[stays] - middle)))
+
+
+_SPREADS = 4.0
+"""Median deviations from the median within which 99 % of a cell's noise is."""
 
 
 @check("DEX1-FRESH-03", "DEX3-FRESH-03")
@@ -227,9 +237,12 @@ def alternates(ctx: Context) -> Outcome:
             for way in (1, -1)
         )
         back = np.minimum(up, down)
-        # even noise of +-a goes forth and back by a third of a from state to state
-        most_noise = ctx.tolerance("min_turn_stroke", joint) / 3 * len(t) / most
-        noise = min(_noise(np.asarray(up, dtype=float), np.asarray(down, dtype=float)), most_noise)
+        # even noise of +-a goes forth and back by a third of a from state to state, and in 99 % of
+        # the cells of n states by no more than a (n / 3 + 1.1 n ** 0.5)
+        states, even = len(t) / most, ctx.tolerance("min_turn_stroke", joint)
+        most_noise = even * (states / 3 + 1.1 * states**0.5)
+        ways = np.asarray(up, dtype=float), np.asarray(down, dtype=float)
+        noise = min(_noise(*ways, 2 * even), most_noise)
         often = np.convolve(back >= limit + noise, np.ones(count), "valid")
         i = int(np.argmax(often))
         found = (int(often[i]), float(back[i : i + count].max()), joint, float(t[0]) + i * cell)

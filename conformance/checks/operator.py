@@ -94,7 +94,9 @@ def _judge(
     observed = ctx.named(text(worst), joint)
     if worst <= ctx.tolerance(limit, joint):
         return ctx.passed(text(worst), observed, **values)
-    wanted = 1.0 / client_for(ctx.recording.dialect, (side,)).period
+    dialect = ctx.recording.dialect
+    sides = tuple(Side) if dialect.commands_both else (side,)
+    wanted = 1.0 / client_for(dialect, sides).period
     if found.client_hz < _PART * wanted:
         skipped = ctx.skipped(
             f"the kit's own client managed {found.client_hz:.0f} of {wanted:.0f} commands a "

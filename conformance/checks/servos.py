@@ -9,13 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks.motion import Step, steps_of
 from dexkit.conformance.checks.timing import longest_gap
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 
 _CONTACT_S = 0.7  # s after which the joints stand at the object
 _TURNS_S = 0.08  # s after which a joint has taken up a new speed
+_MOST_OF_IT = 0.9  # part of a way after which a joint may slow down
 _STANDS_S = 0.4  # s within which a joint that stands has come to its goal
+_FASTEST_HZ = 60.0  # frequency up to which a vibration is looked for
+_PERIODS = 1.5  # fewest periods that tell a vibration from a motion
+_BELOW_NYQUIST = 0.4  # part of the rate of states; a wave of half of it is not told from noise
+_CHANCE = 1e-7  # probability with which white noise is taken for one, in each stretch
 
 
 @check("BRAINCO-SPEED-01")
@@ -39,6 +45,68 @@ def slow_command(ctx: Context) -> Outcome:
     if part <= ctx.tolerance("max_part"):
         return ctx.passed(f"{part:.0%}", text, part=part)
     return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *span), part=part).about(joint)
+
+
+def _commanded_speeds(ctx: Context) -> list[tuple[Step, float]]:
+    """The motions of a phase in which every joint has a speed of its own, and that speed."""
+    found = []
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        given = ctx.commands.dq[(ctx.commands.t >= begin) & (ctx.commands.t <= end)]
+        given = given[np.isfinite(given).all(axis=1)]
+        if len(given):
+            found += [(s, float(np.median(given[:, s.joint]))) for s in steps_of(ctx, phase)]
+    return found
+
+
+@check("BRAINCO-SPEED-02")
+def no_speed(ctx: Context) -> Outcome:
+    """Motion of a joint that is commanded to another position with the speed 0."""
+    moved = [
+        (float(np.abs(step.q - step.start).max()) / step.stroke, step)
+        for step, asked in _commanded_speeds(ctx)
+        if asked == 0.0
+    ]
+    if not moved:
+        return ctx.skipped("no joint was commanded with the speed 0")
+    part, step = max(moved, key=lambda m: m[0])
+    way, limit = part * step.stroke, ctx.tolerance("max_motion_stroke", step.joint)
+    text = f"{step.name}moved by {way:.3f} {ctx.unit} with the speed 0"
+    figure = f"{way:.3f} {ctx.unit}"
+    if way <= limit:
+        return ctx.passed(figure, text, motion_rad=way).placed(way, limit)
+    place = ctx.at(ctx.states.topic, step.begin, step.end)
+    outcome = ctx.failed(figure, text, place, motion_rad=way)
+    return outcome.about(step.joint).placed(way, limit).if_late(STROKE_S * part)
+
+
+@check("BRAINCO-SPEED-03")
+def own_speeds(ctx: Context) -> Outcome:
+    """Speed of each joint relative to the one that it is commanded to move with."""
+    worst: tuple[float, Step, float, float] | None = None
+    slack = ctx.tolerance("slack")
+    for step, asked in _commanded_speeds(ctx):
+        way = (step.q - step.start) * np.sign(step.size)
+        arrived = np.flatnonzero(way >= _MOST_OF_IT * abs(step.size))
+        last = int(arrived[0]) if len(arrived) else len(way) - 1
+        seconds = float(step.t[last]) - step.begin - ctx.tolerance("start_s")
+        if not asked or seconds <= 0:
+            continue
+        part = float(way[last]) / seconds / ctx.joints[step.joint].dq_max
+        excess = max(
+            part / (ctx.tolerance("max_ratio") * asked + slack),
+            (ctx.tolerance("min_ratio") * asked - slack) / max(part, 1e-6),
+        )
+        if worst is None or excess > worst[0]:
+            worst = excess, step, asked, part
+    if worst is None:
+        return ctx.skipped("no joint was commanded with a speed of its own")
+    excess, step, asked, part = worst
+    text = f"{step.name}moved with {part:.0%} of its full speed, commanded with {asked:.0%}"
+    if excess <= 1.0:
+        return ctx.passed(f"{part:.0%} of {asked:.0%}", text, part=part)
+    place = ctx.at(ctx.states.topic, step.begin, step.end)
+    return ctx.failed(f"{part:.0%} of {asked:.0%}", text, place, part=part).about(step.joint)
 
 
 @check("BRAINCO-GRIP-01")
@@ -91,28 +159,59 @@ def _gives_way(
 
 @check("BRAINCO-STILL-02")
 def vibrates(ctx: Context) -> Outcome:
-    """The most reversals of q per second of a joint with a constant goal."""
+    """The most reversals of q per second of a joint with a constant goal.
+
+    Those of small size count where one frequency explains q, and noise of the measurement does not.
+    """
     worst: tuple[float, int, tuple[float, float], float] | None = None
+    limit = ctx.tolerance("max_turns_hz")
     for begin, end in _rests(ctx):
         rows = ctx.states.between(begin, end)
         if len(ctx.states.t[rows]) < 10:
             continue
-        for joint, spec in enumerate(ctx.joints):
-            q = ctx.states.q[rows, joint]
-            q = q[np.isfinite(q)]
-            turns = _turns(q, ctx.requirement.tolerance("min_turn_stroke") * spec.stroke)
-            rate = turns / (end - begin) if turns >= ctx.tolerance("min_turns") else 0.0
+        for joint in range(len(ctx.joints)):
+            t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
+            t, q = t[np.isfinite(q)], q[np.isfinite(q)]
+            rate = _turn_rate(ctx, t, q, "min_turn_stroke", joint)
+            if rate > limit and not _repeats(t, q, 0.5 * limit):
+                rate = _turn_rate(ctx, t, q, "max_noise_stroke", joint)
             if worst is None or rate > worst[0]:
                 worst = rate, joint, (begin, end), float(np.ptp(q)) if len(q) else 0.0
     if worst is None:
         return ctx.skipped("no joint stood for long enough")
     rate, joint, span, size = worst
     text = ctx.named(f"turns {rate:.1f} times a second at rest, over {size:.3f} {ctx.unit}", joint)
-    limit = ctx.tolerance("max_turns_hz")
     if rate <= limit:
         return ctx.passed(f"{rate:.1f} /s", text, turns_hz=rate)
     place = ctx.at(ctx.states.topic, *span)
     return ctx.failed(f"{rate:.0f} /s", text, place, turns_hz=rate).about(joint)
+
+
+def _turn_rate(ctx: Context, t: Floats, q: Floats, least: str, joint: int) -> float:
+    """Reversals of q a second of at least this tolerance; 0 where they are few."""
+    turns = _turns(q, ctx.tolerance(least, joint))
+    return turns / float(t[-1] - t[0]) if turns >= ctx.tolerance("min_turns") else 0.0
+
+
+def _repeats(t: Floats, q: Floats, lowest: float) -> bool:
+    """Whether one frequency explains more of q than it ever does of noise without a frequency.
+
+    :param lowest: frequency, Hz.
+    """
+    seconds = float(t[-1] - t[0])
+    if not seconds:
+        return False
+    off = q - np.polyval(np.polyfit(t - t[0], q, 1), t - t[0])  # it may still come to rest
+    power = float(off @ off)
+    highest = min(_BELOW_NYQUIST * (len(t) - 1) / seconds, _FASTEST_HZ)
+    tried = np.arange(max(lowest, _PERIODS / seconds), highest, 0.5 / seconds)
+    if not power or not len(tried):
+        return False
+    waves = np.exp(-2j * np.pi * np.outer(tried, t - t[0]))
+    explained = float((np.abs(waves @ off) ** 2).max()) * 2.0 / (len(q) * power)
+    # of white noise each frequency explains x or more with a probability of (1 - x) ** half
+    half = 0.5 * (len(q) - 3)
+    return bool(explained > 1.0 - (_CHANCE / len(tried)) ** (1.0 / half))
 
 
 def _rests(ctx: Context) -> list[tuple[float, float]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.servo_force import stands
 from dexkit.conformance.touch import Touch
 from dexkit.hand import Floats
 
@@ -120,3 +121,75 @@ def touch_rate(ctx: Context) -> Outcome:
     )
     late = 1.0 / max(rate, 0.5) - 1.0 / limit
     return outcome.rated(rate, limit, seconds).if_late(late, how="mean", best=late)
+
+
+_FEW = 2  # stretches of a failure: a single one may be disturbed
+
+
+def _rises(ctx: Context, touch: Touch) -> dict[str, Floats]:
+    """The largest rise of an element of each finger's areas in each message, counts, above what it
+    was before the first command.
+    """
+    first = float(ctx.commands.t[0]) if len(ctx.commands) else float(touch.t[0])
+    before = max(int(np.searchsorted(touch.t, first)), 1)
+    rise = np.nan_to_num(touch.values - np.median(touch.values[:before], axis=0))
+    fingers = dict.fromkeys(j.name.partition("_")[0] for j in ctx.joints)
+    mine = {f: [i for i, a in enumerate(touch.areas) if a.place.startswith(f)] for f in fingers}
+    return {f: rise[:, rows].max(axis=(1, 2)) for f, rows in mine.items() if rows}
+
+
+@check("FTP-TOUCH-05")
+def touch_in_grips(ctx: Context) -> Outcome:
+    """The touch of each finger in its grips, and where nothing touches it."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    touch = _touch(ctx)
+    if touch is None:
+        return ctx.absent(_NOTHING)
+    judged = False
+    for finger, rise in _rises(ctx, touch).items():
+        joints = [i for i, j in enumerate(ctx.joints) if j.name.startswith(finger)]
+        grips = [s for s in stands(ctx) if s.presses[joints].any()]
+        for one in grips:
+            last = int(np.searchsorted(touch.t, one.end)) - 1
+            gap = one.end - float(touch.t[max(last, 0)])
+            own = ctx.states.t[ctx.states.between(one.end - gap, one.end)]
+            if gap > ctx.tolerance("max_gap_s") and len(own) > 5:
+                text = f"no touch message for {gap:.2f} s while the {finger} grips"
+                return ctx.failed(f"{gap:.1f} s", text, ctx.at(touch.topic, one.end - gap, one.end))
+        held = [(_last(touch, rise, s.begin, s.end), s) for s in grips]
+        most = max(
+            (float(rise[i]) for _, s in held for i in _rows(touch, s.begin, s.end)), default=0
+        )
+        if most <= 0.0:
+            continue
+        judged = True
+        weak = [s for part, s in held if part < ctx.tolerance("min_part") * most]
+        if len(weak) >= _FEW:
+            text = f"of its touch in other grips hardly any is left while the {finger} grips"
+            return ctx.failed("no touch", text, ctx.at(touch.topic, weak[0].begin, weak[-1].end))
+        free = [s for s in stands(ctx) if s.free[joints].all()]
+        ends = np.array([s.end for s in grips])
+        kept = [
+            s
+            for s in free
+            if not ((ends > s.begin - ctx.tolerance("release_s")) & (ends <= s.end)).any()
+            and _last(touch, rise, s.begin, s.end) > ctx.tolerance("max_part") * most
+        ]
+        if len(kept) >= _FEW:
+            text = f"the touch of a grip is there while nothing touches the {finger}"
+            return ctx.failed("touch", text, ctx.at(touch.topic, kept[0].begin, kept[-1].end))
+    if not judged:
+        return ctx.skipped("no finger's areas rose at the object")
+    return ctx.passed("as gripped", "each finger's areas tell its grips")
+
+
+def _rows(touch: Touch, begin: float, end: float) -> range:
+    """The messages in [begin, end], and the last one before, if there is none in it."""
+    first, last = np.searchsorted(touch.t, begin), np.searchsorted(touch.t, end, "right")
+    return range(int(first) if first < last else max(int(first) - 1, 0), max(int(last), 1))
+
+
+def _last(touch: Touch, rise: Floats, begin: float, end: float) -> float:
+    """The last rise in [begin, end]."""
+    return float(rise[_rows(touch, begin, end)[-1]])

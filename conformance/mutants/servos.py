@@ -277,7 +277,12 @@ class _Vanishes(ServoHand):
         super().move(dt, [0.05 * p for p in pull] if self.pressed > 1.0 else pull)
 
 
-@wrong_hand("FTP-FORCE-06", also=("FTP-SENS-09",), sides=BOTH, whole=True)
+@wrong_hand(
+    "FTP-FORCE-06",
+    also=("FTP-FORCE-01", "FTP-SENS-09", "FTP-TOUCH-05"),
+    sides=BOTH,
+    whole=True,
+)
 class ForceVanishes(FtpService):
     """Presses with a twentieth of the force after a second of contact, and does not open."""
 
@@ -393,3 +398,321 @@ class DeafAfterOutOfRange(ServoService):
             self.deaf_until[side] = self.now + 0.8
         if self.now >= self.deaf_until.get(side, 0.0):
             super().motors(side, motors)
+
+
+# -------------------------------------------------------------------- forces that are reported
+
+
+class _Feels(ServoHand):
+    """Counts the seconds in which it touches the object, and its grips."""
+
+    grip = 0.0
+    off = 9.0
+    grips = 0
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        if self.touches and max(map(abs, self.contact)) > 0.02 and not self.free():
+            self.grips += self.grip == 0.0
+            self.grip, self.off = self.grip + dt, 0.0
+            self.version += 1  # a fault depends on the time
+            return
+        self.off += dt
+        if self.off > 0.3:
+            self.grip = 0.0
+
+    def free(self) -> bool:
+        """Whether no joint is where the object is."""
+        pairs = zip(self.q, self.floor, self.ceiling, self.low, self.high, strict=True)
+        return not any((lo > a and q < lo) or (hi < b and q > hi) for q, lo, hi, a, b in pairs)
+
+
+class _FeelingService(ServoService):
+    hand_fault: Any = _Feels
+
+
+@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
+class ForceAgainstClosing(_FeelingService):
+    """Reports the force of a grip with the other sign."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        if hand.grip > 0.0:  # type: ignore[attr-defined]
+            motors["tau_est"] *= -1.0
+
+
+@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
+@wrong_hand("FTP-FORCE-01", also=("FTP-FORCE-06",), sides=BOTH)
+class ForceZeroedInGrip(_FeelingService):
+    """Sets its forces to zero half a second after it has touched."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        if hand.grip > 0.5:  # type: ignore[attr-defined]
+            motors["tau_est"] = 0.0
+
+
+@wrong_hand("BRAINCO-FORCE-01", also=("BRAINCO-FORCE-04",), sides=BOTH)
+class ForceOfNextJoint(ServoService):
+    """Reports each force as its neighbour's."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] = np.roll(motors["tau_est"], 1)
+
+
+@wrong_hand("BRAINCO-FORCE-02", also=("BRAINCO-FORCE-04",), sides=BOTH)
+class ForceInThousandths(ServoService):
+    """Reports forces a thousand times too large."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= 1000.0
+
+
+@wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
+class NoForce(ServoService):
+    """Reports no force."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] = 0.0
+
+
+@wrong_hand("BRAINCO-FORCE-04", sides=BOTH)
+class ForceKept(ServoService):
+    """Keeps the largest force of each joint for ever."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.most = {s: np.zeros(len(h.q)) for s, h in self.hands.items()}
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        tau, kept = np.array(motors["tau_est"]), self.most[hand.side]
+        kept[:] = np.where(np.abs(tau) > np.abs(kept), tau, kept)
+        motors["tau_est"] = kept
+
+
+class _BacksOff(_Feels):
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        if self.grip > 0.2:
+            closing = [j.closing for j in self.model.joints[self.side]]
+            ahead = zip(self.place, self.q, closing, strict=True)
+            self.place = [q + c * min(c * (p - q), 0.015) for p, q, c in ahead]
+            self.law_q = list(self.place)
+            self.rests = False
+
+
+@wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
+@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-06",), sides=BOTH)
+class ForceBacksOff(_FeelingService):
+    """Takes its goals back to a seventh of the force as soon as it touches."""
+
+    hand_fault = _BacksOff
+
+
+class _WeakAgain(_Feels):
+    weak = False
+
+    def is_weak(self) -> bool:
+        return False
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        if self.is_weak() != self.weak:
+            self.weak = not self.weak
+            self.changed()
+
+    def changed(self) -> None:
+        super().changed()
+        if self.weak:
+            self.law_kp = [0.15 * k for k in self.law_kp]
+
+
+class _GivesUp(_WeakAgain):
+    def is_weak(self) -> bool:
+        return self.grip > 1.0
+
+
+@wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
+@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-06", "FTP-SENS-09"), sides=BOTH, whole=True)
+class ForceGivesUp(_FeelingService):
+    """Presses with a seventh of its force after a second of a grip."""
+
+    hand_fault = _GivesUp
+
+
+@wrong_hand("BRAINCO-FORCE-05", sides=BOTH, whole=True)
+class WeakAfterRestart(_FeelingService):
+    """Presses with a seventh of its force after a restart of the service."""
+
+    hand_fault = _WeakAgain
+
+    def take_over(self, before: Any) -> None:
+        super().take_over(before)
+        for hand in self.hands.values():
+            hand.is_weak = lambda hand=hand: hand.grip > 0.0  # type: ignore[attr-defined]
+
+
+# ----------------------------------------------------------------------------- tactile areas
+
+
+class _FeelingFtp(FtpService):
+    hand_fault = _Feels
+
+    def gripping(self, side: Side, seconds: float) -> bool:
+        hand = self.hands[side]
+        assert isinstance(hand, _Feels)
+        return hand.grip > seconds
+
+
+@wrong_hand("FTP-TOUCH-05", also=("FTP-TOUCH-03",), sides=BOTH)
+class TouchStopsInGrip(_FeelingFtp):
+    """Publishes no touch from 0.4 s of a grip on."""
+
+    def touch(self) -> list[Sample]:
+        quiet = [self.touch_topic(s) for s in self.sides if self.gripping(s, 0.4)]
+        return [sample for sample in super().touch() if sample.topic not in quiet]
+
+
+@wrong_hand("FTP-TOUCH-05", also=("FTP-SENS-04",), sides=BOTH)
+class TouchZeroedInGrip(_FeelingFtp):
+    """Sets its tactile areas to zero 0.3 s after it has touched."""
+
+    def touched(self, side: Side) -> bytes:
+        hand = self.hands[side]
+        contact = hand.contact
+        if self.gripping(side, 0.3):
+            hand.contact = [0.0] * len(contact)
+        message = super().touched(side)
+        hand.contact = contact
+        return message
+
+
+@wrong_hand("FTP-TOUCH-05", also=("FTP-SENS-04",), sides=BOTH)
+class TouchKept(FtpService):
+    """Keeps the largest reading of each element for ever."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.most: dict[Side, Floats] = {}
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        felt = super().pressures(hand)
+        self.most[hand.side] = np.maximum(self.most.get(hand.side, felt), felt)
+        return self.most[hand.side]
+
+
+# ------------------------------------------------------------------------------- speeds
+
+
+def _speed_fault(change: Any) -> type[ServoHand]:
+    """A hand that takes other speeds than those of a command."""
+
+    class _Hand(ServoHand):
+        def take(self, rows: Floats, mode: Ints) -> None:
+            other = rows.copy()
+            other[1] = change(rows[1])
+            super().take(other, mode)
+
+    return _Hand
+
+
+@wrong_hand("BRAINCO-SPEED-02")
+class ZeroIsFullSpeed(ServoService):
+    """Moves at full speed where dq is 0."""
+
+    hand_fault = _speed_fault(lambda dq: np.where(dq == 0.0, 1.0, dq))
+
+
+@wrong_hand("BRAINCO-SPEED-03", also=("BRAINCO-SPEED-02",))
+class SpeedOfTheFirst(ServoService):
+    """Moves all joints with the speed of the first one."""
+
+    hand_fault = _speed_fault(lambda dq: np.full_like(dq, dq[0]))
+
+
+@wrong_hand("BRAINCO-SPEED-03")
+class HalfSpeeds(ServoService):
+    """Takes half of each speed below the full one."""
+
+    hand_fault = _speed_fault(lambda dq: np.where(dq < 0.9, 0.5 * dq, dq))
+
+
+# ---------------------------------------------------------------- after silences and restarts
+
+
+@wrong_hand("BRAINCO-WDOG-03")
+class LateAfterSilence(ServoService):
+    """Obeys commands 0.4 s late for half a second after a silence."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.mail: list[tuple[float, Side, tuple[Motor, ...]]] = []
+        self.heard = self.slow_until = 0.0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if self.heard and self.now - self.heard > 1.0:
+            self.slow_until = self.now + 0.5
+        self.heard = self.now
+        late = 0.4 if self.now < self.slow_until else 0.0
+        self.mail.append((self.now + late, side, motors))
+
+    def live(self, dt: float) -> None:
+        while self.mail and self.mail[0][0] <= self.now:
+            super().motors(*self.mail.pop(0)[1:])
+        super().live(dt)
+
+    def brake(self) -> None:
+        self.mail.clear()
+        super().brake()
+
+
+class _SwapsSome(ServoService):
+    """Takes the goals of its third and fifth joint for each other, at times."""
+
+    def swaps(self) -> bool:
+        return False
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if self.swaps():
+            order = (0, 1, 4, 3, 2, *range(5, len(motors)))
+            motors = tuple(motors[i] for i in order)
+        super().motors(side, motors)
+
+
+@wrong_hand("BRAINCO-LIFE-02", whole=True)
+class SwapsForNewClients(_SwapsSome):
+    """Mixes two joints up in the commands of a restarted client."""
+
+    client = 0
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.client = client
+        super().receive(topic, payload, client)
+
+    def swaps(self) -> bool:
+        return 0 < self.client < 1000 and not self.restarted
+
+
+@wrong_hand("BRAINCO-LIFE-03", also=("BRAINCO-WDOG-03",), whole=True)
+class SwapsAfterRestart(_SwapsSome):
+    """Mixes two joints up in commands after a restart of the service."""
+
+    def swaps(self) -> bool:
+        return self.restarted
+
+
+@wrong_hand("BRAINCO-WDOG-03", whole=True)
+class SwapsAfterSilence(_SwapsSome):
+    """Mixes two joints up in commands for three seconds after a silence."""
+
+    heard = until = 0.0
+
+    def swaps(self) -> bool:
+        if self.heard and self.now - self.heard > 0.5:
+            self.until = self.now + 3.0
+        self.heard = self.now
+        return self.now < self.until

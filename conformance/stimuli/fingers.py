@@ -26,6 +26,7 @@ lock           the first with the client's gains and status 0 or mode 0
 mixed          a step in which some joints are locked under way, by their mode byte, and the others
                go on: three times, with other joints
 status         mode bytes with every status that no document defines
+speeds         position servos: each joint with another speed, and one with none; again with others
 ends           one finger after the other to both ends of its range, with the thumb out of the way
 push, pull     a torque alone, without a position gain: towards closed, and towards open
 replay         a recorded session, as recorded
@@ -35,7 +36,7 @@ old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 touch          one finger alone presses on the object, if there is one
 firmer         all fingers hold it softly, and one after the other presses firmly
-squeeze        all fingers close on it, for seconds
+squeeze        all fingers close on it, for seconds; position servos also after each restart
 guarded-step   some joints of each hand have time-out protection from here on (bit 7 of the mode
                byte); a step, and back
 guarded        meanwhile a hand without an object holds its pose
@@ -117,6 +118,15 @@ _WIDE = (CLOSED + 5.0, 5.0)
 """Percent of closing between which joints are locked under way."""
 _UNDER_WAY = 0.08
 """Seconds after which a joint moves fast in a step with the client's gains."""
+_APART = 7.0
+"""Percent of closing by which goals of position servos differ, where they tell joints apart: more
+than a good one may be off, and less than what makes it another step."""
+_SPEEDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.15)
+"""Speeds of the joints of position servos, parts of the full one."""
+_SPEEDS_SECONDS, _SPEEDS_SHIFTS = 0.5, (0, 2)
+"""Seconds of each turn with them, and by how many joints they are shifted in it."""
+_GRIP_SECONDS = 1.1
+"""Seconds of a grip after a restart."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -144,6 +154,8 @@ class FingerScript(HandScript):
 
     _turn_of_splits = 0
     """Number of times that joints got different treatment."""
+    _turn_of_places = 0
+    """Number of times that joints got goals that tell them apart."""
     _drives = 0
     """Number of times that joints have been set in motion."""
 
@@ -178,6 +190,8 @@ class FingerScript(HandScript):
             yield from self._everyone("center", {s: self._home(s) for s in sides})
         if "single" in phases:
             yield from self._single()
+        if "speeds" in phases:
+            yield from self._speeds()
         if "ends" in phases:
             yield from self._to_the_ends()
         if "load" in phases:
@@ -225,6 +239,27 @@ class FingerScript(HandScript):
                 key=lambda pose: sum(abs(a - b) for a, b in zip(pose, here, strict=True)),
             )
         return places
+
+    def _apart(self, places: Mapping[Side, Pose]) -> dict[Side, Pose]:
+        """The places of position servos, in which no two joints have the same goal twice.
+
+        Where all joints have the same one, it cannot be seen that they have been mixed up.
+        """
+        if not self.plan.dialect.position_servo:
+            return dict(places)
+        turn = self._turn_of_places
+        self._turn_of_places += 1
+        found = {}
+        for s, pose in places.items():
+            by_thirds = (turn + (s is Side.RIGHT)) % 2 == 0
+            found[s] = tuple(
+                q + ((i % 3 if by_thirds else i // 2) - 1) * _APART / 100 * j.stroke * j.closing
+                for i, (q, j) in enumerate(zip(pose, self._joints[s], strict=True))
+            )
+        return found
+
+    def _after_silence(self, poses: Mapping[Side, Pose]) -> Steps:
+        yield from self._everyone("resume", self._apart(poses), most=1.5)
 
     def _reachable(self, side: Side) -> bool:
         return side not in self.plan.objects
@@ -406,7 +441,7 @@ class FingerScript(HandScript):
         """
         yield from self._drive("drive", self.plan.sides, {}, guarded=guarded)
         yield from self._silence("silence", self._model.command_timeout + 0.7)
-        yield from self._to("resume", CLOSED - 5.0)
+        yield from self._after_silence({s: self._pose(s, CLOSED - 5.0) for s in self.plan.sides})
 
     def _silent_alone(
         self, side: Side, rejected: Motors, guarded: Mapping[Side, frozenset[int]]
@@ -421,8 +456,9 @@ class FingerScript(HandScript):
         self._report(f"no good commands to the {side} hand alone: nothing may be left driven")
         yield from self._drive("drive", (side,), {}, guarded=guarded)
         yield from self._silence_alone("silence", side, {side: rejected} if rejected else {})
-        poses = {s: self._pose(s, CLOSED - 5.0 if s is side else OPEN) for s in self.plan.sides}
-        yield from self._everyone("resume", poses, most=1.5)
+        yield from self._after_silence(
+            {s: self._pose(s, CLOSED - 5.0 if s is side else OPEN) for s in self.plan.sides}
+        )
 
     def _once_more(self) -> dict[Side, frozenset[int]]:
         """The joints with time-out protection in a further silence."""
@@ -539,6 +575,26 @@ class FingerScript(HandScript):
             yield from self._hold(0.35, self._locked(hands, splits))
             self._end(phase)
             self._goal.update(poses)
+        yield from self._to("center", OPEN)
+
+    def _speeds(self) -> Steps:
+        """Each joint closes with another speed, and one with none."""
+        self._report("a speed for each joint: each must move with its own, and with 0 not at all")
+        sides = self.plan.sides
+        for shift in _SPEEDS_SHIFTS:
+            yield from self._to("center", OPEN)
+            poses = {s: self._pose(s, CLOSED) for s in sides}
+            targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+            hands = {
+                s: [
+                    replace(m, dq=_SPEEDS[(i + shift + 3 * (s is Side.RIGHT)) % len(_SPEEDS)])
+                    for i, m in enumerate(self._motors(s, pose))
+                ]
+                for s, pose in poses.items()
+            }
+            phase = self._begin("speeds", sides, targets=targets)
+            yield from self._hold(_SPEEDS_SECONDS, hands)
+            self._end(phase)
         yield from self._to("center", OPEN)
 
     def _to_the_ends(self) -> Steps:
@@ -767,6 +823,32 @@ class FingerScript(HandScript):
         self._end(phase)
         self._goal.update(poses)
 
+    def _grips_again(self) -> Steps:
+        """A position servo's limits of force are its own: what a restart does to them is seen by a
+        grip.
+        """
+        pressing = [s for s in self.plan.sides if s in self.plan.objects]
+        if (
+            not pressing
+            or "squeeze" not in self.plan.phases
+            or not self.plan.dialect.position_servo
+        ):
+            return
+        self._report("squeezing the object again")
+        yield from self._squeeze(pressing, _GRIP_SECONDS)
+        yield from self._to("center", OPEN)
+
+    def _squeeze(self, sides: Sequence[Side], seconds: float) -> Steps:
+        """All fingers close on the object, as a phase."""
+        squeeze = self._squeezes(sides, {})
+        targets = {
+            s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
+            for s in sides
+        }
+        phase = self._begin("squeeze", sides, targets=targets)
+        yield from self._hold(seconds, squeeze)
+        self._end(phase)
+
     def _squeezes(
         self, sides: Sequence[Side], guarded: Mapping[Side, frozenset[int]]
     ) -> dict[Side, Motors]:
@@ -787,13 +869,7 @@ class FingerScript(HandScript):
         squeeze = self._squeezes(pressing, {})
         if pressing:
             self._report("squeezing the object")
-            targets = {
-                s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
-                for s in pressing
-            }
-            phase = self._begin("squeeze", pressing, targets=targets)
-            yield from self._hold(2.0, squeeze)
-            self._end(phase)
+            yield from self._squeeze(pressing, 2.0)
         if self.plan.phases & {"silence", "resume"}:
             self._report("slow motion without protection, and then ...")
             yield from self._drive("drive", free, squeeze)

@@ -109,6 +109,7 @@ class HandScript(Script[Side]):
             self._report("the commanding program is restarted: the new one must be obeyed")
             yield Restart()
             yield from self._in_turn("restart")
+            yield from self._grips_again()
             if "nan" in self.plan.phases:
                 yield from self._again()
         yield from self._hold(0.2)
@@ -131,6 +132,10 @@ class HandScript(Script[Side]):
     def _silent_again(self) -> Steps:
         """Missing commands once more, after a restart of the service."""
 
+    def _grips_again(self) -> Steps:
+        """A short grip after a restart of the client or the service."""
+        yield from ()
+
     def _before_shutdown(self) -> Steps:
         """Commands to the hand before its service is stopped."""
         yield from ()
@@ -150,6 +155,10 @@ class HandScript(Script[Side]):
     @abstractmethod
     def _other_place(self) -> dict[Side, Pose]:
         """A pose worth moving to from here."""
+
+    def _apart(self, places: Mapping[Side, Pose]) -> dict[Side, Pose]:
+        """These places, or such near them that tell whose joint's goal another one has."""
+        return dict(places)
 
     @abstractmethod
     def _motors(self, side: Side, pose: Pose) -> Motors:
@@ -264,7 +273,7 @@ class HandScript(Script[Side]):
 
         :param divided: another client commands the other side in the last of them.
         """
-        home, away = dict(self._goal), self._other_place()
+        home, away = dict(self._goal), self._apart(self._other_place())
         first, *others = self.plan.sides
         turns = [{first: away[first]}, {first: home[first]}]
         for side in others:
@@ -595,6 +604,7 @@ class HandScript(Script[Side]):
         yield from self._silence("restarted", 1.3)
         yield from self._everyone("service-restart", self._after_shutdown(), most=4.0)
         yield from self._in_turn("service-restart")
+        yield from self._grips_again()
         if "silence" in self.plan.phases:
             yield from self._silent_again()
 

@@ -1,0 +1,211 @@
+"""Check the force or current that position servos report: in a grip, and without one.
+
+Such a hand has no gains, and no source says how much force a goal beyond the object makes. So a
+grip is recognised by position, and its force is compared with that of other grips of the run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.hand import Floats
+from dexkit.models import model
+
+__all__ = ["Stand", "stands"]
+
+_WINDOW_S, _GRID_S, _PARTS = 0.3, 0.05, 3
+"""Seconds of a stretch in which joints stand, from one to the next, and the parts of each."""
+_STANDS = 0.03  # of the stroke: motion in a stretch
+_AT_GOAL = 0.03  # of the stroke: distance from the goal of a joint that has reached it
+_OFF_GOAL = 0.1  # of the stroke: distance from the goal of a joint that is held back
+_NEAR, _CLEAR = 0.08, 0.08  # of the stroke: from where the object is, of one that touches or not
+_END = 0.05  # of the stroke: distance from the ends within which a stop may press
+_HEARD_S = 0.25  # s from the last command, after which a hand may do what it does in a silence
+_FAST = 0.5  # part of the full speed from which a goal is soon beyond the object
+_FEW = 2  # stretches of a failure: a single one may be disturbed
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A stretch in which some joints stand under an unchanged command.
+
+    :param presses: which joints the object holds back, well before their goal.
+    :param free: which joints have reached their goal, where neither object nor stop is.
+    :param force: median of tau_est towards closing in each third of it, shape (3, n_joints).
+    """
+
+    begin: float
+    end: float
+    presses: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    force: Floats
+
+
+def stands(ctx: Context) -> list[Stand]:
+    """Every such stretch of the run in which a joint presses on the object, or is free."""
+    return ctx.once("stands", lambda: _stands(ctx))
+
+
+def _stands(ctx: Context) -> list[Stand]:
+    states, given = ctx.states, ctx.commands
+    good = np.isfinite(given.q).all(axis=1) & np.isfinite(given.dq).all(axis=1)
+    t, goals, speeds = given.t[good], given.q[good], given.dq[good]
+    if not len(t) or not len(states):
+        return []
+    specs = ctx.joints
+    stroke = np.array([j.stroke for j in specs])
+    closing = np.array([j.closing for j in specs])
+    low, high = np.array([j.q_min for j in specs]), np.array([j.q_max for j in specs])
+    goals = np.clip(goals, low, high)
+    changes = (np.abs(np.diff(goals, axis=0)) > 1e-6) | (np.abs(np.diff(speeds, axis=0)) > 1e-6)
+    rows = np.where(changes, np.arange(1, len(t))[:, None], 0)
+    since = np.vstack((np.zeros(len(specs), np.intp), np.maximum.accumulate(rows, axis=0)))
+    fast = np.ones(len(specs), np.bool_)
+    at = None if ctx.object_at is None else ctx.object_at / 100
+    contact = np.array([j.closed_by(at) if at is not None and j.closing else np.nan for j in specs])
+    found = []
+    for begin in np.arange(float(t[0]), float(t[-1]), _GRID_S).tolist():
+        end = begin + _WINDOW_S
+        last = int(np.searchsorted(t, end, "right")) - 1
+        if end - t[last] > _HEARD_S:
+            continue
+        same = t[since[last]] <= begin
+        rows_here = states.between(begin, end)
+        q, tau = states.q[rows_here], states.tau[rows_here]
+        if not same.any() or len(q) < 2 * _PARTS or not np.isfinite(q).all():
+            continue
+        here = np.median(q, axis=0)
+        still = same & (np.ptp(q, axis=0) <= _STANDS * stroke)
+        if ctx.recording.dialect.speed_units:
+            fast = speeds[last] >= _FAST
+        left = (goals[last] - here) * closing / stroke
+        with np.errstate(invalid="ignore"):
+            way = (contact - here) * closing / stroke  # NaN without an object
+            presses = still & fast & (left >= _OFF_GOAL) & (np.abs(way) <= _NEAR)
+            clear = np.isnan(way) | (way >= _CLEAR)
+        inside = (here >= low + _END * stroke) & (here <= high - _END * stroke)
+        free = still & (np.abs(left) <= _AT_GOAL) & clear & inside & (closing != 0)
+        if presses.any() or free.any():
+            parts = np.array_split(tau * closing, _PARTS)
+            force = np.array([np.median(part, axis=0) for part in parts])
+            found.append(Stand(begin, end, presses, free, force))
+    return found
+
+
+def _unit(ctx: Context) -> str:
+    return model(ctx.recording.dialect.model).torque_unit
+
+
+def _reported(ctx: Context) -> Outcome | None:
+    """Why the force of a hand cannot be judged."""
+    if not np.nan_to_num(ctx.states.tau).any():
+        return ctx.absent("tau_est is not filled (0 throughout)")
+    return None
+
+
+def _without_object(ctx: Context) -> Outcome | None:
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    if not any(s.presses.any() for s in stands(ctx)):
+        return ctx.skipped("the object held no joint back for long enough")
+    return None
+
+
+@check("BRAINCO-FORCE-03")
+def reported(ctx: Context) -> Outcome:
+    """Whether tau_est is anything but 0 while the hand presses on the object."""
+    if (skipped := _without_object(ctx)) is not None:
+        return skipped
+    most = max(float(np.abs(s.force[:, s.presses]).max()) for s in stands(ctx) if s.presses.any())
+    text = f"tau_est is {most:.2f} {_unit(ctx)} at most in a grip"
+    if np.nan_to_num(ctx.states.tau).any():
+        return ctx.passed(f"{most:.2f}", text, tau_nm=most)
+    return ctx.failed("0", "tau_est is 0 throughout the run, in each grip as well")
+
+
+@check("BRAINCO-FORCE-01")
+def felt(ctx: Context) -> Outcome:
+    """The smallest tau_est towards closing of a joint that stands against the object."""
+    if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
+        return skipped
+    unit = _unit(ctx)
+    worst: tuple[float, int, Stand] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        mine = [s for s in stands(ctx) if s.presses[joint]]
+        mine.sort(key=lambda s, i=joint: float(s.force[-1, i]))  # type: ignore[misc]
+        if len(mine) >= _FEW:
+            one = mine[_FEW - 1]
+            part = float(one.force[-1, joint]) / spec.tau_max
+            worst = min(worst or (part, joint, one), (part, joint, one), key=lambda w: w[:2])
+    if worst is None:
+        return ctx.skipped("the object held no joint back for long enough")
+    part, joint, one = worst
+    tau = part * ctx.joints[joint].tau_max
+    text = ctx.named(f"tau_est of {tau:.2f} {unit} towards closing in a grip", joint)
+    limit = ctx.tolerance("min_part")
+    if part >= limit:
+        return ctx.passed(f"{tau:.2f} {unit}", text, tau_nm=tau)
+    place = ctx.at(ctx.states.topic, one.begin, one.end)
+    outcome = ctx.failed(f"{tau:.2f} {unit}", text, place, tau_nm=tau).about(joint)
+    if part <= -limit:
+        return outcome.because("It has the sign of the motor or of q, and not of closing.")
+    return outcome
+
+
+@check("BRAINCO-FORCE-04")
+def none_without_contact(ctx: Context) -> Outcome:
+    """The largest tau_est of a joint that has reached its goal and touches nothing."""
+    if (skipped := _reported(ctx)) is not None:
+        return skipped
+    unit = _unit(ctx)
+    worst: tuple[float, int, Stand] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        mine = [s for s in stands(ctx) if s.free[joint]]
+        mine.sort(key=lambda s, i=joint: -abs(float(s.force[-1, i])))  # type: ignore[misc]
+        if len(mine) >= _FEW:
+            one = mine[_FEW - 1]
+            part = abs(float(one.force[-1, joint])) / spec.tau_max
+            worst = max(worst or (part, joint, one), (part, joint, one), key=lambda w: w[:2])
+    if worst is None:
+        return ctx.skipped("no joint stood at its goal for long enough")
+    part, joint, one = worst
+    tau = part * ctx.joints[joint].tau_max
+    text = ctx.named(f"tau_est of {tau:.2f} {unit} at its goal, where it touches nothing", joint)
+    if part <= ctx.tolerance("max_part"):
+        return ctx.passed(f"{tau:.2f} {unit}", text, tau_nm=tau)
+    place = ctx.at(ctx.states.topic, one.begin, one.end)
+    return ctx.failed(f"{tau:.2f} {unit}", text, place, tau_nm=tau).about(joint)
+
+
+@check("BRAINCO-FORCE-05")
+def grips_alike(ctx: Context) -> Outcome:
+    """The weakest stretch of a joint's grips, relative to the strongest."""
+    if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
+        return skipped
+    unit = _unit(ctx)
+    worst: tuple[float, int, float, float, Stand] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        mine = [s for s in stands(ctx) if s.presses[joint]]
+        strongest = max((float(np.abs(s.force[:, joint]).max()) for s in mine), default=0.0)
+        if len(mine) < _FEW or strongest < ctx.tolerance("min_strongest_part") * spec.tau_max:
+            continue
+        mine.sort(key=lambda s, i=joint: abs(float(s.force[-1, i])))  # type: ignore[misc]
+        one = mine[_FEW - 1]
+        weakest = abs(float(one.force[-1, joint]))
+        found = weakest / strongest, joint, strongest, weakest, one
+        worst = min(worst or found, found, key=lambda w: w[:2])
+    if worst is None:
+        return ctx.skipped("no joint pressed with enough force to compare")
+    part, joint, strongest, weakest, one = worst
+    text = ctx.named(
+        f"tau_est of {weakest:.2f} {unit} in a grip, where it was {strongest:.2f} {unit} at most",
+        joint,
+    )
+    if part >= ctx.tolerance("min_part"):
+        return ctx.passed(f"{part:.0%}", text, part=part)
+    place = ctx.at(ctx.states.topic, one.begin, one.end)
+    return ctx.failed(f"{part:.0%}", text, place, part=part).about(joint)
