@@ -6,6 +6,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +17,14 @@ from hypothesis import strategies as st
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
-from dexkit.conformance.checks.servos import _turns
+from dexkit.conformance.checks.servos import _repeats, _turns
 from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.mutants.servos import StatesSwapped, Vibrates
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.brainco import BrainCoService
+from dexkit.conformance.virtual.fingers import FingerHand
 from dexkit.doctor.ways import Course, moves_against, swapped
 from dexkit.emulators.sim_brainco import SimBrainCo, sim_brainco
 from dexkit.errors import HandLost, UsageError
@@ -273,6 +275,43 @@ def test_emulated_hand_meets_every_requirement() -> None:
 )
 def test_turns_are_counted_by_their_size(q: list[float], turns: int) -> None:
     assert _turns(np.array(q), 0.005) == turns
+
+
+@each("states_hz", [100.0, 500.0])
+def test_noise_of_a_hundredth_is_no_vibration_and_a_small_oscillation_is(states_hz: float) -> None:
+    draw = np.random.default_rng(8)
+    t = np.arange(0.0, 0.25, 1.0 / states_hz)
+    for _ in range(300):
+        noise = draw.uniform(-0.01, 0.01, len(t))
+        assert not _repeats(t, 0.5 + noise, 4.0)
+        assert not _repeats(t, 0.5 + 0.02 * np.exp(-t / 0.05) + noise, 4.0)
+    assert not _repeats(t, np.full(len(t), 0.5), 4.0)
+    for hertz in (8.0, 12.0, 25.0):
+        wave = 0.003 * np.sin(2 * np.pi * hertz * t)
+        assert _repeats(t, 0.5 + wave + draw.uniform(-3e-4, 3e-4, len(t)), 4.0)
+
+
+class _Noisy(BrainCoService):
+    """Has noise of 0.9 % of the travel in each direction."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.draw = np.random.default_rng(9)
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["q"] += self.draw.uniform(-0.009, 0.009, len(motors))
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.version += 1
+
+
+@pytest.mark.soak
+def test_a_hand_with_noise_is_not_blamed() -> None:
+    result = run_mutant(_Noisy, plan_for("brainco"))
+    assert {r.verdict for r in result.results} == {Verdict.PASS, Verdict.NOT_APPLICABLE}
 
 
 # ----------------------------------------------------------------------------------------- doctor

@@ -24,14 +24,15 @@ from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.mutants.servos import ReversedScale
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
-from dexkit.conformance.virtual.inspire import InspireService
+from dexkit.conformance.virtual.fingers import Ints
+from dexkit.conformance.virtual.inspire import InspireHand, InspireService
 from dexkit.doctor import Observations, diagnose
 from dexkit.doctor.dds import _Watch
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Policies, Stream
 from dexkit.doctor.rtps import EndpointData
 from dexkit.emulators.sim_inspire import SimInspireDfx, sim_inspire_dfx
 from dexkit.errors import HandLost, UsageError
-from dexkit.hand import Hand, HandCommand, HandState, Side
+from dexkit.hand import Floats, Hand, HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_go
 from dexkit.models import INSPIRE_DFX, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
@@ -267,6 +268,25 @@ def test_reversed_scale_is_found_and_reported_in_parts_of_the_travel() -> None:
     assert "DFX-MOVE-01" in failed
     assert all(not RADIANS.search(r.observed) for r in result.results)
     assert any("full travel" in r.observed for r in result.results)
+
+
+class _SlowRing(InspireHand):
+    """Its ring finger needs 2 s for the whole travel."""
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        self.reach[1] = 0.5
+
+
+class _SlowRings(InspireService):
+    hand = _SlowRing
+
+
+def test_a_slow_joint_is_told_from_a_slow_client() -> None:
+    plan = replace(plan_for("inspire_dfx"), phases=frozenset(["listen", "joint", "operator"]))
+    result = run_mutant(_SlowRings, plan)
+    verdicts = {r.verdict for r in result.results if r.requirement.id == "DFX-OPER-01"}
+    assert verdicts == {Verdict.WARN}
 
 
 class Emulated(EmulatedService):

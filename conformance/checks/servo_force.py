@@ -156,6 +156,22 @@ def felt(ctx: Context) -> Outcome:
     return outcome
 
 
+@check("BRAINCO-FORCE-02")
+def unit(ctx: Context) -> Outcome:
+    """The largest tau_est in the run, relative to the joint's limit."""
+    tau = np.abs(np.nan_to_num(ctx.states.tau))
+    limits = np.array([j.tau_max for j in ctx.joints])
+    if not len(tau):
+        return ctx.skipped("no state")
+    row, joint = (int(i) for i in np.unravel_index(int(np.argmax(tau / limits)), tau.shape))
+    most, name = float(tau[row, joint]), _unit(ctx)
+    text = ctx.named(f"tau_est of {most:.3g} {name} at most", joint)
+    if most <= ctx.tolerance("max_part") * limits[joint]:
+        return ctx.passed(f"{most:.3g} {name}", text, tau_nm=most)
+    place = ctx.at(ctx.states.topic, float(ctx.states.t[row]))
+    return ctx.failed(f"{most:.3g} {name}", text, place, tau_nm=most).about(joint)
+
+
 @check("BRAINCO-FORCE-04")
 def none_without_contact(ctx: Context) -> Outcome:
     """The largest tau_est of a joint that has reached its goal and touches nothing."""
