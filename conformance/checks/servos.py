@@ -61,17 +61,17 @@ def _commanded_speeds(ctx: Context) -> list[tuple[Step, float]]:
 
 @check("BRAINCO-SPEED-02")
 def no_speed(ctx: Context) -> Outcome:
-    """Motion of a joint that is commanded to another position with the speed 0."""
+    """Motion of a joint that is commanded to another position with a speed of 0 or less."""
     moved = [
         (float(np.abs(step.q - step.start).max()) / step.stroke, step)
         for step, asked in _commanded_speeds(ctx)
-        if asked == 0.0
+        if asked <= 0.0
     ]
     if not moved:
-        return ctx.skipped("no joint was commanded with the speed 0")
+        return ctx.skipped("no joint was commanded with a speed of 0 or less")
     part, step = max(moved, key=lambda m: m[0])
     way, limit = part * step.stroke, ctx.tolerance("max_motion_stroke", step.joint)
-    text = f"{step.name}moved by {way:.3f} {ctx.unit} with the speed 0"
+    text = f"{step.name}moved by {way:.3f} {ctx.unit} with a speed of 0 or less"
     figure = f"{way:.3f} {ctx.unit}"
     if way <= limit:
         return ctx.passed(figure, text, motion_rad=way).placed(way, limit)
@@ -90,7 +90,7 @@ def own_speeds(ctx: Context) -> Outcome:
         arrived = np.flatnonzero(way >= _MOST_OF_IT * abs(step.size))
         last = int(arrived[0]) if len(arrived) else len(way) - 1
         seconds = float(step.t[last]) - step.begin - ctx.tolerance("start_s")
-        if not asked or seconds <= 0:
+        if asked <= 0.0 or seconds <= 0.0:
             continue
         part = float(way[last]) / seconds / ctx.joints[step.joint].dq_max
         excess = max(

@@ -204,7 +204,7 @@ class _Fast(ServoHand):
         super().take(fast, mode)
 
 
-@wrong_hand("BRAINCO-SPEED-01")
+@wrong_hand("BRAINCO-SPEED-01", also=("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"))
 class AlwaysFast(ServoService):
     """Moves at full speed, whatever dq is."""
 

@@ -121,10 +121,10 @@ _UNDER_WAY = 0.08
 _APART = 7.0
 """Percent of closing by which goals of position servos differ, where they tell joints apart: more
 than a good one may be off, and less than what makes it another step."""
-_SPEEDS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.15)
-"""Speeds of the joints of position servos, parts of the full one."""
-_SPEEDS_SECONDS, _SPEEDS_SHIFTS = 0.5, (0, 2)
-"""Seconds of each turn with them, and by how many joints they are shifted in it."""
+_SPEEDS = ((0.0, 0.1, 0.2, 0.3, 0.4, 0.15), (0.2, 0.4, -0.2, 0.15, 0.1, 0.3))
+"""Speeds of the joints of position servos in two turns, parts of the full one."""
+_SPEEDS_SECONDS = 0.5
+"""Seconds of each turn with them."""
 _GRIP_SECONDS = 1.1
 """Seconds of a grip after a restart."""
 _BAD = {
@@ -581,13 +581,13 @@ class FingerScript(HandScript):
         """Each joint closes with another speed, and one with none."""
         self._report("a speed for each joint: each must move with its own, and with 0 not at all")
         sides = self.plan.sides
-        for shift in _SPEEDS_SHIFTS:
+        for speeds in _SPEEDS:
             yield from self._to("center", OPEN)
             poses = {s: self._pose(s, CLOSED) for s in sides}
             targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
             hands = {
                 s: [
-                    replace(m, dq=_SPEEDS[(i + shift + 3 * (s is Side.RIGHT)) % len(_SPEEDS)])
+                    replace(m, dq=speeds[(i + 3 * (s is Side.RIGHT)) % len(speeds)])
                     for i, m in enumerate(self._motors(s, pose))
                 ]
                 for s, pose in poses.items()
