@@ -6,7 +6,7 @@ kit judges dexkit's own service as well, and with shared code it could not see a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,6 +60,11 @@ Motors = Sequence[Motor]
 
 LIMP = Motor(kp=0.0, kd=0.0)
 """No torque: what fills the place of a motor that is not meant."""
+
+
+def _members(motors: Sequence[Any]) -> Callable[[str], list[Any]]:
+    """A member of each of these objects, by its name."""
+    return lambda name: [getattr(m, name) for m in motors]
 
 
 def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
@@ -179,7 +184,7 @@ class MotorCodec:
 
     def _payload(self, motors: Motors) -> bytes:
         if self.command.name in _LISTS:
-            message = self._lists(self.command, motors)
+            message = self._lists(self.command, len(motors), _members(motors))
             message.mode = _ANGLES
             return self.command.encode(message)
         message = self.command.cls()
@@ -236,12 +241,15 @@ class MotorCodec:
             for i in range(len(motors))
         ]
 
-    def _lists(self, kind: MessageType, motors: Sequence[Any]) -> Any:
-        """A message with a list for each quantity, of objects with the members of motors."""
+    def _lists(self, kind: MessageType, count: int, member_of: Callable[[str], Any]) -> Any:
+        """A message with a list for each quantity.
+
+        :param member_of: a member of each of the ``count`` motors.
+        """
         every = [f.name for f in kind.layout.fields if f.sequence]
-        message = kind.cls(**{name: [0] * len(motors) for name in every})
+        message = kind.cls(**{name: [0] * count for name in every})
         for member, (name, scale) in _LISTS[kind.name].items():
-            values = np.array([getattr(m, member) for m in motors], dtype=np.float64) * scale
+            values = np.array(member_of(member), dtype=np.float64) * scale
             # -1 leaves a joint alone
             whole = np.clip(np.rint(np.where(np.isnan(values), -1, values)), -32768, 32767)
             setattr(message, name, whole.astype(int).tolist())
@@ -252,7 +260,7 @@ class MotorCodec:
 
         :param motors: array of structs with the members of motors.
         """
-        return self.state.encode(self._lists(self.state, motors.view(np.recarray)))
+        return self.state.encode(self._lists(self.state, len(motors), motors.__getitem__))
 
     def column(self, columns: Columns, side: Subject, kind: MessageType, name: str) -> Floats:
         """A value of a subject's joints: shape (n, n_joints), NaN where the sequence is too short.
@@ -291,7 +299,9 @@ class MotorCodec:
             kind = message_type(self._state_motor).cls
             given = next(iter(hands.values()), ())
             made = [kind(**dict(fields)) for fields in given] or [kind() for _ in range(count)]
-            return self.state.encode(self._lists(self.state, made[:count]))
+            return self.state.encode(
+                self._lists(self.state, len(made[:count]), _members(made[:count]))
+            )
         message, places = self._blank_state(count)
         for side, motors in hands.items():
             for index, fields in enumerate(motors, self.dialect.index[side]):
