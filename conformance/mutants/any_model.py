@@ -206,9 +206,11 @@ class RepeatsOldStates(Service):
 
 @wrong_hand(
     ("DEX1-FRESH-01", "DEX3-FRESH-01"),
-    also=("DEX3-GAIN-03", "DEX5-GAIN-03", "DFX-SIDE-01"),
+    also=("DEX3-GAIN-03", "DEX5-GAIN-03"),
     whole=True,
 )
+@wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
+@wrong_hand("DFX-FRESH-01", also=("DFX-SIDE-01",), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -363,7 +365,10 @@ class EmptyNowAndThen(Service):
 # both sides do the same while one joint moves, so that only later steps show it
 @wrong_hand(
     "BRAINCO-SIDE-01",
-    also=("BRAINCO-SAFE-01", "BRAINCO-WDOG-01"),
+    also=(
+        *("BRAINCO-LIFE-02", "BRAINCO-SAFE-01", "BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
+        "BRAINCO-WDOG-01",
+    ),
     sides=BOTH,
 )
 @wrong_hand("DFX-SIDE-01", also=("DFX-WDOG-03",), sides=BOTH)

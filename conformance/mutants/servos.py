@@ -162,7 +162,7 @@ class _Lazy(ServoHand):
         self.reach = [0.4 * r for r in self.reach]
 
 
-@wrong_hand("BRAINCO-MOVE-04")
+@wrong_hand("BRAINCO-MOVE-04", also=("BRAINCO-SPEED-03",))
 class SlowServos(ServoService):
     """Takes 0.4 of each speed that is commanded."""
 
@@ -459,15 +459,6 @@ class ForceOfNextJoint(ServoService):
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] = np.roll(motors["tau_est"], 1)
-
-
-@wrong_hand("BRAINCO-FORCE-02", also=("BRAINCO-FORCE-04",), sides=BOTH)
-class ForceInThousandths(ServoService):
-    """Reports forces a thousand times too large."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] *= 1000.0
 
 
 @wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
