@@ -365,7 +365,9 @@ class _SlowAfterNan(ServoHand):
             self.reach = [0.33 * r for r in self.reach]
 
 
-@wrong_hand("BRAINCO-ABUSE-01", also=("DFX-MOVE-08",), where=takes_floats)
+@wrong_hand(
+    "BRAINCO-ABUSE-01", also=("BRAINCO-SPEED-03", "DFX-MOVE-08", "DFX-WDOG-03"), where=takes_floats
+)
 class SlowAfterNan(ServoService):
     """Moves with a third of each speed since it has got a command that is not finite."""
 
