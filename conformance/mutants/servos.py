@@ -699,6 +699,8 @@ class SwapsAfterRestart(_SwapsSome):
 
 
 @wrong_hand("BRAINCO-WDOG-03", whole=True)
+@wrong_hand("DFX-WDOG-03", also=("DFX-STILL-01",), whole=True)
+@wrong_hand("FTP-WDOG-03", whole=True)
 class SwapsAfterSilence(_SwapsSome):
     """Mixes two joints up in commands for three seconds after a silence."""
 
