@@ -28,7 +28,7 @@ from dexkit.conformance.virtual.fingers import FingerHand
 from dexkit.doctor.ways import Course, moves_against, swapped
 from dexkit.emulators.sim_brainco import SimBrainCo, sim_brainco
 from dexkit.errors import HandLost, UsageError
-from dexkit.hand import Hand, HandCommand, HandState, Side
+from dexkit.hand import Floats, Hand, HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_go
 from dexkit.models import BRAINCO_REVO2, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
@@ -280,7 +280,7 @@ def test_turns_are_counted_by_their_size(q: list[float], turns: int) -> None:
 @each("states_hz", [100.0, 500.0])
 def test_noise_of_a_hundredth_is_no_vibration_and_a_small_oscillation_is(states_hz: float) -> None:
     draw = np.random.default_rng(8)
-    t = np.arange(0.0, 0.25, 1.0 / states_hz)
+    t: Floats = np.arange(round(0.25 * states_hz)) / states_hz
     for _ in range(300):
         noise = draw.uniform(-0.01, 0.01, len(t))
         assert not _repeats(t, 0.5 + noise, 4.0)
