@@ -8,14 +8,19 @@ from functools import cache
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from dexkit.conformance.checks.afterwards import fastest
+from dexkit.conformance.checks.motion import Step
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import gripper, plan_for
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Load, Overall, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
+from dexkit.conformance.virtual.fingers import Dex3Service, FingerHand
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
@@ -174,6 +179,46 @@ def test_steps_of_a_coarse_encoder_are_not_old_values() -> None:
 @pytest.mark.parametrize("service", [Capped, CappedAndCoarse])
 def test_acceleration_of_a_slow_or_coarse_hand_agrees_with_q(service: type[Service]) -> None:
     assert result_of(judged(service), "DEX1-FIELD-06").verdict is not Verdict.WARN
+
+
+def test_speed_of_a_step_is_not_known_where_there_was_no_state() -> None:
+    t = np.arange(0.0, 0.3, 0.002)
+    course = np.minimum(t / 0.1, 1.0)
+
+    def step(kept: NDArray[np.bool_]) -> Step:
+        return Step("", 0, 5.4, 0.0, 0.3, 1.0, 0.0, 1.0, t[kept], course[kept], "rad")
+
+    assert fastest(step(t >= 0.0)) == pytest.approx(10.0, rel=0.1)
+    assert fastest(step(t >= 0.07)) is None
+    assert fastest(step((t < 0.02) | (t >= 0.09))) is None
+
+
+class MeasuresEach30Ms(Dex3Service):
+    """Publishes 500 times a second what it measures every 30 ms."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.measured: dict[Side, tuple[float, Any]] = {}
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        at, values = self.measured.get(hand.side, (-1.0, None))
+        if values is not None and self.now - at < 0.03 - 1e-9:
+            motors["values"] = values
+        else:
+            self.measured[hand.side] = self.now, np.array(motors["values"])
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.version += 1
+
+
+def test_dq_of_rare_measurements_agrees_with_the_slope_of_q() -> None:
+    plan = replace(plan_for("dex3", sides=(Side.LEFT,)), phases=frozenset({"joint", "two-writers"}))
+    result = judge(Recording.decode(run_virtual(plan, MeasuresEach30Ms)))
+    assert result_of(result, "DEX3-FIELD-16").verdict is Verdict.PASS
+    assert result_of(result, "DEX3-FIELD-05").verdict is Verdict.NOT_APPLICABLE
 
 
 def test_hand_at_rest_at_its_command_is_not_frozen() -> None:

@@ -10,7 +10,7 @@ from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, ste
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
-__all__: list[str] = []
+__all__ = ["fastest"]
 
 _AFTER_ABUSE = ("recover", "resume", "company", "restart", "service-restart")
 _RESTARTED = ("company", "restart", "service-restart")
@@ -18,6 +18,8 @@ _AT_A_STOP = 0.05
 """Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
 _AT_REST_PART = 0.01
 """Part of the range by which q may vary in the 0.1 s before a step that begins at rest."""
+_UNSEEN_S = 0.03
+"""Seconds without a state in a step, after which its speed is not known: RATE-03 judges the gap."""
 _FAST_S = 0.05
 """Seconds over which the fastest part of a step is measured: several states of the slowest rate."""
 
@@ -99,13 +101,13 @@ def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
             before = ctx.states.q[ctx.states.between(step.begin - 0.1, step.begin), step.joint]
             if not (len(before) and np.ptp(before) < _AT_REST_PART * step.stroke):
                 continue  # it was under way, so that this is not the same step
-            now = _fastest(step)
+            now = fastest(step)
             known = [
                 # a hand of constant speed is not faster over a longer distance, a spring-like one
                 # is
                 fast * min(1.0, abs(step.size / s.size))
                 for s in _like(first, step)
-                if (fast := _fastest(s)) is not None
+                if (fast := fastest(s)) is not None
             ]
             if now is None or not known:
                 continue
@@ -123,10 +125,15 @@ def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
     return None
 
 
-def _fastest(step: Step) -> float | None:
-    """The speed of a step's fastest part, rad/s; None if it has no such part or does not arrive."""
+def fastest(step: Step) -> float | None:
+    """The speed of a step's fastest part, rad/s; None if it has no such part, does not arrive, or
+    moved while there was no state.
+    """
     part = (step.q - step.start) / step.size if step.size else np.zeros(0)
     if not (part >= 0.9).any():
+        return None
+    until = int(np.argmax(part >= 0.9))
+    if np.diff(step.t[: until + 1], prepend=step.begin).max() > _UNSEEN_S:
         return None
     later = np.searchsorted(step.t, step.t + _FAST_S)
     whole = np.flatnonzero(later < len(step.t))

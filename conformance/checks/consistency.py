@@ -32,6 +32,12 @@ _FAST = 0.999
 does not count."""
 _OWN = 1.2
 """Allowed factor over that speed."""
+STAIRS = 3.0
+"""Measurements that a slope of q is taken over."""
+_STAIR_PART = 0.005
+"""Least part of the range of a step between two measurements that counts for their usual time."""
+_LONGEST_HOLD_S = 0.1
+"""Longest time between two measurements of a joint that moves, seconds."""
 _LAGS = np.array([1.25, 4.0, 10.0, 25.0])
 """Lengths of the windows in which q is compared with the integral of dq, in lags."""
 
@@ -278,7 +284,8 @@ def slope(ctx: Context) -> Outcome:
         return ctx.absent("dq is not filled (0 throughout)")
     worst: tuple[float, float, int, float] | None = None
     for joint, spec in enumerate(ctx.joints):
-        found = _window_error(ctx, _Joint.from_context(ctx, joint), spec.stroke)
+        x = _Joint.from_context(ctx, joint)
+        found = _window_error(ctx, x, spec.stroke, held_s(ctx, joint))
         if found is not None and (worst is None or found[0] > worst[0]):
             worst = (*found[:2], joint, found[2])
     if worst is None:
@@ -302,9 +309,27 @@ def slope(ctx: Context) -> Outcome:
     return outcome.about(joint).if_late((error - limit) * ctx.tolerance("slope_s"))
 
 
-def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float, float] | None:
-    """Error, ratio and begin of a joint's worst window; None if it does not move."""
-    step = ctx.tolerance("slope_s")
+def held_s(ctx: Context, joint: int) -> float:
+    """The usual time from one measurement to the next while the joint moves, seconds.
+
+    A hand may measure more rarely than it publishes (DEX1-FRESH-01): then q is a staircase, whose
+    slope shows only over several of its steps.
+    """
+    x = _Joint.from_context(ctx, joint)
+    steps = np.diff(x.t)
+    stairs = np.abs(np.diff(x.q)) >= _STAIR_PART * ctx.joints[joint].stroke
+    steps = steps[stairs & (steps <= _LONGEST_HOLD_S)]
+    return median(steps) if len(steps) >= _FEW else 0.0
+
+
+def _window_error(
+    ctx: Context, x: _Joint, stroke: float, held: float
+) -> tuple[float, float, float] | None:
+    """Error, ratio and begin of a joint's worst window; None if it does not move.
+
+    :param held: see :func:`held_s`.
+    """
+    step = max(ctx.tolerance("slope_s"), STAIRS * held)
     count = round(ctx.tolerance("window_s") / step)
     if len(x.t) < _FEW or x.t[-1] - x.t[0] < 2 * count * step:
         return None
@@ -313,8 +338,12 @@ def _window_error(ctx: Context, x: _Joint, stroke: float) -> tuple[float, float,
     last = np.minimum(np.searchsorted(x.t, grid + step), len(x.t) - 1)
     span = x.t[last] - x.t[first]
     whole = (span > 0.5 * step) & (span < 2 * step)
-    for begin, end in _unstable(ctx):
-        whole[np.searchsorted(grid, begin - step) : np.searchsorted(grid, end)] = False
+    # what alternates faster than it is measured is not seen
+    barred = _unstable(ctx)
+    if step > ctx.tolerance("slope_s"):
+        barred += [ctx.span(p) for name in FOUGHT_OVER for p in ctx.phases(name)]
+    for begin, end in barred:
+        whole &= (grid + step < begin) | (grid > end)
     c = x.said
     moved = np.where(whole, x.q[last] - x.q[first], 0.0)
     said = np.where(whole, c[last] - c[first], 0.0)
