@@ -11,6 +11,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.firmness import STIFFNESS, nudges
 from dexkit.conformance.checks.grip import Press, worst_of
 from dexkit.conformance.checks.motion import (
     Step,
@@ -21,6 +22,7 @@ from dexkit.conformance.checks.motion import (
     steps,
     steps_of,
 )
+from dexkit.conformance.checks.safety import sags
 from dexkit.conformance.stimulus_record import Phase
 
 __all__: list[str] = []
@@ -287,12 +289,69 @@ def torque_drives(ctx: Context) -> Outcome:
                 )
                 place = ctx.at(ctx.states.topic, *ctx.span(phase))
                 return ctx.failed("against it", text, place, motion_rad=moved).about(joint)
+    fast = _too_fast(ctx)
+    if fast is not None:
+        return fast
     _, moved, joint, phase = least
     text = ctx.named(f"moved by {moved:.2f} {ctx.unit} while a torque was commanded", joint)
     if moved >= ctx.tolerance("min_motion_stroke", joint):
         return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
     place = ctx.at(ctx.states.topic, *ctx.span(phase))
     return ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
+
+
+def _too_fast(ctx: Context) -> Outcome | None:
+    """The failure of a joint that a torque moves faster than kd allows, where that is limited."""
+    if "max_speed_part" not in ctx.requirement.tolerances:
+        return None
+    for phase in ctx.phases("push"):
+        begin, end = ctx.span(phase)
+        late = begin + _LATE * (end - begin)
+        given = (ctx.commands.t >= late) & (ctx.commands.t <= end)
+        for joint, moved in _pushed(ctx, phase, after=_LATE):
+            kd, tau = (np.abs(a[given, joint]) for a in (ctx.commands.kd, ctx.commands.tau))
+            if not len(kd) or not kd.min() > 0:
+                continue
+            speed, most = moved / (end - late), float(np.median(tau / kd))
+            if speed > ctx.tolerance("max_speed_part") * most:
+                unit = f"{ctx.unit}/s"
+                text = ctx.named(
+                    f"moved at {speed:.2f} {unit} where tau / kd is {most:.2f} {unit}", joint
+                )
+                place = ctx.at(ctx.states.topic, late, end)
+                outcome = ctx.failed(f"{speed:.2f} {unit}", text, place, speed_rad_s=speed)
+                return outcome.about(joint)
+    return None
+
+
+@check("DEX1-GAIN-07", "DEX3-GAIN-07")
+def torque_way(ctx: Context) -> Outcome:
+    """Motion against a commanded torque, without a position gain and beside one.
+
+    A joint that sags with zero gains may sag here.
+    """
+    sag = sags(ctx)
+    found = [
+        (-moved - (0.0 if sag is None else float(sag[joint])), joint, *ctx.span(phase))
+        for name in ("push", "pull")
+        for phase in ctx.phases(name)
+        for joint, moved in _pushed(ctx, phase, after=_LATE)
+    ]
+    if not found:
+        return ctx.skipped("no state while a torque was commanded")
+    if len(ctx.joints) == 1:
+        held = nudges(ctx, [*ctx.phases(STIFFNESS), *ctx.phases("nudge")])
+        found += [(-n.way, 0, n.begin, n.end) for n in held if n.at_rest]
+    against, joint, begin, end = max(found, key=lambda f: f[0] / ctx.joints[f[1]].stroke)
+    against = max(against, 0.0)
+    limit = ctx.tolerance("max_motion_stroke", joint)
+    text = ctx.named(f"moved by {against:.2f} {ctx.unit} against a commanded torque", joint)
+    figure = f"{against:.2f} {ctx.unit}"
+    if against <= limit:
+        return ctx.passed(figure, text, motion_rad=against).placed(against, limit)
+    place = ctx.at(ctx.states.topic, begin, end)
+    outcome = ctx.failed(figure, text, place, motion_rad=against).about(joint)
+    return outcome.placed(against, limit)
 
 
 @check("DEX3-GAIN-05")

@@ -21,6 +21,8 @@ __all__ = ["Nudge", "nudges"]
 
 STIFFNESS = "stiffness"
 """The phase of the pushes that are repeated throughout a run."""
+_RESTS_PART = 0.005
+"""Part of the stroke by which q may vary at rest."""
 _PEAKS_S, _FEW_PEAKS = 1.05, 3
 """Window of contact in which peaks are counted, seconds, and the fewest peaks of a failure."""
 
@@ -30,12 +32,14 @@ class Nudge:
     """A torque pulse on a position-controlled gripper.
 
     :param way: displacement by the torque, rad; ``asked`` is torque / kp.
+    :param at_rest: whether the gripper stood still before it.
     """
 
     begin: float
     end: float
     way: float
     asked: float
+    at_rest: bool
 
 
 def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
@@ -51,7 +55,8 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
         kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
         if kp > 0 and tau != 0:  # a damaged recording may hold another command here
             way = (median(after) - median(before)) * (1 if tau > 0 else -1)
-            found.append(Nudge(begin, end, way, abs(tau) / kp))
+            rests = float(np.ptp(before)) <= _RESTS_PART * ctx.joints[0].stroke
+            found.append(Nudge(begin, end, way, abs(tau) / kp, rests))
     return found
 
 

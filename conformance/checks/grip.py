@@ -23,8 +23,12 @@ __all__ = ["Press", "torque_scales", "worst_of"]
 
 _FREE = ("joint", "step", "fingerprint", "stiff")
 """Phases in which the joints move without contact, by the client's gains."""
+_ALIKE = 3
+"""Fewest joints whose scales of tau_est can be compared."""
 _FEW = 20
 """Fewest states for a factor."""
+_REACHED = 0.9
+"""Quantile of tau_est, relative to its command, that is compared between joints."""
 _OTHER_UNITS = (1e-3, 1e3)
 """Factors of tau_est where N m and mN m are mistaken for each other, in a dialect that has both."""
 _HELD = 0.2
@@ -121,10 +125,13 @@ class _Factors:
 
     :param factors: of each joint.
     :param scales: the same where tau_est is in another unit than N m, else 1.
+    :param reached: a high quantile of the same, NaN where it is not known: the first states of a
+        motion still show the torque of the command before.
     """
 
     factors: Floats
     scales: Floats
+    reached: Floats
 
 
 def _factors(ctx: Context, least: float) -> _Factors:
@@ -134,7 +141,7 @@ def _factors(ctx: Context, least: float) -> _Factors:
     """
     count = len(ctx.joints)
     units = _OTHER_UNITS if ctx.recording.dialect.torque_units else ()
-    found = _Factors(np.ones(count), np.ones(count))
+    found = _Factors(np.ones(count), np.ones(count), np.full(count, np.nan))
     if not len(ctx.commands):
         return found
     spans = [ctx.span(p) for name in _FREE for p in ctx.phases(name)]
@@ -155,6 +162,7 @@ def _factors(ctx: Context, least: float) -> _Factors:
             continue
         low, middle, high = (float(mine[int(p * (len(mine) - 1))]) for p in (0.25, 0.5, 0.75))
         found.factors[joint] = abs(middle)
+        found.reached[joint] = np.sort(np.abs(mine))[int(_REACHED * (len(mine) - 1))]
         # late values are small as well, but not alike
         alike = low * high > 0 and high - low <= 0.5 * abs(middle)
         if alike and any(0.5 * unit <= abs(middle) <= 2.0 * unit for unit in units):
@@ -172,6 +180,35 @@ def torque_scales(ctx: Context, least: float) -> Floats:
     :param least: torque from which states in free motion count, N m.
     """
     return _once(ctx, least).scales
+
+
+@check("DEX3-FORCE-09")
+def one_scale(ctx: Context) -> Outcome:
+    """tau_est of each joint relative to its command in free motion, compared with the others."""
+    factors = _once(ctx, ctx.tolerance("min_tau_nm"))
+    units = ctx.recording.dialect.torque_units or (1.0,) * len(ctx.joints)
+    worst: tuple[float, int, float, float] | None = None
+    for unit in dict.fromkeys(units):
+        own = [i for i, u in enumerate(units) if u == unit and np.isfinite(factors.reached[i])]
+        if len(own) < _ALIKE:
+            continue
+        usual = float(np.median(factors.reached[own]))
+        for joint in own:
+            factor = float(factors.reached[joint])
+            apart = max(factor, usual) / max(min(factor, usual), 1e-9)
+            if worst is None or apart > worst[0]:
+                worst = apart, joint, factor, usual
+    if worst is None:
+        return ctx.skipped("too few joints were driven by a torque that shows in free motion")
+    apart, joint, factor, usual = worst
+    text = ctx.named(
+        f"tau_est is {factor:.3g} times the commanded torque in free motion, and {usual:.3g} times "
+        "in most joints",
+        joint,
+    )
+    if apart <= ctx.tolerance("max_ratio"):
+        return ctx.passed(f"x {apart:.1f}", text, ratio=apart)
+    return ctx.failed(f"x {apart:.3g}", text, ratio=apart).about(joint)
 
 
 @check("DEX3-FORCE-08")

@@ -548,13 +548,47 @@ def long(ctx: Context) -> Outcome:
 @check("DEX1-SAFE-05", "DEX3-SAFE-06")
 def negative_gains(ctx: Context) -> Outcome:
     """Commands with negative kp and kd."""
-    return stays(ctx, "commands with negative gains", sags=_sags(ctx))
+    return stays(ctx, "commands with negative gains", sags=sags(ctx))
+
+
+@check("DEX1-SAFE-10", "DEX3-SAFE-11")
+def driven_away(ctx: Context) -> Outcome:
+    """Motion away from q during commands with negative gains."""
+    sag = sags(ctx)
+    worst: tuple[float, float, int, float, float] | None = None
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+        q = ctx.states.q[ctx.states.between(begin, end)]
+        given = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        given &= (ctx.commands.kp < 0).any(axis=1)
+        if not len(before) or not len(q) or not given.any():
+            continue
+        start = np.median(before, axis=0)
+        way = np.sign(np.median(ctx.commands.q[given], axis=0) - start)
+        with np.errstate(invalid="ignore"):
+            away = np.max((start - q) * way, axis=0) - (0.0 if sag is None else sag)
+        for joint, spec in enumerate(ctx.joints):
+            found = (float(away[joint]) / spec.stroke, float(away[joint]), joint, begin, end)
+            if np.isfinite(found[0]) and (worst is None or found > worst):
+                worst = found
+    if worst is None:
+        return ctx.skipped("no state during commands with negative gains")
+    _, most, joint, begin, end = worst
+    most = max(most, 0.0)
+    text = ctx.named(f"moved by {most:.2f} {ctx.unit} away from q with negative gains", joint)
+    figure, limit = f"{most:.2f} {ctx.unit}", ctx.tolerance("max_motion_stroke", joint)
+    if most <= limit:
+        return ctx.passed(figure, text, motion_rad=most).placed(most, limit)
+    place = ctx.at(ctx.states.topic, begin, end)
+    outcome = ctx.failed(figure, text, place, motion_rad=most).about(joint)
+    return outcome.placed(most, limit).if_late(STROKE_S * most / ctx.joints[joint].stroke)
 
 
 _SAGS_AGAIN = 1.5  # factor on the sag of a limp joint, for other poses
 
 
-def _sags(ctx: Context) -> Floats | None:
+def sags(ctx: Context) -> Floats | None:
     """Allowed sag of each limp joint, rad, measured with zero gains, whatever q was.
 
     None if the stimulus cannot tell sag from motion towards q.
@@ -704,6 +738,81 @@ def load(ctx: Context) -> Outcome:
     span = begin, end
     met = ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
     return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))
+
+
+@check("DEX1-LOAD-03", "DEX3-LOAD-03")
+def late_under_load(ctx: Context) -> Outcome:
+    """How much later than without load the states show a motion that is commanded under load."""
+    worst: tuple[float, int, float, float, float, float] | None = None
+    usual = _usual_lags(ctx)
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        begin, end = ctx.span(phase)
+        for joint in usual:
+            lag = _lag(ctx, joint, begin, end)
+            if lag is None:
+                continue
+            found = (lag - usual[joint], joint, begin, end, lag, usual[joint])
+            worst = found if worst is None or found > worst else worst
+    if worst is None:
+        return ctx.skipped("no motion under load, or none without it to compare with")
+    more, joint, begin, end, lag, before = worst
+    more = max(more, 0.0)
+    text = ctx.named(
+        f"q follows {lag:.2f} s behind the command under load, {before:.2f} s without", joint
+    )
+    figure, limit = f"{more:.2f} s", ctx.tolerance("max_more_s")
+    if more <= limit:
+        return ctx.passed(figure, text, lag_s=lag).timed(more, limit, span=(begin, end))
+    place = ctx.at(ctx.states.topic, begin, end)
+    outcome = ctx.failed(figure, text, place, lag_s=lag).about(joint)
+    return outcome.timed(more, limit).if_late(more - limit)
+
+
+_FREE_STEPS = ("fingerprint", "step", "joint", "center", "recover")
+"""Phases of free steps, without load."""
+_LAGS = np.arange(0.0, 0.61, 0.01)
+_FOLLOWS_PART = 0.5
+"""Least part of the way of a motion under load, and of its shape, in which a lag shows."""
+
+
+def _usual_lags(ctx: Context) -> dict[int, float]:
+    """Seconds that q is behind the command in free steps, by joint: the median.
+
+    For a linear hand the mean delay of a step, the integral of what is left of it, is the lag
+    behind a ramp; a hand of limited speed is less behind a slow ramp.
+    """
+    lags: dict[int, list[float]] = {}
+    for phase in (p for name in _FREE_STEPS for p in ctx.phases(name) if obeyed_before(ctx, p)):
+        for step in steps_of(ctx, phase):
+            if abs(step.size) < ctx.tolerance("min_way_stroke", step.joint) or len(step.t) < 5:
+                continue
+            left = (step.final - step.q) / (step.final - step.start or np.inf)
+            if abs(step.final - step.start) >= _FOLLOWS_PART * abs(step.size):
+                spent = np.diff(step.t, prepend=step.begin)
+                lags.setdefault(step.joint, []).append(float(np.sum(left * spent)))
+    return {joint: float(np.median(found)) for joint, found in lags.items()}
+
+
+def _lag(ctx: Context, joint: int, begin: float, end: float) -> float | None:
+    """By how many seconds q follows its command in [begin, end]; None if it does not follow."""
+    rows = ctx.states.between(begin, end)
+    t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
+    given, goals = ctx.commands.t, ctx.commands.q[:, joint]
+    good = np.isfinite(goals)
+    given, goals = given[good], goals[good]
+    if len(t) < 10 or not np.isfinite(q).all() or not len(given):
+        return None
+    shifted = np.searchsorted(given, t[None, :] - _LAGS[:, None], "right") - 1
+    wanted = goals[np.maximum(shifted, 0)]
+    way = float(np.ptp(wanted[0]))
+    if way < ctx.tolerance("min_way_stroke", joint) or np.ptp(q) < _FOLLOWS_PART * way:
+        return None
+    wanted = wanted - wanted.mean(axis=1, keepdims=True)
+    shown = q - q.mean()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        alike = wanted @ shown / np.sqrt((wanted**2).sum(axis=1) * (shown**2).sum())
+    best = int(np.nanargmax(alike))
+    return float(_LAGS[best]) if alike[best] >= _FOLLOWS_PART else None
 
 
 @check("DEX1-LOAD-02", "DEX3-LOAD-02")

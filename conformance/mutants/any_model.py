@@ -1028,6 +1028,70 @@ class WaitsForItsReaders(Service):
         return [] if self.loaded and self.now % 0.5 < 0.2 else super().publish()
 
 
+@wrong_hand(("DEX1-LOAD-03", "DEX3-LOAD-03"), also=("DEX1-FIELD-17",))
+class OldUnderLoad(Service):
+    """Queues its states for a slow reliable reader: they are 0.3 s old when they leave."""
+
+    late_s = 0.3
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.queue: deque[tuple[float, list[Sample]]] = deque()
+
+    @property
+    def lateness(self) -> float:
+        """How old a state is when it leaves, seconds."""
+        return self.late_s if self.loaded else 0.0
+
+    def publish(self) -> list[Sample]:
+        self.queue.append((self.now, super().publish()))
+        while len(self.queue) > 1 and self.queue[1][0] <= self.now - self.lateness:
+            self.queue.popleft()
+        return [replace(s, sent=self.now) for s in self.queue[0][1]]
+
+
+@wrong_hand(("DEX1-LOAD-03", "DEX3-LOAD-03"))
+class OldUnderThousands(OldUnderLoad):
+    """Its states wait behind its commands: 0.3 s from 1000 commands a second on."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
+        self.came: deque[float] = deque(maxlen=200)
+
+    @property
+    def lateness(self) -> float:
+        """How old a state is when it leaves, seconds."""
+        full = len(self.came) == self.came.maxlen and self.now - self.came[0] < 0.1
+        return self.late_s if full else 0.0
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if side is self.sides[0]:
+            self.came.append(self.now)
+        super().motors(side, motors)
+
+
+@wrong_hand(("DEX1-LOAD-03", "DEX3-LOAD-03"))
+class LateUnderLoad(Service):
+    """Puts commands in force 0.3 s late while a slow reader is there."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        self.mail: deque[tuple[float, Side, tuple[Motor, ...]]] = deque()
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.mail.append((self.now + (0.3 if self.loaded else 0.0), side, motors))
+        self.deliver()
+
+    def deliver(self) -> None:
+        while self.mail and self.mail[0][0] <= self.now:
+            _, side, motors = self.mail.popleft()
+            super().motors(side, motors)
+
+    def live(self, dt: float) -> None:
+        self.deliver()
+        super().live(dt)
+
+
 @wrong_hand(("DEX1-WDOG-02", "DEX3-WDOG-02"))
 class QuietInSilence(Service):
     """Publishes only while it is commanded."""

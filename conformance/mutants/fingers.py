@@ -30,6 +30,8 @@ from dexkit.hand import Floats, Side
 from dexkit.models import HandModel
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
+_SECOND_AT_ONCE = 1000
+"""Number of a client that commands beside another one."""
 
 # --------------------------------------------------------------------- discovery and start-up
 
@@ -808,11 +810,53 @@ class _TurnedTorque(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-04")
+@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04",))
 class TurnedTorque(FingerService):
     """Obeys the torque of a command with the wrong sign."""
 
     hand_fault = _TurnedTorque
+
+
+class _TorqueOfNeighbour(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[2] = np.roll(own[2], 1)
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04", "DEX3-HOLD-01", "DEX5-FIELD-18"))
+class TorqueOfTheMotorBefore(FingerService):
+    """Adds the torque that is commanded to the motor before, in each."""
+
+    hand_fault = _TorqueOfNeighbour
+
+
+class _SwappedTorque(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[2] = own[2][[0, 1, 2, 5, 6, 3, 4]]
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04",))
+class SwappedTorque(Dex3Service):
+    """Adds the torques of index and middle finger to each other's."""
+
+    hand_fault = _SwappedTorque
+
+
+class _Stronger(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[2, -1] *= 5.0
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-04")
+class TorqueOfAnotherGear(FingerService):
+    """Drives its last joint with five times the commanded torque."""
+
+    hand_fault = _Stronger
 
 
 class _TurnedVelocityCommand(FingerHand):
@@ -873,6 +917,70 @@ class _OneStatus(FingerHand):
     def understood(self, mode: Ints) -> tuple[Ints, Flags]:
         status, guarded = super().understood(mode)
         return np.full_like(status, status[2]), guarded
+
+
+class _ZeroIsNoChange(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        status, guarded = super().understood(mode)
+        return np.where(status == 0, self.status, status), guarded
+
+
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX5-MODE-07"))
+class ZeroIsNoChange(FingerService):
+    """Keeps a joint driven that is switched off: takes 0 for "as before"."""
+
+    hand_fault = _ZeroIsNoChange
+
+
+class _OneStaysOn(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        status, guarded = super().understood(mode)
+        last = np.arange(len(status)) == len(status) - 1
+        return np.where(last & (status == 0), self.status, status), guarded
+
+
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX5-MODE-07"))
+class LastJointStaysOn(FingerService):
+    """Keeps its last joint driven when it is switched off."""
+
+    hand_fault = _OneStaysOn
+
+
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",), whole=True)
+class StaysOnForALaterClient(FingerService):
+    """Switches its motors off for its first client only."""
+
+    later = False
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.seen: dict[Side, tuple[tuple[Motor, ...], tuple[Motor, ...]]] = {}
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.later = 0 < client < _SECOND_AT_ONCE
+        super().receive(topic, payload, client)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not self.later:
+            super().motors(side, motors)
+            return
+        if self.seen.get(side, ((), ()))[0] is not motors:
+            driven = tuple(replace(m, mode=m.mode | self.codec.mode(0)) for m in motors)
+            self.seen[side] = motors, driven
+        super().motors(side, self.seen[side][1])
+
+
+class _AnyModeDrives(FingerHand):
+    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
+        _, guarded = super().understood(mode)
+        return np.where(mode != 0, 1, 0), guarded
+
+
+@wrong_hand("DEX5-MODE-07")
+class AnyModeDrives(FingerService):
+    """Drives a joint with any mode but 0."""
+
+    hand_fault = _AnyModeDrives
 
 
 @wrong_hand("DEX3-MODE-05")
@@ -1175,6 +1283,24 @@ class MilliNewtonMetres(FingerService):
         motors["tau_est"] *= 1e3
 
 
+@wrong_hand("DEX5-FORCE-02", also=("DEX5-FORCE-03",), sides=BOTH)
+class ThumbInTheFingersUnit(FingerService):
+    """Publishes the torques of the thumb in mN m, as those of the fingers."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"][16:] *= 1e3
+
+
+@wrong_hand("DEX3-FORCE-09")
+class OneJointOnTheRotorsSide(FingerService):
+    """Publishes the rotor's torque of its last joint: without the gear."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"][-1:] /= 214.0
+
+
 # ------------------------------------------------------------------------------------ safety
 
 
@@ -1186,11 +1312,39 @@ class _NegativeGains(FingerHand):
         self.kd = np.abs(rows[4])
 
 
-@wrong_hand("DEX3-SAFE-06")
+@wrong_hand("DEX3-SAFE-06", also=("DEX3-SAFE-11",))
 class NegativeGains(FingerService):
     """Applies a negative kp."""
 
     hand_fault = _NegativeGains
+
+
+class _ChecksTheFirst(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        super().take(rows, mode)
+        if rows[3, 0] >= 0.0:
+            self.kp = np.where(rows[3] < 0.0, 0.3 * rows[3], rows[3])
+
+
+@wrong_hand("DEX3-SAFE-11", also=("DEX3-SAFE-06",))
+class ChecksTheGainsOfTheFirst(FingerService):
+    """Rejects negative gains in its first joint, and applies them in the others."""
+
+    hand_fault = _ChecksTheFirst
+
+
+class _GainsWithoutSign(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[3:] = np.abs(own[3:])
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-SAFE-06")
+class GainsWithoutSign(FingerService):
+    """Drops the sign of negative gains, and goes to q."""
+
+    hand_fault = _GainsWithoutSign
 
 
 def _values(motor: Motor) -> tuple[float, ...]:

@@ -632,11 +632,53 @@ class _UnsignedTorque(ReferenceHand):
         return replace(super().accept(motor), tau=abs(motor.tau))
 
 
-@wrong_hand("DEX1-GAIN-03")
+@wrong_hand("DEX1-GAIN-03", also=("DEX1-GAIN-07",))
 class UnsignedTorque(ReferenceService):
     """Opens with the torque of a command, whatever its sign is."""
 
     hand = _UnsignedTorque
+
+
+class _TurnedTorque(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return replace(accepted, tau=-accepted.tau)
+
+
+@wrong_hand("DEX1-GAIN-07", also=("DEX1-GAIN-03",), dialect="unitree_actuator")
+class TurnedTorque(ReferenceService):
+    """Obeys the torque of a command with the wrong sign, in one dialect."""
+
+    hand = _TurnedTorque
+
+
+class _TurnedWhileHeld(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return replace(accepted, tau=-accepted.tau) if accepted.kp > 0 else accepted
+
+
+@wrong_hand("DEX1-GAIN-07")
+class TurnedTorqueWhileHeld(ReferenceService):
+    """Obeys the torque of a command with the wrong sign where a position gain holds it."""
+
+    hand = _TurnedWhileHeld
+
+
+@wrong_hand("DEX1-GAIN-07", also=("DEX1-FORCE-09", "DEX1-FORCE-10", "DEX1-GAIN-03"), sides=BOTH)
+class TorqueOfTheOtherSide(ReferenceService):
+    """Adds the torque that the other gripper is commanded."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.asked = dict.fromkeys(self.sides, 0.0)
+
+    def command(self, side: Side, motor: Motor) -> None:
+        if math.isfinite(motor.tau):
+            self.asked[side] = motor.tau
+            other = [tau for s, tau in self.asked.items() if s != side]
+            motor = replace(motor, tau=other[0])
+        super().command(side, motor)
 
 
 @wrong_hand("DEX1-FORCE-01")
@@ -878,11 +920,36 @@ class _NegativeGains(ReferenceHand):
         return replace(super().accept(motor), kp=motor.kp, kd=motor.kd)
 
 
-@wrong_hand("DEX1-SAFE-05")
+@wrong_hand("DEX1-SAFE-05", also=("DEX1-SAFE-10",))
 class NegativeGains(ReferenceService):
     """Applies negative gains."""
 
     hand = _NegativeGains
+
+
+class _NegativeStiffness(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return replace(accepted, kp=motor.kp) if motor.kd >= 0.0 else accepted
+
+
+@wrong_hand("DEX1-SAFE-10", also=("DEX1-SAFE-05",))
+class NegativeStiffnessAlone(ReferenceService):
+    """Clamps gains that are both negative, and applies a negative kp beside a good kd."""
+
+    hand = _NegativeStiffness
+
+
+class _GainsWithoutSign(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        return replace(super().accept(motor), kp=abs(motor.kp), kd=abs(motor.kd))
+
+
+@wrong_hand("DEX1-SAFE-05")
+class GainsWithoutSign(ReferenceService):
+    """Drops the sign of negative gains, and goes to q."""
+
+    hand = _GainsWithoutSign
 
 
 class _NoLimits(ReferenceHand):

@@ -22,13 +22,14 @@ burst          hundreds of commands at once, of which the last one counts
 stiff, soft,   a step with the client's gains, with a tenth of its stiffness and with a third of it;
 mild           then steps in which only some joints are soft, three times with other joints
 limp           zero gains, with a q far towards closed, and then with one towards open
-lock           the first with the client's gains and status 0 or mode 0
+lock           the first with the client's gains and status 0 or mode 0; again for a later client
 mixed          a step in which some joints are locked under way, by their mode byte, and the others
                go on: three times, with other joints
 status         mode bytes with every status that no document defines
 speeds         position servos: each joint with another speed, and one with none; again with others
 ends           one finger after the other to both ends of its range, with the thumb out of the way
-push, pull     a torque alone, without a position gain: towards closed, and towards open
+push, pull     a torque alone, without a position gain: some joints towards closed and the others
+               towards open, and the other way round
 replay         a recorded session, as recorded
 single         commands that are sent once
 load           many commands a second, and a reader that is slow
@@ -80,6 +81,8 @@ __all__ = ["FingerScript"]
 
 OPEN, CLOSED = 15.0, 50.0
 """Percent of closing between which the hand moves freely."""
+_FAR = 80.0
+"""Percent of closing that is far from both."""
 BEYOND = 25.0
 """Percent of closing by which an object is squeezed."""
 SOFTER = 0.1
@@ -89,7 +92,7 @@ MILD = 1.0 / 3.0
 1.5 (docs/sources/unitree-dex.md#b1)."""
 _OPENED = 8
 """Motors of a hand up to which their opening is judged as their closing is."""
-_PUSH, _PUSH_DAMPING, _PUSH_SECONDS = 0.3, 0.5, 0.3  # N m, N m s/rad, s
+_PUSH, _PUSH_DAMPING, _PUSH_SECONDS = 0.3, 0.5, 0.25  # N m, N m s/rad, s
 _SPEED, _DAMPING = 0.35, 0.5  # rad/s and N m s/rad of joints that are driven by a velocity
 # of joints that move slowly, N m/rad and N m s/rad: still under way five seconds later
 _SLOW_GAINS = (0.2, 0.8)
@@ -336,8 +339,10 @@ class FingerScript(HandScript):
             yield from self._bad_commands(name, self.plan.sides, far, each)
         else:
             for alone in self._each_alone():
-                for malformed in self._malformed(name, alone):
-                    yield from self._bad_commands(name, alone, [malformed], 0.25)
+                kinds = self._malformed(name, alone)
+                for malformed in kinds:
+                    each = 0.25 if name != "negative" else 0.25 / len(kinds)
+                    yield from self._bad_commands(name, alone, [malformed], each)
         group = next((names for names in _TOGETHER if name in names), (name,))
         these = [n for n in group if n in self.plan.phases]
         if name != these[-1]:
@@ -372,8 +377,13 @@ class FingerScript(HandScript):
             ]
         if name == "negative":
             near = {s: self._motors(s, self._aside(s, 0.1)) for s in sides}
+            # kp alone, in all but the first joint: that one may be checked for all
             return [
-                {s: [replace(m, kp=-m.kp, kd=-m.kd) for m in motors] for s, motors in near.items()}
+                {s: [replace(m, kp=-m.kp, kd=-m.kd) for m in motors] for s, motors in near.items()},
+                {
+                    s: [good[s][0], *(replace(m, kp=-m.kp, kd=0.1 * m.kd) for m in motors[1:])]
+                    for s, motors in near.items()
+                },
             ]
         return [{s: self._crossed(s, motors) for s, motors in good.items()}]
 
@@ -417,6 +427,8 @@ class FingerScript(HandScript):
         yield from self._everyone(
             "recover", self._other_place(), most=1.5, after=self._bad_phases_since_recovery
         )
+        if "lock" in self.plan.phases:
+            yield from self._lock(_FAR, 0.25)
 
     def _before_shutdown(self) -> Steps:
         """Move: what was commanded last must not be in force after the restart."""
@@ -527,15 +539,20 @@ class FingerScript(HandScript):
             for percent in (CLOSED, 0.0):
                 targets = {s: dict(enumerate(self._pose(s, percent))) for s in sides}
                 phase = self._begin(name, sides, targets=targets)
-                yield from self._hold(0.25, self._all(percent, kp=0.0, kd=0.0))
+                yield from self._hold(0.2, self._all(percent, kp=0.0, kd=0.0))
                 self._end(phase)
         else:
-            targets = {s: dict(enumerate(self._pose(s, CLOSED))) for s in sides}
-            phase = self._begin(name, sides, targets=targets)
-            every = {s: frozenset(range(len(self._joints[s]))) for s in sides}
-            yield from self._hold(0.35, self._locked(self._all(CLOSED), every))
-            self._end(phase)
+            yield from self._lock(CLOSED, 0.3)
         yield from self._to("center", OPEN)
+
+    def _lock(self, percent: float, seconds: float) -> Steps:
+        """All motors locked, with a q that is so far closed."""
+        sides = self.plan.sides
+        targets = {s: dict(enumerate(self._pose(s, percent))) for s in sides}
+        phase = self._begin("lock", sides, targets=targets)
+        every = {s: frozenset(range(len(self._joints[s]))) for s in sides}
+        yield from self._hold(seconds, self._locked(self._all(percent), every))
+        self._end(phase)
 
     def _locked(
         self, hands: Mapping[Side, Motors], joints: Mapping[Side, frozenset[int]]
@@ -623,23 +640,43 @@ class FingerScript(HandScript):
         return tuple(pose)
 
     def _pushes(self) -> Steps:
-        """Close and open all flexing joints by a torque alone."""
+        """Close and open each flexing joint by a torque alone, while others are driven the other
+        way: a torque of another joint or side shows.
+        """
         self._report("a torque without a position gain: the joints must move with it")
         sides = self.plan.sides
-        for name, way, percent in (("push", 1, 100.0), ("pull", -1, 0.0)):
-            targets = {s: self._pose(s, percent) for s in sides}
-            flexing = {s: [i for i, j in enumerate(self._joints[s]) if j.closing] for s in sides}
-            phase = self._begin(
-                name, sides, targets={s: {i: targets[s][i] for i in flexing[s]} for s in sides}
-            )
+        for first in (True, False):
+            pushed = {s: self._pushed(s, first) for s in sides}
+            phases = []
+            for name, way, percent in (("push", 1, 100.0), ("pull", -1, 0.0)):
+                targets = {
+                    s: {i: self._pose(s, percent)[i] for i, w in pushed[s].items() if w == way}
+                    for s in sides
+                }
+                phases.append(self._begin(name, sides, targets=targets))
             motors = {s: list(self._motors(s, self._goal[s])) for s in sides}
             for s in sides:
-                for i in flexing[s]:
+                for i, way in pushed[s].items():
                     tau = way * math.copysign(_PUSH, self._joints[s][i].closing)
                     motors[s][i] = replace(motors[s][i], tau=tau, kp=0.0, kd=_PUSH_DAMPING)
             yield from self._hold(_PUSH_SECONDS, motors)
-            self._end(phase)
+            for phase in phases:
+                self._end(phase)
         yield from self._to("center", OPEN)
+
+    def _pushed(self, side: Side, first: bool) -> dict[int, int]:
+        """The flexing joints with 1 where they close and -1 where they open, first or afterwards.
+
+        Joints of one motor go the same way. On the left no motor goes as the next one does for
+        long, and neither do those of one place in two fingers; the right hand has another order.
+        """
+        flexing = [[i for i in m if self._joints[side][i].closing] for m in self._model.motors]
+        bit = 1 if side is Side.LEFT else 2
+        return {
+            i: 1 if bool((n ^ n >> bit) & 1) is not first else -1
+            for n, joints in enumerate(filter(None, flexing))
+            for i in joints
+        }
 
     def _drive(
         self,

@@ -333,8 +333,10 @@ class GripperScript(HandScript):
         elif name == "negative":
             kp, kd = self._model.client_gains
             for alone in self._each_alone():
-                wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in alone}
-                yield from self._bad_commands(name, alone, [wrong], 0.3)
+                near = {s: self._aside(s, 0.1)[0] for s in alone}
+                for damping in (-kd, kd):
+                    wrong = {s: (Motor(q=q, kp=-kp, kd=damping),) for s, q in near.items()}
+                    yield from self._bad_commands(name, alone, [wrong], 0.2)
         else:
             for alone in self._each_alone():
                 yield from self._bad_commands(name, alone, [self._empty(alone)], 0.3)
