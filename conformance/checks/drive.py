@@ -343,7 +343,7 @@ def torque_way(ctx: Context) -> Outcome:
         held = nudges(ctx, [*ctx.phases(STIFFNESS), *ctx.phases("nudge")])
         found += [(-n.way, 0, n.begin, n.end) for n in held if n.at_rest]
     against, joint, begin, end = max(found, key=lambda f: f[0] / ctx.joints[f[1]].stroke)
-    against = max(against, 0.0)
+    against = max(0.0, against)
     limit = ctx.tolerance("max_motion_stroke", joint)
     text = ctx.named(f"moved by {against:.2f} {ctx.unit} against a commanded torque", joint)
     figure = f"{against:.2f} {ctx.unit}"

@@ -575,7 +575,7 @@ def driven_away(ctx: Context) -> Outcome:
     if worst is None:
         return ctx.skipped("no state during commands with negative gains")
     _, most, joint, begin, end = worst
-    most = max(most, 0.0)
+    most = max(0.0, most)
     text = ctx.named(f"moved by {most:.2f} {ctx.unit} away from q with negative gains", joint)
     figure, limit = f"{most:.2f} {ctx.unit}", ctx.tolerance("max_motion_stroke", joint)
     if most <= limit:
@@ -756,7 +756,7 @@ def late_under_load(ctx: Context) -> Outcome:
     if worst is None:
         return ctx.skipped("no motion under load, or none without it to compare with")
     more, joint, begin, end, lag, before = worst
-    more = max(more, 0.0)
+    more = max(0.0, more)
     text = ctx.named(
         f"q follows {lag:.2f} s behind the command under load, {before:.2f} s without", joint
     )
