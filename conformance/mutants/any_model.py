@@ -806,7 +806,7 @@ class DiesOfAnyType(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
-@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"))
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"), also=("DEX1-LOAD-03",))
 class QueuesCommands(Service):
     """Queues up to 600 commands and carries out at most two of them in each cycle."""
 
@@ -850,6 +850,7 @@ class StopsInABurst(Service):
         "DEX1-SAFE-09",
         "DEX3-SAFE-10",
         "DEX1-RATE-03",
+        "DEX1-RATE-04",
         "DEX3-RATE-03",
     ),
 )

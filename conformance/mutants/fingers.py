@@ -737,8 +737,8 @@ class _GainsOfFirst(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-GAIN-03",))
-@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18"))
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-GAIN-03", "DEX3-SAFE-06"))
+@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))
 class GainsOfFirstMotor(FingerService):
     """Uses the gains of its first motor for all."""
 
@@ -752,8 +752,8 @@ class _GainsOfNeighbour(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01",))
-@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18"))
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01", "DEX3-SAFE-06"))
+@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))
 class GainsOfTheMotorBefore(FingerService):
     """Uses the gains of the motor before in each."""
 
