@@ -339,9 +339,9 @@ class FingerScript(HandScript):
             yield from self._bad_commands(name, self.plan.sides, far, each)
         else:
             for alone in self._each_alone():
-                kinds = self._malformed(name, alone)
-                for malformed in kinds:
-                    each = 0.25 if name != "negative" else 0.25 / len(kinds)
+                wrong = self._malformed(name, alone)
+                for malformed in wrong:
+                    each = 0.25 if name != "negative" else 0.25 / len(wrong)
                     yield from self._bad_commands(name, alone, [malformed], each)
         group = next((names for names in _TOGETHER if name in names), (name,))
         these = [n for n in group if n in self.plan.phases]
