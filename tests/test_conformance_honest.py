@@ -22,7 +22,7 @@ from dexkit.conformance.results import Load, Overall, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.fingers import Dex3Service, FingerHand
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
-from dexkit.hand import Side
+from dexkit.hand import Floats, Side
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 
 PHASES = frozenset(
@@ -183,7 +183,7 @@ def test_acceleration_of_a_slow_or_coarse_hand_agrees_with_q(service: type[Servi
 
 def test_speed_of_a_step_is_not_known_where_there_was_no_state() -> None:
     t = np.arange(0.0, 0.3, 0.002)
-    course = np.minimum(t / 0.1, 1.0)
+    course: Floats = np.asarray(np.minimum(t / 0.1, 1.0), dtype=float)
 
     def step(kept: NDArray[np.bool_]) -> Step:
         return Step("", 0, 5.4, 0.0, 0.3, 1.0, 0.0, 1.0, t[kept], course[kept], "rad")
