@@ -753,7 +753,7 @@ class _GainsOfNeighbour(FingerHand):
 
 
 @wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01", "DEX3-SAFE-06"))
-@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))
+@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-FORCE-09", "DEX5-SAFE-06"))
 class GainsOfTheMotorBefore(FingerService):
     """Uses the gains of the motor before in each."""
 
