@@ -349,7 +349,7 @@ def legacy_ready(ctx: Context) -> Outcome:
     before = [v.states.q[v.states.t < first] for v in ctx.recording.sides.values()]
     if not any(len(q) for q in before):
         return ctx.skipped("no state before the first command")
-    most = max((float(np.nanmax(np.abs(q))) for q in before if len(q)), default=0.0)
+    most = max(float(np.nan_to_num(np.abs(q)).max()) for q in before if len(q))
     if most > 0:
         return ctx.passed(
             f"{most:.2f} {ctx.unit}", f"up to {most:.3f} {ctx.unit} before the first command"
