@@ -389,6 +389,7 @@ class Swapped(Service):
     also=(
         "DEX1-CMD-01",
         "DEX1-LIFE-02",
+        "DEX1-SAFE-05",
         "DEX1-WDOG-03",
         "DEX3-WDOG-03",
     ),

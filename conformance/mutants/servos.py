@@ -472,7 +472,7 @@ class NoForce(ServoService):
         motors["tau_est"] = 0.0
 
 
-@wrong_hand("BRAINCO-FORCE-04", sides=BOTH)
+@wrong_hand("BRAINCO-FORCE-04", sides=BOTH, whole=True)
 class ForceKept(ServoService):
     """Keeps the largest force of each joint for ever."""
 
