@@ -204,11 +204,7 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(
-    ("DEX1-FRESH-01", "DEX3-FRESH-01"),
-    also=("DEX3-GAIN-03", "DEX5-GAIN-03"),
-    whole=True,
-)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-04", "DEX5-GAIN-03"), whole=True)
 @wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
 @wrong_hand("DFX-FRESH-01", also=("DFX-SIDE-01",), whole=True)
 class StaleState(Service):
@@ -397,7 +393,7 @@ class Swapped(Service):
 @wrong_hand("BRAINCO-MOVE-06", also=("BRAINCO-PATH-01", "BRAINCO-WDOG-03"))
 # slower: it does not come far meanwhile
 @wrong_hand("DFX-MOVE-06", also=("DFX-WDOG-03",))
-@wrong_hand("DEX5-MOVE-06", also=("DEX5-PATH-01", "DEX5-WDOG-03"))
+@wrong_hand("DEX5-MOVE-06", also=("DEX5-MODE-07", "DEX5-PATH-01", "DEX5-WDOG-03"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -486,7 +482,10 @@ class HomesWhenRestarted(_Moves):
 
 @wrong_hand(
     ("DEX1-STILL-01", "DEX3-STILL-01"),
-    also=("DEX1-FIELD-19", "DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
+    also=(
+        *("DEX1-FIELD-19", "DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
+        "DEX5-SAFE-11",
+    ),
     sides=BOTH,
     whole=True,
     where=obeys_gains,

@@ -177,7 +177,7 @@ class JumpsOnce(_Timed):
             motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
 
 
-@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-19",))
+@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-19", "DEX5-FORCE-09"))
 class ShakenVelocity(_Timed):
     """For some seconds has an oscillation on dq that q does not make."""
 
@@ -266,7 +266,14 @@ class _Filled(FingerService):
 
 @wrong_hand(
     "DEX3-FIELD-20",
-    also=("DEX3-FIELD-05", "DEX3-FIELD-19", "DEX3-GAIN-03", "DEX3-GAIN-05", "DEX3-SAFE-06"),
+    also=(
+        "DEX3-FIELD-05",
+        "DEX3-FIELD-19",
+        "DEX3-GAIN-03",
+        "DEX3-GAIN-04",
+        "DEX3-GAIN-05",
+        "DEX3-SAFE-06",
+    ),
     whole=True,
 )
 @wrong_hand("DEX5-FIELD-20", also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-05"), whole=True)
@@ -574,7 +581,8 @@ class OneJointBackwards(FingerService):
     hand_fault = _Backwards
 
 
-@wrong_hand("DEX3-MOVE-02")
+@wrong_hand("DEX3-MOVE-02", also=("DEX3-FORCE-09",))
+@wrong_hand("DEX5-MOVE-02")
 class OtherScale(FingerService):
     """Moves only 75 % of the way from its rest pose."""
 
@@ -692,7 +700,7 @@ class _Creeps(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04", "DFX-CMD-01"))
-@wrong_hand("DEX5-MOVE-07")
+@wrong_hand("DEX5-MOVE-07", also=("DEX5-FORCE-09",))
 class Creeps(FingerService):
     """One joint moves the last part of the way to its goal slowly."""
 
@@ -1509,7 +1517,9 @@ class _LatchesWithoutGuard(FingerHand):
 
 
 @wrong_hand("DEX3-WDOG-03", also=("DEX3-MOVE-08",))
-@wrong_hand(("DEX5-WDOG-03", "BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"))
+@wrong_hand(
+    ("DEX5-WDOG-03", "BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"), also=("DEX5-MODE-02",)
+)
 class StuckAfterSilence(FingerService):
     """Obeys no command after a silence without protection."""
 

@@ -57,7 +57,7 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand("DEX1-OPER-06", also=("DEX1-OPER-01", "DEX1-OPER-04"))
+@wrong_hand("DEX1-OPER-06", also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-04"))
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a goal nearer than 0.14 rad: the client waits there and never moves on."""
 
@@ -84,7 +84,15 @@ class SaturatingGain(ReferenceService):
 # what it leaves of each step shows in steps of every kind
 @wrong_hand(
     "DEX3-OPER-02",
-    also=("DEX3-ABUSE-01", "DEX3-CMD-01", "DEX3-MODE-07", "DEX5-LOAD-02"),
+    also=(
+        "DEX3-ABUSE-01",
+        "DEX3-CMD-01",
+        "DEX3-LOAD-03",
+        "DEX3-MODE-07",
+        "DEX3-SAFE-06",
+        "DEX3-SAFE-11",
+        "DEX5-LOAD-02",
+    ),
     where=obeys_gains,
 )
 class FingerDeadBand(_DeadBand, FingerService):
@@ -239,6 +247,16 @@ class Springs(_OpenEnd, FingerService):
 @wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02", "DEX3-CMD-01"))
 @wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",))
 # its delay is long compared with the steps of the light joints
-@wrong_hand("DEX5-OPER-05", also=("DEX5-TRACK-02", "DEX5-OPER-02", "DEX5-CMD-01", "DEX5-GAIN-05"))
+@wrong_hand(
+    "DEX5-OPER-05",
+    also=(
+        "DEX5-CMD-01",
+        "DEX5-GAIN-04",
+        "DEX5-GAIN-05",
+        "DEX5-MODE-02",
+        "DEX5-OPER-02",
+        "DEX5-TRACK-02",
+    ),
+)
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""

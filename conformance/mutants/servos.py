@@ -46,7 +46,14 @@ class Thousandths(ServoService):
 # with an object in one hand, the other one shows that it is held back
 @wrong_hand(
     "BRAINCO-SIDE-01",
-    also=("BRAINCO-MOVE-09", "BRAINCO-SAFE-01", "BRAINCO-WDOG-01"),
+    also=(
+        "BRAINCO-LIFE-02",
+        "BRAINCO-MOVE-09",
+        "BRAINCO-SAFE-01",
+        "BRAINCO-SPEED-02",
+        "BRAINCO-SPEED-03",
+        "BRAINCO-WDOG-01",
+    ),
     sides=BOTH,
 )
 @wrong_hand("DFX-SIDE-01", also=("DFX-MOVE-09", "DFX-WDOG-03"), sides=BOTH)
