@@ -221,7 +221,7 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
-@wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-03",), whole=True)
+@wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
 @wrong_hand(
     ("DEX1-FRESH-01", "DEX5-FRESH-01", "BRAINCO-FRESH-01"), also=("FTP-SAFE-10",), whole=True
 )

@@ -276,7 +276,11 @@ class _Filled(FingerService):
     ),
     whole=True,
 )
-@wrong_hand("DEX5-FIELD-20", also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-05"), whole=True)
+@wrong_hand(
+    "DEX5-FIELD-20",
+    also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-04", "DEX5-GAIN-05"),
+    whole=True,
+)
 class ShowsTheGoalNearIt(FingerService):
     """Publishes the commanded q of one joint within a tenth of its range from it."""
 
@@ -603,7 +607,8 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", whole=True, where=obeys_gains)
+@wrong_hand("DEX3-MOVE-03", also=("DEX3-FORCE-09",), whole=True, where=obeys_gains)
+@wrong_hand("DEX5-MOVE-03", whole=True)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
@@ -1516,7 +1521,7 @@ class _LatchesWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
-@wrong_hand("DEX3-WDOG-03", also=("DEX3-MOVE-08",))
+@wrong_hand("DEX3-WDOG-03", also=("DEX3-MODE-02", "DEX3-MOVE-08"))
 @wrong_hand(
     ("DEX5-WDOG-03", "BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"), also=("DEX5-MODE-02",)
 )
@@ -1729,7 +1734,7 @@ class _Dead(FingerHand):
         self.dead = tripped if self.dead is None else self.dead | tripped
 
 
-@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-WDOG-03"))
+@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-MODE-02", "DEX3-WDOG-03"))
 class NeverClears(FingerService):
     """A motor whose protection has tripped never reacts again."""
 

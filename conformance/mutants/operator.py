@@ -91,9 +91,20 @@ class SaturatingGain(ReferenceService):
         "DEX3-MODE-07",
         "DEX3-SAFE-06",
         "DEX3-SAFE-11",
-        "DEX5-LOAD-02",
     ),
     where=obeys_gains,
+)
+@wrong_hand(
+    "DEX5-OPER-02",
+    also=(
+        "DEX5-ABUSE-01",
+        "DEX5-CMD-01",
+        "DEX5-FORCE-09",
+        "DEX5-LOAD-02",
+        "DEX5-MODE-07",
+        "DEX5-SAFE-06",
+        "DEX5-SAFE-11",
+    ),
 )
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
@@ -244,7 +255,7 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-@wrong_hand("DEX3-OPER-05", also=("DEX3-TRACK-02", "DEX3-CMD-01"))
+@wrong_hand("DEX3-OPER-05", also=("DEX3-CMD-01", "DEX3-GAIN-04", "DEX3-MODE-02", "DEX3-TRACK-02"))
 @wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",))
 # its delay is long compared with the steps of the light joints
 @wrong_hand(

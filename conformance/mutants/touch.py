@@ -57,7 +57,7 @@ class RareTouch(FtpService):
     touch_period = 0.1
 
 
-@wrong_hand("FTP-SENS-04", sides=BOTH)
+@wrong_hand("FTP-SENS-04", also=("FTP-TOUCH-05",), sides=BOTH)
 class CountsFromTheThumb(FtpService):
     """Publishes the areas of the fingers in the opposite order, the thumb's first."""
 
