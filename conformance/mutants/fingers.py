@@ -500,7 +500,7 @@ class OneSensorBuffer(FingerService):
         return super().pressures(right)
 
 
-@wrong_hand("DEX3-SENS-09", sides=BOTH)
+@wrong_hand("DEX3-SENS-09", also=("FTP-TOUCH-05",), sides=BOTH)
 class TaresInAGrip(FingerService):
     """Treats a pressure that is constant for a second as drift, and takes it as the new zero."""
 
