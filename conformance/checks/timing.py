@@ -44,6 +44,7 @@ _OFF_LATTICE = 0.05
 """Tolerance of a multiple of the encoder's step, as a part of the step, for rounded values."""
 _EXPLAINED = 1.5
 """Steps of a coarse encoder for which a joint may seem to stand still."""
+_STEPS = 2.0  # usual times between states that the last state of a position counts for at most
 _IN_A_ROW = 5  # held positions, whose median ignores one outlier
 
 
@@ -628,7 +629,10 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     # a value repeated between two large changes in one direction was old
     moving = np.flatnonzero(big[1:] & big[:-1])
     moving = moving[np.sign(size[moving + 1]) == np.sign(size[moving])]
-    holds = t[changes[moving + 1]] - t[changes[moving]]
+    # how long states showed it: a time without any state is judged by the rate
+    since, until = changes[moving], changes[moving + 1]
+    step = np.minimum(t[until] - t[until - 1], _STEPS * median(np.diff(t)))
+    holds = t[until - 1] - t[since] + step
     travel = float(np.ptp(q))
     if len(holds) < ctx.tolerance("min_intervals"):
         if travel < least:

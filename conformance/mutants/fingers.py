@@ -1734,7 +1734,11 @@ class _Dead(FingerHand):
         self.dead = tripped if self.dead is None else self.dead | tripped
 
 
-@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-MODE-02", "DEX3-WDOG-03"))
+@wrong_hand(
+    "DEX3-GUARD-04",
+    also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-MODE-02", "DEX3-WDOG-03"),
+    whole=True,
+)
 class NeverClears(FingerService):
     """A motor whose protection has tripped never reacts again."""
 
