@@ -170,7 +170,7 @@ def test_a_missing_servo_is_named_and_nothing_driven(tmp_path: Path) -> None:
 
 
 def test_a_servo_that_is_unplugged_in_motion_stops_the_other(tmp_path: Path) -> None:
-    with opened(tmp_path, timeout=0.1) as (gripper, hand):
+    with opened(tmp_path) as (gripper, hand):
         drive(hand, OPEN, at(5.4))
         drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
         gripper.inject("brown-out:volts=0,id=2")

@@ -20,7 +20,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -299,9 +299,10 @@ def _sockets(pid: int) -> dict[str, int]:
 def _family(pid: int) -> list[int]:
     """A process and those that it has started."""
     found = [pid]
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        for child in (task / "children").read_text().split():
-            found += _family(int(child))
+    with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                found += _family(int(child))
     return found
 
 
@@ -332,13 +333,19 @@ def _listening(program: Program, indices: Sequence[int]) -> list[tuple[str, str,
     wanted = interface_filter.program(indices)
     found = []
     for pid in _family(program.process.pid):
-        own = _sockets(pid)
-        for protocol in ("udp", "udp6", "tcp", "tcp6"):
-            for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
-                fields = line.split()
-                if fields[9] in own and (protocol[:3] == "udp" or fields[3] == "0A"):
-                    filtered = _filter_in(pid, own[fields[9]]) == wanted
-                    found.append((protocol, fields[1].split(":")[0], filtered))
+        with suppress(FileNotFoundError, ProcessLookupError):  # a child that has ended meanwhile
+            found += _listening_of(pid, wanted)
+    return found
+
+
+def _listening_of(pid: int, wanted: bytes) -> list[tuple[str, str, bool]]:
+    own, found = _sockets(pid), []
+    for protocol in ("udp", "udp6", "tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[9] in own and (protocol[:3] == "udp" or fields[3] == "0A"):
+                filtered = _filter_in(pid, own[fields[9]]) == wanted
+                found.append((protocol, fields[1].split(":")[0], filtered))
     return found
 
 
