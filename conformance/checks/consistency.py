@@ -315,6 +315,10 @@ def held_s(ctx: Context, joint: int) -> float:
     A hand may measure more rarely than it publishes (DEX1-FRESH-01): then q is a staircase, whose
     slope shows only over several of its steps.
     """
+    return ctx.once(("held", joint), lambda: _held_s(ctx, joint))
+
+
+def _held_s(ctx: Context, joint: int) -> float:
     x = _Joint.from_context(ctx, joint)
     steps = np.diff(x.t)
     stairs = np.abs(np.diff(x.q)) >= _STAIR_PART * ctx.joints[joint].stroke
