@@ -6,6 +6,7 @@ grip is recognised by position, and its force is compared with that of other gri
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,18 +16,19 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.hand import Floats
 from dexkit.models import model
 
-__all__ = ["Stand", "stands"]
+__all__ = ["FEW_STANDS", "Stand", "stands"]
 
-_WINDOW_S, _GRID_S, _PARTS = 0.3, 0.05, 3
-"""Seconds of a stretch in which joints stand, from one to the next, and the parts of each."""
+_PART_S, _GRID_S, _PARTS = 0.1, 0.05, 3
+"""Seconds after ``settle_s`` in which the force is taken, seconds from one stretch to the next, and
+the parts of a stretch."""
 _STANDS = 0.03  # of the stroke: motion in a stretch
 _AT_GOAL = 0.03  # of the stroke: distance from the goal of a joint that has reached it
-_OFF_GOAL = 0.1  # of the stroke: distance from the goal of a joint that is held back
 _NEAR, _CLEAR = 0.08, 0.08  # of the stroke: from where the object is, of one that touches or not
 _END = 0.05  # of the stroke: distance from the ends within which a stop may press
 _HEARD_S = 0.25  # s from the last command, after which a hand may do what it does in a silence
 _FAST = 0.5  # part of the full speed from which a goal is soon beyond the object
-_FEW = 2  # stretches of a failure: a single one may be disturbed
+FEW_STANDS = 2
+"""Stretches of a failure: a single one may be disturbed."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,16 @@ class Stand:
 
 
 def stands(ctx: Context) -> list[Stand]:
-    """Every such stretch of the run in which a joint presses on the object, or is free."""
-    return ctx.once("stands", lambda: _stands(ctx))
+    """Every such stretch of the run in which a joint presses on the object, or is free.
+
+    The requirement says how long joints stand before their force is taken (``settle_s``), and how
+    far from its goal one is held back (``min_held_stroke``).
+    """
+    settle, held = (ctx.requirement.tolerance(n) for n in ("settle_s", "min_held_stroke"))
+    return ctx.once(("stands", settle, held), lambda: _stands(ctx, settle, held))
 
 
-def _stands(ctx: Context) -> list[Stand]:
+def _stands(ctx: Context, settle: float, held: float) -> list[Stand]:
     states, given = ctx.states, ctx.commands
     good = np.isfinite(given.q).all(axis=1) & np.isfinite(given.dq).all(axis=1)
     t, goals, speeds = given.t[good], given.q[good], given.dq[good]
@@ -67,9 +74,9 @@ def _stands(ctx: Context) -> list[Stand]:
     fast = np.ones(len(specs), np.bool_)
     at = None if ctx.object_at is None else ctx.object_at / 100
     contact = np.array([j.closed_by(at) if at is not None and j.closing else np.nan for j in specs])
-    found = []
+    found, seconds = [], round(settle + _PART_S, 9)
     for begin in np.arange(float(t[0]), float(t[-1]), _GRID_S).tolist():
-        end = begin + _WINDOW_S
+        end = begin + seconds
         last = int(np.searchsorted(t, end, "right")) - 1
         if end - t[last] > _HEARD_S:
             continue
@@ -85,7 +92,7 @@ def _stands(ctx: Context) -> list[Stand]:
         left = (goals[last] - here) * closing / stroke
         with np.errstate(invalid="ignore"):
             way = (contact - here) * closing / stroke  # NaN without an object
-            presses = still & fast & (left >= _OFF_GOAL) & (np.abs(way) <= _NEAR)
+            presses = still & fast & (left >= held) & (np.abs(way) <= _NEAR)
             clear = np.isnan(way) | (way >= _CLEAR)
         inside = (here >= low + _END * stroke) & (here <= high - _END * stroke)
         free = still & (np.abs(left) <= _AT_GOAL) & clear & inside & (closing != 0)
@@ -115,6 +122,26 @@ def _without_object(ctx: Context) -> Outcome | None:
     return None
 
 
+def _extreme(
+    ctx: Context, which: Callable[[Stand, int], bool], force: Callable[[float], float]
+) -> tuple[float, int, Stand] | None:
+    """The least ``force`` of tau_est at the end of a stretch, in parts of the joint's limit, the
+    joint and the stretch; the second least of each joint. None without enough stretches.
+    """
+    found = []
+    for joint, spec in enumerate(ctx.joints):
+        mine = [
+            (force(float(s.force[-1, joint])) / spec.tau_max, joint, s.begin, s)
+            for s in stands(ctx)
+            if which(s, joint)
+        ]
+        found += sorted(mine, key=lambda m: m[:3])[FEW_STANDS - 1 : FEW_STANDS]
+    if not found:
+        return None
+    part, joint, _, stand = min(found, key=lambda f: f[:2])
+    return part, joint, stand
+
+
 @check("BRAINCO-FORCE-03")
 def reported(ctx: Context) -> Outcome:
     """Whether tau_est is anything but 0 while the hand presses on the object."""
@@ -133,14 +160,7 @@ def felt(ctx: Context) -> Outcome:
     if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
         return skipped
     unit = _unit(ctx)
-    worst: tuple[float, int, Stand] | None = None
-    for joint, spec in enumerate(ctx.joints):
-        mine = [s for s in stands(ctx) if s.presses[joint]]
-        mine.sort(key=lambda s, i=joint: float(s.force[-1, i]))  # type: ignore[misc]
-        if len(mine) >= _FEW:
-            one = mine[_FEW - 1]
-            part = float(one.force[-1, joint]) / spec.tau_max
-            worst = min(worst or (part, joint, one), (part, joint, one), key=lambda w: w[:2])
+    worst = _extreme(ctx, lambda s, joint: bool(s.presses[joint]), float)
     if worst is None:
         return ctx.skipped("the object held no joint back for long enough")
     part, joint, one = worst
@@ -178,17 +198,10 @@ def none_without_contact(ctx: Context) -> Outcome:
     if (skipped := _reported(ctx)) is not None:
         return skipped
     unit = _unit(ctx)
-    worst: tuple[float, int, Stand] | None = None
-    for joint, spec in enumerate(ctx.joints):
-        mine = [s for s in stands(ctx) if s.free[joint]]
-        mine.sort(key=lambda s, i=joint: -abs(float(s.force[-1, i])))  # type: ignore[misc]
-        if len(mine) >= _FEW:
-            one = mine[_FEW - 1]
-            part = abs(float(one.force[-1, joint])) / spec.tau_max
-            worst = max(worst or (part, joint, one), (part, joint, one), key=lambda w: w[:2])
+    worst = _extreme(ctx, lambda s, joint: bool(s.free[joint]), lambda tau: -abs(tau))
     if worst is None:
         return ctx.skipped("no joint stood at its goal for long enough")
-    part, joint, one = worst
+    part, joint, one = -worst[0], *worst[1:]
     tau = part * ctx.joints[joint].tau_max
     text = ctx.named(f"tau_est of {tau:.2f} {unit} at its goal, where it touches nothing", joint)
     if part <= ctx.tolerance("max_part"):
@@ -207,11 +220,12 @@ def grips_alike(ctx: Context) -> Outcome:
     for joint, spec in enumerate(ctx.joints):
         mine = [s for s in stands(ctx) if s.presses[joint]]
         strongest = max((float(np.abs(s.force[:, joint]).max()) for s in mine), default=0.0)
-        if len(mine) < _FEW or strongest < ctx.tolerance("min_strongest_part") * spec.tau_max:
+        weak = strongest < ctx.tolerance("min_strongest_part") * spec.tau_max
+        if weak or len(mine) < FEW_STANDS:
             continue
-        mine.sort(key=lambda s, i=joint: abs(float(s.force[-1, i])))  # type: ignore[misc]
-        one = mine[_FEW - 1]
-        weakest = abs(float(one.force[-1, joint]))
+        ends = [abs(float(s.force[-1, joint])) for s in mine]
+        second = int(np.argsort(ends, kind="stable")[FEW_STANDS - 1])
+        weakest, one = ends[second], mine[second]
         found = weakest / strongest, joint, strongest, weakest, one
         worst = min(worst or found, found, key=lambda w: w[:2])
     if worst is None:

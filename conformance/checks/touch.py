@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.servo_force import stands
+from dexkit.conformance.checks.servo_force import FEW_STANDS, stands
 from dexkit.conformance.touch import Touch
 from dexkit.hand import Floats
 
@@ -123,9 +123,6 @@ def touch_rate(ctx: Context) -> Outcome:
     return outcome.rated(rate, limit, seconds).if_late(late, how="mean", best=late)
 
 
-_FEW = 2  # stretches of a failure: a single one may be disturbed
-
-
 def _rises(ctx: Context, touch: Touch) -> dict[str, Floats]:
     """The largest rise of an element of each finger's areas in each message, counts, above what it
     was before the first command.
@@ -165,7 +162,7 @@ def touch_in_grips(ctx: Context) -> Outcome:
             continue
         judged = True
         weak = [s for part, s in held if part < ctx.tolerance("min_part") * most]
-        if len(weak) >= _FEW:
+        if len(weak) >= FEW_STANDS:
             text = f"of its touch in other grips hardly any is left while the {finger} grips"
             return ctx.failed("no touch", text, ctx.at(touch.topic, weak[0].begin, weak[-1].end))
         free = [s for s in stands(ctx) if s.free[joints].all()]
@@ -176,7 +173,7 @@ def touch_in_grips(ctx: Context) -> Outcome:
             if not ((ends > s.begin - ctx.tolerance("release_s")) & (ends <= s.end)).any()
             and _last(touch, rise, s.begin, s.end) > ctx.tolerance("max_part") * most
         ]
-        if len(kept) >= _FEW:
+        if len(kept) >= FEW_STANDS:
             text = f"the touch of a grip is there while nothing touches the {finger}"
             return ctx.failed("touch", text, ctx.at(touch.topic, kept[0].begin, kept[-1].end))
     if not judged:

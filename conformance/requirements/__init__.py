@@ -310,13 +310,15 @@ def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str
         def ours(value: Any, theirs: str = theirs) -> Any:
             if isinstance(value, str):
                 return renamed(value, theirs, prefix)
+            if isinstance(value, dict):
+                return {name: ours(v) for name, v in value.items()}
             return [ours(v) for v in value] if isinstance(value, list) else value
 
         taken = {key: ours(value) for key, value in origins.items()}
         source = origins["source"]
         taken["source"] = source if "like" in origins else f"as {entry['like']}: {source}"
         taken["confidence"] = "inferred"
-        tolerances = {**origins.get("tolerances", {}), **entry.get("tolerances", {})}
+        tolerances = {**taken.get("tolerances", {}), **entry.get("tolerances", {})}
         found.append({**taken, **entry, **({"tolerances": tolerances} if tolerances else {})})
     return found
 
