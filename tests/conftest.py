@@ -12,9 +12,9 @@ from tests import surroundings
 from tests.optional import header
 
 # A machine that is busy with something else makes examples slow, not wrong.
-# A quarter of the usual number of examples: the campaign goes on where the tests end.
+# An eighth of the usual number of examples: the campaign goes on where the tests end.
 settings.register_profile(
-    "dexkit", deadline=None, max_examples=25, suppress_health_check=[HealthCheck.too_slow]
+    "dexkit", deadline=None, max_examples=12, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("dexkit")
 

@@ -52,7 +52,7 @@ def _cyclone(reference: str, struct: Struct, message: Any) -> Any:
 
 @pytest.mark.parametrize("reference", REFERENCES)
 @pytest.mark.parametrize("name", [*NAMES, *SERVICE_NAMES])
-@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(data=st.data())
 def test_same_bytes_as_cyclonedds(reference: str, name: str, data: st.DataObject) -> None:
     mt = message_type(name)

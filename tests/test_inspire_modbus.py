@@ -11,7 +11,6 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from dexkit.backends import BackendOptions, backend
@@ -195,6 +194,9 @@ def test_a_connection_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyP
 
 
 def test_driver_speaks_to_pymodbus_server() -> None:
+    # not above: it brings a web server, which every worker of a run would import
+    from pymodbus.server import ModbusTcpServer
+
     written: list[tuple[int, list[int]]] = []
 
     def trace(sending: bool, pdu: object) -> object:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -34,10 +35,14 @@ from tests.cli_helpers import running
 from tests.patience import PATIENCE
 from tests.watch_helpers import closing_hands, ns
 
+if TYPE_CHECKING:
+    from dexkit.view.browser_page import Page
+
 FEW = settings(max_examples=25, deadline=None)
 
-pytest.importorskip("viser")
-from dexkit.view.browser_page import Page  # noqa: E402
+# found, not imported: every worker of a run would spend a quarter of a second on it
+if importlib.util.find_spec("viser") is None:
+    pytest.skip("the page needs viser: pip install 'dexkit[view]'", allow_module_level=True)
 
 # -- the time line ---------------------------------------------------------------------------------
 
@@ -162,6 +167,8 @@ def test_failed_requirements_are_marked_where_they_show() -> None:
 
 @pytest.fixture
 def page() -> Iterator[Page]:
+    from dexkit.view.browser_page import Page
+
     marks = (Mark(ns(0), ns(1), "phase", "step left"), Mark(ns(1), ns(1), "fail", "DEX3-X-01 left"))
     recording = Recorded("one", closing_hands(2.0), marks)
     with Page([recording, Recorded("two", closing_hands(1.0))], port=0) as made:
@@ -197,7 +204,7 @@ def test_what_has_not_changed_is_not_sent(page: Page) -> None:
 def test_page_is_bound_to_this_machine_and_to_a_free_port(page: Page) -> None:
     assert page.url == f"http://127.0.0.1:{page.port}"
     with pytest.raises(UsageError, match="cannot be bound"):
-        Page([Recorded("x", Collector())], port=page.port)
+        type(page)([Recorded("x", Collector())], port=page.port)
 
 
 def test_page_asks_nobody_for_a_share_link(page: Page) -> None:

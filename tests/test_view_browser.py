@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import threading
 from collections.abc import Iterator
@@ -19,9 +20,8 @@ from dexkit.watch import Mark
 from tests.watch_helpers import STATE, closing_hands, dex3_state, ns
 from tools.browser import Browser, chromium
 
-pytest.importorskip("viser")
-if chromium() is None:
-    pytest.skip("no chromium here", allow_module_level=True)
+if importlib.util.find_spec("viser") is None or chromium() is None:
+    pytest.skip("needs viser and chromium", allow_module_level=True)
 
 pytestmark = pytest.mark.soak  # a page needs seven seconds of a processor
 

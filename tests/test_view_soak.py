@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import signal
@@ -22,9 +23,8 @@ from tests.dds_helpers import DdsNode, free_domain
 from tests.watch_helpers import STATE
 from tools.browser import Browser, chromium
 
-pytest.importorskip("viser")
-if chromium() is None:
-    pytest.skip("no chromium here", allow_module_level=True)
+if importlib.util.find_spec("viser") is None or chromium() is None:
+    pytest.skip("needs viser and chromium", allow_module_level=True)
 
 pytestmark = pytest.mark.soak
 
