@@ -152,21 +152,21 @@ class TestFaults:
 
     @pytest.mark.parametrize("fault", ["stall", "stall-out"])
     def test_stalled_endpoint_is_cleared_by_the_driver(self, fault: str) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
             emulated.inject(fault)
             drive(hand, go(GOAL[Side.LEFT]), lambda s: hand.statistics.link.stalls == 1)
             drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
             assert hand.statistics.link.stalls == 1
 
     def test_silent_motor_is_in_the_state(self) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
             emulated.inject("silent:id=4,for=500ms")
             state = drive(hand, go(GOAL[Side.LEFT]), lambda s: s.fault[4] & LOST)
             assert np.flatnonzero(state.fault & LOST).tolist() == [4]
             drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault[4] & LOST)
 
     def test_motor_errors_are_in_the_state(self) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
             emulated.inject("overcurrent:id=2,for=300ms")
             drive(hand, HandCommand.brake(7), lambda s: s.fault[2] & int(MotorError.OVERCURRENT))
             drive(hand, HandCommand.brake(7), lambda s: not s.fault.any())
@@ -174,7 +174,7 @@ class TestFaults:
 
 class TestTimeoutProtection:
     def test_tripped_motors_are_reported_and_restarted(self) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
+        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
             assert isinstance(emulated, Dex3Hands)
             device = emulated.device()
             hand.exchange(go(GOAL[Side.LEFT]))
@@ -191,7 +191,8 @@ import sys, numpy as np
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.hand import HandCommand, Side
-hand = Dex3Usb(Side.LEFT, Dex3Settings(server=parse_server(sys.argv[1])[0]))
+settings = Dex3Settings(server=parse_server(sys.argv[1])[0], **{PATIENT})
+hand = Dex3Usb(Side.LEFT, settings)
 hand.open()
 for count in range(10**9):
     hand.exchange(HandCommand.position(np.array({GOAL[Side.LEFT].tolist()}), kp=1.5, kd=0.2))

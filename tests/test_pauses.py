@@ -232,7 +232,7 @@ def test_command_from_before_a_pause_is_not_sent_to_the_dex3() -> None:
     clock = Slow()
     with Dex3Hands((LEFT,)) as hands:
         device = hands.device(LEFT)
-        settings = Dex3Settings(server=parse_server(hands.url)[0])
+        settings = Dex3Settings(server=parse_server(hands.url)[0], timeout=5.0, send_timeout=5.0)
         with Dex3Usb(LEFT, settings, clock=clock) as hand:
             frames = device.counters.frames
             _refuses(hand, clock, HandCommand.position(np.zeros(7)))
