@@ -6,9 +6,10 @@ kit judges dexkit's own service as well, and with shared code it could not see a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from struct import Struct
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import Columns, MessageType, message_type
+from dexkit.messages import layout as layouts
 from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
 __all__ = ["Motor", "MotorCodec", "Motors", "mode_byte"]
@@ -67,11 +69,84 @@ def _members(motors: Sequence[Any]) -> Callable[[str], list[Any]]:
     return lambda name: [getattr(m, name) for m in motors]
 
 
+def _whole(values: Iterable[float], scale: float) -> list[int]:
+    """What a list of int16 has for these values; -1, which leaves a joint alone, for NaN.
+
+    Plain numbers: there are too few joints for numpy to be quick.
+    """
+    scaled = [value * scale for value in values]
+    return [round(x) if -32768.0 <= x <= 32767.0 else _beyond(x) for x in scaled]
+
+
+def _beyond(value: float) -> int:
+    """The int16 for what is none."""
+    return -1 if value != value else 32767 if value > 0.0 else -32768
+
+
 def mode_byte(index: int, status: int = JointMode.FOC, timeout: bool = False) -> int:
     """RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7
     (docs/sources/unitree-dex.md#b4).
     """
     return index | status << 4 | timeout << 7
+
+
+class _Shape:
+    """States of one shape: with the header, length and lengths of sequences of one that has been
+    decoded.
+
+    Such a state can be decoded as well, so that q and dq are read without all the rest: a script
+    looks at every state of a hand.
+
+    :param message: what ``data``, which is little endian, was decoded to.
+    """
+
+    def __init__(self, kind: MessageType, data: bytes, message: Any) -> None:
+        sequence, motor = _SEQUENCE[kind.name]
+        lengths, at, begin, count = "<4s", 4, 0, 0
+        for member in kind.layout.fields:
+            if not member.sequence:
+                at = 4 + layouts.Struct((), "", (member,)).end(at - 4)
+                continue
+            pad = -at % 4
+            at += pad + 4
+            lengths += f"{at - 4 - Struct(lengths).size}xI"
+            elements = len(getattr(message, member.name))
+            if member.name == sequence:
+                begin, count = at, elements
+            at += elements * member.element_size
+        self._lengths = Struct(lengths)
+        self._same = self._lengths.unpack_from(data)
+        self._scale = 0
+        if kind.name in _LISTS:
+            self._scale = _LISTS[kind.name]["q"][1]
+            self._numbers = Struct(f"<{begin}x{count}h")
+            return
+        size = message_type(motor).layout.end(0)
+        q, dq = (_offset(message_type(motor).layout, name) for name in ("q", "dq"))
+        assert dq == q + 4
+        self._numbers = Struct(f"<{begin}x" + f"{q}x2f{size - q - 8}x" * count)
+
+    def fits(self, data: bytes) -> bool:
+        """Whether a state of the same length has this shape."""
+        return self._lengths.unpack_from(data) == self._same
+
+    def read(self, data: bytes) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """(q, dq) of all motors of a state of this shape."""
+        found = self._numbers.unpack_from(data)
+        if self._scale:
+            return tuple([x / self._scale for x in found]), (0.0,) * len(found)
+        return found[::2], found[1::2]
+
+
+def _offset(kind: layouts.Struct, name: str) -> int:
+    """Where a number is in a struct, bytes."""
+    at = 0
+    for leaf in kind.leaves():
+        at += -at % leaf.type.size
+        if leaf.path == (name,):
+            return at
+        at += leaf.count * leaf.type.size
+    raise AssertionError(name)
 
 
 class MotorCodec:
@@ -105,6 +180,7 @@ class MotorCodec:
             foreign = next(t for t in others if t != dialect.cmd_type)
         self.foreign: MessageType = message_type(foreign)
         self._states: dict[int, Any] = {}
+        self._shapes: dict[int, _Shape] = {}
         self._ids = dialect.mode_byte is ModeByte.RIS
         self._modes = dialect.mode_byte is not ModeByte.UNUSED
         self.command_topics: Mapping[Subject, str] = {s: dialect.topics(s)[0] for s in subjects}
@@ -202,10 +278,18 @@ class MotorCodec:
 
         :raises WireError: the payload is not of the dialect's state type.
         """
-        motors = self._mine(self._motors(self.state, data), side)
-        if motors is None:
-            return None
-        return tuple(m.q for m in motors), tuple(m.dq for m in motors)
+        shape = self._shapes.get(len(data))
+        if shape is None or not shape.fits(data):
+            message = self.state.decode(data)
+            motors = self._motors(self.state, message)
+            if data[1] == 1:  # little endian
+                self._shapes[len(data)] = _Shape(self.state, data, message)
+            q, dq = tuple(m.q for m in motors), tuple(m.dq for m in motors)
+        else:
+            q, dq = shape.read(data)
+        first = self.dialect.index[side]
+        end = first + self.joints
+        return None if len(q) < end else (q[first:end], dq[first:end])
 
     def read_command(self, data: bytes, side: Subject) -> tuple[Motor, ...] | None:
         """Decode a subject's motors of a command; None if the sequence is too short.
@@ -224,10 +308,9 @@ class MotorCodec:
 
         :raises WireError: the payload is not of the dialect's command type.
         """
-        return self._motors(self.command, data)
+        return self._motors(self.command, self.command.decode(data))
 
-    def _motors(self, kind: MessageType, data: bytes) -> Sequence[Any]:
-        message = kind.decode(data)
+    def _motors(self, kind: MessageType, message: Any) -> Sequence[Any]:
         sequence, motor = _SEQUENCE[kind.name]
         motors: Sequence[Any] = getattr(message, sequence)
         if kind.name not in _LISTS:
@@ -249,10 +332,7 @@ class MotorCodec:
         every = [f.name for f in kind.layout.fields if f.sequence]
         message = kind.cls(**{name: [0] * count for name in every})
         for member, (name, scale) in _LISTS[kind.name].items():
-            values = np.array(member_of(member), dtype=np.float64) * scale
-            # -1 leaves a joint alone
-            whole = np.clip(np.rint(np.where(np.isnan(values), -1, values)), -32768, 32767)
-            setattr(message, name, whole.astype(int).tolist())
+            setattr(message, name, _whole(member_of(member), scale))
         return message
 
     def state_lists(self, motors: Any) -> bytes:
@@ -260,7 +340,27 @@ class MotorCodec:
 
         :param motors: array of structs with the members of motors.
         """
-        return self.state.encode(self._lists(self.state, len(motors), motors.__getitem__))
+        data, numbers, places = self._blank_lists(len(motors))
+        for member, (name, scale) in _LISTS[self.state.name].items():
+            numbers.pack_into(data, places[name], *_whole(motors[member].tolist(), scale))
+        return bytes(data)
+
+    def _blank_lists(self, count: int) -> tuple[bytearray, Struct, Mapping[str, int]]:
+        """A state of lists of that length, how one of int16 is packed, and where each begins;
+        made once.
+        """
+        if count not in self._states:
+            blank = self._lists(self.state, count, lambda member: [0.0] * count)
+            places: dict[str, int] = {}
+            at = 4  # header
+            for field in self.state.layout.fields:
+                at += -at % 4 + 4  # its length
+                places[field.name] = at
+                at += count * field.element_size
+            data = bytearray(self.state.encode(blank))
+            self._states[count] = data, Struct(f"<{count}h"), places
+        found: tuple[bytearray, Struct, Mapping[str, int]] = self._states[count]
+        return found
 
     def column(self, columns: Columns, side: Subject, kind: MessageType, name: str) -> Floats:
         """A value of a subject's joints: shape (n, n_joints), NaN where the sequence is too short.
