@@ -172,29 +172,37 @@ class FingerHand:
         Implicit in damping and stiffness, so that a stiff law is stable at this step. Plain
         numbers: there are too few joints for numpy to be quick.
         """
+        coulomb, viscous = self.coulomb, self.viscous
         part = dt / self.inertia
-        slip = part * self.coulomb
-        # of a joint that stays at rest, only the contact is new
-        q_, dq_, tau_, contact_ = self.q.copy(), [0.0] * len(pull), pull.copy(), pull.copy()
-        for i, (q, dq, tau, kp, kd, low, high, most) in enumerate(
-            zip(self.q, self.dq, pull, self.law_kp, self.law_kd, *self.stops, strict=True)
+        slip = part * coulomb
+        law_kp, law_kd, law_on = self.law_kp, self.law_kd, self.law_on
+        floor, ceiling, torque = self.stops
+        # most joints stay at rest between their stops: for them, only the torque is new
+        q_, dq_, tau_, contact_ = self.q.copy(), [0.0] * len(pull), pull.copy(), [0.0] * len(pull)
+        for i, (q, dq, tau, low, high) in enumerate(
+            zip(self.q, self.dq, pull, floor, ceiling, strict=True)
         ):
-            contact = self.stiffness * ((low if q < low else high if q > high else q) - q)
-            contact_[i] = contact
-            if dq == 0.0 and -self.coulomb < tau + contact < self.coulomb:
+            contact = 0.0
+            if not low <= q <= high:
+                contact = self.stiffness * ((low if q < low else high if q > high else q) - q)
+                contact_[i] = contact
+            if dq == 0.0 and -coulomb < tau + contact < coulomb:
                 continue
-            damping = kd + dt * kp
-            new = (dq + part * (tau + contact)) / (1.0 + part * (damping + self.viscous))
+            damping = law_kd[i] + dt * law_kp[i]
+            new = (dq + part * (tau + contact)) / (1.0 + part * (damping + viscous))
             tau -= damping * new
+            most = torque[i]
             if tau > most or tau < -most:
                 tau = most if tau > most else -most
-                new = (dq + part * (tau + contact)) / (1.0 + part * self.viscous)
+                new = (dq + part * (tau + contact)) / (1.0 + part * viscous)
             new = new - slip if new > slip else new + slip if new < -slip else 0.0
             q_[i] = q + dt * new
             dq_[i] = new
             tau_[i] = tau
         self.q, self.dq, self.contact = q_, dq_, contact_
-        self.tau = [t if on else 0.0 for t, on in zip(tau_, self.law_on, strict=True)]
+        if not all(law_on):
+            tau_ = [t if on else 0.0 for t, on in zip(tau_, law_on, strict=True)]
+        self.tau = tau_
 
     def pressures(self) -> Floats:
         """Shape (n_sensors, 12): the values of the sensor packets."""
@@ -226,7 +234,7 @@ class Dex3Hand(FingerHand):
 
     def pressures(self) -> Floats:
         """Values of the sensor packets, shape (9, 12)."""
-        if not self.touches:
+        if not self.touches or not any(self.contact):
             return _UNTOUCHED
         felt = np.array(_UNTOUCHED)
         felt[_PRESSED] = 1e4 * np.abs(self.contact)[_PRESSING]
@@ -255,7 +263,23 @@ def _pressed() -> tuple[tuple[Ints, Ints], Ints]:
 
 
 _UNTOUCHED = _untouched()
+_UNTOUCHED.setflags(write=False)
 _PRESSED, _PRESSING = _pressed()
+
+
+class _Message:
+    """The bytes of a state, and views of the motors and sensor packets in it."""
+
+    def __init__(self, data: bytearray, motors: Any, packets: Any) -> None:
+        self.data, self.motors, self.packets = data, motors, packets
+        self._felt: Floats | None = None
+
+    def feel(self, felt: Floats) -> None:
+        """Fill in the values of the packets, shape (n_sensors, 12)."""
+        # those of a hand that touches nothing are one array that cannot change
+        if felt is not self._felt or felt.flags.writeable:
+            self.packets["pressure"] = felt[: len(self.packets)]
+            self._felt = felt
 
 
 class FingerService(Service):
@@ -284,7 +308,7 @@ class FingerService(Service):
     ) -> None:
         super().__init__(dialect, sides, touch)
         self.hands = {s: self.hand(s, touch.get(s)) for s in self.sides}
-        self._blank: dict[int, tuple[bytearray, Any, Any]] = {}
+        self._blank: dict[tuple[tuple[Side, ...], int], _Message] = {}
         self._sent: dict[tuple[Side, ...], tuple[object, bytes]] = {}
         units = dialect.torque_units or (1.0,) * self.codec.joints
         self.torque_units: Floats = np.array(units)
@@ -318,19 +342,22 @@ class FingerService(Service):
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         """The state of these hands on the wire."""
         count = self.dialect.length if length is None else length
-        key = (*(self.hands[s].version for s in sides), count)
-        if self._sent.get(sides, (None, b""))[0] == key:
-            return self._sent[sides][1]
-        data, motors, packets = self._message(count)
-        for side in sides:
-            hand, first = self.hands[side], self.dialect.index[side]
-            mine = motors[first : first + len(hand.q)]
+        hands = [self.hands[s] for s in sides]
+        key = (count, *[hand.version for hand in hands])
+        sent = self._sent.get(sides)
+        if sent is not None and sent[0] == key:
+            return sent[1]
+        message = self._message(sides, count)
+        for side, hand in zip(sides, hands, strict=True):
+            first = self.dialect.index[side]
+            mine = message.motors[first : first + len(hand.q)]
             if len(mine):
                 self.fill(mine, hand)
-            if len(packets):
-                packets["pressure"] = self.pressures(hand)[: len(packets)]
-        self._sent[sides] = (key, bytes(data))
-        return self._sent[sides][1]
+            if self.sensors:
+                message.feel(self.pressures(hand))
+        payload = bytes(message.data)
+        self._sent[sides] = (key, payload)
+        return payload
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         """Fill in the motors of a state."""
@@ -338,8 +365,12 @@ class FingerService(Service):
         motors["mode"] = hand.mode[:n]
         before, dt = hand.gained
         ddq = [(a - b) / dt for a, b in zip(hand.dq, before, strict=True)]
-        tau = np.array(hand.tau) / self.torque_units if self.scaled else hand.tau
-        motors["values"] = np.array((hand.q, hand.dq, ddq, tau)).T[:n]
+        tau = hand.tau
+        if self.scaled:
+            tau = [t / unit for t, unit in zip(tau, self.torque_units.tolist(), strict=True)]
+        values = hand.q, hand.dq, ddq, tau
+        # numpy is quicker with the lists themselves than with an array of them
+        motors["values"].T[...] = values if n == len(tau) else [row[:n] for row in values]
 
     def pressures(self, hand: FingerHand) -> Floats:
         """Shape (n_sensors, 12): the values of its sensor packets."""
@@ -359,16 +390,16 @@ class FingerService(Service):
         message.imu_state.quaternion = list(self.quaternion())
         return message
 
-    def _message(self, count: int) -> tuple[bytearray, Any, Any]:
-        """A message of so many motors, and views of the motors and packets in it; made once."""
-        if count not in self._blank:
+    def _message(self, sides: tuple[Side, ...], count: int) -> _Message:
+        """A message of these hands with so many motors; made once."""
+        if (sides, count) not in self._blank:
             data = bytearray(self.codec.state.encode(self.message(count)))
             at = 8  # header and length
             motors = np.frombuffer(data, self.motor_layout, count, at)
             at += count * self.motor_layout.itemsize + 4
             packets = np.frombuffer(data, _PACKET, self.sensors, at if self.sensors else 0)
-            self._blank[count] = (data, motors, packets)
-        return self._blank[count]
+            self._blank[sides, count] = _Message(data, motors, packets)
+        return self._blank[sides, count]
 
 
 class Dex3Service(FingerService):

@@ -49,7 +49,7 @@ class ReferenceHand:
     def command(self, motor: Motor) -> None:
         """Take a command; one field that is not finite rejects it."""
         fields = (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)
-        if all(math.isfinite(x) for x in fields):
+        if all(map(math.isfinite, fields)):
             self.goal = self.accept(motor)
             self.heard = self.now
 
@@ -65,11 +65,11 @@ class ReferenceHand:
 
     def motor_torque(self) -> float:
         """The motor's torque, N m."""
-        goal = self.goal
+        goal, most = self.goal, self.tau_max
         if goal is None or self.braking:
             return 0.0
         tau = goal.kp * (goal.q - self.q) + goal.kd * (goal.dq - self.dq) + goal.tau
-        return min(max(tau, -self.tau_max), self.tau_max)
+        return -most if tau < -most else most if tau > most else tau
 
     def step(self, dt: float) -> None:
         """Advance by one step."""
@@ -80,8 +80,9 @@ class ReferenceHand:
         # implicit in the damping, so that a stiff brake and a high kd are stable at this step
         force = self.tau + kd * self.dq + self.contact()
         damping = self.viscous + kd + (self.brake if braking else 0.0)
-        dq = (self.dq + dt * force / self.inertia) / (1.0 + dt * damping / self.inertia)
-        slip = dt * self.coulomb / self.inertia
+        inertia = self.inertia
+        dq = (self.dq + dt * force / inertia) / (1.0 + dt * damping / inertia)
+        slip = dt * self.coulomb / inertia
         self.dq = 0.0 if abs(dq) < slip else dq - math.copysign(slip, dq)
         self.q += dt * self.dq
 

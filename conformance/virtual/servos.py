@@ -78,16 +78,29 @@ class ServoHand(FingerHand):
 
     def step(self, dt: float) -> None:
         """Advance by one step."""
-        if self.driven.any():
+        if any(self.driven.tolist()):
             here = self.place
-            self.place = [
-                min(max(p + min(max(g - p, -r * dt), r * dt), q - _LEAD), q + _LEAD)
-                for p, g, r, q in zip(here, self.goal.tolist(), self.reach, self.q, strict=True)
-            ]
+            self.place = self.lead(dt)
             if self.place != here:
                 self.law_q = self.place
                 self.rests = False
         super().step(dt)
+
+    def lead(self, dt: float) -> list[float]:
+        """The goal that each servo follows: toward q with its speed, not far from where it is."""
+        found = []
+        for place, goal, speed, q in zip(
+            self.place, self.goal.tolist(), self.reach, self.q, strict=True
+        ):
+            # comparisons, for min() and max() take several times as long
+            way, most = goal - place, speed * dt
+            if way < -most:
+                way = -most
+            if way > most:
+                way = most
+            to, low, high = place + way, q - _LEAD, q + _LEAD
+            found.append(low if to < low else high if to > high else to)
+        return found
 
 
 class ServoService(FingerService):
@@ -100,13 +113,14 @@ class ServoService(FingerService):
     ) -> None:
         super().__init__(dialect, sides, touch)
         units = dialect.speed_units
-        self.speed_units: Floats = np.array(units or (1.0,) * len(self.torque_units))
+        self.speed_units: Floats | None = np.array(units) if units else None
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         """Fill in the motors of a state."""
         super().fill(motors, hand)
-        for name in ("dq", "ddq"):
-            motors[name] /= self.speed_units[: len(motors)]
+        if self.speed_units is not None:
+            speeds = motors["values"][:, 1:3]  # dq and ddq
+            speeds /= self.speed_units[: len(motors), None]
 
     def message(self, count: int) -> Any:
         """A state with its constant members."""
