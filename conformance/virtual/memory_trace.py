@@ -25,7 +25,10 @@ class MemoryTrace:
 
     def put(self, topic: str, type_name: str, log_ns: int, sent_ns: int, data: bytes) -> None:
         """Record one sample."""
-        self.rows.setdefault((topic, type_name), []).append((log_ns, sent_ns, data))
+        rows = self.rows.get((topic, type_name))
+        if rows is None:
+            rows = self.rows[topic, type_name] = []
+        rows.append((log_ns, sent_ns, data))
 
     @property
     def channels(self) -> list[ChannelInfo]:

@@ -142,26 +142,27 @@ class _Player:
 
     def _take(self, samples: Iterable[Sample]) -> None:
         """Record published states, and note the first one for a late reader."""
-        log_ns = log_time_ns(self.now) + 100_000
+        now_ns = log_time_ns(self.now)
+        log_ns, state_type = now_ns + 100_000, self._plan.dialect.state_type
         for sample in samples:
-            sent_ns = log_time_ns(sample.sent)
-            self.trace.put(sample.topic, sample.type_name, log_ns, sent_ns, sample.payload)
-            sides = self._sides.get(sample.topic)
-            if not sides or sample.type_name != self._plan.dialect.state_type:
+            topic, payload = sample.topic, sample.payload
+            sent_ns = now_ns if sample.sent == self.now else log_time_ns(sample.sent)
+            self.trace.put(topic, sample.type_name, log_ns, sent_ns, payload)
+            sides = self._sides.get(topic)
+            if not sides or sample.type_name != state_type:
                 continue
-            self._newest[sample.topic] = sample.payload
+            self._newest[topic] = payload
             if self._joined_at is not None and self._service.serves_late_readers:
                 for side in sides:
                     self._joined.setdefault(side, self.now - self._joined_at)
 
     def _send(self, action: Send) -> None:
         self._service.stamp = self.now - action.age_s
+        log_ns, sent_ns = log_time_ns(self.now) + 50_000, log_time_ns(self.now - action.age_s)
         for topic, payload in action.payloads:
             if action.by is Role.STRANGER:
                 self._service.foreign(topic, self._codec.foreign.name, payload)
                 continue
-            log_ns = log_time_ns(self.now) + 50_000
-            sent_ns = log_time_ns(self.now - action.age_s)
             self.trace.put(topic, self._plan.dialect.cmd_type, log_ns, sent_ns, payload)
             if self._service.matches_clients:
                 client = _RIVAL if action.by is Role.RIVAL else self._clients
