@@ -268,9 +268,9 @@ _PRESSED, _PRESSING = _pressed()
 
 
 class _Message:
-    """The bytes of a state, and views of the motors and sensor packets in it."""
+    """The bytes of a state, and views of each hand's motors and of the sensor packets in it."""
 
-    def __init__(self, data: bytearray, motors: Any, packets: Any) -> None:
+    def __init__(self, data: bytearray, motors: Sequence[Any], packets: Any) -> None:
         self.data, self.motors, self.packets = data, motors, packets
         self._felt: Floats | None = None
 
@@ -348,9 +348,7 @@ class FingerService(Service):
         if sent is not None and sent[0] == key:
             return sent[1]
         message = self._message(sides, count)
-        for side, hand in zip(sides, hands, strict=True):
-            first = self.dialect.index[side]
-            mine = message.motors[first : first + len(hand.q)]
+        for hand, mine in zip(hands, message.motors, strict=True):
             if len(mine):
                 self.fill(mine, hand)
             if self.sensors:
@@ -362,15 +360,18 @@ class FingerService(Service):
     def fill(self, motors: Any, hand: FingerHand) -> None:
         """Fill in the motors of a state."""
         n = len(motors)
-        motors["mode"] = hand.mode[:n]
-        before, dt = hand.gained
-        ddq = [(a - b) / dt for a, b in zip(hand.dq, before, strict=True)]
+        motors["mode"] = hand.mode if n == len(hand.mode) else hand.mode[:n]
         tau = hand.tau
         if self.scaled:
             tau = [t / unit for t, unit in zip(tau, self.torque_units.tolist(), strict=True)]
-        values = hand.q, hand.dq, ddq, tau
+        values = hand.q, *self.rates(hand), tau
         # numpy is quicker with the lists themselves than with an array of them
         motors["values"].T[...] = values if n == len(tau) else [row[:n] for row in values]
+
+    def rates(self, hand: FingerHand) -> tuple[list[float], list[float]]:
+        """(dq, ddq) of a state's motors."""
+        before, dt = hand.gained
+        return hand.dq, [(a - b) / dt for a, b in zip(hand.dq, before, strict=True)]
 
     def pressures(self, hand: FingerHand) -> Floats:
         """Shape (n_sensors, 12): the values of its sensor packets."""
@@ -395,7 +396,9 @@ class FingerService(Service):
         if (sides, count) not in self._blank:
             data = bytearray(self.codec.state.encode(self.message(count)))
             at = 8  # header and length
-            motors = np.frombuffer(data, self.motor_layout, count, at)
+            every = np.frombuffer(data, self.motor_layout, count, at)
+            firsts = [self.dialect.index[s] for s in sides]
+            motors = [every[first : first + self.codec.joints] for first in firsts]
             at += count * self.motor_layout.itemsize + 4
             packets = np.frombuffer(data, _PACKET, self.sensors, at if self.sensors else 0)
             self._blank[sides, count] = _Message(data, motors, packets)

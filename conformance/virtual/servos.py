@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -112,15 +113,20 @@ class ServoService(FingerService):
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
     ) -> None:
         super().__init__(dialect, sides, touch)
-        units = dialect.speed_units
-        self.speed_units: Floats | None = np.array(units) if units else None
+        self.speed_units = dialect.speed_units
 
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        """Fill in the motors of a state."""
-        super().fill(motors, hand)
-        if self.speed_units is not None:
-            speeds = motors["values"][:, 1:3]  # dq and ddq
-            speeds /= self.speed_units[: len(motors), None]
+    def rates(self, hand: FingerHand) -> tuple[list[float], list[float]]:
+        """(dq, ddq) of a state's motors, in the dialect's units."""
+        dq, ddq = super().rates(hand)
+        units = self.speed_units
+        if not units:
+            return dq, ddq
+        # measured as numbers of 32 bits
+        dq, ddq = array("f", dq).tolist(), array("f", ddq).tolist()
+        return (
+            [speed / unit for speed, unit in zip(dq, units, strict=True)],
+            [change / unit for change, unit in zip(ddq, units, strict=True)],
+        )
 
     def message(self, count: int) -> Any:
         """A state with its constant members."""
