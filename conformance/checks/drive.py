@@ -4,6 +4,7 @@ against motion.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,7 @@ from dexkit.conformance.checks.motion import (
     steps_of,
 )
 from dexkit.conformance.checks.safety import sags
+from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 
 __all__: list[str] = []
@@ -210,15 +212,19 @@ def as_commanded(ctx: Context) -> Outcome:
     return outcome.pressed(tau, limit * asked, at_least=True)
 
 
-@check("DEX3-FORCE-05")
+@check("DEX3-FORCE-05", "DEX3-FORCE-10")
 def joints_as_commanded(ctx: Context) -> Outcome:
     """The smallest and largest tau_est of pressing joints, relative to kp times the distance to the
     goal.
+
+    A requirement without ``max_part`` has no upper limit.
     """
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     pieces = []
-    least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
+    least, most = ctx.tolerance("min_part"), math.inf
+    if "max_part" in ctx.requirement.tolerances:
+        most = ctx.tolerance("max_part")
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
@@ -253,17 +259,47 @@ def joints_as_commanded(ctx: Context) -> Outcome:
 
 
 _LATE = 0.6  # of a pull: before it, a hand may still obey the previous command
+_FEW = 5  # states that show the noise of q
+_MOST_NOISE = 0.008  # of the stroke
+_AROUND_S = 0.02  # s before and after a time: states whose median is the position at that time
 
 
 def _pushed(ctx: Context, phase: Phase, *, after: float = 0.0) -> Iterator[tuple[int, float]]:
     """Joints that a phase pushes, and their motion towards the target, rad.
 
+    Both ends are medians: one state is off by the noise of q, which is allowed to be of the size
+    of the motion.
+
     :param after: part of the phase that is skipped.
     """
     for step in steps_of(ctx, phase):
-        rows = step.t >= step.begin + after * (step.end - step.begin)
-        start = float(step.q[rows][0]) if after and rows.any() else step.start
-        yield step.joint, (float(step.q[-1]) - start) * (1 if step.size > 0 else -1)
+        start = step.start
+        if after:
+            start = _place(ctx, step.joint, step.begin + after * (step.end - step.begin), start)
+        end = _place(ctx, step.joint, step.end, float(step.q[-1]))
+        yield step.joint, (end - start) * (1 if step.size > 0 else -1)
+
+
+def _place(ctx: Context, joint: int, at: float, otherwise: float) -> float:
+    """The median of q around a time, rad: in a steady motion, that of the time itself."""
+    q = ctx.states.q[ctx.states.between(at - _AROUND_S, at + _AROUND_S), joint]
+    q = q[np.isfinite(q)]
+    return median(q) if len(q) else otherwise
+
+
+def _noise(ctx: Context, joint: int) -> float:
+    """The noise of q at rest, rad: half of its range in the quietest of the times before a push.
+
+    No more than what a hand may have: what exceeds it counts as motion.
+    """
+    quiet = _MOST_NOISE * ctx.joints[joint].stroke
+    for phase in (p for name in ("push", "pull") for p in ctx.phases(name)):
+        begin, _ = ctx.span(phase)
+        q = ctx.states.q[ctx.states.between(begin - _REST_S, begin), joint]
+        q = q[np.isfinite(q)]
+        if len(q) >= _FEW:
+            quiet = min(quiet, 0.5 * float(np.ptp(q)))
+    return quiet
 
 
 @check("DEX1-GAIN-03", "DEX3-GAIN-04")
@@ -283,7 +319,8 @@ def torque_drives(ctx: Context) -> Outcome:
         return ctx.skipped("no state while a torque was commanded")
     for phase in ctx.phases("pull"):
         for joint, moved in _pushed(ctx, phase, after=_LATE):
-            if moved < -0.5 * ctx.tolerance("min_motion_stroke", joint):
+            most = 0.5 * ctx.tolerance("min_motion_stroke", joint) + _noise(ctx, joint)
+            if moved < -most:
                 text = ctx.named(
                     f"moved by {-moved:.2f} {ctx.unit} against a torque that was commanded", joint
                 )
@@ -294,7 +331,7 @@ def torque_drives(ctx: Context) -> Outcome:
         return fast
     _, moved, joint, phase = least
     text = ctx.named(f"moved by {moved:.2f} {ctx.unit} while a torque was commanded", joint)
-    if moved >= ctx.tolerance("min_motion_stroke", joint):
+    if moved >= ctx.tolerance("min_motion_stroke", joint) - _noise(ctx, joint):
         return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
     place = ctx.at(ctx.states.topic, *ctx.span(phase))
     return ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
@@ -332,7 +369,11 @@ def torque_way(ctx: Context) -> Outcome:
     """
     sag = sags(ctx)
     found = [
-        (-moved - (0.0 if sag is None else float(sag[joint])), joint, *ctx.span(phase))
+        (
+            -moved - _noise(ctx, joint) - (0.0 if sag is None else float(sag[joint])),
+            joint,
+            *ctx.span(phase),
+        )
         for name in ("push", "pull")
         for phase in ctx.phases(name)
         for joint, moved in _pushed(ctx, phase, after=_LATE)

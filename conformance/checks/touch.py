@@ -14,6 +14,7 @@ from dexkit.hand import Floats
 __all__: list[str] = []
 
 _WINDOW_S = 1.0
+_HELD_S = 0.3  # s at the end of a grip in which its counts are taken
 _NOTHING = "nothing was received on the touch topic"
 
 
@@ -190,3 +191,30 @@ def _rows(touch: Touch, begin: float, end: float) -> range:
 def _last(touch: Touch, rise: Floats, begin: float, end: float) -> float:
     """The last rise in [begin, end]."""
     return float(rise[_rows(touch, begin, end)[-1]])
+
+
+@check("FTP-TOUCH-06")
+def untouched(ctx: Context) -> Outcome:
+    """The largest count of an element before the first command, relative to the most in a grip."""
+    if ctx.object_at is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    touch = _touch(ctx)
+    if touch is None or not len(ctx.commands):
+        return ctx.absent(_NOTHING)
+    before = int(np.searchsorted(touch.t, float(ctx.commands.t[0])))
+    held = [touch.median(max(b, e - _HELD_S), e) for b, e in map(ctx.span, ctx.phases())]
+    most = max((float(np.nanmax(m)) for m in held if m is not None), default=0.0)
+    if not before or most <= 0.0:
+        return ctx.skipped("no message before the first command, or no touch in a grip")
+    rest = np.nan_to_num(np.median(touch.values[:before], axis=0))
+    area, element = (int(i) for i in np.unravel_index(int(np.argmax(rest)), rest.shape))
+    level = float(rest[area, element])
+    limit = ctx.tolerance("max_part") * most
+    text = (
+        f"{touch.areas[area].member} has {level:.0f} before the first command, where the most in a "
+        f"grip is {most:.0f}"
+    )
+    if level <= limit:
+        return ctx.passed(f"{level:.0f}", text, counts=level)
+    place = ctx.at(touch.topic, float(touch.t[0]), float(touch.t[before - 1]))
+    return ctx.failed(f"{level:.0f}", text, place, counts=level)

@@ -66,6 +66,23 @@ def _rows_from(t: Floats, times: Floats) -> Rows:
     return np.asarray(np.searchsorted(t, times))
 
 
+@check("DEX1-FIELD-22", "DEX3-FIELD-21")
+def shown(ctx: Context) -> Outcome:
+    """Whether dq of each joint that moves is ever other than 0."""
+    moved = 0
+    for joint in range(len(ctx.joints)):
+        _, q, dq = _series(ctx, joint)
+        if len(q) < _FEW or float(np.ptp(q)) < ctx.tolerance("min_way_stroke", joint):
+            continue
+        moved += 1
+        if not dq.any():
+            text = ctx.named("dq is 0 throughout, although q moves", joint)
+            return ctx.failed("0", text).about(joint)
+    if not moved:
+        return ctx.skipped("no joint moves in this recording")
+    return ctx.passed("filled", "dq is not 0 throughout in any joint that moves")
+
+
 @check("DEX1-FIELD-19", "DEX3-FIELD-18")
 def one_course(ctx: Context) -> Outcome:
     """Number of cells in which dq alternates by the speed itself, in the worst window."""

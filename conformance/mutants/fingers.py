@@ -1104,6 +1104,30 @@ class ForceOfOtherGear(Dex3Service):
         motors["tau_est"] *= 0.4
 
 
+class _GearSquared(FingerHand):
+    def changed(self) -> None:
+        super().changed()
+        self.law_kp = [k / 1.75**2 if i else k for i, k in enumerate(self.law_kp)]
+        self.law_kd = [k / 1.75**2 if i else k for i, k in enumerate(self.law_kd)]
+
+
+@wrong_hand("DEX3-FORCE-10", also=("DEX3-FORCE-05", "DEX3-GAIN-04"), sides=BOTH)
+class GearOfTheThumb(Dex3Service):
+    """Divides the gains of all joints by the square of the thumb's gear but for the thumb's own."""
+
+    hand_fault = _GearSquared
+
+
+@wrong_hand("DEX3-FIELD-21")
+class FingersWithoutVelocity(Dex3Service):
+    """Publishes no dq and no ddq."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        motors["dq"] = 0.0
+        motors["ddq"] = 0.0
+
+
 class _Tires(FingerHand):
     loaded = 0.0
 

@@ -175,6 +175,14 @@ class TurnedVelocity(_Fields):
         return {**fields, "dq": -fields["dq"]}
 
 
+@wrong_hand("DEX1-FIELD-22")
+class NoVelocity(_Fields):
+    """Publishes no dq."""
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return {**fields, "dq": 0.0}
+
+
 # --------------------------------------------------------------------- consistency of the state
 
 
@@ -347,10 +355,10 @@ class HotByte(_Filled):
 
 @wrong_hand("DEX1-FIELD-08")
 class HotAtStart(_Fields):
-    """Publishes 120 degrees Celsius until it gets its first command."""
+    """Publishes 90 degrees Celsius until it gets its first command."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return fields if self.hands[side].goal else {**fields, "temperature": 120}
+        return fields if self.hands[side].goal else {**fields, "temperature": 90}
 
 
 @wrong_hand("DEX1-FIELD-09")

@@ -65,3 +65,11 @@ class CountsFromTheThumb(FtpService):
         felt = super().pressures(hand)
         felt[_TOPS] = felt[_TOPS[::-1]]
         return felt
+
+
+@wrong_hand("FTP-TOUCH-06", sides=BOTH)
+class CountsWithoutTouch(FtpService):
+    """Publishes areas that have 400 counts too many: they were set to zero under a load."""
+
+    def pressures(self, hand: FingerHand) -> Floats:
+        return super().pressures(hand) + 400.0
