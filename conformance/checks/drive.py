@@ -443,12 +443,23 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
 @check("DEX1-GAIN-04")
 def soft_commands(ctx: Context) -> Outcome:
     """Progress of a step with low stiffness, as a part of the step."""
+    return _progress(ctx, "with little stiffness")
+
+
+@check("DEX1-GAIN-08")
+def fed_commands(ctx: Context) -> Outcome:
+    """Progress of a step whose commands have a velocity and a torque, as a part of the step."""
+    return _progress(ctx, "with a feed-forward of velocity and torque")
+
+
+def _progress(ctx: Context, how: str) -> Outcome:
+    """The least progress of the steps of the phases that the requirement needs."""
     found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * s.stroke]
     if not found:
-        return ctx.skipped("no state during a step with little stiffness")
+        return ctx.skipped(f"no state during a step {how}")
     worst = min(found, key=lambda s: (s.final - s.start) / s.size)
     part = (worst.final - worst.start) / worst.size
-    text = f"with little stiffness {worst}"
+    text = f"{how} {worst}"
     limit = ctx.tolerance("min_progress")
     if part >= limit:
         return ctx.passed(f"{part:.0%}", text, progress=part)

@@ -1152,6 +1152,7 @@ class _Tires(FingerHand):
     also=(
         "DEX3-SENS-09",
         "DEX3-FORCE-05",
+        "DEX3-FORCE-10",
     ),
     sides=BOTH,
     whole=True,
@@ -1301,7 +1302,7 @@ class OneJointGoesOn(Dex5Service):
     hand_fault = _OneGoesOn
 
 
-@wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-MOVE-09"), sides=BOTH)
+@wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-FORCE-10", "DEX3-MOVE-09"), sides=BOTH)
 class TorqueInMillis(Dex3Service):
     """Publishes a thousandth of the torque: a conversion from mN m is made twice."""
 
@@ -1698,7 +1699,11 @@ class _FedByNews(FingerHand):
             super().command(motors)
 
 
-@wrong_hand("DEX3-GUARD-02", also=("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06"), sides=BOTH)
+@wrong_hand(
+    "DEX3-GUARD-02",
+    also=("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-10"),
+    sides=BOTH,
+)
 class DropsEqualCommands(Dex3Service):
     """Drops commands that equal the last, before they feed the time-out."""
 

@@ -587,6 +587,37 @@ class TurnedVelocityCommand(ReferenceService):
     hand = _TurnedVelocityCommand
 
 
+class _SpeedMode(ReferenceHand):
+    def accept(self, motor: Motor) -> Motor:
+        accepted = super().accept(motor)
+        return replace(accepted, kp=0.0) if accepted.dq else accepted
+
+
+@wrong_hand("DEX1-GAIN-08")
+class SpeedModeByDq(ReferenceService):
+    """Selects its speed mode by a dq other than 0: q is not used then."""
+
+    hand = _SpeedMode
+
+
+class _TorqueLimit(ReferenceHand):
+    def motor_torque(self) -> float:
+        goal = self.goal
+        if goal is None or not goal.tau:
+            return super().motor_torque()
+        most, self.goal = abs(goal.tau), replace(goal, tau=0.0)
+        tau = super().motor_torque()
+        self.goal = goal
+        return min(max(tau, -most), most)
+
+
+@wrong_hand("DEX1-GAIN-08", also=("DEX1-GAIN-03",))
+class LimitsByTau(ReferenceService):
+    """Takes tau of a command for the limit of its torque."""
+
+    hand = _TorqueLimit
+
+
 class _KeepsGains(ReferenceHand):
     def accept(self, motor: Motor) -> Motor:
         accepted = super().accept(motor)

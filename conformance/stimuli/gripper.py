@@ -24,6 +24,7 @@ limp           zero gains of one side after the other, with a q far towards clos
 unlike         steps of the other side meanwhile
 pull, push     a torque alone, without a position gain: towards closed, and towards open; one side
                is pulled while the other one is pushed
+fed            a step to the middle whose commands have a velocity and a torque, too
 replay         a recorded session, as recorded
 single         commands that are sent once
 load           many commands a second, and a reader that is slow
@@ -130,6 +131,10 @@ _SLOWEST_HZ, _FASTEST_HZ = 30.0, 1000.0
 _SOFTEST, _SOFT_STEP = 0.8, 0.3
 """kp, N m/rad, and size, in parts of the stroke, of a soft step."""
 _PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
+_FED_DQ, _FED_TAU, _FED_SECONDS = -0.5, 0.1, 0.7
+"""A feed-forward towards closed and a torque towards open, rad/s and N m, and for how long, s: with
+the client's gains they move the end of a step by less than 0.02 rad. A hand that takes them for
+limits makes a quarter of the step."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -176,7 +181,7 @@ class GripperScript(HandScript):
         yield from self._stiffness(sides)
         if "burst" in self.plan.phases:
             yield from self._flood()
-        if self.plan.phases & {"limp", "unlike", "push", "drive"} and self._gains_used:
+        if self.plan.phases & {"limp", "unlike", "push", "drive", "fed"} and self._gains_used:
             yield from self._undriven()
         if not self._gains_used:
             self._gainless = True
@@ -459,7 +464,19 @@ class GripperScript(HandScript):
                 yield from self._pushes(dict(zip(sides, names, strict=False)))
         if "drive" in self.plan.phases:
             yield from self._drive(sides, 0.16, seconds=0.35)
+        if "fed" in self.plan.phases:
+            yield from self._fed(sides)
         yield from self._everyone("center", {s: self._home(s) for s in sides})
+
+    def _fed(self, sides: Sequence[Side]) -> Steps:
+        """The way back to the middle, with a feed-forward that hardly changes it."""
+        self._report("a velocity and a torque beside a position: it must be reached all the same")
+        goals = {s: self._home(s) for s in sides}
+        phase = self._begin("fed", sides, targets={s: {0: q} for s, (q,) in goals.items()})
+        fed = {s: (Motor(q=q, dq=_FED_DQ, tau=_FED_TAU),) for s, (q,) in goals.items()}
+        yield from self._hold(_FED_SECONDS, fed)
+        self._end(phase)
+        self._goal.update(goals)
 
     def _limp(self, side: Side) -> Steps:
         """Zero gains of one side, with a q on either side of the hand, as a weight pulls the same
