@@ -186,7 +186,7 @@ class NoVelocity(_Fields):
 # --------------------------------------------------------------------- consistency of the state
 
 
-@wrong_hand("DEX1-FIELD-15", also=("DEX1-PATH-01", "DEX1-STILL-01"))
+@wrong_hand("DEX1-FIELD-15", also=("DEX1-FIELD-22", "DEX1-PATH-01", "DEX1-STILL-01"))
 class JumpsOnce(_Fields):
     """Has no dq, and publishes one q that is 30 % of the stroke off."""
 
