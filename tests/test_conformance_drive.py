@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.mutants.generated import parse
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.selection import length
@@ -86,6 +87,13 @@ def test_a_torque_moves_the_gripper_one_way_at_least() -> None:
 
     (result,) = judged(Clamped, "DEX1-GAIN-03")
     assert result.verdict is Verdict.PASS
+
+
+def test_noise_of_q_does_not_hide_that_a_torque_moves_a_gripper() -> None:
+    hand = parse("dex1-1/unitree_actuator:slower+noise-q-wide+predicts-100+state-late-10")
+    results = run_mutant(hand.service(), plan_for(hand.dialect.name, sides=hand.sides)).results
+    found = [r.verdict for r in results if r.requirement.id in ("DEX1-GAIN-03", "DEX1-GAIN-07")]
+    assert found == [Verdict.PASS] * 4
 
 
 def test_a_default_run_of_hands_is_short_enough() -> None:
