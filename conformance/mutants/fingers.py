@@ -164,7 +164,7 @@ class _Timed(FingerService):
             hand.changed()
 
 
-@wrong_hand("DEX3-FIELD-15", also=("DEX3-PATH-01", "DEX3-STILL-01"))
+@wrong_hand("DEX3-FIELD-15", also=("DEX3-FIELD-21", "DEX3-PATH-01", "DEX3-STILL-01"))
 class JumpsOnce(_Timed):
     """Has no dq, and publishes one pose that is half of each joint's range off."""
 
@@ -1111,7 +1111,7 @@ class _GearSquared(FingerHand):
         self.law_kd = [k / 1.75**2 if i else k for i, k in enumerate(self.law_kd)]
 
 
-@wrong_hand("DEX3-FORCE-10", also=("DEX3-FORCE-05", "DEX3-GAIN-04"), sides=BOTH)
+@wrong_hand("DEX3-FORCE-10", also=("DEX3-FORCE-05", "DEX3-GAIN-04"), sides=BOTH, whole=True)
 class GearOfTheThumb(Dex3Service):
     """Divides the gains of all joints by the square of the thumb's gear but for the thumb's own."""
 
