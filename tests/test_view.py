@@ -216,7 +216,7 @@ def test_page_asks_nobody_for_a_share_link(page: Page) -> None:
 
 def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "dexkit.view.browser_page")
+    monkeypatch.delitem(sys.modules, "dexkit.view.browser_page", raising=False)
     with pytest.raises(ExtraMissing) as error:
         import dexkit.view.browser_page  # noqa: F401
     assert "dexkit[view]" in error.value.hint
