@@ -69,17 +69,17 @@ def _members(motors: Sequence[Any]) -> Callable[[str], list[Any]]:
     return lambda name: [getattr(m, name) for m in motors]
 
 
-def _whole(values: Iterable[float], scale: float) -> list[int]:
-    """What a list of int16 has for these values; -1, which leaves a joint alone, for NaN.
+def _as_int16(values: Iterable[float], scale: float) -> list[int]:
+    """Scale, round and saturate to int16; NaN becomes -1, which leaves a joint alone.
 
     Plain numbers: there are too few joints for numpy to be quick.
     """
     scaled = [value * scale for value in values]
-    return [round(x) if -32768.0 <= x <= 32767.0 else _beyond(x) for x in scaled]
+    return [round(x) if -32768.0 <= x <= 32767.0 else _saturated(x) for x in scaled]
 
 
-def _beyond(value: float) -> int:
-    """The int16 for what is none."""
+def _saturated(value: float) -> int:
+    """The int16 of a value out of its range, or of NaN."""
     return -1 if value != value else 32767 if value > 0.0 else -32768
 
 
@@ -332,7 +332,7 @@ class MotorCodec:
         every = [f.name for f in kind.layout.fields if f.sequence]
         message = kind.cls(**{name: [0] * count for name in every})
         for member, (name, scale) in _LISTS[kind.name].items():
-            setattr(message, name, _whole(member_of(member), scale))
+            setattr(message, name, _as_int16(member_of(member), scale))
         return message
 
     def state_lists(self, motors: Any) -> bytes:
@@ -342,7 +342,7 @@ class MotorCodec:
         """
         data, numbers, places = self._blank_lists(len(motors))
         for member, (name, scale) in _LISTS[self.state.name].items():
-            numbers.pack_into(data, places[name], *_whole(motors[member].tolist(), scale))
+            numbers.pack_into(data, places[name], *_as_int16(motors[member].tolist(), scale))
         return bytes(data)
 
     def _blank_lists(self, count: int) -> tuple[bytearray, Struct, Mapping[str, int]]:

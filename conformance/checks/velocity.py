@@ -67,7 +67,7 @@ def _rows_from(t: Floats, times: Floats) -> Rows:
 
 
 @check("DEX1-FIELD-22", "DEX3-FIELD-21")
-def shown(ctx: Context) -> Outcome:
+def velocity_filled(ctx: Context) -> Outcome:
     """Whether dq of each joint that moves is ever other than 0."""
     moved = 0
     for joint in range(len(ctx.joints)):

@@ -274,7 +274,7 @@ class _Message:
         self.data, self.motors, self.packets = data, motors, packets
         self._felt: Floats | None = None
 
-    def feel(self, felt: Floats) -> None:
+    def set_pressures(self, felt: Floats) -> None:
         """Fill in the values of the packets, shape (n_sensors, 12)."""
         # those of a hand that touches nothing are one array that cannot change
         if felt is not self._felt or felt.flags.writeable:
@@ -352,7 +352,7 @@ class FingerService(Service):
             if len(mine):
                 self.fill(mine, hand)
             if self.sensors:
-                message.feel(self.pressures(hand))
+                message.set_pressures(self.pressures(hand))
         payload = bytes(message.data)
         self._sent[sides] = (key, payload)
         return payload
