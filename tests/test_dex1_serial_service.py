@@ -124,12 +124,13 @@ def test_it_goes_as_far_as_the_furthest_client_commands() -> None:
         with HandService(hand, node=node, state_rate=200.0) as service:  # type: ignore[arg-type]
             wait_until(lambda: node.sent)
             core = service.cores[side]
-            for asked in (5.5, 5.62, 100.0):
+            for asked, clamped in ((5.5, False), (5.62, True), (100.0, True)):
+                before = core.counters.clamped
 
-                def there(q: float = asked) -> bool:
+                def there(q: float = asked, before: int = before, more: bool = clamped) -> bool:
                     node.deliver(GO.topics(side)[0], message(q))
                     time.sleep(0.01)
-                    return abs(newest(node, side).q - 5.5) < 0.02
+                    counted = core.counters.clamped > before
+                    return counted is more and abs(newest(node, side).q - 5.5) < 0.02
 
                 wait_until(there)
-            assert core.counters.clamped > 0

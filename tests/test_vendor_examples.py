@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,6 +64,8 @@ def emulated(acme: ModuleType, object_at: float | None = None) -> Iterator[str]:
 
 def opened(acme: ModuleType, address: str, **settings: str) -> Hand:
     hand: Hand = acme.hand.backend.create(BackendOptions(Side.LEFT, address, settings))
+    # time-outs are not the subject, and its emulator is a thread of a busy machine
+    hand._spec = replace(hand.spec, exchange_timeout=5.0)  # type: ignore[attr-defined]
     hand.open()
     return hand
 

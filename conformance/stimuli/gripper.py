@@ -432,10 +432,12 @@ class GripperScript(HandScript):
         sides = self.plan.sides
         if "push" in self.plan.phases:
             yield from self._pushes(dict.fromkeys(sides, "push"))
-        yield from self._everyone("center", {s: (self._low(s),) for s in sides})
         pressing = [s for s in sides if s in self.plan.objects]
-        self._grip = dict(self._squeeze(pressing))
         free = [s for s in sides if s not in pressing]
+        # from elsewhere than before: a free hand that goes to a place of its own must not be there
+        starts = {s: (self._low(s) if s in pressing else self._middle(s),) for s in sides}
+        yield from self._everyone("center", starts)
+        self._grip = dict(self._squeeze(pressing))
         yield from self._drive(free, 0.16, last_hz=_SLOWEST_HZ)
         first, *rest = sides
         if rest and not self._codec.shared and "rejected" in self.plan.phases:
