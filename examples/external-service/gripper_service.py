@@ -103,11 +103,17 @@ class Gripper:
         """Move on by ``dt`` seconds, and say where it is."""
         driven = self._command is not None and now - self._since < SILENCE
         self.dq = 0.0
-        if driven and self._command is not None and self._command.kp > 0:  # no gains, no force
-            goal = min(max(self._command.q, 0.0), OPEN)
-            self.dq = min(max(30.0 * (goal - self.q), -TOP_SPEED), TOP_SPEED)
-        self.q += self.dq * dt
+        if driven and self._command is not None:
+            self.dq = min(max(self._speed(self._command), -TOP_SPEED), TOP_SPEED)
+        before, self.q = self.q, min(max(self.q + self.dq * dt, 0.0), OPEN)
+        self.dq = (self.q - before) / dt
         return MotorState(int(driven), self.q, self.dq, 0, 0, 0, 0, 0, 25, 0, [0, 0])
+
+    def _speed(self, c: MotorCmd) -> float:
+        """Speed towards q; without kp, that at which kd balances dq and tau; without both, 0."""
+        if c.kp > 0:
+            return 30.0 * (min(max(c.q, 0.0), OPEN) - self.q)
+        return c.dq + c.tau / c.kd if c.kd > 0 else 0.0
 
 
 def serve(side: str, domain: int, interface: str) -> None:
