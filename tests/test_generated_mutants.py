@@ -18,7 +18,7 @@ from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
 from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.mutants.generated.rig import Part, What, compose
 from dexkit.conformance.mutants.generated.times import WHENS
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
@@ -341,6 +341,17 @@ def documented_example() -> str:
     text = DOCUMENT.read_text(encoding="utf-8")
     (example,) = re.findall(r"<!-- example: .* -->\n```python\n(.*?)```", text, re.DOTALL)
     return str(example)
+
+
+def test_the_document_says_which_areas_a_model_has_not() -> None:
+    table = DOCUMENT.read_text().partition("| model | prefix | has not |\n")[2]
+    rows = [line.strip("| ").split(" | ") for line in table.partition("\n\n")[0].splitlines()[1:]]
+    ids = [tuple(r.id.split("-")[:2]) for r in catalogue() if r.level is not Level.INFO]
+    areas = {area for _, area in ids}
+    assert {prefix for _, prefix, _ in rows} == {prefix for prefix, _ in ids}
+    for _, prefix, absent in rows:
+        has = {area for of, area in ids if of == prefix}
+        assert set(absent.split(", ")) == areas - has, prefix
 
 
 def test_the_documented_example_is_loaded(tmp_path: Path) -> None:
