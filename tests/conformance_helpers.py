@@ -9,7 +9,7 @@ from functools import cache
 
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Result, RunResult, Verdict
+from dexkit.conformance.results import Load, Result, RunResult, Verdict
 from dexkit.conformance.stimulus_record import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
@@ -67,3 +67,9 @@ def result_of(result: RunResult, requirement: str, side: str = "left") -> Result
 
 def failed(result: RunResult) -> set[tuple[str, str]]:
     return {(r.requirement.id, r.side) for r in result.results if r.verdict is Verdict.FAIL}
+
+
+def failed_or_excused(result: RunResult) -> set[tuple[str, str]]:
+    """What failed, and what was left open because this machine was too busy."""
+    excused = [r for r in result.results if r.disturbance.load is Load.TOO_BUSY]
+    return failed(result) | {(r.requirement.id, r.side) for r in excused}
