@@ -373,13 +373,9 @@ class Faulty(Service):
                 tau = what.torque(joint, tau, dt)
         return tau
 
-    def _report(self, side: Side, joint: int, values: Report) -> None:
-        for what in self._hooked["report"][side]:
-            if what.since is not None and joint in what.joints:
-                what.report(joint, values)
-
-    def _reports(self, side: Side) -> bool:
-        return any(w.since is not None for w in self._hooked["report"][side])
+    def _reporters(self, side: Side) -> list[What]:
+        """The faults in force that change what a side reports."""
+        return [w for w in self._hooked["report"][side] if w.since is not None]
 
     def _note(self, side: Side, motors: Motors) -> None:
         track = self.tracks[side]
@@ -455,10 +451,13 @@ class _FaultyGripper(Faulty, ReferenceService):
         return abs(self.hands[side].dq) > _MOVES * self.dialect.q_open
 
     def _shape(self, side: Side, found: dict[str, float]) -> dict[str, float]:
-        if not self._reports(side):
+        reporters = self._reporters(side)
+        if not reporters:
             return found
         values = Report(found["q"], found["dq"], found["ddq"], found["tau_est"], int(found["mode"]))
-        self._report(side, 0, values)
+        for what in reporters:
+            if 0 in what.joints:
+                what.report(0, values)
         return {
             **found,
             "mode": values.mode,
@@ -536,14 +535,18 @@ class _FaultyFingers(Faulty, FingerService):
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        if not self._reports(hand.side):
+        reporters = self._reporters(hand.side)
+        if not reporters:
             return
-        for joint, row in enumerate(motors):
-            q, dq, ddq, tau = row["values"].tolist()
-            values = Report(q, dq, ddq, tau, int(row["mode"]))
-            self._report(hand.side, joint, values)
-            row["values"] = values.q, values.dq, values.ddq, values.tau
-            row["mode"] = values.mode & 0xFF
+        reported, modes = motors["values"].tolist(), motors["mode"].tolist()
+        for joint, (q, dq, ddq, tau) in enumerate(reported):
+            values = Report(q, dq, ddq, tau, modes[joint])
+            for what in reporters:
+                if joint in what.joints:
+                    what.report(joint, values)
+            reported[joint] = values.q, values.dq, values.ddq, values.tau
+            modes[joint] = values.mode & 0xFF
+        motors["values"], motors["mode"] = reported, modes
 
 
 def compose(
