@@ -16,19 +16,15 @@ import math
 import os
 import secrets
 import stat
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import tomli
+
 from dexkit.errors import DexkitError, UsageError
 from dexkit.escaping import one_line, output_error
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 __all__ = [
     "DEEPEST",
@@ -159,7 +155,7 @@ def parse_toml(
         or is nested more than :data:`DEEPEST` levels.
     """
     try:
-        document = tomllib.loads(text, parse_float=_finite)
+        document = tomli.loads(text, parse_float=_finite)
         _limit_depth(document)
     except RecursionError:
         raise error(f"{origin} is not valid TOML: {_TOO_DEEP}", hint=hint) from None
