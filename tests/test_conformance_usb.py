@@ -207,8 +207,10 @@ def test_failure_has_evidence_in_the_recording() -> None:
     (failed,) = [r for r in results if r.verdict is Verdict.FAIL]
     assert failed.requirement.id == "DEX3USB-PROT-02"
     assert 1.3 < failed.values["driven_s"] < 1.5
-    (place,) = failed.evidence
-    assert place.topic == "usb/dex3/left/in"
+    place, drive = failed.evidence
+    assert place.topic == drive.topic == "usb/dex3/left/in"
+    assert drive.end_s is not None
+    assert drive.end_s <= place.time_s
     assert place.end_s is not None
     assert 1.4 < place.end_s - place.time_s < 1.6
 

@@ -618,7 +618,10 @@ def _stops(c: UsbContext) -> Outcome:
     if driven <= c.tolerance("max_s"):
         return c.passed(figure, driven_s=driven)
     observed = f"without commands it went as far as in {figure} of driving"
-    return c.failed(figure, observed, c.over(silence), driven_s=driven).about(DRIVEN)
+    # a busy machine delays the answers that the speed is measured by
+    places = [c.over(phase) for phase in (silence, *c.hand.phases("drive"))]
+    outcome = c.failed(figure, observed, *places, driven_s=driven).about(DRIVEN)
+    return outcome.if_late(driven - c.tolerance("max_s"))
 
 
 @check("DEX3USB-PROT-03")
