@@ -351,7 +351,6 @@ def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None
         "DEX1-TOPIC-01": "pass",
         "DEX1-FIELD-02": "pass",
         "DEX1-FIELD-03": "pass",
-        "DEX1-FORCE-02": "pass",
         "DEX1-FORCE-04": "pass",
         "DEX1-FORCE-05": "not applicable",  # of the dialect unitree_hg alone
     }
