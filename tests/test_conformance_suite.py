@@ -21,7 +21,7 @@ from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements
-from dexkit.conformance.results import RunResult
+from dexkit.conformance.results import Overall, RunResult
 from dexkit.conformance.selection import length, quick
 from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
@@ -38,6 +38,9 @@ from tests.reproduction_helpers import checked
 from tests.slow_hand import SLOW
 
 ROOT = Path(__file__).parent.parent
+
+ATTEMPTS = 5
+"""Runs of a suite that a busy machine may leave inconclusive: its report says to run it again."""
 
 
 def suite(*arguments: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
@@ -351,15 +354,22 @@ def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None
         "DEX1-TOPIC-01": "pass",
         "DEX1-FIELD-02": "pass",
         "DEX1-FIELD-03": "pass",
+        "DEX1-FORCE-02": "pass",
         "DEX1-FORCE-04": "pass",
         "DEX1-FORCE-05": "not applicable",  # of the dialect unitree_hg alone
     }
     wanted = [word for name in verdicts for word in ("--require", name)]
-    run = suite(
-        "conformance/", "--backend", "ezgripper", "--side", "right", *wanted,
-        "--trace", sample_path("dex1_pick_place"), "--json", files[0], "--report", files[1],
-        "--recording", files[2], "--junitxml", files[3],
-    )  # fmt: skip
+    for _ in range(ATTEMPTS):
+        for file in files:
+            file.unlink(missing_ok=True)
+        run = suite(
+            "conformance/", "--backend", "ezgripper", "--side", "right", *wanted,
+            "--trace", sample_path("dex1_pick_place"), "--json", files[0], "--report", files[1],
+            "--recording", files[2], "--junitxml", files[3],
+        )  # fmt: skip
+        # inconclusive: the gripper's process stood still, and commands were too old for it
+        if run.returncode != Overall.INCONCLUSIVE.exit_code:
+            break
     assert run.returncode == 0, run.stdout + run.stderr
     assert "PASS: every MUST that could be judged is met" in run.stdout
     result = json.loads(files[0].read_text())

@@ -23,7 +23,7 @@ from dexkit.conformance.mutants import mutants
 from dexkit.conformance.mutants.matrix import Outcome, try_one
 from dexkit.conformance.mutants.trials import run_usb_mutant
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.results import Load, Verdict
 from dexkit.conformance.stimuli.usb import BUSES, DAMAGES
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
@@ -269,7 +269,8 @@ def test_emulated_hand_passes_and_faulty_hand_fails(hands: str, tmp_path: Path) 
     assert set(recording.sides) == set(Side)
     results = judge_layer(USB, recording, usb())
     # what a test machine may be too slow for is not judged, nor what is blocked by it
-    timed = {r.requirement.id for r in results if r.requirement.realtime}
+    timed = {r.requirement.id for r in results if r.requirement.realtime} - {"DEX3USB-PROT-02"}
+    timed |= {r.requirement.id for r in results if r.disturbance.load is Load.TOO_BUSY}
     wrong = [
         r
         for r in results

@@ -434,7 +434,7 @@ class GripperScript(HandScript):
             yield from self._pushes(dict.fromkeys(sides, "push"))
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
-        # from elsewhere than before: a free hand that goes to a place of its own must not be there
+        # a free hand is elsewhere in this silence: one that goes to a fixed position shows then
         starts = {s: (self._low(s) if s in pressing else self._middle(s),) for s in sides}
         yield from self._everyone("center", starts)
         self._grip = dict(self._squeeze(pressing))
