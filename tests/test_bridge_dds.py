@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -225,6 +227,18 @@ def test_bridge_can_be_used_from_python(dds_node: DdsNode) -> None:
             right, left = states.take()[-1].message.states
             assert (right.q, left.q) == (1.25, 0.0)
     bridge.stop()  # twice does no harm
+
+
+def test_example_of_the_document_runs(
+    dds_node: DdsNode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = Path(__file__).parents[1] / "docs" / "bridge.md"
+    (example,) = re.findall(r"(?ms)^```python\n(.*?)^```$", page.read_text(encoding="utf-8"))
+    for shown, domain in (("DdsNode(1)", dds_node.domain), ('DdsNode(0, "eth0")', free_domain())):
+        assert shown in example
+        example = example.replace(shown, f"DdsNode({domain})")
+    exec(compile(example, str(page), "exec"), {})
+    assert "'commands'" in capsys.readouterr().out
 
 
 def test_help_has_examples() -> None:

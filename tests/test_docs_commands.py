@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import re
 from pathlib import Path
 
 import click
@@ -65,3 +68,22 @@ def test_every_make_target_and_module_in_the_documents_exists() -> None:
         if command.program == "python" and command.words[0] == "-m":
             module = ROOT / command.words[1].replace(".", "/")
             assert module.is_dir() or module.with_suffix(".py").is_file(), command
+
+
+def test_what_the_examples_import_from_dexkit_exists() -> None:
+    seen, missing = 0, []
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        text = path.read_text(encoding="utf-8")
+        for block in re.finditer(r"(?ms)^```python\n(.*?)^```$", text):
+            for node in ast.walk(ast.parse(block[1])):
+                if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith(
+                    "dexkit"
+                ):
+                    continue
+                module = importlib.import_module(node.module or "")
+                for name in node.names:
+                    seen += 1
+                    if not hasattr(module, name.name):
+                        missing.append(f"{path.name}: from {node.module} import {name.name}")
+    assert seen > 20
+    assert not missing, "\n".join(missing)
