@@ -1,5 +1,5 @@
-"""The predictive estimator of the note on predictive state: its promises, and what happens at an
-obstacle.
+"""The predictive estimator (docs/sources/mx64-ezgripper.md#d8): what it guarantees, and what
+happens at an obstacle.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def test_estimate_never_jumps_overshoots_or_reverses(
 def test_estimate_without_measurements_is_the_model_of_the_source(
     start: float, command: float, speed: tuple[float, float]
 ) -> None:
-    """Phase 2 of the note on predictive state, its 200 Hz loop written out."""
+    """The loop of docs/sources/mx64-ezgripper.md#d8-1, 200 Hz, written out."""
     e = JointEstimator(JOINT, speed)
     e.measure(start, 0.0)
     e.follow(command, 0.0)
@@ -239,8 +239,8 @@ def test_turning_round_ends_a_stall() -> None:
 
 
 def test_a_speed_that_is_too_high_is_not_a_stall() -> None:
-    """The 952 %/s of the note on predictive state cannot be (docs/sources/mx64-ezgripper.md#d10-6);
-    the hand is slow, not stuck.
+    """952 %/s (docs/sources/mx64-ezgripper.md#d8-3) is impossible
+    (docs/sources/mx64-ezgripper.md#d10-6): the hand is slow, not stuck.
     """
     e = JointEstimator(JOINT, (952.43 / 100 * STROKE,) * 2)
     true, v = 0.0, 1.0 * STROKE  # 100 %/s

@@ -1,21 +1,20 @@
-"""Prediction of joint positions between the measurements of a slow link (the note on predictive
-state).
+"""Predict joint positions between the measurements of a slow link.
 
 Unitree's clients steer by the newest reported position: xr_teleoperate clips each command to
 0.18 rad from it, so a gripper that reports at 5 Hz is driven at a crawl
 (docs/sources/mx64-ezgripper.md#d7). Where the link is slower than that, the service publishes what
 a velocity-limited model predicts and lets the measurements correct the model.
 
-The note on predictive state states the model and three promises (never teleports, never overshoots,
-never reverses), and its correction step breaks the third: a measurement behind the prediction pulls
-it back. Here the two are kept apart. The *model* is the seed's: it runs to the command at the
-calibrated speed, each measurement moves it by 10 % of the difference, and a difference above
-10 % of the stroke puts it on the measurement. The *prediction* that is published follows the
-model, and these hold of it, between two resynchronisations, for one standing command:
+The model and its thresholds are those of docs/sources/mx64-ezgripper.md#d8. In that model a
+measurement behind the prediction pulls the prediction back. Here the two are kept apart. The
+*model* runs to the command at the calibrated speed, each measurement moves it by 10 % of the
+difference, and a difference above 10 % of the stroke puts it on the measurement. The *prediction*
+that is published follows the model, and these hold of it, between two resynchronisations, for one
+standing command:
 
 V  it never moves faster than the calibrated speed of the direction in which it moves;
 O  it never passes the command in the direction in which it came to it, not even when the hand
-   does (the note on predictive state: "never overshoots");
+   does (docs/sources/mx64-ezgripper.md#d8-1);
 R  travelling, it never moves away from the command: it waits until the model has caught up.
 
 A resynchronisation (difference above the threshold) is the one jump, onto what was measured:
@@ -24,7 +23,7 @@ nothing is predicted in that direction until the hand is seen to move or the com
 round, so a gripper that holds an object is not reported to creep through it.
 
 Travelling ends when the model arrives. From then on the velocity model has nothing to add, and
-the prediction follows the measurements alone, up to the command (the note on predictive state would
+the prediction follows the measurements alone, up to the command (the model of the source would
 return to the command after each correction and so report an arrival that never happened).
 """
 
@@ -41,8 +40,8 @@ from dexkit.hand import Floats, HandCommand, HandSpec, HandState, JointSpec
 
 __all__ = ["CORRECTION", "STALL_THRESHOLD", "JointEstimator", "StateEstimator"]
 
-STALL_THRESHOLD = 0.1  # of the stroke (the note on predictive state, "Thresholds")
-CORRECTION = 0.1  # of the difference, per measurement (the note on predictive state, "Thresholds")
+STALL_THRESHOLD = 0.1  # of the stroke (docs/sources/mx64-ezgripper.md#d8-2)
+CORRECTION = 0.1  # of the difference, per measurement (docs/sources/mx64-ezgripper.md#d8-2)
 _MOVING = 0.005  # of the stroke between two measurements: the hand moves, it is not stuck
 
 

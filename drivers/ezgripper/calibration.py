@@ -5,7 +5,7 @@ The zero is found by closing at reduced current until the fingers stop
 so it is accepted only if the gripper then opens by its whole stroke. An object is not detected if
 the fingers can open wider than the stroke, so the gripper must be empty.
 
-The speed is measured over the full stroke at full effort, as in the note on predictive state, but
+The speed is measured over the full stroke at full effort (docs/sources/mx64-ezgripper.md#d8-3), but
 from timed positions between 10 % and 90 %, which excludes command latency and settling
 (docs/sources/mx64-ezgripper.md#d10-6, docs/sources/mx64-ezgripper.md#d10-7).
 
@@ -315,8 +315,8 @@ def measure_distances(
 ) -> tuple[DistanceResult, DistanceResult]:
     """Time moves over several distances; return the results for opening and for closing.
 
-    The overhead is where the straight line through times over distances meets distance 0 (the
-    note on predictive state, "fixed overhead"). A move lasts from its command until the fingers
+    The overhead is where the straight line through times over distances meets distance 0
+    (docs/sources/mx64-ezgripper.md#d8-3). A move lasts from its command until the fingers
     are within a percent of the goal.
 
     :param zero: ticks, in any turn.

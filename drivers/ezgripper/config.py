@@ -1,6 +1,6 @@
 """Store the calibration of each gripper (zero, speeds, force table) in the user's JSON file.
 
-The layout is that of the note on predictive state, so a file of SAKE's driver can be used
+The layout is that of docs/sources/mx64-ezgripper.md#d8-5, so a file of SAKE's driver can be used
 unchanged, and what is written has the types that such a driver reads::
 
     {"left": "/dev/ttyUSB0", "left_serial": "DA1Z9T40",

@@ -1,8 +1,8 @@
-"""Estimate grip force from motor current with a calibrated table (the note on predictive state).
+"""Estimate grip force from motor current with a calibrated table.
 
 The table maps Present Current (absolute value, units of 3.36 mA) to grip force, by linear
 interpolation; beyond its last point it goes on with the slope of the last two. The state's
-``tau_est`` is the force divided by ten, as in the note on predictive state and the interface
+``tau_est`` is the force divided by ten (docs/sources/mx64-ezgripper.md#d8-4), as in the interface
 specification.
 
 Present Current of an MX-64 is a noisy estimate (docs/sources/mx64-ezgripper.md#d10-11), so no
@@ -21,7 +21,7 @@ from dexkit.errors import UsageError
 __all__ = ["DEFAULT_FORCE_TABLE", "TAU_PER_FORCE", "ForceTable"]
 
 TAU_PER_FORCE = 0.1
-"""tau_est of one unit of force (the note on predictive state: ``tau_est = grip_force / 10``)."""
+"""tau_est of one unit of force (docs/sources/mx64-ezgripper.md#d8-4)."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class ForceTable:
 
     @classmethod
     def from_mapping(cls, table: Mapping[str, object]) -> ForceTable:
-        """Build a table from the note's JSON form: ``{"0": 0.0, "100": 0.5, ...}``.
+        """Build a table from its JSON form (docs/sources/mx64-ezgripper.md#d8-5):
+        ``{"0": 0.0, "100": 0.5, ...}``.
 
         :raises UsageError: keys or values are not numbers, or not a valid table.
         """
@@ -68,7 +69,7 @@ class ForceTable:
         return cls(tuple(sorted(points)))
 
     def to_mapping(self) -> dict[str, float]:
-        """Return the table in the note's JSON form."""
+        """Return the table in the JSON form of :meth:`from_mapping`."""
         return {f"{current:g}": force for current, force in self.points}
 
     def covers(self, current: float) -> bool:
@@ -99,4 +100,4 @@ class ForceTable:
 DEFAULT_FORCE_TABLE = ForceTable(
     ((0.0, 0.0), (100.0, 0.5), (200.0, 1.2), (300.0, 2.0), (1023.0, 10.0))
 )
-"""The example of the note on predictive state, used for grippers without a calibrated table."""
+"""The example of docs/sources/mx64-ezgripper.md#d8-4, for grippers without a calibrated table."""
