@@ -232,7 +232,7 @@ class Campaign:
                     break  # the line that was being written when the program was stopped
                 raise UsageError(
                     f"{self.file}:{number}: no trial of generated hands",
-                    hint="give a file of an earlier campaign, or a new one",
+                    hint="give a file of an earlier trial, or a new one",
                 ) from error
             if seed != self.seed:
                 raise UsageError(
