@@ -636,9 +636,9 @@ def no_force_at_any_rest(ctx: Context) -> Outcome:
         if worst is None or size - limit > worst[0]:
             worst = (size - limit, size, limit, float(begin))
     if worst is None:
-        return ctx.skipped("the gripper never rests in the free in this recording")
+        return ctx.skipped("the gripper never rests without contact in this recording")
     beyond, size, limit, at = worst
-    text = f"tau_est of {size:.3f} N m at the worst of {count} rests in the free"
+    text = f"tau_est of {size:.3f} N m at the worst of {count} rests without contact"
     if beyond <= 0:
         return ctx.passed(f"{size:.3f} N m", text, tau_nm=size).pressed(size, limit)
     place = ctx.at(states.topic, at, at + window)

@@ -127,7 +127,7 @@ def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
             tau = float(hit.above.max())
             text = (
                 f"tau_est of {tau:.2f} N m in contact in {count} of {states} states, where at most "
-                f"{hit.limit:.2f} N m follow from the stiffness that it shows in the free"
+                f"{hit.limit:.2f} N m follow from the stiffness that it shows without contact"
             )
             place = ctx.at(ctx.states.topic, near[0].begin, near[-1].end)
             outcome = ctx.failed(f"{tau:.2f} N m", text, place, tau_nm=tau)
@@ -171,7 +171,7 @@ def presses_as_it_holds(ctx: Context) -> Outcome:
         return ctx.skipped("it never pressed on the object for long enough")
     text = (
         f"tau_est of {worst.felt:.2f} N m in contact, where {worst.bound} {worst.limit:.2f} N m "
-        "follow from the stiffness that it shows in the free"
+        "follow from the stiffness that it shows without contact"
     )
     hammers = _hammers(ctx, peaks) if worst.part <= 1.0 else None
     return hammers or worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)

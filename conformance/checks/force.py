@@ -313,7 +313,7 @@ def zero(ctx: Context) -> Outcome:
     if len(asked):
         free &= states.t < asked[0]
     if int(free.sum()) < 20:
-        return ctx.skipped("it was not in the free before the first command")
+        return ctx.skipped("it was never without contact before the first command")
     level = median(tau[free])
     text = f"tau_est of {level:.3f} N m before the first command"
     limit = ctx.tolerance("max_tau_nm")

@@ -268,7 +268,7 @@ def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
 
 @dataclass(frozen=True)
 class _Spring:
-    """What a gripper's tau_est is in the free: stiffness times the distance to q, less damping.
+    """A gripper's tau_est without contact: stiffness times the distance to q, less damping.
 
     :param stiffness: N m/rad; ``error`` is its standard error.
     :param residual: part of tau_est (RMS) that is not explained.
@@ -284,7 +284,7 @@ class _Spring:
 
 
 def _spring(ctx: Context) -> _Spring | None:
-    """The spring that moves a gripper in the free, from the age of commands that explains it best.
+    """The spring that moves a gripper without contact, by the age of commands that fits best.
 
     The strength of a grip has no sign: only states count in which it moves towards its goal.
     """
@@ -371,6 +371,6 @@ def grips_as_it_moves(ctx: Context) -> Outcome:
     text = (
         f"tau_est of {worst.felt:.2f} N m in contact, where {worst.bound} {worst.limit:.2f} N m "
         f"follow from the {stiffest if worst.over else softest:.1f} N m/{ctx.unit} with which it "
-        "moves in the free"
+        "moves without contact"
     )
     return worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)

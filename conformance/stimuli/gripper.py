@@ -8,7 +8,7 @@ approach       slowly to mid stroke
 step           large steps of one side, the others hold
 ends           fully open, and fully closed where there is no object
 grip           (first) close on the object before anything has disturbed the hand
-stiffness      a torque pushes a hand that is held by kp: in the free, before anything has
+stiffness      a torque pushes a hand that is held by kp without contact: before anything has
                disturbed it, after the bad commands and at the end
 dead-zone      where a dialect has them (``unitree_hg``): the inner limits of the zones that mean
                fully open and fully closed
@@ -31,7 +31,7 @@ load           many commands a second, and a reader that is slow
 old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 grip           close on the object, if there is one, by xr_teleoperate's lead: equal commands for
-               long, 30 a second; meanwhile the other side is held in the free, and pushed by a
+               long, 30 a second; meanwhile the other side is held without contact, and pushed by a
                torque at first and at last (nudge)
 squeeze        the same after it has opened, by half as much again
 release        zero gains at the q of the squeeze
@@ -285,7 +285,7 @@ class GripperScript(HandScript):
             yield from self._stiffness(free)
 
     def _stiffness(self, sides: Sequence[Side]) -> Steps:
-        """Push hands that are held in the free by a torque."""
+        """Push hands that are held without contact by a torque."""
         if not sides or not self._gains_used or "stiffness" not in self.plan.phases:
             return
         phase = self._begin("stiffness", sides)
@@ -562,7 +562,7 @@ class GripperScript(HandScript):
             yield from self._soft_step(sides)
 
     def _hold_long(self, pressing: Sequence[Side], free: Sequence[Side]) -> Steps:
-        """Equal commands for long: a grip by the client's lead, and a hand held in the free.
+        """Equal commands for long: a grip by the client's lead, and a hand held without contact.
 
         They come at the rate of a camera, so that one command to the wrong side would be in force
         long enough to show. A torque pushes the free hand at first and at last.
@@ -691,7 +691,7 @@ class GripperScript(HandScript):
             self._end(phase)
 
     def _soft_step(self, sides: Sequence[Side]) -> Steps:
-        """A step in the free with the least stiffness."""
+        """A step without contact with the least stiffness."""
         if not self._gains_used or "soft" not in self.plan.phases:
             return
         goals = {s: self._aside(s, _SOFT_STEP) for s in sides}
