@@ -194,7 +194,7 @@ def test_wrong_device_fails_only_its_requirements(name: str) -> None:
 
 
 def test_script_ends_early_without_answers() -> None:
-    results = run_usb_mutant(BY_NAME["Deaf"].made, usb())
+    results = run_usb_mutant(BY_NAME["NoAnswers"].made, usb())
     assert {r.verdict for r in results if r.requirement.needs != "nothing"} == {
         Verdict.FAIL,  # no answer
         Verdict.PASS,  # and no frame without a command

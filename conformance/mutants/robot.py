@@ -59,7 +59,7 @@ class OtherCommands(_OtherFamily):
 
 
 @wrong_hand("H1-TOPIC-03")
-class Twins(ReferenceRobot):
+class TwoStatePublishers(ReferenceRobot):
     """Two publishers send its state."""
 
     def endpoints(self) -> list[TraceEndpoint]:
@@ -139,14 +139,14 @@ class Slow(ReferenceRobot):
 
 
 @wrong_hand("H1-RATE-02")
-class Leisurely(ReferenceRobot):
+class StateAt333Hz(ReferenceRobot):
     """Publishes at 333 Hz."""
 
     period = 0.003
 
 
 @wrong_hand("H1-RATE-03")
-class Stumbles(ReferenceRobot):
+class StateGap(ReferenceRobot):
     """Publishes nothing for 0.2 s once."""
 
     def publish(self) -> list[Sample]:
@@ -204,7 +204,7 @@ class NoSpeed(ReferenceRobot):
 
 
 @wrong_hand("H1-FIELD-05")
-class Ghost(ReferenceRobot):
+class PositionInUnusedSlot(ReferenceRobot):
     """Publishes a position in a slot without a motor."""
 
     def message(self) -> Any:
@@ -223,7 +223,7 @@ class NoSensor(ReferenceRobot):
 
 
 @wrong_hand("H1-TEMP-02")
-class Frozen(ReferenceRobot):
+class TemperaturesZero(ReferenceRobot):
     """Publishes motor temperatures of 0."""
 
     def warmth(self) -> Any:
@@ -266,7 +266,7 @@ class NoHead(ReferenceRobot):
 
 
 @wrong_hand("H1-BMS-01")
-class Empty(ReferenceRobot):
+class BatteryChargeZero(ReferenceRobot):
     """Publishes a battery charge of 0 %."""
 
     def message(self) -> Any:
@@ -276,7 +276,7 @@ class Empty(ReferenceRobot):
 
 
 @wrong_hand("H1-FOOT-01")
-class Hangs(ReferenceRobot):
+class NegativeFootForce(ReferenceRobot):
     """Publishes a negative foot force."""
 
     def message(self) -> Any:
@@ -405,7 +405,7 @@ class NoModes(ReferenceRobot):
 
 
 @wrong_hand("H1-CRC-02")
-class TrustsAll(ReferenceRobot):
+class CommandCrcNotChecked(ReferenceRobot):
     """Does not check the CRC of commands."""
 
     def intact(self, payload: bytes) -> bool:
@@ -451,7 +451,7 @@ class Untyped(_OtherFamily):
 
 
 @wrong_hand("H1-SAFE-04")
-class Sulks(ReferenceRobot):
+class IgnoresCommandsAfterNan(ReferenceRobot):
     """Ignores commands for about 2 s after a NaN."""
 
     until = -math.inf
@@ -499,7 +499,7 @@ class Latches(ReferenceRobot):
 
 
 @wrong_hand("H1-WDOG-04")
-class Nervous(ReferenceRobot):
+class TimeoutTooShort(ReferenceRobot):
     """Times out after 0.15 s."""
 
     timeout = 0.15
@@ -509,14 +509,14 @@ class Nervous(ReferenceRobot):
 
 
 @wrong_hand("H1-LIFE-01")
-class KnowsItsReaders(ReferenceRobot):
+class NoStateForLateSubscribers(ReferenceRobot):
     """Its states reach only subscribers that were there when it started."""
 
     serves_late_readers = False
 
 
 @wrong_hand("H1-LIFE-02")
-class Loyal(ReferenceRobot):
+class ObeysFirstClientOnly(ReferenceRobot):
     """Obeys only the first client."""
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:

@@ -69,7 +69,7 @@ class SmallPackets(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-XCHG-01")
-class Deaf(ReferenceDevice):
+class NoAnswers(ReferenceDevice):
     """Answers nothing."""
 
     def answer(self) -> None:
@@ -134,7 +134,7 @@ class Slow(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-RATE-02")
-class Stumbles(ReferenceDevice):
+class LateAnswers(ReferenceDevice):
     """Needs 4 ms for every 20th answer."""
 
     count = 0
@@ -149,7 +149,7 @@ class Stumbles(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-SIZE-01")
-class Padded(ReferenceDevice):
+class AnswersPaddedTo512(ReferenceDevice):
     """Fills its answers up to whole packets of 512 bytes."""
 
     def frame(self) -> bytes:
@@ -209,7 +209,7 @@ class SensorCrc(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-PACK-01")
-class Rubbish(ReferenceDevice):
+class UndefinedTrailingBytes(ReferenceDevice):
     """Sends two undefined bytes after the packets of a bus."""
 
     def wrap(self, buses: list[bytes]) -> bytes:
@@ -388,7 +388,7 @@ class SlowTrip(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-PROT-03")
-class ForgivesItself(ReferenceDevice):
+class ClearsTripByAnyCommand(ReferenceDevice):
     """Clears the time-out on any command, once it was reported."""
 
     def __init__(self, side: Side) -> None:
@@ -408,7 +408,7 @@ class ForgivesItself(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-PROT-04")
-class NeverForgives(ReferenceDevice):
+class TripCannotBeCleared(ReferenceDevice):
     """Stays tripped without end."""
 
     def command(self, joint: int, order: Motor) -> None:
@@ -436,7 +436,7 @@ class EarlyTrip(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-BAD-01")
-class TrustsFrames(ReferenceDevice):
+class FrameCrcNotChecked(ReferenceDevice):
     """Does not check the frame's CRC."""
 
     def good_frame(self, data: bytes) -> bool:
@@ -444,7 +444,7 @@ class TrustsFrames(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-BAD-02")
-class TrustsPackets(ReferenceDevice):
+class PacketCrcNotChecked(ReferenceDevice):
     """Does not check the packets."""
 
     def good_packet(self, data: bytes) -> bool:
@@ -475,7 +475,7 @@ class CutsOff(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-BAD-05")
-class BelievesSizes(ReferenceDevice):
+class BusSizeNotChecked(ReferenceDevice):
     """Obeys a frame whose bus size is larger than its buffer."""
 
     def good_frame(self, data: bytes) -> bool:
@@ -496,7 +496,7 @@ class IdModulo(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-BAD-07")
-class Sulks(ReferenceDevice):
+class SilentAfterDamagedFrame(ReferenceDevice):
     """Answers nothing for 0.5 s after a damaged frame."""
 
     until = 0.0
@@ -523,7 +523,7 @@ class NoBroadcast(ReferenceDevice):
 
 
 @wrong_hand("DEX3USB-CONN-01")
-class OnceOnly(ReferenceDevice):
+class SilentAfterInterfaceRelease(ReferenceDevice):
     """Answers nothing after the interface was released once."""
 
     gone = False
