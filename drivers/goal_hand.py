@@ -173,7 +173,7 @@ class GoalHand(ABC):
         """
         deadline = WriteDeadline(self._clock)
         if self._channel is None:
-            raise HandLost("the hand is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the hand", hint="call open() first")
         goals = self._goals(command)
         if goals != self._written:
             self._written = None
@@ -192,7 +192,7 @@ class GoalHand(ABC):
         """Run one request; close the channel if the device has gone."""
         channel = self._channel
         if channel is None:
-            raise HandLost("the hand is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the hand", hint="call open() first")
         try:
             return request(channel)
         except HandTimeout:

@@ -149,7 +149,7 @@ class SimulatedHand:
         :raises HandLost: the hand is not open.
         """
         if not self._open:
-            raise HandLost("the simulated hand is not open")
+            raise HandLost("the simulated hand is not connected", hint="call open() first")
         now = self._clock.now()
         if now - self._last > PAUSE:
             self._mechanics.brake()

@@ -115,7 +115,7 @@ def test_driver_moves_measures_and_brakes_on_close() -> None:
             drive(hand, CLOSE, moving)
         assert motors.motor.mechanics.mode is JointMode.BRAKE
         hand.close()
-        with pytest.raises(HandLost, match="not open"):
+        with pytest.raises(HandLost, match="not connected"):
             hand.exchange(BRAKE)
 
 
@@ -504,7 +504,7 @@ def test_calibration_makes_closed_the_zero_once() -> None:
         with pytest.raises(HandRefused, match="before since power-up"):
             hand.calibrate()
         hand.close()
-        with pytest.raises(HandLost, match="not open"):
+        with pytest.raises(HandLost, match="not connected"):
             hand.calibrate()
 
 

@@ -685,7 +685,7 @@ class TestExchange:
             assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
 
     def test_not_open(self) -> None:
-        with pytest.raises(HandLost, match="not open"):
+        with pytest.raises(HandLost, match="not connected"):
             Dex3Usb(Side.LEFT).exchange(GO)
 
 

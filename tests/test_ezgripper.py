@@ -246,7 +246,7 @@ def test_other_devices_are_refused(tmp_path: Path) -> None:
         EZGripper("NOPE").open()
     with pytest.raises(HandNotFound, match="not a serial port"):
         EZGripper("/dev/null").open()
-    with pytest.raises(HandLost, match="not open"):
+    with pytest.raises(HandLost, match="not connected"):
         EZGripper("/dev/null").exchange(BRAKE)
     assert find_device("/dev/null").serial_number is None
 

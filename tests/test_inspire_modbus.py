@@ -157,7 +157,7 @@ def test_another_server_is_not_taken_for_a_hand(
         hand = driver(place, timeout=0.05)
         with pytest.raises(error):
             hand.open()
-        with pytest.raises(HandLost, match="not open"):
+        with pytest.raises(HandLost, match="not connected"):
             hand.exchange(HandCommand.brake(N))
 
 

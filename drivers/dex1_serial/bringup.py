@@ -177,7 +177,7 @@ class Dex1Bench:
         :raises HandLost: the port has gone away, or is not open.
         """
         if self._wire is None or not self._motors:
-            raise HandLost("the gripper is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the gripper", hint="call open() first")
         readings = {}
         # the driven one last: another that does not answer must not delay its lock
         driven = None if drive is None else int(drive.motor)

@@ -227,7 +227,7 @@ class Dex1Serial:
         deadline = WriteDeadline(self._clock)
         line = self._line
         if line is None:
-            raise HandLost("the gripper is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the gripper", hint="call open() first")
         frame = self._encode_command(command)
         data = line.exchange(frame, self.id, self.configuration.timeout, deadline)
         stamp = self._clock.now()
@@ -300,7 +300,7 @@ class Dex1Serial:
         """
         line = self._line
         if line is None:
-            raise HandLost("the gripper is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the gripper", hint="call open() first")
         frame = Calibration(self.id, position, time=int(time())).pack()
         problem = calibration_outcome(line.exchange(frame, self.id, _FLASH_TIME))
         if problem:

@@ -180,7 +180,7 @@ class Dex3Bench:
         :raises HandTimeout: no intact answer in time.
         """
         if self._found is None or self._wire is None:
-            raise HandLost("the hand is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the hand", hint="call open() first")
         packets = {(bus, number): lock(number) for bus, number in self._found.motors}
         if drive is not None:
             place = next(p for p in packets if f"{p[0]}.{p[1]}" == drive.motor)

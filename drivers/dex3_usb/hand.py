@@ -317,7 +317,7 @@ class Dex3Usb:
         deadline = WriteDeadline(self._clock)
         link = self._link
         if link is None:
-            raise HandLost("the hand is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the hand", hint="call open() first")
         if self._limits is not None:
             command = replace(command, q=np.clip(command.q, *self._limits))
         protect, tripped = self._protect, self._tripped

@@ -202,7 +202,7 @@ class UsbLink:
         :raises HandRefused, HandError: any other error of libusb.
         """
         if self._handle is None:
-            raise HandLost(f"{self.name} is not open")
+            raise HandLost(f"not connected to {self.name}", hint="call open() first")
         if self._drain_first:
             self._wait_for_late()
         if before is not None:

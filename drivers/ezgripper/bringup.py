@@ -182,7 +182,7 @@ class EZGripperBench:
         :raises HandTimeout: a servo does not answer.
         """
         if not self._servos:
-            raise HandLost("the gripper is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the gripper", hint="call open() first")
         for motor, sample in self._last.items():
             if drive is not None and motor == drive.motor:
                 current = min(round(drive.torque / _JOINT_TORQUE), CURRENT_LIMIT)

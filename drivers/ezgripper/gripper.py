@@ -415,7 +415,7 @@ class EZGripper:
         deadline = WriteDeadline(self._clock)
         command = self.adapt_command(command)
         if not self._units or self._units[-1].last is None:
-            raise HandLost("the gripper is not open", hint="call open() first")
+            raise HandLost("the driver is not connected to the gripper", hint="call open() first")
         if self._restart.active:
             self._restart.step()
         try:
