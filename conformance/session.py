@@ -174,8 +174,8 @@ class SuiteOptions:
         for pct in by_side.values():
             if not low <= pct <= high:
                 raise UsageError(
-                    f"an object at {pct:g} % of {of_what}",
-                    hint=f"{low} to {high} % leaves room to move",
+                    f"--object {pct:g}: the object must be at {low} to {high} % of {of_what}",
+                    hint="elsewhere the hand has no room to move on one of its sides",
                 )
         started = backend in SIMULATED or emulator_of(backend) is not None
         if not objects and started and not devices:

@@ -150,7 +150,7 @@ class SerialLine(ABC):
         self.counters.failures += 1
         if self.failure is None:
             self.failure = error
-            log.error("the emulated device failed on %r (said once)", message, exc_info=error)
+            log.error("the emulated device failed on %r (logged once)", message, exc_info=error)
 
     def _send(self, begin: float, data: bytes, rate: int) -> None:
         """Send ``data`` from a device, its first bit at ``begin``; a fault may alter it."""

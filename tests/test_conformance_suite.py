@@ -184,7 +184,7 @@ def test_contradictory_options_are_refused() -> None:
         SuiteOptions.make(backend="ezgripper", side="both", devices=["left=/dev/ttyUSB0"])
     with pytest.raises(UsageError, match="not under test"):
         SuiteOptions.make(backend="external", side="left", objects=["right=30"])
-    with pytest.raises(UsageError, match="at 80 % of opening"):
+    with pytest.raises(UsageError, match="at 5 to 60 % of opening"):
         SuiteOptions.make(backend="external", objects=["80"])
     with pytest.raises(UsageError, match="not a number"):
         SuiteOptions.make(backend="external", objects=["soft"])

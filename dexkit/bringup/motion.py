@@ -145,7 +145,11 @@ class Mover:
             self._silent += 1
             self._running = False
             if self._silent >= _SILENT:
-                raise HandFault(f"motor {self.go.motor} does not answer any more")
+                raise HandFault(
+                    f"motor {self.go.motor} no longer answers",
+                    hint="check its cable and its supply; then run the same command again: it "
+                    "goes on where it was",
+                )
             return None
         self._silent = 0
         self.q = q = reading.q
@@ -186,7 +190,11 @@ class Mover:
                 "direction than the manual's, and dexkit must not drive it",
             )
         if (q - self._carrot) * towards > _RUNAWAY:
-            raise HandFault(f"motor {self.go.motor} runs ahead of its command")
+            raise HandFault(
+                f"motor {self.go.motor} is {abs(q - self._carrot):.2f} rad ahead of its command",
+                hint="does something pull the joint? If not, the motor obeys neither the speed nor "
+                "the torque that it is given, and dexkit must not drive it",
+            )
         for address, before in self._resting.items():
             now = snapshot.motors.get(address)
             if address != self.go.motor and now and abs(now.q - before.q) > _OTHERS:

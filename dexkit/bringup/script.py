@@ -182,7 +182,11 @@ def _travel(plan: Plan, joint: JointChoice, motor: str, findings: Findings) -> _
             target = start + direction * sign * far
             end, ends[direction] = yield Go(motor, target, f"{key}: {seen}, to its stop")
             if end is not End.STALLED and (joint.most_travel is None or not last):
-                raise HandFault(f"{key} reached no stop", hint=f"is it the right {plan.part}?")
+                raise HandFault(
+                    f"{key} turned further than its joint can, and met no stop",
+                    hint=f"is the motor coupled to its joint, and is this the {plan.part} that the "
+                    "command names? Then run the same command again",
+                )
             if end is not End.STALLED:
                 ends[direction] = ends[joint.first] + direction * sign * (stops[1] - stops[0])
         free = yield Question(
@@ -237,10 +241,12 @@ def _ratio(plan: Plan, joint: JointChoice, stops: tuple[float, float], travel: f
     if len(fitting) == 1:
         return fitting[0]
     found = ", ".join(
-        f"{math.degrees(stroke + more):.0f}° with {r:g}" for r, more in beyond.items()
+        f"{math.degrees(stroke + more):.0f}° with a gear ratio of {r:g}"
+        for r, more in beyond.items()
     )
     raise HandFault(
-        f"{joint.name} travels {found} turns a turn; the model says {math.degrees(stroke):.0f}°",
+        f"no gear ratio fits {joint.name}: its travel is {found}; by the model it is "
+        f"{math.degrees(stroke):.0f}°",
         hint="did something stop it on its way, or was it another joint? Run the same command "
         "again, or begin anew with --restart",
     )

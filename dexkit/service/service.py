@@ -453,7 +453,7 @@ class HandService:
         """Log the remarks about a command, each kind only once."""
         if kind not in self._logged:
             self._logged.add(kind)
-            log.warning("%s: a command was odd (counted, logged once): %s", self.cmd_topic, text)
+            log.warning("%s: unusual command (counted, logged once): %s", self.cmd_topic, text)
 
     def _log_stale(self, sent: float) -> None:
         age = self._clock.now() - sent
@@ -546,7 +546,11 @@ class HandService:
         unit.core.opened(unit.hand.spec, speeds)
         unit.watch.restart()
         if unit.core.predicting and speeds is None:
-            log.warning("%s: the speed of the hand is not known; predictions will jump", unit.side)
+            log.warning(
+                "%s: the backend has no joint_speeds, so predicted positions jump to the measured "
+                "ones (docs/backends.md)",
+                unit.side,
+            )
         try:
             unit.core.measured(unit.hand.exchange(unit.core.next_command()))
         except Exception as error:

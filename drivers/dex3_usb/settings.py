@@ -341,8 +341,14 @@ def _parse_location(options: BackendOptions) -> dict[str, object]:
     if device is not None and "://" in device:
         other, number = parse_server(device)
         if server not in (None, other) or usb == "system":
-            raise UsageError(f"--device {device} and usb={usb} name different places")
+            raise UsageError(
+                f"--device {device} and usb={usb} name different places",
+                hint="say once where the hand is",
+            )
         server, device = other, number
     if serial is not None and device not in (None, serial):
-        raise UsageError(f"serial number {device} or {serial}?")
+        raise UsageError(
+            f"--device {device} and usb={usb} name different serial numbers",
+            hint="give the serial number once",
+        )
     return {"serial": device or serial, "server": server, "local": usb != "system"}

@@ -143,7 +143,11 @@ def _check(sample: Sample) -> None:
             hint="let it cool down, free the fingers, and try again",
         )
     if not sample.torque:
-        raise CalibrationFailed("the servo's torque went off during calibration")
+        raise CalibrationFailed(
+            "the servo switched its torque off during calibration",
+            hint="does another program use the servo, or did its supply drop out? See to it, and "
+            "try again",
+        )
     if sample.watchdog == mx64.WATCHDOG_TRIPPED:
         # it stands where it was stopped, which must not be taken for an end of the stroke
         raise CalibrationFailed(
@@ -194,7 +198,9 @@ def move(
                 return Track(tuple(samples), stopped=False)
             if sample.time - samples[0].time > timeout:
                 raise CalibrationFailed(
-                    f"the fingers have been moving for {timeout:g} s without coming to a stop"
+                    f"the fingers neither stopped nor reached the goal within {timeout:g} s",
+                    hint="does the servo turn without moving the fingers, or do they creep? Check "
+                    "tendons and supply, and try again",
                 )
     except BaseException:
         # limp after any failure; if this write fails, too, the bus watchdog stops the motor
@@ -400,7 +406,10 @@ def _measure_run(
     low, high = 0.1 * stroke, 0.9 * stroke
     elapsed = _crossing_time(points, high) - _crossing_time(points, low)
     if elapsed <= 0:
-        raise CalibrationFailed("too few samples to measure a speed", hint="see the latency timer")
+        raise CalibrationFailed(
+            "too few samples to measure a speed",
+            hint="set the adapter's latency timer to 1 ms (docs/ezgripper.md)",
+        )
     return 100 * (high - low) / stroke / elapsed
 
 
@@ -408,7 +417,10 @@ def _crossing_time(points: list[tuple[float, int]], level: float) -> float:
     for (t0, p0), (t1, p1) in pairwise(points):
         if p0 < level <= p1:
             return t0 + (t1 - t0) * (level - p0) / (p1 - p0)
-    raise CalibrationFailed(f"the stroke did not pass {level / TICKS_PER_PERCENT:.0f} %")
+    raise CalibrationFailed(
+        f"the fingers stopped before {level / TICKS_PER_PERCENT:.0f} % of their stroke",
+        hint="free the fingers and try again",
+    )
 
 
 def measure_current(

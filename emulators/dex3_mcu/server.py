@@ -306,7 +306,7 @@ class Server:
         except Exception as error:  # an error on one client's message must not stop the server
             if self.failure is None:
                 self.failure = error
-                log.error("the emulated device failed (said once)", exc_info=error)
+                log.error("the emulated device failed (logged once)", exc_info=error)
             connection.close_soon()
         self._flush(connection)
 

@@ -93,8 +93,8 @@ class FrameTimes:
     def __str__(self) -> str:
         return (
             f"{self.rate:.2f} frames a second; correlation {self.correlation:.4f}, elsewhere "
-            f"{self.elsewhere:.4f}; {100 * self.matched:.0f} % of the actions are on the wire as "
-            f"they stand; confidence {self.confidence:.2f}"
+            f"{self.elsewhere:.4f}; {100 * self.matched:.0f} % of the actions are recorded as "
+            f"commands; confidence {self.confidence:.2f}"
         )
 
 
@@ -134,7 +134,8 @@ def find_times(session: Session, wire: Sequence[Stream]) -> FrameTimes:
     if poor or found.confidence < LEAST_CONFIDENCE:
         raise SessionError(
             f"the episode was not found in the recording with certainty: {found}; actions and "
-            f"commands differ by {apart:.2f} of their motion"
+            f"commands differ by {apart:.2f} of their motion",
+            hint="was the recording made of these hands, and while this episode was?",
         )
     return found
 

@@ -112,7 +112,10 @@ def one_side(sides: Sequence[Side]) -> Side:
     :raises UsageError: both sides are given.
     """
     if len(sides) != 1:
-        raise UsageError("a line has one hand", hint="run one emulator for each side")
+        raise UsageError(
+            "this emulator has one hand on its line; --side is left or right",
+            hint="run one emulator for each side",
+        )
     return sides[0]
 
 
