@@ -55,7 +55,7 @@ help: ## this list
 
 setup: $(STAMP) ## create the environment (PYTHON_VERSION=3.12 for another Python, DDS=no without DDS)
 
-demo: $(STAMP) ## two emulated EZGrippers prove themselves as Dex1 drop-ins; writes demo-out/report.html
+demo: $(STAMP) ## the conformance suite on two emulated EZGrippers; writes demo-out/report.html
 	@$(RUN) dexkit demo --out demo-out
 
 # Otherwise each worker rewrites the assertions of every test module.
@@ -70,17 +70,17 @@ test: $(STAMP) $(COLLECTED) ## the tests, six workers for two cores (ARGS="-k na
 soak: $(STAMP) ## the long tests
 	$(RUN) pytest -m soak $(ARGS)
 
-campaign: $(STAMP) ## tries to break it: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record FRESH=1 (docs/campaign.md)
+campaign: $(STAMP) ## fuzz and fault campaign: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record FRESH=1 (docs/campaign.md)
 	$(RUN) python -m tools.campaign $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED)) \
 		$(if $(JOBS),--jobs $(JOBS)) $(if $(ONLY),--only $(ONLY)) $(if $(FRESH),--fresh) $(ARGS)
 
-campaign-sample: $(STAMP) ## two minutes of it, all cases in miniature
+campaign-sample: $(STAMP) ## a short form of each case of the campaign, two minutes
 	$(RUN) python -m tools.campaign --sample $(if $(JOBS),--jobs $(JOBS)) $(ARGS)
 
 platforms: $(STAMP) ## each Python from 3.10 to 3.13: DDS, conformance, both directions with the 0.10.2 wheel
 	$(RUN) python -m tools.platforms $(ARGS)
 
-aarch64: $(STAMP) ## dexkit on an emulated aarch64 processor (qemu-user), heard and moved by a client on x86-64
+aarch64: $(STAMP) ## dexkit on an emulated aarch64 processor (qemu-user), driven over DDS by a client on x86-64
 	$(RUN) python -m tools.aarch64 $(ARGS)
 
 lab: $(STAMP) ## a real kernel in QEMU with the emulated devices plugged in (ARGS="--only dex3"; docs/lab.md)

@@ -21,8 +21,20 @@ __all__ = ["command"]
 @click.command("cut")
 @click.argument("file", type=FILE)
 @click.argument("out", type=FILE)
-@click.option("--from", "begin", type=Number(), metavar="S", help="From S seconds after the start.")
-@click.option("--to", "end", type=Number(), metavar="S", help="To S seconds after the start.")
+@click.option(
+    "--from",
+    "begin",
+    type=Number(),
+    metavar="S",
+    help="Cut from S seconds after the start of the recording.",
+)
+@click.option(
+    "--to",
+    "end",
+    type=Number(),
+    metavar="S",
+    help="Cut to S seconds after the start of the recording.",
+)
 @click.option(
     "--phase",
     "phases",

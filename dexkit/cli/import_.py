@@ -28,7 +28,7 @@ __all__ = ["command"]
     "--wire",
     type=FILE,
     metavar="FILE",
-    help="A recording made while the episodes were: it gives their frames true times.",
+    help="A recording (.mcap) of the same session; the frames get the times of its messages.",
 )
 @click.option("--embed-pictures", is_flag=True, help="Put single pictures into the recording.")
 @overwrite_option("existing recordings")

@@ -38,7 +38,8 @@ __all__ = ["command"]
     "episodes",
     type=FILE,
     metavar="DIR",
-    help="Where xr_teleoperate writes its episodes meanwhile: each gets the times of the wire.",
+    help="Directory in which xr_teleoperate writes episodes meanwhile; their frames get the times "
+    "of the recorded messages.",
 )
 @click.option(
     "--compression",

@@ -95,7 +95,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     default=0.5,
     show_default=True,
     metavar="RAD/S",
-    help="Speed of the way to the first pose.",
+    help="Joint speed of the motion to the first pose.",
 )
 @click.option(
     "--gains",
@@ -156,7 +156,8 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     "--max-distance",
     type=Number(min=0, min_open=True),
     metavar="RAD",
-    help="Stop if a joint is further from its command ...  [default: a quarter of its stroke]",
+    help="Stop if a joint is further than RAD from its command for the time of --distance-time.  "
+    "[default: a quarter of its stroke]",
 )
 @click.option(
     "--distance-time",
@@ -164,7 +165,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     default=1.0,
     show_default=True,
     metavar="S",
-    help="... for longer than this.",
+    help="Time for which a joint may be further from its command than --max-distance.",
 )
 @click.option(
     "--max-silence",
@@ -172,7 +173,7 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     default=PAUSE,
     show_default=True,
     metavar="S",
-    help="Stop if a hand publishes no state for longer.",
+    help="Stop if a hand publishes no state for S seconds.",
 )
 @click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
 @session_options()

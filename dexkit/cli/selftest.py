@@ -70,7 +70,8 @@ whose client asks for all of it, are tried at it."""
     default=0.18,
     show_default=True,
     metavar="Q",
-    help="A command is never further ahead of its joint, so a motor gives at most kp times this.",
+    help="Largest distance of a command from its joint's position, which limits the torque to kp "
+    "times Q.",
 )
 @click.option(
     "--touch/--no-touch",

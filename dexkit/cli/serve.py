@@ -88,8 +88,8 @@ _LONELY = 10.0  # seconds without a client before a hint
     type=Number(0, 100),
     default=0.0,
     metavar="NM",
-    help="tau_est of a joint whose prediction has met something, where less is measured: the only "
-    "sense of touch of a hand that reports positions alone.  [default: as measured]",
+    help="Least tau_est of a joint whose prediction has stopped at an object; for hands that "
+    "measure no current.  [default: as measured]",
 )
 @click.option(
     "--fill",

@@ -72,13 +72,14 @@ _MS = 1e3
     "--release",
     "release_name",
     type=click.Choice([str(r) for r in Release]),
-    help="Of xr_teleoperate, for a Dex1-1.  [default: 1.4; 1.1 for unitree_actuator]",
+    help="Release of xr_teleoperate whose Dex1-1 client is imitated.  "
+    "[default: 1.4; 1.1 for unitree_actuator]",
 )
 @click.option(
     "--sim",
     "simulated",
     is_flag=True,
-    help="As xr_teleoperate --sim: a Dex1-1's commands are not clipped.",
+    help="Do not clip the commands of a Dex1-1, as xr_teleoperate --sim.",
 )
 @click.option(
     "--record",
