@@ -47,7 +47,7 @@ class MotorCmd_:
     DDS type ``unitree_go::msg::dds_::MotorCmd_``.
     """
 
-    mode: int = 0  # gripper: 0 brake, 1 FOC; body: 1 or 10 by motor
+    mode: int = 0  # gripper: 0 brake, 1 FOC; robot: 1 or 10 by motor
     q: float = 0.0  # rad
     dq: float = 0.0  # rad/s
     tau: float = 0.0  # N m
@@ -141,7 +141,7 @@ class BmsState_:
 
 @dataclass(slots=True)
 class LowCmd_:
-    """Command of a body: all motors at once.
+    """Command of a robot: all motors at once.
 
     DDS type ``unitree_go::msg::dds_::LowCmd_``.
     """
@@ -164,7 +164,7 @@ class LowCmd_:
 
 @dataclass(slots=True)
 class LowState_:
-    """State of a body.
+    """State of a robot.
 
     DDS type ``unitree_go::msg::dds_::LowState_``.
     """

@@ -131,7 +131,7 @@ class HandState_:
 
 @dataclass(slots=True)
 class LowCmd_:
-    """Command of a body: all motors at once.
+    """Command of a robot: all motors at once.
 
     DDS type ``unitree_hg::msg::dds_::LowCmd_``.
     """
@@ -145,7 +145,7 @@ class LowCmd_:
 
 @dataclass(slots=True)
 class LowState_:
-    """State of a body.
+    """State of a robot.
 
     DDS type ``unitree_hg::msg::dds_::LowState_``.
     """
