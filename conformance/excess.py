@@ -89,7 +89,7 @@ class Course:
         return self._integrals[1]
 
     def bound(self, lengths: Sequence[float]) -> float:
-        """What the excess of no window of these lengths, seconds, is above; infinite if unknown."""
+        """Upper bound of the excess in windows of these lengths, seconds; infinite if unknown."""
         return max(float(self._bounds(s).max()) for s in lengths) if self._blocks else np.inf
 
     def _bounds(self, seconds: float) -> Floats:
@@ -170,7 +170,7 @@ class Course:
 
 
 class _Blocks:
-    """Blocks of rows, and between what bounds their numbers lie."""
+    """Blocks of rows, each with lower and upper bounds of its values."""
 
     def __init__(self, course: Course, size: int, lag: float, part: float) -> None:
         self._size, self._t = size, course.t
@@ -210,7 +210,7 @@ class _Blocks:
         self._slack = rounding * (1 + largest + abs(float(path[-1])))
 
     def bounds(self, seconds: float) -> Floats:
-        """What the excess of no window is above that begins in a block, for each block."""
+        """For each block, an upper bound of the excess in windows that begin in it."""
         most = self._count - 1
         ahead = self._begins + seconds
         # the last block that begins until then, in which, or behind which, the first window ends

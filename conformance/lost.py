@@ -1,4 +1,4 @@
-"""What lateness adds up to in an interval: of the kit's timer, or of a hand's processes."""
+"""Sum up lateness in an interval: of the kit's timer, or of a hand's processes."""
 
 from __future__ import annotations
 

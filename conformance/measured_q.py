@@ -57,7 +57,7 @@ _FEW = 40
 
 
 class Finding(str, Enum):
-    """What an observation says."""
+    """Result of an observation."""
 
     SHOWS = "shows it"
     NO_SIGN = "no sign"
@@ -122,7 +122,7 @@ class MeasuredQ:
 
     @property
     def confidence(self) -> Confidence:
-        """From the observations: an object stops q, which no command tells, counts most."""
+        """Confidence from the observations; q that stops at an object counts most."""
         if any(o.finding is Finding.CONTRADICTS for o in self.observations):
             return Confidence.CONTRADICTED
         shown = [o.name for o in self.observations if o.finding is Finding.SHOWS]

@@ -576,7 +576,7 @@ def _acquire_domain(number: int, interface: str) -> None:
 
 
 def _filter_interfaces(number: int, interface: str, before: dict[int, int]) -> DomainSockets | None:
-    """Accept only packets that arrive on ``interface``. The domain is deaf when this is called.
+    """Accept only packets that arrive on ``interface``; call it while the domain receives nothing.
 
     :returns: None when the user allows all interfaces.
     :raises DdsSetupError: the system has no such filter.
@@ -1226,7 +1226,7 @@ class DdsNode:
 
     @contextlib.contextmanager
     def _whatever_it_says(self) -> Iterator[None]:
-        """One announcement that cannot be read costs itself, not those that came with it."""
+        """Skip an announcement that cannot be decoded, and keep those received with it."""
         try:
             yield
         except Exception:

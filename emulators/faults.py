@@ -302,7 +302,7 @@ def _parse(text: str, family: FaultFamily) -> Fault:
 
 
 class FaultSchedule:
-    """Tells which faults begin and end as time passes.
+    """Determines which faults begin and end as time passes.
 
     :param faults: to come, their times counted from ``start``.
     :param start: seconds on the caller's clock.

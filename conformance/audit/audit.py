@@ -1,4 +1,4 @@
-"""An audit from its locations to its tables and its page."""
+"""Run an audit: find the files, judge them, write the tables and the summary page."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def tag_of(about: dict[str, Any]) -> str:
 
 
 class Object:
-    """An object, as it is now.
+    """An object behind a URL, with its size and version when it was opened.
 
     :ivar size: bytes; 0 if the storage does not say.
     :ivar ranges: whether a part of it can be asked for.

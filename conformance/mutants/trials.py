@@ -112,7 +112,7 @@ def _blamed(results: Sequence[Result]) -> set[str]:
 
 
 class TopicTrial(ABC):
-    """On DDS topics."""
+    """Trial of a wrong hand on DDS topics."""
 
     @abstractmethod
     def cost(self, mutant: Mutant) -> float:
@@ -192,7 +192,7 @@ class UsbTrial:
 
 
 class ClientTrial:
-    """In a session with good hands."""
+    """Trial of a wrong client in a session with good hands."""
 
     def cost(self, mutant: Mutant) -> float:
         """Roughly how long a run takes, in units of the shortest on DDS."""

@@ -361,7 +361,7 @@ class Procedure:
         return lag if late <= _GAP * period else None
 
     def _speeds(self, j: int) -> Turns[None]:
-        """To and fro, faster each time while it keeps up and stops where it should."""
+        """Move back and forth, faster each time, while the joint follows and stops at its goal."""
         bench, joint = self.bench, self.found.joints[j]
         slow = float(bench.slow[j])
         reached = {"speed+": math.nan, "speed-": math.nan}

@@ -133,7 +133,7 @@ class ElementResult:
 
     @property
     def faulty(self) -> bool:
-        """Whether it lacks."""
+        """Whether the element does not answer, or has no value."""
         return self.touch in (Touch.DEAD, Touch.NO_VALUE)
 
     @property

@@ -52,7 +52,7 @@ def operator_of(phase: Phase, dialect: Dialect) -> Operator:
 
 
 def operate(script: HandScript) -> Steps:
-    """The phase."""
+    """Play the phase ``operator``: Unitree's client in a closed loop with the hand."""
     plan = script.plan
     if not plan.dialect.has_client:
         return  # no client of Unitree's speaks it, and none of the requirements applies

@@ -102,7 +102,7 @@ class Join:
 
 @dataclass(frozen=True)
 class Leave:
-    """It leaves."""
+    """The participant that joined leaves the domain."""
 
     role: Role = Role.MONITOR
 
@@ -119,7 +119,7 @@ class StopService:
 
 @dataclass(frozen=True)
 class StartService:
-    """Start them again."""
+    """Start the hands' services again."""
 
 
 Action = Send | Join | Leave | Restart | StopService | StartService

@@ -72,7 +72,7 @@ class ReferenceClient:
         return client_for(self.dialect, self.sides)
 
     def receive(self, now: float, q: Mapping[Side, Pose]) -> None:
-        """States came."""
+        """Take the newest states."""
         self.q.update(q)
         self.client.receive(now, q)
 

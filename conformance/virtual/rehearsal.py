@@ -142,7 +142,7 @@ class _Log:
         self.command: tuple[float, ...] = (float("nan"),) * joints
 
     def note(self, now: float, seen: HandSeen, *, playing: bool) -> None:
-        """A state came."""
+        """Record a state, and the last command before it."""
         self.t.append(now)
         self.rows.append((self.command, seen.q, seen.tau))
         self.playing.append(float(playing))
@@ -212,7 +212,7 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
 
 
 def _turn(result: Rehearsal, now: float) -> None:
-    """Note the phase."""
+    """Record the replay's phase at ``now``, seconds."""
     phase = result.machine.phase
     if result.phases and result.phases[-1][0] is phase:
         result.phases[-1] = (phase, result.phases[-1][1], now)

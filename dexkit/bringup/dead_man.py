@@ -1,4 +1,4 @@
-"""Tell from the bytes of a terminal whether the space bar is held; sans-IO.
+"""Detect from a terminal's bytes whether the space bar is held; sans-IO.
 
 A terminal sends no event when a key is released: a held key repeats, and silence is the release.
 """
@@ -20,7 +20,7 @@ _SPACE = b" "
 
 
 class DeadMan:
-    """The dead-man key.
+    """Detect whether the dead-man key is held, from the times of its key presses.
 
     ``held`` is True from the fourth press of an unbroken series until :data:`RELEASE` seconds after
     the last one, until another key, or until the caller was paused.

@@ -90,6 +90,6 @@ class StatusLine:
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
     def clear(self) -> None:
-        """Take it away."""
+        """Clear the status line."""
         if self.on_terminal:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)

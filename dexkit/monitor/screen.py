@@ -165,13 +165,13 @@ def _beside(blocks: Iterable[list[Text]], cells: int) -> list[Text]:
 
 
 def hand_lines(view: SubjectView, signs: Signs, width: int) -> list[Text]:
-    """A hand: ages, who commands, faults, a line for each joint, and what its fingers feel."""
+    """A hand: ages, who commands, faults, a line for each joint, and its fingers' pressures."""
     joints = [_joint(view, i, signs, width) for i in range(len(view.joints))]
     return [*_head(view), *joints, *_touch(view)]
 
 
 def _touch(view: SubjectView) -> list[Text]:
-    """The most that each finger feels, three fingers a line."""
+    """The largest pressure of each finger, three fingers a line."""
     told = [f"{one_line(name)} {number(count, 0)}" for name, count in view.touched.items()]
     return [
         Text(f"{'' if i else 'touch':6}{'  '.join(told[i : i + 3])}", "dim")

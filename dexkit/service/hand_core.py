@@ -394,7 +394,7 @@ class HandCore:
         return stale
 
     def _observe_rate(self, now: float) -> None:
-        """Count exchanges over half a second; one hiccup must not switch the estimator on."""
+        """Count exchanges over half a second: one late answer must not switch the estimator on."""
         if self._missed or now - self._answered > self._overdue():
             self._window = (now, 0)
             return

@@ -98,7 +98,7 @@ class Plan:
 
 
 def make_plan(machine: Machine, options: Options | None = None) -> Plan:
-    """Decide.
+    """Decide what to install or build, and from what.
 
     :raises InterpreterRefused: nothing may or can be installed for this interpreter.
     :raises DdsLibraryMissing: there is no library to build against.

@@ -1,4 +1,4 @@
-"""Child processes of ``dexkit setup-dds``: all they print goes to the log, and they end with it."""
+"""Run child processes of ``dexkit setup-dds``: log their output, end them when it is stopped."""
 
 from __future__ import annotations
 

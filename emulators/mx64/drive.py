@@ -300,7 +300,10 @@ class Drive:
         self._ramped += max(-most, min(most, target - self._ramped))
 
     def step(self, profile_acceleration: int = 0) -> None:
-        """One period."""
+        """Advance by one control period (:data:`PERIOD` seconds).
+
+        :param profile_acceleration: units of the register; used in velocity mode.
+        """
         p = self.physics
         d = self.demand
         joint = self.joint

@@ -1,4 +1,4 @@
-"""The drawings: joints by index and name, how they close, where a hand feels.
+"""The drawings: joints by index and name, how they close, and the tactile elements.
 
 Places come from the layout of a profile, everything else from the models.
 """

@@ -278,7 +278,7 @@ def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> Non
 
 
 def _feel(felt: Pressure, items: Mapping[int, dict[str, Any]], name: str) -> None:
-    """Insert what a hand feels, but in gaps."""
+    """Insert the pressures of a hand, except in gaps."""
     for suffix in (f"_{STATE}", f"_{COMMAND}"):
         name = name.removesuffix(suffix)
     times = np.array(sorted(items), dtype=np.int64)

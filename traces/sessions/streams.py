@@ -89,7 +89,7 @@ class Stream:
 
     @property
     def felt(self) -> Pressure | None:
-        """What the sensors in the states feel; None without sensors."""
+        """Pressures of the sensors in the states; None without sensors."""
         if self.pressure is None:
             return None
         return Pressure(self.part, self.elements, self.times_ns, self.pressure, self.topic)
@@ -108,7 +108,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class Pressure:
-    """What the sensors of a hand feel, of its states or of its touch topic.
+    """Pressures of a hand's sensors, from its states or its touch topic.
 
     :param part: ``left_hand``, ``right_hand``.
     :param elements: a name for each column.
@@ -144,7 +144,7 @@ class Pressure:
 
 
 def pressures_of(trace: Trace, streams: Sequence[Stream]) -> list[Pressure]:
-    """What the hands of a recording feel, by part.
+    """Pressures of the hands of a recording, by part.
 
     :param streams: of the recording: the states of some hands have sensors in them.
     """

@@ -1,4 +1,4 @@
-"""Wrong and good hands by construction: a fault is what, where and when.
+"""Generate wrong and good hands: a fault has a kind, a place and conditions.
 
 A hand has a name that says all of it, so that it can be made again::
 

@@ -1,4 +1,4 @@
-"""Is a generated hand wrong? Decided by its behaviour beside the reference's, and by no check.
+"""Decide whether a generated hand is wrong by comparing it with the reference, without any check.
 
 The hand and its reference get the same commands open loop: those of a conformance run, and a long
 random stimulus. Compared is what an observer can tell: what comes over the wire, and the true
