@@ -113,7 +113,7 @@ def test_whatever_is_wrong_with_a_file_is_a_row(tmp_path: Path) -> None:
     assert (outcome.exit_code(), outcome.exit_code("fail")) == (2, 0)
 
 
-def test_exit_codes() -> None:
+def test_exit_code_follows_fail_on() -> None:
     def code(fail_on: str, **counts: int) -> int:
         return Outcome(total=2, done=2, **counts).exit_code(fail_on)
 
@@ -123,7 +123,7 @@ def test_exit_codes() -> None:
     assert [code(on, warned=1) for on in ("unusable", "warn")] == [0, 1]
 
 
-def test_tables(tmp_path: Path) -> None:
+def test_tables_have_a_row_for_each_file_and_finding(tmp_path: Path) -> None:
     small(tmp_path / "archive/day/a.mcap")
     (tmp_path / "archive/b.mcap").write_bytes(b"")
     out = tmp_path / "out"
@@ -320,7 +320,7 @@ def test_files_that_cannot_be_examined_are_tried_again(tmp_path: Path) -> None:
     assert "INCONCLUSIVE" in (tmp_path / "out/files.jsonl").read_text()
 
 
-def test_page(tmp_path: Path) -> None:
+def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
     summary = Summary()
     for day in range(1, 5):
         for name, verdict in (("good", "pass"), ("<b>bad", "fail")):
@@ -350,7 +350,9 @@ def test_page(tmp_path: Path) -> None:
     assert "8.0 h" in page
 
 
-def test_cli(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+def test_command_writes_tables_page_and_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
     monkeypatch.chdir(tmp_path)
     small(tmp_path / "archive/a.mcap")
     copied(tmp_path, "archive/b.mcap", "dex1_hand_dropout")

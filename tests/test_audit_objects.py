@@ -145,7 +145,7 @@ class Server(SimpleHTTPRequestHandler):
 
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("ranges", [True, False])
-def test_a_web_server(tmp_path: Path, ranges: bool) -> None:
+def test_audit_reads_objects_of_a_web_server(tmp_path: Path, ranges: bool) -> None:
     pytest.importorskip("aiohttp", reason="install it: .tools/bin/uv pip install aiohttp")
     for name in ("good", "gone", "refused"):
         shutil.copyfile(sample_path(SAMPLE), tmp_path / f"{name}.mcap")
@@ -179,7 +179,7 @@ def test_a_web_server(tmp_path: Path, ranges: bool) -> None:
 
 
 @pytest.mark.soak
-def test_a_bucket(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_audit_reads_objects_of_an_s3_bucket(monkeypatch: pytest.MonkeyPatch) -> None:
     """S3, as moto emulates it on the loopback interface."""
     enable = "install it: .tools/bin/uv pip install s3fs 'moto[s3,server]'"
     pytest.importorskip("s3fs", reason=enable)

@@ -479,7 +479,7 @@ class TestOneMessageIntoTwoTopics:
         wire.state(*BOTH)
         assert q_of(GO, "state", wire.state(*BOTH, q=0.0)) == {LEFT: 0.0, RIGHT: 0.0}
 
-    def test_one_side_of_both(self) -> None:
+    def test_one_side_of_a_topic_for_both_hands_is_translated(self) -> None:
         wire = Wire(GO, ACTUATOR, (RIGHT,))
         assert set(q_of(GO, "state", wire.state(*BOTH))) == {RIGHT}
         (right, left) = motors(wire.command(RIGHT, q=1.5, kp=5.0))  # does not wait

@@ -118,12 +118,12 @@ def check_wiring(seed: int, tmp_path: Path, effort: Effort) -> None:
 
 
 @pytest.mark.parametrize("seed", [3])
-def test_it_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
+def test_bringup_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
     check_wiring(seed, tmp_path, FAST)
 
 
 @each("seed", [10])
-def test_it_finds_the_motors_of_random_wirings(seed: int, tmp_path: Path) -> None:
+def test_bringup_finds_the_motors_of_random_wirings(seed: int, tmp_path: Path) -> None:
     wiring = Wiring.random(seed)
     bring = Bring(tmp_path, wiring=wiring, effort=FAST)
     findings = bring.session.findings
@@ -140,7 +140,7 @@ def test_it_finds_the_motors_of_random_wirings(seed: int, tmp_path: Path) -> Non
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(20))
-def test_it_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
+def test_bringup_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
     for seed in range(10 * part, 10 * part + 10):
         (tmp_path / str(seed)).mkdir()
         check_wiring(seed, tmp_path / str(seed), FAST)
@@ -199,7 +199,7 @@ def test_a_fault_ends_it_for_good(moving: Bring) -> None:
     assert len(moving.driven) == sent
 
 
-def test_other_events_that_end_a_bringup(moving: Bring) -> None:
+def test_motion_of_another_motor_ends_the_bringup(moving: Bring) -> None:
     active = next(i for i, mode in enumerate(moving.mcu.mechanics.mode) if mode)
     other = (active + 1) % 7
     moving.mcu.mechanics.joints[other].q += 0.3
@@ -207,7 +207,7 @@ def test_other_events_that_end_a_bringup(moving: Bring) -> None:
         moving.cycle()
 
 
-def test_heat_and_silence_end_it(tmp_path: Path) -> None:
+def test_hot_silent_or_blocked_motor_ends_the_bringup(tmp_path: Path) -> None:
     hot = Bring(tmp_path)
     hot.mcu.mechanics.heat(2, 65.0)
     with pytest.raises(HandFault, match=r"is at \d+ °C"):
@@ -238,7 +238,7 @@ def test_unseen_motion_ends_the_bringup(tmp_path: Path) -> None:
         bring.cycle()
 
 
-def test_again_repeats_a_motion(tmp_path: Path) -> None:
+def test_answer_again_repeats_the_motion(tmp_path: Path) -> None:
     bring = Bring(tmp_path)
     for _ in range(2):
         question = bring.until_question()
@@ -264,7 +264,7 @@ def test_a_torque_is_never_exceeded(moving: Bring) -> None:
 # ------------------------------------------------------------------------------ resuming, files
 
 
-def test_it_resumes_where_it_was(tmp_path: Path) -> None:
+def test_bringup_resumes_where_it_was(tmp_path: Path) -> None:
     bring = Bring(tmp_path, wiring=Wiring.random(2))
     answered = 0
     while answered < 5:

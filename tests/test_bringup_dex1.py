@@ -95,13 +95,13 @@ def check_wiring(seed: int, tmp: Path) -> None:
 
 
 @each("seed", [1, 2])
-def test_it_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
+def test_bringup_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
     check_wiring(seed, tmp_path)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(10))
-def test_it_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
+def test_bringup_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
     for seed in range(20 * part, 20 * part + 20):
         (tmp_path / str(seed)).mkdir()
         check_wiring(seed, tmp_path / str(seed))
@@ -164,7 +164,7 @@ def test_the_other_sides_gripper_alone_is_named(tmp_path: Path) -> None:
         bring.run()
 
 
-def test_it_resumes_where_it_was(tmp_path: Path) -> None:
+def test_bringup_resumes_where_it_was(tmp_path: Path) -> None:
     line, bring = watched(tmp_path, Wiring.random(4))
     for _ in range(2):
         question = bring.until_question()

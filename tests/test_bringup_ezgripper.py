@@ -121,13 +121,13 @@ def check_wiring(seed: int, tmp: Path) -> None:
 
 
 @each("seed", [0])
-def test_it_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
+def test_bringup_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
     check_wiring(seed, tmp_path)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(10))
-def test_it_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
+def test_bringup_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
     for seed in range(20 * part, 20 * part + 20):
         (tmp_path / str(seed)).mkdir()
         check_wiring(seed, tmp_path / str(seed))

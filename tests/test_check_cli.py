@@ -79,7 +79,7 @@ def test_check_without_a_verdict_does_not_pass(capsys: pytest.CaptureFixture[str
     assert "nothing was judged, which is not a pass" in capsys.readouterr().err
 
 
-def test_selection(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_judges_only_the_selected_requirements(capsys: pytest.CaptureFixture[str]) -> None:
     assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--level", "must") == 0
     out = capsys.readouterr().out
     assert "DEX1-RATE-01" in out
@@ -101,7 +101,9 @@ def test_the_selection_is_listed_without_a_recording(capsys: pytest.CaptureFixtu
     assert "which recording is to be judged" in capsys.readouterr().err
 
 
-def test_claims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_applies_the_claims_of_a_vendor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     claims, out = tmp_path / "capabilities.toml", tmp_path / "r.json"
     claims.write_text('[hand]\nname = "X"\n[claims]\nvelocity = true\n')
     junit = tmp_path / "r.xml"

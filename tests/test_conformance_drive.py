@@ -63,7 +63,7 @@ class Servo(ReferenceService):
     hand = _Strong
 
 
-def test_one_sign_of_force_is_asked_for_and_not_which() -> None:
+def test_tau_est_may_have_either_sign_but_only_one() -> None:
     ids = ("DEX1-FORCE-08", "DEX1-FORCE-01")
     for service in (ReferenceService, Turned, InContact):
         assert {r.verdict for r in judged(service, *ids)} == {Verdict.PASS}, service
@@ -72,12 +72,12 @@ def test_one_sign_of_force_is_asked_for_and_not_which() -> None:
     assert turned.figure == "two signs"
 
 
-def test_a_stiffer_servo_is_no_weaker_than_commanded() -> None:
+def test_stiffer_servo_passes_the_check_of_grip_strength() -> None:
     (strength,) = judged(Servo, "DEX1-FORCE-09")
     assert strength.verdict is Verdict.PASS
 
 
-def test_a_torque_moves_the_gripper_one_way_at_least() -> None:
+def test_torque_that_only_opens_passes_the_check_of_torque_commands() -> None:
     class _Clamped(ReferenceHand):
         def accept(self, motor: Any) -> Any:
             return replace(super().accept(motor), tau=max(motor.tau, 0.0))

@@ -278,7 +278,7 @@ def test_worst_verdict_of_judged_sides_counts() -> None:
     assert worst([]) is Verdict.NOT_APPLICABLE
 
 
-def test_sides() -> None:
+def test_sides_are_parsed_or_refused() -> None:
     assert sides_of("both") == (Side.LEFT, Side.RIGHT)
     assert sides_of("right") == (Side.RIGHT,)
     with pytest.raises(UsageError, match="no side"):

@@ -164,7 +164,7 @@ def test_length_of_stimulus_equals_length_of_run() -> None:
     assert length("dex1-1", plan.phases) == pytest.approx(recording.duration, rel=0.3)
 
 
-def test_defaults() -> None:
+def test_suite_options_have_their_defaults() -> None:
     options = SuiteOptions.make(backend="ezgripper")
     assert options.sides == (Side.LEFT, Side.RIGHT)
     assert options.domain is None

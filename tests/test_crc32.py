@@ -43,7 +43,7 @@ def bitwise(data: bytes) -> int:
 
 
 @each(("data", "crc"), VECTORS)
-def test_vectors(data: bytes, crc: int) -> None:
+def test_crc_equals_documented_values(data: bytes, crc: int) -> None:
     assert crc32_words(data) == crc
     assert bitwise(data) == crc
 
@@ -60,7 +60,7 @@ def test_agrees_with_the_bitwise_one(data: bytes) -> None:
 
 @settings(deadline=None)
 @given(words)
-def test_swapped_words(data: bytes) -> None:
+def test_crc_of_swapped_words_is_the_same(data: bytes) -> None:
     swapped = b"".join(data[i : i + 4][::-1] for i in range(0, len(data), 4))
     assert crc32_swapped(swapped) == crc32_words(data)
 

@@ -58,7 +58,7 @@ def test_a_writer_keeps_its_one_instance(dds_node: DdsNode) -> None:
     assert handle > 0
 
 
-def test_depth_and_order(dds_node: DdsNode) -> None:
+def test_reader_keeps_as_many_samples_as_its_depth_in_order(dds_node: DdsNode) -> None:
     deep = dds_node.reader("rt/t2", STATES, depth=1000)
     shallow = dds_node.reader("rt/t2", STATES)
     writer = dds_node.writer("rt/t2", STATES)

@@ -116,7 +116,7 @@ def test_two_hands_on_one_line_in_one_process(tmp_path: Path) -> None:
                 hand.exchange(HandCommand.brake(1))
 
 
-def test_it_goes_as_far_as_the_furthest_client_commands() -> None:
+def test_commands_are_clamped_at_the_widest_clients_limit() -> None:
     node = FakeNode()
     side = Side.LEFT
     with Dex1Motors() as motors:

@@ -130,7 +130,7 @@ class TestSettings:
     def options(self, device: str | None = None, **settings: str) -> BackendOptions:
         return BackendOptions(Side.LEFT, device, settings)
 
-    def test_the_defaults(self) -> None:
+    def test_settings_have_their_defaults(self) -> None:
         assert from_options(self.options()) == Dex3Settings(config=default_path())
 
     def test_all_settings_are_read(self) -> None:
@@ -248,7 +248,7 @@ class TestSettings:
 
 
 class TestDiscovery:
-    def test_by_side(self) -> None:
+    def test_hand_is_found_by_side(self) -> None:
         left, right = RawDevice(FakeHand()), RawDevice(FakeHand(Side.RIGHT), side=Side.RIGHT)
         other = RawDevice(FakeHand(), vendor=0x1209)
         with serving(other, right, left) as server:
@@ -259,7 +259,7 @@ class TestDiscovery:
             with hand:
                 assert right.attachments == 1
 
-    def test_by_serial_number(self) -> None:
+    def test_hand_is_found_by_serial_number(self) -> None:
         hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2", None)]
         with serving(*hands) as server, hand_on(server, serial="A2") as hand:
             assert hand.serial == "A2"
@@ -300,7 +300,9 @@ class TestDiscovery:
             Dex3Usb(Side.LEFT, Dex3Settings(server=discovery.LOCAL_SERVER)).open()
         assert "dexkit emulate dex3-usb" in caught.value.hint
 
-    def test_no_libusb(self, no_usb: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_libusb_is_reported_with_a_hint(
+        self, no_usb: None, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: None)
         for local in (True, False):
             with pytest.raises(HandNotFound, match="libusb is not installed") as caught:
@@ -431,7 +433,9 @@ class TestOpening:
             UsbLink(fake, "device", "it")
 
     @pytest.mark.parametrize("call", ["open_device", "claim_interface", "detach_kernel_driver"])
-    def test_no_permission(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_missing_permission_is_refused_with_a_hint(
+        self, call: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fake = FakeBackend(FakeHand())
         fake.kernel_driver = True
         fake.fail[call] = usb_error(errno.EACCES)
@@ -450,7 +454,9 @@ class TestOpening:
         with pytest.raises(HandRefused, match="no permission"):
             Dex3Usb(Side.LEFT, Dex3Settings(serial="SN1")).open()
 
-    def test_busy(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_interface_that_another_program_claims_is_refused(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fake = FakeBackend(FakeHand())
         fake.fail["claim_interface"] = usb_error(errno.EBUSY)
         with pytest.raises(HandRefused, match="another program holds") as caught:
@@ -459,7 +465,7 @@ class TestOpening:
         assert "lsof" in caught.value.hint
         assert "bulk_write" not in fake.calls
 
-    def test_busy_over_usbip(self) -> None:
+    def test_hand_that_another_client_has_imported_is_refused(self) -> None:
         device = RawDevice(FakeHand())
         with (
             serving(device) as server,
@@ -684,7 +690,7 @@ class TestExchange:
             state = hand.exchange(GO)
             assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
 
-    def test_not_open(self) -> None:
+    def test_exchange_before_open_is_refused(self) -> None:
         with pytest.raises(HandLost, match="not connected"):
             Dex3Usb(Side.LEFT).exchange(GO)
 
@@ -704,7 +710,9 @@ class TestLateAnswers:
     """An answer belongs to the command that it follows, however late it comes."""
 
     @each("late", [0.105, 0.115, 0.15, 0.3])
-    def test_over_usbip(self, late: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_late_answer_over_usbip_is_dropped(
+        self, late: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         # how long the driver looks out for it: a machine that stalls may exceed half a second
         monkeypatch.setattr("dexkit.drivers.dex3_usb.link._LATE_ANSWER_WATCH", PATIENCE)
         fake = LateHand()
@@ -743,7 +751,7 @@ class TestLateAnswers:
             assert hand.statistics.link.late == 0
             assert hand.statistics.link.timeouts == 1
 
-    def test_on_libusb(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_late_answer_on_libusb_is_dropped(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         with fake_hand(fake, monkeypatch) as hand:
             hand.exchange(GO)
@@ -906,7 +914,7 @@ class TestTroubleOnTheWay:
         assert "could not brake" in caplog.text
         assert expected in caplog.text
 
-    def test_closing_a_hand_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_unplugged_hand_can_be_closed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         hand = fake_hand(fake, monkeypatch)
         hand.open()

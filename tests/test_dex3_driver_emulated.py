@@ -272,7 +272,7 @@ def message(q: np.ndarray) -> bytes:  # type: ignore[type-arg]
 
 
 class TestService:
-    def test_unplugged_in_mid_motion(self) -> None:
+    def test_hand_unplugged_in_motion_comes_back_without_motion(self) -> None:
         """Publishing goes on with the fault visible; back within a second; nothing stale moves."""
         node = FakeNode()
         with emulated_dex3() as emulated:

@@ -90,7 +90,9 @@ def numbers(value: Any) -> Iterator[float]:
             yield from numbers(getattr(value, name))
 
 
-def test_unplugged_in_mid_motion(dds_domain: int, dds_node: DdsNode) -> None:
+def test_served_hand_unplugged_in_motion_comes_back_without_motion(
+    dds_domain: int, dds_node: DdsNode
+) -> None:
     """The state goes on and shows the fault; no stale command moves the hand on its return."""
     client = Client(dds_node)
     with (

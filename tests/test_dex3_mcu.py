@@ -344,7 +344,7 @@ def test_lock_status_brakes_and_foc_status_drives() -> None:
 
 
 @each("status", [2, 5, 6, 7])
-def test_other_statuses(status: int) -> None:
+def test_undefined_status_brakes_or_is_ignored(status: int) -> None:
     bench = Bench()
     bench.ask(bench.frame(bench.rest))
     assert bench.ask(single(0, packet(0, status=status))).mode[0] == 0
@@ -487,7 +487,7 @@ def test_motors_that_were_not_addressed_may_be_silent() -> None:
 # --- faults
 
 
-def test_dropped_answers() -> None:
+def test_command_is_obeyed_although_its_answer_is_dropped() -> None:
     bench = Bench(faults=["drop@1s:for=1s"])
     assert bench.mcu.exchange(empty()) is not None
     bench.clock.advance(1.5)

@@ -355,7 +355,7 @@ def test_a_stalled_motor_warms_up_and_cools_down() -> None:
     assert not mechanics.fans
 
 
-def test_supply_current() -> None:
+def test_supply_current_follows_the_motors() -> None:
     mechanics = Dex3Mechanics(Side.LEFT, supply_v=58.0)
     live(mechanics, 0.1)
     assert mechanics.current == pytest.approx(0.2)  # the manual's static current

@@ -52,12 +52,12 @@ def test_sizes_and_offsets() -> None:
     assert d.COMMAND_734.structure.offsets["crc"] == 730
 
 
-def test_identity() -> None:
+def test_usb_ids_are_those_of_the_manual() -> None:
     assert (d.VENDOR_ID, d.PRODUCT_ID) == (0x34B7, {Side.LEFT: 0x1010, Side.RIGHT: 0x1011})
     assert d.PRODUCT[Side.LEFT] == "Dexthree LeftHand"
 
 
-def test_covered_words() -> None:
+def test_crc_covers_the_words_that_the_manual_names() -> None:
     assert [
         (s.covered[1] - s.covered[0]) // 4
         for s in (
@@ -123,7 +123,7 @@ def test_packets_measured_on_the_sibling(packet: Any, expected: str) -> None:
         ),
     ],
 )
-def test_the_worked_example(layout: d.CommandLayout, crc: int, digest: str) -> None:
+def test_frame_equals_the_worked_example(layout: d.CommandLayout, crc: int, digest: str) -> None:
     data = worked_example(layout)
     assert len(data) == layout.size
     assert int.from_bytes(data[-4:], "little") == crc
@@ -196,7 +196,7 @@ def test_every_flipped_bit_is_noticed(packet: Any) -> None:
 
 
 @each("packet", [MOTOR, SENSOR, d.MotorCmd(3, 1, True, 1, 2, 3, 4, 5)])
-def test_wrong_lengths(packet: Any) -> None:
+def test_packet_of_another_length_is_refused(packet: Any) -> None:
     data = packet.pack()
     for length in range(len(data)):
         with pytest.raises(TruncatedError, match=f"got {length}"):
@@ -219,7 +219,7 @@ def test_wrong_lengths(packet: Any) -> None:
         (dataclasses.replace(SENSOR, pressure=(0,) * 11 + (65536,)), r"pressure\[11\] = 65536"),
     ],
 )
-def test_values_that_do_not_fit(packet: Any, what: str) -> None:
+def test_value_that_does_not_fit_its_field_is_refused(packet: Any, what: str) -> None:
     with pytest.raises(EncodeError, match=what):
         packet.pack()
 
@@ -232,7 +232,7 @@ def test_wrong_header_is_reported() -> None:
 # --- bus buffers
 
 
-def test_any_order() -> None:
+def test_packets_of_a_bus_are_read_in_any_order() -> None:
     other = dataclasses.replace(MOTOR, id=1)
     found, problems = d.parse_bus(SENSOR.pack() + MOTOR.pack() + SENSOR.pack() + other.pack())
     assert found == [SENSOR, MOTOR, SENSOR, other]

@@ -340,7 +340,7 @@ def test_a_decoded_state_is_a_whole_hand_state() -> None:
         decoded.stamp = 2.0  # type: ignore[misc]
 
 
-def test_a_tripped_motor() -> None:
+def test_tripped_motor_has_its_timeout_bit() -> None:
     codec = d.HandCodec(JOINTS)
     tripped = np.zeros(7, np.uint32)
     tripped[2] = MotorError.MOTOR_SAW_HOST_TIMEOUT

@@ -157,7 +157,7 @@ def test_an_unknown_request_stalls_the_control_pipe(both: Dex3Process) -> None:
         exchange(device)
 
 
-def test_an_endpoint_that_is_not_there(both: Dex3Process) -> None:
+def test_transfer_to_a_missing_endpoint_is_an_error(both: Dex3Process) -> None:
     with host(both.port) as computer:
         computer.find()
         connection = next(iter(computer.backend._conns.values()))
@@ -445,7 +445,7 @@ def test_unlinks_of_transfers_that_never_come_are_limited() -> None:
             exchange(computer.find())
 
 
-def test_an_exchange_in_one_message() -> None:
+def test_read_and_write_sent_together_are_both_answered() -> None:
     with emulated_dex3() as hands, imported(inside(hands).port) as sock:
         submit(sock, 1, IN, 1, b"")  # a read that waits is answered by the write behind it
         submit(sock, 2, OUT, 2, brake())

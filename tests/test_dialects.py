@@ -235,13 +235,13 @@ class TestHgState:
         known = mapping.state({LEFT: view(temperature=41.0, voltage=11.1)}).motor_state[0]
         assert (known.temperature, known.vol) == ((41, 41), 11.1)
 
-    def test_faults(self) -> None:
+    def test_state_holds_faults_and_missed_exchanges(self) -> None:
         message = one("unitree_hg").state({LEFT: view(fault=0x80000020, missed=3, measured=False)})
         assert tuple(message.error) == (0x80000020, 3)
         assert message.motor_state[0].motorstate == 0x80000020
         assert tuple(message.motor_state[0].reserve) == (1, 0, 0, 0)
 
-    def test_the_rest_of_the_hand(self) -> None:
+    def test_state_holds_pressure_attitude_and_supply(self) -> None:
         pressure = np.full((2, 12), 0.5)
         message = one("unitree_hg").state(
             {

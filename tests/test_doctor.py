@@ -440,7 +440,7 @@ def service() -> Iterator[int]:
         process.terminate()
 
 
-def test_the_command_line(service: int) -> None:
+def test_doctor_prints_its_verdict_and_sets_the_exit_code(service: int) -> None:
     base = ["doctor", "--domain", str(service), "--scan", "none", "--seconds", "1"]
     good = CliRunner().invoke(cli, base, standalone_mode=False)
     assert good.return_value == 0, good.output

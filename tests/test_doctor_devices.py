@@ -102,7 +102,7 @@ def test_no_port_and_no_serial_port(tmp_path: Path) -> None:
     assert _ids(doctor_devices.inspect_port(str(tmp_path / "file"))) == {"SERIAL-NOT-A-PORT"}
 
 
-def test_the_latency_timer(tmp_path: Path) -> None:
+def test_latency_timer_of_a_port_is_read(tmp_path: Path) -> None:
     with _line(1_000_000) as path:
         folder = tmp_path / "bus/usb-serial/devices" / Path(path).resolve().name
         folder.mkdir(parents=True)
@@ -120,7 +120,7 @@ def _usb(*devices: UsbDevice) -> set[str]:
     return {f.id for f in found if f.id.startswith("USB")}
 
 
-def test_a_hand_in_sysfs(tmp_path: Path) -> None:
+def test_hand_is_found_in_sysfs(tmp_path: Path) -> None:
     folder = tmp_path / "sys/bus/usb/devices/1-4"
     (tmp_path / "sys/bus/usb/drivers/cdc_acm").mkdir(parents=True)
     folder.mkdir(parents=True)
@@ -146,7 +146,7 @@ def test_a_hand_in_sysfs(tmp_path: Path) -> None:
     assert _usb() == {"USB-MISSING"}
 
 
-def test_a_usbip_server() -> None:
+def test_hands_of_a_usbip_server_are_found() -> None:
     with emulated_dex3([Side.LEFT], serials=["S1"]) as hands:
         (hand,) = doctor_devices.on_server(hands.url)
         assert (hand.side, hand.serial) == ("left", "S1")

@@ -40,7 +40,7 @@ def _only(packet: bytes, kind: type) -> Data:
         (packets.CYCLONE_11_PARTICIPANT, "11.0.1"),
     ],
 )
-def test_a_captured_participant(packet: bytes, version: str) -> None:
+def test_captured_participant_announcement_is_parsed(packet: bytes, version: str) -> None:
     found = rtps.parse_participant(_only(packet, Data).payload)
     assert rtps.vendor_name(found.vendor) == "CycloneDDS"
     assert found.version == version
@@ -52,7 +52,7 @@ def test_a_captured_participant(packet: bytes, version: str) -> None:
     assert found.multicast
 
 
-def test_a_captured_writer() -> None:
+def test_captured_writer_announcement_is_parsed() -> None:
     item = _only(packets.CYCLONE_0_10_PUBLICATION, Data)
     assert item.writer == rtps.SEDP_PUBLICATIONS
     found = rtps.parse_endpoint(item.payload, writer=True)

@@ -332,7 +332,7 @@ def test_every_diagnosis_has_a_test() -> None:
 
 
 @each("name", list(CASES))
-def test_a_diagnosis(name: str) -> None:
+def test_each_case_gets_its_diagnosis(name: str) -> None:
     # what concerns devices only: that no hand is on DDS is another matter
     found = [f for f in diagnose(CASES[name]) if f.id == name]
     assert found, _ids(CASES[name])
@@ -360,7 +360,7 @@ def test_healthy_observation_has_no_finding() -> None:
         *("NET-LO-MULTICAST", "NET-INTERFACE", "DDS-OTHER-STACK"),
     ],
 )
-def test_a_client_waits(name: str) -> None:
+def test_client_is_reported_to_wait_where_state_is_missing(name: str) -> None:
     states = readiness(CASES[name])
     assert states
     assert not any(s.ready for s in states if s.dialect in ("unitree_go", "dex3"))

@@ -338,12 +338,12 @@ def test_bad_crc_is_reported_only_when_asked() -> None:
         (A + "03 00 01 19 4F", ChecksumError),
     ],
 )
-def test_decode_errors(wire: str, error: type[Exception]) -> None:
+def test_invalid_bytes_raise_the_right_error(wire: str, error: type[Exception]) -> None:
     with pytest.raises(error):
         dxl.decode(h(wire))
 
 
-def test_encode_errors() -> None:
+def test_invalid_packets_cannot_be_encoded() -> None:
     with pytest.raises(EncodeError):
         dxl.encode(253, Instruction.PING)
     with pytest.raises(EncodeError):

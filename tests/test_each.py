@@ -44,7 +44,7 @@ def test_each_leaves_fixtures_and_instances_to_pytest(tmp_path: Path) -> None:
 
 @each("letter", ["a", "b"])
 @each("number, more", [(1, "x"), (2, "y")])
-def test_each_can_be_stacked(letter: str, number: int, more: str, tmp_path: Path) -> None:
+def test_decorator_each_can_be_stacked(letter: str, number: int, more: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     (tmp_path / f"{letter}{number}{more}").touch()
 

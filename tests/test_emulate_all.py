@@ -178,7 +178,7 @@ class TestArguments:
         assert result.exit_code == 2
         assert "need hands" in result.output
 
-    def test_it_is_listed_with_the_robots(self) -> None:
+    def test_emulate_all_is_listed_with_the_robots(self) -> None:
         listed = CliRunner().invoke(emulate, ["--help"]).output
         for name in ("all", "g1", "h1"):
             assert f"  {name} " in listed

@@ -207,7 +207,9 @@ def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
         (["--latency-timer", "-1"], 2, "-1"),
     ],
 )
-def test_wrong_usage(tmp_path: Path, arguments: list[str], code: int, expected: str) -> None:
+def test_wrong_options_of_mx64_are_refused(
+    tmp_path: Path, arguments: list[str], code: int, expected: str
+) -> None:
     if arguments:
         arguments = ["--link", str(tmp_path / "g"), *arguments]
     found, _, err = run_command(["emulate", "mx64", *arguments])

@@ -45,7 +45,7 @@ def test_documented_example_of_folded_position() -> None:
     assert scaling.relative_position(1414, 3010) == 2500
 
 
-def test_joint_and_ticks() -> None:
+def test_joint_angles_convert_to_ticks_and_back() -> None:
     assert scaling.ticks_of_joint(0.0) == 0
     assert scaling.ticks_of_joint(5.4) == 2500
     assert scaling.ticks_of_joint(2.7) == 1250
@@ -69,7 +69,7 @@ def test_profile_velocity_is_never_zero() -> None:
 # --- force
 
 
-def test_default_table_is_that_of_seed_003() -> None:
+def test_default_force_table_equals_sakes() -> None:
     assert DEFAULT_FORCE_TABLE.force(0) == 0
     assert DEFAULT_FORCE_TABLE.force(100) == 0.5
     assert DEFAULT_FORCE_TABLE.force(-150) == pytest.approx(0.85)
@@ -617,7 +617,7 @@ def test_calibration_store_keeps_unknown_keys(tmp_path: Path) -> None:
     assert there == [".file.json.lock", "file.json"], "no temporary file stays"
 
 
-def test_a_file_of_seed_003_reads(tmp_path: Path) -> None:
+def test_calibration_file_of_sakes_driver_is_read(tmp_path: Path) -> None:
     path = tmp_path / "ezgripper_device_config.json"
     path.write_text(
         '{"left": "/dev/ttyUSB0", "left_serial": "DA1Z9T40", "calibration": {"DA1Z9T40": 3010},'

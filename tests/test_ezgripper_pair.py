@@ -241,7 +241,9 @@ def test_exchanged_ids_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak  # a pause of the machine ends it, as it must: the servo's bus watchdog
-def test_both_are_calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_servos_of_a_pair_are_calibrated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(
         "dexkit.cli.calibrate.GripperSettings", partial(GripperSettings, timeout=0.2)
     )

@@ -321,7 +321,7 @@ def test_a_quick_run_judges_only_its_requirements() -> None:
         (["--from", "there-is-none.py"], "no such file"),
     ],
 )
-def test_options_that_make_no_sense_are_errors(arguments: list[str], why: str) -> None:
+def test_contradicting_options_are_errors(arguments: list[str], why: str) -> None:
     with pytest.raises(UsageError, match=why):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 

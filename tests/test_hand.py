@@ -100,13 +100,13 @@ class TestCommand:
         c = HandCommand.position([1.0, 2.0, 3.0], kp=7.0)
         assert list(c.kp) == [7.0, 7.0, 7.0]
 
-    def test_brake(self) -> None:
+    def test_brake_command_has_no_gains(self) -> None:
         c = HandCommand.brake(3)
         assert c.is_brake
         assert not c.kp.any()
         assert CommandGate(DEX1_1.spec(Side.LEFT, io_rate=1.0)).admit(HandCommand.brake(1)).is_brake
 
-    def test_same_as(self) -> None:
+    def test_commands_with_different_gains_are_not_the_same(self) -> None:
         assert HandCommand.position(1.0).same_as(HandCommand.position(1.0))
         assert not HandCommand.position(1.0).same_as(HandCommand.position(1.0, kd=0.1))
 
@@ -136,7 +136,7 @@ class TestSpec:
             {"closing": 2},
         ],
     )
-    def test_joints_that_make_no_sense(self, fields: dict[str, float]) -> None:
+    def test_invalid_joint_limits_are_refused(self, fields: dict[str, float]) -> None:
         good = {"q_min": 0.0, "q_max": 1.0, "dq_max": 1.0, "tau_max": 1.0}
         with pytest.raises(UsageError, match="joint x"):
             JointSpec("x", **{**good, **fields})  # type: ignore[arg-type]
@@ -150,7 +150,7 @@ class TestSpec:
         with pytest.raises(UsageError, match="at least one joint"):
             HandSpec(model="x", side=Side.LEFT, joints=(), io_rate=1.0)
 
-    def test_limits_as_arrays(self) -> None:
+    def test_spec_gives_limits_as_arrays(self) -> None:
         assert list(THREE.q_min) == [-1.0, 0.0, -3.0]
         assert list(THREE.q_max) == [1.0, 2.0, -1.0]
         assert (THREE.n_joints, THREE.joints[1].stroke) == (3, 2.0)
@@ -179,7 +179,7 @@ class TestModels:
              ("unitree_go::msg::dds_::MotorCmds_", "unitree_go::msg::dds_::MotorStates_")),
         ],
     )  # fmt: skip
-    def test_dialects(
+    def test_dialect_has_its_topics_and_types(
         self, name: str, side: Side, topics: tuple[str, str], types: tuple[str, str]
     ) -> None:
         d = dialect(name)

@@ -218,7 +218,7 @@ def test_a_process_id_is_a_number_or_none(text: str) -> None:
     assert 0 <= process_id(text) <= 1 << 22
 
 
-def test_process_ids() -> None:
+def test_process_id_of_a_peer_is_a_number_or_0() -> None:
     assert [process_id(t) for t in ("1234", "4194304", "4194305", "²", "٣", "-1", "", " 1")] == [
         1234,
         4194304,

@@ -54,7 +54,7 @@ RADIANS = re.compile(r"\brad\b|\bradians\b|N m\b|_rad\b")
 # --------------------------------------------------------------------------------------- the model
 
 
-def test_one_is_open_and_the_right_hand_comes_first() -> None:
+def test_inspire_q_is_1_when_open_and_right_motors_come_first() -> None:
     for side in Side:
         joints = INSPIRE_DFX.joints[side]
         names = ["pinky", "ring", "middle", "index", "thumb_bend", "thumb_rotation"]
@@ -68,7 +68,7 @@ def test_one_is_open_and_the_right_hand_comes_first() -> None:
     assert not dialect("unitree_actuator").commands_both  # a motor without gains is limp
 
 
-def test_one_topic_is_of_both_sides() -> None:
+def test_inspire_topic_carries_both_hands() -> None:
     (state,) = roles("rt/inspire/state")
     assert (state.kind, state.dialect.name, set(state.sides)) == ("state", "inspire_dfx", set(Side))
 

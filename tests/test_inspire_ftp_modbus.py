@@ -165,7 +165,7 @@ def test_a_hand_without_tactile_areas_feels_nothing() -> None:
             assert hand.exchange(HandCommand.brake(N)).pressure is None
 
 
-def test_settings() -> None:
+def test_backend_inspire_ftp_modbus_reads_its_settings() -> None:
     assert backend("inspire-ftp-modbus") is inspire_ftp_modbus.backend
     assert inspire_ftp_modbus.backend.emulator is not None
     assert "--tactile" in inspire_ftp_modbus.backend.emulator.arguments

@@ -245,7 +245,7 @@ def test_driver_speaks_to_pymodbus_server() -> None:
     ]
 
 
-def test_settings() -> None:
+def test_backend_inspire_modbus_reads_its_settings() -> None:
     assert backend("inspire-modbus") is inspire_modbus.backend
     options = BackendOptions(Side.LEFT, "10.0.0.2:7000", {"id": "255", "speed": "500"})
     made = inspire_modbus.backend.make(options)

@@ -286,7 +286,7 @@ def test_a_port_that_goes_away_is_reported_and_found_again(emulated: Rh56Hand) -
         hand.exchange(HandCommand.brake(N))
 
 
-def test_hands_that_are_not_there() -> None:
+def test_missing_hand_is_reported() -> None:
     with pytest.raises(HandNotFound, match="no serial port is given"):
         InspireSerial(Side.LEFT).open()
     with Rh56Hand(Side.LEFT, number=2) as other:
@@ -296,7 +296,7 @@ def test_hands_that_are_not_there() -> None:
             assert hand.exchange(HandCommand.brake(N)).q.any()
 
 
-def test_settings() -> None:
+def test_backend_inspire_serial_reads_its_settings() -> None:
     assert backend("inspire-serial") is inspire_serial.backend
     options = BackendOptions(Side.LEFT, "/dev/x", {"id": "2", "speed": "500", "timeout": "0.1"})
     made = inspire_serial.backend.make(options)

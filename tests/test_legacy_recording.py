@@ -85,7 +85,7 @@ def verdicts() -> RunResult:
     return judge(Recording.decode(open_trace(sample_path("dex1_legacy_v1_1"))))
 
 
-def test_every_verdict() -> None:
+def test_legacy_recording_gets_its_verdicts() -> None:
     result = verdicts()
     assert result.overall is Overall.PASS
     assert set(result.stage.values()) == {"moving"}

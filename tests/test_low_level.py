@@ -86,12 +86,12 @@ VECTORS = [
 ]
 
 
-def test_which_types_carry_one() -> None:
+def test_low_level_messages_have_a_crc() -> None:
     assert [name.rsplit(":", 1)[1] for name in LOW_LEVEL_TYPES] == ["LowCmd_", "LowState_"] * 2
 
 
 @each(("message", "crc"), VECTORS)
-def test_measured_crcs(message: Any, crc: int) -> None:
+def test_crc_equals_measured_values(message: Any, crc: int) -> None:
     assert crc_of(message) == crc
     package = type(message).__module__.rsplit(".", 1)[1]
     name = f"{package}::msg::dds_::{type(message).__name__}"

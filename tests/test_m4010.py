@@ -141,7 +141,9 @@ def test_not_a_number_cannot_be_sent(name: str, value: float) -> None:
         (Calibration(0, user_id=0x10000), "user id"),
     ],
 )
-def test_values_that_do_not_fit(frame: MotorCmd | MotorData | Calibration, says: str) -> None:
+def test_value_that_does_not_fit_its_field_is_refused(
+    frame: MotorCmd | MotorData | Calibration, says: str
+) -> None:
     with pytest.raises(EncodeError, match=says):
         frame.pack()
 

@@ -87,7 +87,7 @@ def motor(
 # --- commands
 
 
-def test_it_answers_any_probe_with_what_it_measures() -> None:
+def test_motor_answers_any_probe_with_its_measurements() -> None:
     """The vendor's probe has undefined fields but for id and mode
     (docs/sources/unitree-dex.md#g).
     """
@@ -349,7 +349,7 @@ def test_any_command_keeps_it_finite_and_within_the_stops(
         ("pause:ms=30,bytes=13", lambda data, frame: data == frame[:13]),
     ],
 )
-def test_faults_of_answers(spec: str, first: object) -> None:
+def test_each_fault_alters_the_answer_as_specified(spec: str, first: object) -> None:
     """Those that put the vendor's library out of step are among them
     (docs/sources/unitree-dex.md#g).
     """
@@ -481,7 +481,7 @@ def test_hears_nothing_until_the_baud_rate_is_right(tmp_path: Path) -> None:
         assert counters.garbled == 20
 
 
-def test_a_line_each(tmp_path: Path) -> None:
+def test_each_motor_can_have_its_own_line(tmp_path: Path) -> None:
     links = {Side.LEFT: tmp_path / "l", Side.RIGHT: tmp_path / "r"}
     with Dex1Motors(tuple(Side), links=links) as motors:
         assert len(motors.ready_lines) == 2
@@ -518,7 +518,9 @@ def test_faults_from_input_and_the_end_of_it(tmp_path: Path) -> None:
         ([], "Missing option"),
     ],
 )
-def test_wrong_usage(tmp_path: Path, arguments: list[str], says: str) -> None:
+def test_wrong_options_of_dex1_motor_are_refused(
+    tmp_path: Path, arguments: list[str], says: str
+) -> None:
     result = CliRunner().invoke(
         command, ["dex1-motor", *(a.format(dir=tmp_path) for a in arguments)]
     )

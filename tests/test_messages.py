@@ -45,7 +45,7 @@ def test_the_sequence_of_motors_follows_from_the_layout() -> None:
         _ = message_type("unitree_go::msg::dds_::MotorCmd_").motor_sequence
 
 
-def test_golden_commands() -> None:
+def test_encoded_commands_equal_those_of_unitrees_sdk() -> None:
     message = go.MotorCmds_([go.MotorCmd_(mode=1, q=1.5, kp=5.0, kd=0.05)])
     assert encode(message) == GOLDEN_CMDS
     back = decode("unitree_go/msg/MotorCmds", GOLDEN_CMDS)
@@ -54,7 +54,7 @@ def test_golden_commands() -> None:
     assert back.cmds[0].reserve == (0, 0, 0)
 
 
-def test_golden_states() -> None:
+def test_encoded_states_equal_those_of_unitrees_sdk() -> None:
     message = go.MotorStates_([go.MotorState_(q=1.5, dq=0.25, tau_est=-0.5)])
     assert encode(message) == GOLDEN_STATES
     assert decode("unitree_go.msg.dds_.MotorStates_", GOLDEN_STATES) == message
@@ -78,12 +78,12 @@ def test_golden_states() -> None:
     ],
     ids=lambda v: type(v).__name__ if not isinstance(v, int) else str(v),
 )
-def test_sizes(message: object, size: int) -> None:
+def test_message_has_its_size(message: object, size: int) -> None:
     # docs/sources/unitree-dex.md#a4
     assert len(encode(message)) == size
 
 
-def test_names() -> None:
+def test_message_types_are_found_by_each_of_their_names() -> None:
     mt = message_type("unitree_hg/msg/HandState")
     assert mt.name == "unitree_hg::msg::dds_::HandState_"
     assert mt.ros_name == "unitree_hg/msg/HandState"
@@ -114,7 +114,7 @@ def test_other_representations_are_refused_by_name() -> None:
         mt.decode(b"\x00\x01")
 
 
-def test_trailing_bytes() -> None:
+def test_trailing_bytes_are_refused() -> None:
     mt = message_type("unitree_go/msg/MotorCmds")
     with pytest.raises(OversizeError):
         mt.decode(GOLDEN_CMDS + b"\0")
@@ -155,7 +155,7 @@ def test_trailing_bytes() -> None:
         (3, "is not a message"),
     ],
 )
-def test_values_that_do_not_fit(message: object, text: str) -> None:
+def test_values_that_do_not_fit_their_type_are_refused(message: object, text: str) -> None:
     with pytest.raises(EncodeError, match=text):
         encode(message)
 

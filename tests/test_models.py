@@ -126,7 +126,7 @@ class TestCommandLine:
             assert describe(name)["emulator"] == f"dexkit emulate {name}"
             assert f"  {name} " in listed
 
-    def test_indices_as_text(self) -> None:
+    def test_indices_are_shortened_to_ranges(self) -> None:
         assert indices([0, 1, 2, 5, 8, 9]) == "0 to 2, 5, 8, 9"
         assert indices([]) == ""
 

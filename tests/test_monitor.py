@@ -91,7 +91,7 @@ def test_hidden_lines_are_counted_and_can_be_scrolled_to() -> None:
 
 
 @given(width=st.integers(1, 200), height=st.integers(1, 60), scroll=st.integers(0, 100))
-def test_any_size_is_filled(width: int, height: int, scroll: int) -> None:
+def test_screen_of_any_size_is_filled(width: int, height: int, scroll: int) -> None:
     lines = text_of(HANDS, 0.1, width, height, scroll=scroll)
     assert len(lines) == height
     assert max(map(len, lines)) <= width
@@ -129,7 +129,7 @@ def test_ascii_where_the_terminal_has_no_more() -> None:
     assert all(line.isascii() for line in text_of(HANDS, 0.1, 80, 24, unicode=False))
 
 
-def test_a_hand_in_one_line() -> None:
+def test_hand_is_summarised_in_one_line() -> None:
     view = HANDS.picture(0.1).subjects[0]
     assert summary(view).startswith("left Dex3-1 hand: rests; state 0 ms, cmd 0 ms; q 0.00 ")
     late = HANDS.picture(9.0).subjects[0]

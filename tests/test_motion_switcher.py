@@ -50,7 +50,7 @@ def test_no_program_is_selected_at_first_and_after_a_release() -> None:
         assert ask(switcher, 1001) == none
 
 
-def test_other_requests() -> None:
+def test_motion_switcher_answers_its_other_requests() -> None:
     switcher = MotionSwitcher()
     assert ask(switcher, 1) == (0, "1.0.0.1")
     assert ask(switcher, 1005) == (0, '{"silent": false}')
@@ -73,7 +73,9 @@ def test_other_requests() -> None:
         (1004, '{"silent": "yes"}', 7001),
     ],
 )
-def test_errors(api: int, parameter: str, code: int) -> None:
+def test_motion_switcher_answers_invalid_requests_with_error_codes(
+    api: int, parameter: str, code: int
+) -> None:
     switcher = MotionSwitcher()
     assert ask(switcher, api, parameter) == (code, "")
     assert switcher.name == ""

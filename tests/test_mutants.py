@@ -110,7 +110,7 @@ def test_every_wrong_hand_has_a_summary() -> None:
         ("robot", "g1"),
     ],
 )
-def test_a_third_of_the_requirements_are_negative(layer_name: str, model: str) -> None:
+def test_third_of_the_requirements_forbid_something(layer_name: str, model: str) -> None:
     every = catalogue(model, layer_name)
     assert sum(r.negative for r in every) >= len(every) / 3
 

@@ -400,7 +400,7 @@ def test_answers_queue_on_the_line() -> None:
         ("encoder", "encoder", 0.0, None, {}, None),
     ],
 )
-def test_fault_grammar(
+def test_faults_of_the_bus_are_parsed(
     text: str,
     kind: str,
     at: float,

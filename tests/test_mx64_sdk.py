@@ -77,7 +77,7 @@ def _come(port: sdk.PortHandler, count: int) -> None:
     eventually(lambda: port.ser.in_waiting >= count)
 
 
-def test_ping(port: sdk.PortHandler) -> None:
+def test_sdk_pings_the_servo(port: sdk.PortHandler) -> None:
     assert PACKETS.ping(port, 1) == (mx64.MODEL, *OK)
 
 
@@ -113,7 +113,7 @@ def test_separate_tx_only_and_rx(port: sdk.PortHandler) -> None:
     assert 0 <= value < 8192
 
 
-def test_register_and_act(port: sdk.PortHandler) -> None:
+def test_registered_write_waits_for_action(port: sdk.PortHandler) -> None:
     assert PACKETS.regWriteTxRx(port, 1, mx64.LED.address, 1, [1]) == OK
     assert PACKETS.read1ByteTxRx(port, 1, mx64.REGISTERED_INSTRUCTION.address)[0] == 1
     assert PACKETS.action(port, 1) == sdk.COMM_SUCCESS

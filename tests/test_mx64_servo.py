@@ -145,7 +145,7 @@ def test_error_of_write_to_unused_address_is_configurable() -> None:
     ],
     ids=lambda v: v.name if isinstance(v, Item) else str(v),
 )
-def test_out_of_range(item: Item, value: int) -> None:
+def test_value_out_of_range_is_refused(item: Item, value: int) -> None:
     assert write(servo(), item, value) == ErrorNumber.DATA_RANGE
 
 
@@ -411,7 +411,7 @@ def test_clear_folds_position_only_at_rest() -> None:
 
 
 @each(("option", "servo_id", "baud"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 2_000_000)])
-def test_factory_reset(option: int, servo_id: int, baud: int) -> None:
+def test_factory_reset_keeps_what_its_option_says(option: int, servo_id: int, baud: int) -> None:
     target = servo(7, baudrate=2_000_000)
     write(target, mx64.CURRENT_LIMIT, 100)
     status = send(target, Instruction.FACTORY_RESET, bytes([option]))

@@ -35,7 +35,7 @@ def test_items_do_not_overlap_and_gaps_match_manual() -> None:
     assert gaps == expected
 
 
-def test_areas() -> None:
+def test_items_are_in_eeprom_or_ram() -> None:
     assert mx64.SHUTDOWN.area is Area.EEPROM
     assert mx64.TORQUE_ENABLE.area is Area.RAM
 
@@ -47,7 +47,7 @@ def test_initial_values_are_within_range() -> None:
         assert item.minimum <= item.initial <= item.maximum, item.name
 
 
-def test_codec() -> None:
+def test_items_encode_and_decode_signed_values() -> None:
     assert mx64.GOAL_POSITION.encode(-12000).hex() == "20d1ffff"
     assert mx64.GOAL_POSITION.decode(bytes.fromhex("20d1ffff")) == -12000
     block = bytes.fromhex("3b0000000000c20b0000")
@@ -61,7 +61,7 @@ def test_codec() -> None:
         mx64.ID.encode(256)
 
 
-def test_units() -> None:
+def test_units_match_the_data_sheet() -> None:
     duty = mx64.PWM_MAX * mx64.PWM_UNIT
     assert duty == pytest.approx(1.0, abs=1e-3)
     assert mx64.CURRENT_LIMIT.maximum is not None
@@ -72,7 +72,7 @@ def test_units() -> None:
     assert math.isclose(mx64.EZGRIPPER_STROKE * mx64.TICK, math.radians(219.7), rel_tol=1e-3)
 
 
-def test_indirect_items() -> None:
+def test_indirect_items_have_their_addresses() -> None:
     assert mx64.indirect_address(1).address == 168
     assert mx64.indirect_address(28).address == 222
     assert mx64.indirect_data(28).address == 251

@@ -85,7 +85,7 @@ def test_interface_that_is_not_there(text: str, error: type[Exception], said: st
     assert "this machine has: lo (127.0.0.1)" in raised.value.hint  # type: ignore[attr-defined]
 
 
-def test_peer_that_is_not_known() -> None:
+def test_unknown_peer_is_refused() -> None:
     with pytest.raises(DdsSetupError, match="the peer 'no such host' is not known"):
         resolve_peers(["no such host"])
 

@@ -124,7 +124,7 @@ def test_genuine_sessions_are_found_fit_to_be_played() -> None:
         assert found.plan.sides == (LEFT, RIGHT)
 
 
-def test_data_without_motion_is_named_and_cured(tmp_path: Path) -> None:
+def test_session_without_gains_is_refused_and_played_with_the_models_gains(tmp_path: Path) -> None:
     """No motion (unitree_lerobot 79): without gains, or with motors locked by their mode."""
     (tmp_path / "a").mkdir()
     limp = session(tmp_path / "a", gripper(slow_wave(), kp=0.0))
@@ -153,7 +153,7 @@ def test_data_without_motion_is_named_and_cured(tmp_path: Path) -> None:
     assert max(f.moved for f in rehearse(cured.plan).figures()[LEFT]) > 0.5
 
 
-def test_data_with_loud_motors_is_named_and_cured(tmp_path: Path) -> None:
+def test_session_with_high_gains_and_thin_rate_is_refused_and_corrected(tmp_path: Path) -> None:
     """Loud motors (unitree_lerobot 79): steps of a thin rate, made strong by high gains."""
     waves = hand_waves("dex3-1", LEFT, 90, 0.0)
     loud = session(tmp_path, fingers(waves, hz=30.0, kp=20.0))
@@ -521,7 +521,7 @@ def test_nothing_is_sent_before_a_state_and_none_that_is_no_state() -> None:
     assert machine.phase is Phase.END
 
 
-def test_each_danger_stops_it() -> None:
+def test_fault_silence_or_distance_stops_the_replay() -> None:
     def fault(drive: Drive) -> None:
         drive.seen = HandSeen((drive.q,), (0.0,), (int(MotorError.OVERCURRENT),))
 
@@ -725,7 +725,7 @@ def test_every_source_that_import_knows_is_replayed(tmp_path: Path) -> None:
     assert "http" not in text.replace("http-equiv", "")
 
 
-def test_nominal_times_are_said(tmp_path: Path) -> None:
+def test_session_with_nominal_times_is_reported(tmp_path: Path) -> None:
     made = episode(tmp_path / "e", whole(document(30, "dex3-1")))
     code, output = dexkit("replay", made, "--check", "--resample", 100)
     assert (code, "nominal-time" in output) == (0, True)

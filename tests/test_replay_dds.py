@@ -128,7 +128,7 @@ def test_a_subscriber_without_states_is_no_hand(tmp_path: Path) -> None:
     assert "--as-recorded" in output
 
 
-def test_it_gives_way_to_another_client_without_a_last_command() -> None:
+def test_replay_gives_way_to_another_client_without_a_last_command() -> None:
     hand = Watched()
     with served(hand) as domain, DdsNode(domain) as near, DdsNode(domain) as far, ExitStack() as s:
         machine = ReplayMachine(plan_of(np.full(100_000, 2.0)), Guards(stale=PATIENCE))

@@ -41,7 +41,7 @@ def as_written(data: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def test_check_gives_every_datum_of_the_runs_verdicts_again(
+def test_check_of_a_recording_repeats_the_result_of_the_run(
     recording: Path, tmp_path: Path
 ) -> None:
     # as the suite does after a run: what was asked for, not what the recording says
@@ -55,7 +55,7 @@ def test_check_gives_every_datum_of_the_runs_verdicts_again(
     assert any(m["error"] == pytest.approx(0.001234) for m in measures)
 
 
-def test_part_of_the_requirements_gets_the_verdicts_of_all(recording: Path) -> None:
+def test_selected_requirements_get_the_same_verdicts_as_in_a_whole_check(recording: Path) -> None:
     view = recording_of(open_trace(recording), None, ())
     every = {(r["id"], r["side"]): r for r in judge(view).as_dict()["results"]}
     some = [r for r in catalogue("dex1-1", "dds") if r.id.startswith("DEX1-RATE")]

@@ -51,7 +51,7 @@ def test_the_load_of_the_machine_is_read_from_the_reason() -> None:
         assert {(r.disturbance.load, r.retry) for r in others} == {(Load.NONE, False)}, name
 
 
-def test_a_body_is_a_robot() -> None:
+def test_subject_body_of_version_2_is_read_as_robot() -> None:
     result = read("robot")
     assert set(result.stage) == {"robot"}
     assert {r.side for r in result.results} == {"robot"}
@@ -67,7 +67,7 @@ def test_a_usb_result_names_its_joints_and_plots() -> None:
     assert PlotKind.ANSWERS in {plot.kind for plot in bad.plots}
 
 
-def test_it_is_reported_and_compared_and_written_as_version_3(tmp_path: Path) -> None:
+def test_result_of_version_2_is_reported_compared_and_written_as_version_3(tmp_path: Path) -> None:
     for name in NAMES:
         result = read(name)
         result.write_json(tmp_path / "now.json")

@@ -152,7 +152,7 @@ def test_nothing_is_written_after_a_pause(emulated: Revo2Hand) -> None:
         hand.close()
 
 
-def test_settings() -> None:
+def test_backend_revo2_serial_reads_its_settings() -> None:
     assert backend("revo2-serial") is revo2_serial.backend
     options = BackendOptions(Side.LEFT, "/dev/x", {"id": "2", "speed": "0.5", "timeout": "0.1"})
     made = revo2_serial.backend.make(options)

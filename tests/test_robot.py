@@ -108,7 +108,7 @@ def test_state_before_any_command(model: RobotModel) -> None:
 
 
 @both
-def test_torque_law(model: RobotModel) -> None:
+def test_joint_torque_follows_the_motors_law(model: RobotModel) -> None:
     """tau = tau_ff + kp (q_des - q) + kd (dq_des - dq), reported at the end of the step."""
     bench = Bench(model)
     slot = model.slot("left_elbow")
@@ -184,7 +184,7 @@ def test_mode_of_another_kind_of_motor() -> None:
 
 
 @both
-def test_stop_constants(model: RobotModel) -> None:
+def test_position_and_velocity_stop_constants_drop_their_terms(model: RobotModel) -> None:
     """Position and velocity terms can be left out with kp and kd set
     (docs/sources/unitree-dex.md#a8).
     """
@@ -244,7 +244,7 @@ def test_either_byte_order_and_an_unset_crc(model: RobotModel) -> None:
     assert bench.robot.command(encode_with_crc(low_cmd(model)), 0.0)
 
 
-def test_mode_machine() -> None:
+def test_command_for_another_machine_is_refused() -> None:
     order = low_cmd(G1, mode_machine=0)
     bench = Bench(G1)
     assert not bench.send(order)
@@ -296,7 +296,7 @@ def test_missing_commands_damp_the_joints(model: RobotModel) -> None:
 
 
 @both
-def test_arm_topic(model: RobotModel) -> None:
+def test_arm_topic_moves_the_arms_by_its_weight(model: RobotModel) -> None:
     """As Unitree's examples send it: no CRC, no mode bytes, a weight in a slot not used."""
     arm, leg = model.slot("left_elbow"), model.slot("left_knee")
     bench = Bench(model)
@@ -429,7 +429,7 @@ def test_long_pause_is_not_simulated(model: RobotModel) -> None:
 
 
 @both
-def test_remote(model: RobotModel) -> None:
+def test_state_holds_keys_and_sticks_of_the_remote(model: RobotModel) -> None:
     bench = Bench(model)
     bench.robot.remote = Remote.parse("A, R1,lx=0.5,ry=-1")
     sent = bytes(bench.state().wireless_remote)
@@ -449,7 +449,7 @@ def test_unknown_remote_key_is_refused(text: str) -> None:
 
 
 @given(st.sampled_from(LOW_LEVEL_TYPES), st.binary(min_size=2100, max_size=2100))
-def test_structs_and_samples(name: str, noise: bytes) -> None:
+def test_sample_converts_to_c_struct_and_back(name: str, noise: bytes) -> None:
     """To a sample and back loses nothing but what lies in the gaps."""
     size = len(struct_of_payload(name, encode(message_type(name).cls())))
     sample = payload_of_struct(name, noise[:size])

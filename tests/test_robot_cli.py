@@ -31,7 +31,7 @@ def node() -> Iterator[DdsNode]:
         yield node
 
 
-def test_process(node: DdsNode) -> None:
+def test_emulated_robot_serves_until_it_is_stopped(node: DdsNode) -> None:
     """Ready, state, commands good and bad, the remote, JSON, a clean end."""
     process = subprocess.Popen(
         [
@@ -138,13 +138,13 @@ def test_failure_is_reported(node: DdsNode, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("name", ["h1", "g1"])
-def test_help(name: str) -> None:
+def test_help_of_robots_shows_their_options(name: str) -> None:
     result = CliRunner().invoke(command, [name, "--help"])
     assert result.exit_code == 0
     assert f"dexkit emulate {name} --remote A,R1,lx=0.5" in result.output
     assert ("--mode-machine" in result.output) == (name == "g1")
 
 
-def test_bad_remote() -> None:
+def test_unknown_key_of_the_remote_is_refused() -> None:
     result = CliRunner().invoke(command, ["h1", "--remote", "Z"], standalone_mode=False)
     assert "no key 'Z'" in str(result.exception)

@@ -34,7 +34,9 @@ def positions(model: RobotModel, motors: int, by: float) -> list[float]:
     return q
 
 
-def test_h1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
+def test_unitree_sdk_moves_the_emulated_h1(
+    dds_domain: int, capfd: pytest.CaptureFixture[str]
+) -> None:
     with DdsNode(dds_domain) as node, CppSdk("h1", dds_domain) as sdk:
         with EmulatedRobot(H1, node=node) as robot:
             robot.robot.remote = Remote.parse("A,L2,lx=0.5,ry=-0.25")
@@ -87,7 +89,9 @@ def test_h1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
             )
 
 
-def test_g1(dds_domain: int, capfd: pytest.CaptureFixture[str]) -> None:
+def test_unitree_sdk_moves_the_emulated_g1(
+    dds_domain: int, capfd: pytest.CaptureFixture[str]
+) -> None:
     with (
         DdsNode(dds_domain) as node,
         CppSdk("g1", dds_domain) as sdk,

@@ -36,7 +36,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
         ("move_dex1.py", "sim-dex1", [1.8]),
     ],
 )
-def test_the_hand_gets_there(example: str, backend: str, goal: list[float]) -> None:
+def test_example_of_the_sdk_moves_the_hand(example: str, backend: str, goal: list[float]) -> None:
     domain = str(free_domain())
     serve = Tool("serve", backend, "--side", "left", "--domain", domain)
     try:

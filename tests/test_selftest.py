@@ -444,7 +444,7 @@ def test_nothing_measured_is_not_good() -> None:
 
 
 @each("hand", ["dex1", "brainco"])
-def test_the_page_tells_the_way_up_from_the_way_down(hand: str) -> None:
+def test_page_draws_opening_and_closing_sweeps_differently(hand: str) -> None:
     page = render_selftest(result_of(examined(hand, joints=[0])[0], {}))
     sweep = page.split("over its range, moved slowly", 1)[1].split("</svg>", 1)[0]
     assert sweep.count('class="state line"') == sweep.count('class="cmd line"') == 1

@@ -563,7 +563,7 @@ class TestDiagnose:
         peers = [FakeEndpoint(other, self.GO.state_type, "reader")]
         assert diagnose(peers, self.GO, [Side.LEFT]) == []
 
-    def test_the_low_rate_topic(self) -> None:
+    def test_reader_of_the_low_rate_topic_with_a_wrong_type_is_reported(self) -> None:
         topic = "rt/lf/dex3/left/state"
         peer = FakeEndpoint(topic, self.GO.state_type, "reader")
         (text,) = diagnose([peer], dialect("dex3"), [Side.LEFT])

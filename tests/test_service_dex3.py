@@ -500,7 +500,9 @@ class TestService:
         wait_until(lambda: len(node.sent) > 5)
         assert any(m.q != 0.0 for m in newest(node).motor_state)  # xr_teleoperate waits for it
 
-    def test_the_low_rate_copy(self, node: FakeNode, service: HandService) -> None:
+    def test_low_rate_topic_has_every_fiftieth_state(
+        self, node: FakeNode, service: HandService
+    ) -> None:
         wait_until(lambda: service.counters.published >= 200)
         topics = [t for t, _ in node.sent]
         last = len(topics) - topics[::-1].index(LOW)

@@ -51,7 +51,9 @@ def until(sdk: SdkClient, topic: str, arrived: Callable[[Any], bool], timeout: f
 
 
 @pytest.mark.parametrize("side", list(Side))
-def test_unitree_go(sdk: SdkClient, dds_domain: int, side: Side) -> None:
+def test_unitree_sdk_moves_a_hand_in_unitree_go(
+    sdk: SdkClient, dds_domain: int, side: Side
+) -> None:
     d = dialect("unitree_go")
     cmd, state = d.topics(side)
     with HandService(SimHand(side), domain=dds_domain):
@@ -66,7 +68,7 @@ def test_unitree_go(sdk: SdkClient, dds_domain: int, side: Side) -> None:
         until(sdk, state, lambda m: m.states[0].mode == 0)  # silence: it brakes
 
 
-def test_unitree_hg(sdk: SdkClient, dds_domain: int) -> None:
+def test_unitree_sdk_moves_a_hand_in_unitree_hg(sdk: SdkClient, dds_domain: int) -> None:
     d = dialect("unitree_hg")
     cmd, state = d.topics(Side.LEFT)
     with HandService(SimHand(Side.LEFT), domain=dds_domain, dialect="unitree_hg"):
@@ -82,7 +84,7 @@ def test_unitree_hg(sdk: SdkClient, dds_domain: int) -> None:
         sdk.stop(cmd)
 
 
-def test_unitree_actuator(sdk: SdkClient, dds_domain: int) -> None:
+def test_unitree_sdk_moves_hands_in_unitree_actuator(sdk: SdkClient, dds_domain: int) -> None:
     d = dialect("unitree_actuator")
     cmd, state = d.topics(Side.LEFT)
     hands = [SimHand(Side.LEFT), SimHand(Side.RIGHT)]

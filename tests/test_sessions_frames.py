@@ -221,7 +221,7 @@ def test_a_missing_library_names_its_extra(
 
 @settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(st.integers(1, 50), st.integers(1, 4), st.integers(0, 2**31))
-def test_statistics(frames: int, width: int, seed: int) -> None:
+def test_statistics_are_those_of_numpy(frames: int, width: int, seed: int) -> None:
     values = np.random.default_rng(seed).normal(size=(frames, width)).astype(np.float32)
     found = statistics(values)
     assert found["count"] == [frames]

@@ -105,7 +105,7 @@ def test_a_cyclonedds_that_works_stays() -> None:
     assert isinstance(plan.make_plan(machine).action, plan.Keep)
 
 
-def test_one_that_works_is_replaced_on_request_only() -> None:
+def test_working_cyclonedds_is_replaced_on_request_only() -> None:
     installed = Installed("0.10.5", "", ("/x/libddsc.so.0",))
     machine = dataclasses.replace(
         MACHINE, installed=installed, needs_variables=("LD_LIBRARY_PATH",)
@@ -117,7 +117,7 @@ def test_one_that_works_is_replaced_on_request_only() -> None:
     assert not replaced.notes
 
 
-def test_it_stays_on_an_interpreter_into_which_nothing_may_be_installed() -> None:
+def test_working_cyclonedds_is_kept_where_nothing_may_be_installed() -> None:
     machine = dataclasses.replace(
         with_python(kind="system"), installed=Installed("0.10.5", "", ("/x/libddsc.so.0",))
     )
@@ -125,7 +125,7 @@ def test_it_stays_on_an_interpreter_into_which_nothing_may_be_installed() -> Non
 
 
 @each("problem", ["libddsc.so: cannot open shared object file", ""])
-def test_one_that_does_not_work_is_built_again(problem: str) -> None:
+def test_cyclonedds_that_does_not_work_is_built_again(problem: str) -> None:
     libraries = () if problem else ("/opt/ros/jazzy/lib/libddsc.so.0", "/x/libddsc.so.0.10.5")
     installed = Installed("0.10.5", problem, libraries)
     found = plan.make_plan(dataclasses.replace(MACHINE, installed=installed))
@@ -133,7 +133,7 @@ def test_one_that_does_not_work_is_built_again(problem: str) -> None:
     assert (problem or "two CycloneDDS libraries") in found.examined[0]
 
 
-def test_one_that_loads_the_library_11_is_built_again() -> None:
+def test_cyclonedds_that_loads_library_11_is_built_again() -> None:
     installed = Installed("0.10.5", "", ("/usr/local/lib/libddsc.so.11.0.1",))
     found = plan.make_plan(dataclasses.replace(MACHINE, installed=installed))
     assert isinstance(found.action, plan.Build)

@@ -34,7 +34,7 @@ def hold(
     return state
 
 
-def test_is_a_hand() -> None:
+def test_sim_dex3_implements_hand() -> None:
     hand = SimDex3(Side.RIGHT)
     assert isinstance(hand, Hand)
     assert (hand.spec.model, hand.spec.side, hand.spec.n_joints) == ("dex3-1", Side.RIGHT, 7)
@@ -128,7 +128,7 @@ def test_follows_the_recorded_session_as_the_recorded_hand_did(side: Side) -> No
     assert np.sqrt(np.mean(np.square(error))) < 0.01
 
 
-def test_is_deterministic() -> None:
+def test_sim_dex3_is_deterministic() -> None:
     runs = []
     for _ in range(2):
         hand, clock = opened(object_at=30.0)
@@ -159,7 +159,7 @@ def test_only_an_open_hand_exchanges_and_a_closed_one_is_still() -> None:
     assert np.array_equal(state.q, where)
 
 
-def test_settings() -> None:
+def test_backend_sim_dex3_reads_its_settings() -> None:
     hand = sim_dex3.create(
         BackendOptions(Side.RIGHT, settings={"object": "60", "start": "50", "supply": "36"})
     )

@@ -160,7 +160,7 @@ def test_any_admitted_command_stays_finite_and_within_the_stops(
     assert abs(state.tau_est[0]) <= 15
 
 
-def test_is_deterministic() -> None:
+def test_sim_dex1_is_deterministic() -> None:
     traces = []
     for _ in range(2):
         hand, clock = opened(object_pct=30.0)

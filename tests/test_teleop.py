@@ -179,7 +179,7 @@ def test_target_is_mid_stroke_before_any_input() -> None:
     assert q_of(commands, RIGHT) == LEAD
 
 
-def test_it_leaves_an_end_that_targets_near_it_go_to() -> None:
+def test_client_leaves_an_end_stop_although_targets_near_it_mean_the_end() -> None:
     """In unitree_hg the lead from an end alone would stay where it means that end."""
     hg = DIALECTS["unitree_hg"]
     (closed, opened), q_open = hg.ends, hg.q_open

@@ -117,7 +117,7 @@ def test_a_recording_scrubs_and_its_hands_move(seen: Seen) -> None:
     assert moved.mean() > 0.002  # of the scene
 
 
-def test_numbers_are_charted(seen: Seen) -> None:
+def test_page_adds_a_chart_of_any_number(seen: Seen) -> None:
     browser, _ = seen
     browser.click("Charts")
     browser.wait("document.querySelectorAll('.uplot canvas').length >= 2")
