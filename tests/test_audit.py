@@ -74,7 +74,7 @@ def test_a_file_gets_the_verdicts_of_dexkit_check(tmp_path: Path) -> None:
     assert FileRecord.of_line(found.as_line()) == found
 
 
-def test_whatever_is_wrong_with_a_file_is_a_row(tmp_path: Path) -> None:
+def test_unusable_file_becomes_a_row(tmp_path: Path) -> None:
     archive = tmp_path / "archive"
     good = copied(archive, "good.mcap").read_bytes()
     small(archive / "small.mcap")
@@ -277,7 +277,9 @@ def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         list(find("nosuch://a"))
 
 
-def test_a_mistake_of_dexkit_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_in_the_judging_becomes_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = small(tmp_path / "a.mcap")
 
     def wrong(*given: Any, **more: Any) -> Any:

@@ -114,7 +114,9 @@ def test_stopped_audit_keeps_results_and_the_next_one_continues(
 
 
 @pytest.mark.soak
-def test_a_file_that_takes_too_long_is_a_row(tmp_path: Path, two_nodes: tuple[Any, Any]) -> None:
+def test_file_that_exceeds_the_time_limit_becomes_a_row(
+    tmp_path: Path, two_nodes: tuple[Any, Any]
+) -> None:
     files = archive(tmp_path / "archive")
     for path in sorted(files.iterdir())[2:]:
         path.unlink()
@@ -127,7 +129,7 @@ def test_a_file_that_takes_too_long_is_a_row(tmp_path: Path, two_nodes: tuple[An
     }
 
 
-def test_no_cluster_at_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray_cluster_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", ModuleType("ray"))
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]

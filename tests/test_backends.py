@@ -246,7 +246,7 @@ class TestByPath:
             backend("tests.service_helpers:nope")
         assert "installed" not in (misspelt.value.hint or "")
 
-    def test_a_module_in_the_working_directory(
+    def test_backend_in_the_working_directory_is_found(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         (tmp_path / "hand_being_written.py").write_text(

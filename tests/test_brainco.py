@@ -309,7 +309,7 @@ class _Noisy(BrainCoService):
 
 
 @pytest.mark.soak
-def test_a_hand_with_noise_is_not_blamed() -> None:
+def test_hand_with_noisy_positions_passes() -> None:
     result = run_mutant(_Noisy, plan_for("brainco"))
     assert {r.verdict for r in result.results} == {Verdict.PASS, Verdict.NOT_APPLICABLE}
 

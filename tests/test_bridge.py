@@ -125,7 +125,7 @@ class TestTranslation:
         # once more is the same again
         assert astuple(there_and_back(HG, "state", back)) == near_all(back)
 
-    def test_a_state_of_the_specification(self) -> None:
+    def test_state_of_the_specification_is_translated_to_unitree_go(self) -> None:
         """The interface specification, "Gripper Publishes State"."""
         motor = unitree_hg.MotorState_(
             q=3.14, tau_est=0.5, temperature=(31, 40), vol=12.0, motorstate=0x20
@@ -487,7 +487,7 @@ class TestOneMessageIntoTwoTopics:
         assert (left.q, left.kp) == (1.0, 0.0)  # where it was seen
         assert wire.commands.inputs == {"rt/dex1/right/cmd": (RIGHT,)}
 
-    def test_a_message_for_the_right_only(self) -> None:
+    def test_message_with_one_motor_commands_the_right_gripper(self) -> None:
         wire = Wire(ACTUATOR, GO)
         payload = message_type(ACTUATOR.cmd_type).encode(
             unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=1.0)])

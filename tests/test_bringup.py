@@ -63,7 +63,7 @@ def test_one_press_is_not_held_and_silence_releases() -> None:
     [(b"x", 0.01), (b" x ", 0.01), (b"\x1b[A", 0.01), (b" " * 60, PAUSE + 0.01)],
     ids=["another key", "among spaces", "an arrow", "a pause with old presses"],
 )
-def test_events_that_stop_the_motion_at_once(data: bytes, gap: float) -> None:
+def test_other_key_or_pause_releases_the_dead_man_key(data: bytes, gap: float) -> None:
     key = DeadMan()
     last = hold(key, 0.0, 1.0)
     assert key.held(last + 0.011, b" ")
@@ -359,7 +359,7 @@ def test_mounting_round_trips(
     assert codec.mounting.joint(0, raw) == pytest.approx(q[0])
 
 
-def test_packets_to_sensors() -> None:
+def test_sensor_command_is_packed() -> None:
     data = SensorCmd(3).pack()
     assert len(data) == 20
     assert data[:3] == b"\x7e\xe7\x03"

@@ -241,7 +241,7 @@ def test_settings_of_another_gripper_are_refused(
 
 
 @pytest.mark.soak
-def test_on_a_pseudo_terminal_without_a_person(tmp_path: Path) -> None:
+def test_unattended_bringup_stores_settings_that_serve_uses(tmp_path: Path) -> None:
     """``--answers --unattended``, on the emulated line; and what is then served."""
     config, answers = tmp_path / "dex1.json", tmp_path / "answers.json"
     wiring = Wiring.assumed()

@@ -141,7 +141,7 @@ def test_wirings_differ_and_repeat() -> None:
     assert {len(w.servos) for w in many} == {1, 2}
 
 
-def test_release_and_a_fault_stop_it(tmp_path: Path) -> None:
+def test_released_key_or_fault_switches_torque_off(tmp_path: Path) -> None:
     grippers, bring = watched(
         tmp_path, Wiring.random(0), Side.RIGHT, Effort.from_plan(plan_of(Side.LEFT))
     )
@@ -185,7 +185,7 @@ def test_a_gripper_without_an_open_stop_has_sakes_stroke(tmp_path: Path) -> None
     assert len(grippers.servos) == 1
 
 
-def test_its_torque_is_a_current_limit(tmp_path: Path) -> None:
+def test_torque_of_the_bringup_becomes_a_current_limit(tmp_path: Path) -> None:
     grippers, bring = watched(tmp_path, Wiring.random(0), Side.RIGHT)
     motor = bring.bench.motors[0]
     for torque, most in ((0.2, 64), (99.0, 1600)):
@@ -198,7 +198,7 @@ def test_its_torque_is_a_current_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_on_a_pseudo_terminal_and_then_served(tmp_path: Path) -> None:
+def test_quad_gripper_is_brought_up_unattended_and_served(tmp_path: Path) -> None:
     """A quad gripper with one mirrored servo: found without a person, then driven."""
     seed = next(
         seed

@@ -62,7 +62,9 @@ def test_a_genuine_dex3_session_passes(capsys: pytest.CaptureFixture[str]) -> No
     assert "DEX1" not in out
 
 
-def test_a_dialect_that_is_not_in_the_recording(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_refuses_a_dialect_that_is_not_in_the_recording(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert check(sample_path("dex3_pinch"), "--dialect", "unitree_go") == 2
     assert "rt/dex3/left/state" in capsys.readouterr().err
 

@@ -133,7 +133,7 @@ def test_margin_is_positive_on_the_side_that_passes(
     assert Measure.of_dict(json.loads(json.dumps(measure.as_dict()))) == measure
 
 
-def test_of_several_places_the_least_explained_one_decides() -> None:
+def test_place_least_explained_by_load_decides() -> None:
     early, late = (Measure(0.15, 0.1, span=(a, a + 0.15)) for a in (0.2, 2.0))
     found = weigh(Clock(0.2, 0.001), [early, late], [], (0.0, 9.0))
     assert found is not None

@@ -184,7 +184,7 @@ def luminance(colour: str) -> float:
 
 
 @each("theme", ["light", "dark"])
-def test_text_has_contrast(failing: str, theme: str) -> None:
+def test_text_of_the_report_has_enough_contrast(failing: str, theme: str) -> None:
     blocks = re.findall(r":root\{([^}]*)\}", failing)
     colours: dict[str, str] = {}
     for block in blocks[: 1 if theme == "light" else 2]:

@@ -245,7 +245,7 @@ def test_idle_waits_change_no_verdict() -> None:
         (NanVelocity, FIELD.id),
     ],
 )
-def test_what_no_load_explains_fails_on_a_busy_machine(
+def test_failure_that_load_cannot_cause_fails_on_a_busy_machine(
     service: type[ReferenceService], requirement: str
 ) -> None:
     """Its process waits for half of the time, up to 20 ms at once."""

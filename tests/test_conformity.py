@@ -18,7 +18,7 @@ ROWS = [
 ]
 
 
-def test_rows_are_complete() -> None:
+def test_rows_have_a_status_a_text_and_a_reference() -> None:
     wrong = []
     for document, section, row in ROWS:
         place = f"{document}, {section}: {row.says}"
@@ -66,7 +66,10 @@ def test_the_disputed_statements_have_a_row(words: str) -> None:
 
 
 def test_references_that_lead_nowhere_are_found() -> None:
-    assert reference_error("tests/test_conformity.py::test_rows_are_complete") is None
+    assert (
+        reference_error("tests/test_conformity.py::test_rows_have_a_status_a_text_and_a_reference")
+        is None
+    )
     assert reference_error("DEX1-SAFE-01") is None
     assert reference_error("dexkit/no_such.py") == "there is no such file"
     assert reference_error("DEX1-SAFE-99") == "there is no such requirement"

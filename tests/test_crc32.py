@@ -66,6 +66,6 @@ def test_crc_of_swapped_words_is_the_same(data: bytes) -> None:
 
 
 @each("length", [1, 2, 3, 5, 1270])
-def test_only_whole_words(length: int) -> None:
+def test_crc_refuses_data_that_are_not_whole_words(length: int) -> None:
     with pytest.raises(EncodeError, match="whole 32-bit words"):
         crc32_words(bytes(length))

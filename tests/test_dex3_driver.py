@@ -266,7 +266,7 @@ class TestDiscovery:
             assert hands[1].received
             assert not hands[0].received
 
-    def test_two_of_a_side_are_listed(self) -> None:
+    def test_two_hands_of_one_side_are_refused_and_listed(self) -> None:
         hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2")]
         with (
             serving(*hands) as server,
@@ -295,7 +295,7 @@ class TestDiscovery:
         for word in ("powered", "lsusb -d 34b7:", "dexkit emulate dex3-usb --side left"):
             assert word in caught.value.hint
 
-    def test_no_server_at_an_address(self, no_usb: None) -> None:
+    def test_missing_usbip_server_is_reported(self, no_usb: None) -> None:
         with pytest.raises(HandNotFound, match="no USB/IP server at usbip://127") as caught:
             Dex3Usb(Side.LEFT, Dex3Settings(server=discovery.LOCAL_SERVER)).open()
         assert "dexkit emulate dex3-usb" in caught.value.hint
@@ -351,7 +351,7 @@ class TestDiscovery:
                 assert hand.exchange(GO).measured
             assert (emulated.attachments > 0) == (first == "server")
 
-    def test_two_of_a_side_one_taken(self) -> None:
+    def test_hand_in_use_is_reported_with_the_free_one(self) -> None:
         hands = [RawDevice(FakeHand(), serial=s) for s in ("A1", "A2")]
         with (
             serving(*hands) as server,
@@ -445,7 +445,7 @@ class TestOpening:
         assert "udevadm" in caught.value.hint
         assert ("close_device" in fake.calls) == (call != "open_device")
 
-    def test_no_permission_when_asked_for_a_serial_number(
+    def test_missing_permission_is_reported_with_a_given_serial_number(
         self, no_usb: None, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         fake = FakeBackend(FakeHand())
@@ -810,7 +810,7 @@ class TestTroubleOnTheWay:
                 hand.exchange(GO)
             assert type(caught.value) is expected
 
-    def test_an_error_without_a_number(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_usb_error_without_errno_is_a_hand_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         with fake_hand(fake, monkeypatch) as hand:
             fake.fail["bulk_write"] = USBError("Unknown error", -99, None)
@@ -832,7 +832,7 @@ class TestTroubleOnTheWay:
             assert hand.statistics.link.stalls == 1
 
     @pytest.mark.parametrize("which", ["out", "into"])
-    def test_a_stalled_endpoint_over_usbip(self, which: str) -> None:
+    def test_stalled_endpoint_over_usbip_is_cleared(self, which: str) -> None:
         fake = FakeHand()
         device = RawDevice(fake)
         with serving(device) as server, hand_on(server) as hand:
@@ -844,7 +844,7 @@ class TestTroubleOnTheWay:
                 state = hand.exchange(GO)
                 assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
 
-    def test_a_halt_that_cannot_be_cleared(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_failed_clear_halt_is_a_lost_hand(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
         with fake_hand(fake, monkeypatch) as hand:
             fake.fail["bulk_read"] = usb_error(errno.EPIPE)
@@ -944,7 +944,9 @@ class TestTroubleOnTheWay:
             assert hand.exchange(GO).q.shape == (7,)
             hand.close()
 
-    def test_a_server_that_stops_answering(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_server_that_stops_answering_is_a_timeout(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """Time-outs are kept by the client, whatever the server does."""
         frozen = threading.Event()
         fake = FakeHand()
@@ -1036,7 +1038,7 @@ class TestUsbIpClient:
         connection.close()
         server.close()
 
-    def test_a_timeout_in_the_middle_of_a_reply(self) -> None:
+    def test_reply_cut_by_a_timeout_is_completed_later(self) -> None:
         connection, server = self.connected()
         whole = self.reply(1) + self.reply(2, b"late answer")
         server.sendall(whole[:-4])

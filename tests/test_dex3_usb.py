@@ -27,7 +27,7 @@ from tools.generate.dex3_protocol_page import BLOCKS, PAGE, worked_example
 # --- layouts, against the numbers of docs/sources/unitree-dex.md#c
 
 
-def test_sizes_and_offsets() -> None:
+def test_structs_have_the_sizes_and_offsets_of_the_manual() -> None:
     assert d.MOTOR_CMD.size == 20
     assert d.MOTOR_STATE.size == 26
     assert d.SENSOR_STATE.size == 44
@@ -102,7 +102,7 @@ def test_packets_equal_the_documented_ones() -> None:
          "fcee10212c3085ffc801ecf5f3ff0000000000000000" "4a43ae38"),
     ],
 )  # fmt: skip
-def test_packets_measured_on_the_sibling(packet: Any, expected: str) -> None:
+def test_packets_equal_those_of_the_m4010_library(packet: Any, expected: str) -> None:
     data = bytes.fromhex(expected)
     assert packet.pack() == data
     assert type(packet).parse(data) == packet
@@ -283,7 +283,7 @@ def test_garbage_that_looks_like_a_head() -> None:
     assert len(problems) == 2
 
 
-def test_a_packet_cut_short() -> None:
+def test_truncated_packet_is_reported_with_its_offset() -> None:
     found, problems = d.parse_bus(MOTOR.pack() + SENSOR.pack()[:43])
     assert found == [MOTOR]
     assert isinstance(problems[0].error, TruncatedError)
@@ -349,7 +349,7 @@ def test_command_frames_survive_a_round_trip(
     assert d.parse_command(data) == frame
 
 
-def test_more_than_a_bus_holds() -> None:
+def test_more_packets_than_a_bus_holds_are_refused() -> None:
     cmd = d.MotorCmd(0, 0, False, 0, 0, 0, 0, 0)
     buses = [[], [cmd] * 8, [], [], []]
     assert len(d.parse_command(d.pack_command(d.CommandFrame(buses))).motors) == 8
@@ -389,7 +389,7 @@ def test_every_flipped_bit_of_a_frame_is_noticed() -> None:
         command[bit >> 3] ^= 1 << (bit & 7)
 
 
-def test_a_bus_that_ends_outside_its_buffer() -> None:
+def test_bus_size_beyond_its_buffer_is_reported() -> None:
     data = bytearray(d.pack_state(a_state()))
     data[10:14] = (241).to_bytes(4, "little")
     frame = d.parse_state(reseal(data))
@@ -401,7 +401,7 @@ def test_a_bus_that_ends_outside_its_buffer() -> None:
     assert len(d.parse_state(reseal(data)).problems) == 1
 
 
-def test_a_damaged_packet_in_a_good_frame() -> None:
+def test_damaged_packet_in_a_valid_frame_is_reported() -> None:
     data = bytearray(d.pack_state(a_state()))
     data[26 + 26 + 10] ^= 1
     frame = d.parse_state(reseal(data))

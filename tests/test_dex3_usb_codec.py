@@ -91,7 +91,7 @@ def test_values_are_off_by_less_than_a_count(scale: d.Scale, ratio: float, value
 
 @settings(deadline=None)
 @given(scales, ratios, st.floats(allow_nan=True, allow_infinity=True))
-def test_saturation_and_no_nan(scale: d.Scale, ratio: float, value: float) -> None:
+def test_values_saturate_and_nan_is_refused(scale: d.Scale, ratio: float, value: float) -> None:
     if math.isfinite(value):
         assert scale.low <= scale.encode(value, ratio) <= scale.high
     else:
@@ -202,7 +202,7 @@ def test_nan_is_never_sent(name: str, value: float) -> None:
     assert codec.encode(command()) == good, "nothing of the refused one stays"
 
 
-def test_commands_that_are_not_for_this_hand() -> None:
+def test_commands_that_do_not_fit_the_hand_are_refused() -> None:
     codec = d.HandCodec(JOINTS)
     good = codec.encode(command())
     with pytest.raises(EncodeError, match="7 joints"):
@@ -296,7 +296,7 @@ def same(a: HandState, b: HandState, *, but: tuple[int, ...] = ()) -> None:
         np.testing.assert_allclose(left, right, rtol=1e-14, err_msg=name)
 
 
-def test_states_survive() -> None:
+def test_states_survive_encoding_and_decoding() -> None:
     codec = d.HandCodec(JOINTS)
     for seed in range(5):  # the first is found, the others are read where it was
         state = a_state(seed)

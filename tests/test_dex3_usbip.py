@@ -286,7 +286,7 @@ def test_invalid_options_are_refused(wrong: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("spec", ["stall", "stall-out"])
-def test_a_stalled_endpoint_until_the_host_clears_it(spec: str) -> None:
+def test_stalled_endpoint_works_again_when_the_host_clears_it(spec: str) -> None:
     endpoint = IN_EP if spec == "stall" else OUT_EP
     with emulated_dex3() as hands, host(inside(hands).port) as computer:
         device = computer.find()

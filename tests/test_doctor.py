@@ -280,7 +280,7 @@ def test_root_cause_suppresses_its_consequences(looked: _Looked) -> None:
         assert "DDS-NOBODY" not in looked.findings(situation)
 
 
-def test_a_hand_on_another_domain(looked: _Looked) -> None:
+def test_hand_on_another_domain_is_reported(looked: _Looked) -> None:
     hand, client = looked.domains["good"], looked.domains["nobody"]
     views = tuple(v for v in looked.seen.domains if v.number in (hand, client))
     seen = Observations(domains=views)
@@ -347,7 +347,7 @@ def _cyclone_11(*answers: bytes) -> tuple[list[Finding], str]:
     return found, one.version
 
 
-def test_a_participant_of_cyclonedds_11() -> None:
+def test_participant_of_cyclonedds_11_is_an_error() -> None:
     (found,), version = _cyclone_11(packets.CYCLONE_11_PARTICIPANT, packets.CYCLONE_11_PUBLICATION)
     assert version == "11.0.1"
     assert "CycloneDDS 11.0.1" in found.seen

@@ -52,14 +52,14 @@ def test_healthy_servo_has_no_finding() -> None:
     assert _ids(port) == set()
 
 
-def test_a_servo_at_another_baud_rate() -> None:
+def test_servo_at_another_baud_rate_is_reported() -> None:
     with _line(57_600) as path:
         port = doctor_devices.inspect_port(path)
     assert [s.baudrate for s in port.servos] == [57_600]
     assert _ids(port) == {"SERIAL-BAUD"}
 
 
-def test_a_servo_of_protocol_1() -> None:
+def test_servo_of_protocol_1_is_reported() -> None:
     with _line(old=(Protocol1Servo(1, baudrate=57_600),)) as path:
         port = doctor_devices.inspect_port(path)
     assert _ids(port) == {"SERIAL-PROTOCOL-1"}
@@ -96,7 +96,7 @@ def test_port_in_use_is_not_opened() -> None:
         assert not holders(path)
 
 
-def test_no_port_and_no_serial_port(tmp_path: Path) -> None:
+def test_missing_port_and_file_that_is_no_port_are_reported(tmp_path: Path) -> None:
     assert _ids(doctor_devices.inspect_port(str(tmp_path / "ttyUSB0"))) == {"SERIAL-MISSING"}
     (tmp_path / "file").touch()
     assert _ids(doctor_devices.inspect_port(str(tmp_path / "file"))) == {"SERIAL-NOT-A-PORT"}
@@ -219,7 +219,7 @@ def test_a_process_that_listens_to_a_domain_is_named() -> None:
     pytest.fail("no port is free")
 
 
-def test_a_process_of_this_machine() -> None:
+def test_command_line_and_start_time_of_a_process_are_read() -> None:
     assert "pytest" in command_line(os.getpid()) or "-c" in command_line(os.getpid())
     began = start_time(os.getpid())
     assert began is not None

@@ -224,7 +224,7 @@ def test_overshoot_of_the_hand_does_not_move_the_prediction_past_the_goal(goal: 
     assert e.q == goal
 
 
-def test_turning_round_ends_a_stall() -> None:
+def test_opposite_goal_ends_a_stall() -> None:
     e = JointEstimator(JOINT, (5.0, 5.0))
     e.measure(2.0, 0.0)
     e.follow(0.0, 0.0)
@@ -321,6 +321,6 @@ class TestStateEstimator:
         assert state is not None
         assert np.array_equal(state.q, [1.0])
 
-    def test_one_pair_of_speeds_a_joint(self) -> None:
+    def test_wrong_number_of_joint_speeds_is_refused(self) -> None:
         with pytest.raises(UsageError, match="2 pairs"):
             StateEstimator(self.spec, [(1.0, 1.0), (1.0, 1.0)])

@@ -105,7 +105,7 @@ def delayed(kind: str) -> tuple[Floats, Floats]:
 
 @pytest.mark.parametrize("kind", ["delayed", "still", "constant", "huge"])
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
-def test_the_best_delay_is_that_of_all_sums(kind: str) -> None:
+def test_best_delay_equals_that_of_a_search_over_all_delays(kind: str) -> None:
     seen, asked = delayed(kind)
     for free in (np.ones(9000, np.bool_), np.arange(9000) % 7 > 1):
         here = np.where(free, seen, 0.0)

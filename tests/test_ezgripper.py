@@ -147,7 +147,7 @@ def test_transmit_stuffing_follows_the_manual() -> None:
         bytes(10),
     ],
 )
-def test_stuffing_on_receive(payload: bytes) -> None:
+def test_stuffing_is_removed_from_received_packets(payload: bytes) -> None:
     port = _FakePort(b"\x00\xff garbage first" + dynamixel.status(1, 0, payload))
     assert _bus_on(port).read(1, 126, 10) == (payload, False)
 
@@ -265,7 +265,7 @@ def test_port_without_permission_is_clear_error(
     assert "dialout" in denied.value.hint
 
 
-def test_latency_timer_warning(tmp_path: Path) -> None:
+def test_high_latency_timer_is_warned_about_and_not_changed(tmp_path: Path) -> None:
     timer = tmp_path / "bus/usb-serial/devices/ttyUSB7/latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text("16\n")

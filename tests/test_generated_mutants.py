@@ -210,7 +210,7 @@ def test_a_generated_hand_is_graded_and_judged(name: str, severity: str, caught:
 
 
 @pytest.mark.soak
-def test_the_effect_of_a_fault_that_the_run_does_not_provoke_is_shown_by_another_stimulus() -> None:
+def test_fault_that_the_run_does_not_provoke_is_shown_by_random_commands() -> None:
     hand = parse("dex1-1/unitree_hg:force-fades@right,joint0,at-first")
     opinion = oracle.examine(hand.service(), hand.dialect, hand.sides)
     assert opinion.severity is oracle.Severity.BREAKING
@@ -458,7 +458,7 @@ def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
         "dex3-1/dex3:predicts-150",
     ],
 )
-def test_good_hands_that_were_blamed_once(name: str) -> None:
+def test_good_hands_that_once_failed_pass(name: str) -> None:
     trial = try_generated(parse(name))
     assert (trial.failed, trial.warned) == ((), ()), name
 

@@ -66,7 +66,7 @@ class TestGate:
         assert gate.rejected == 0
         assert gate.clamped == (not out.same_as(command(values)))
 
-    def test_within_the_limits_it_is_the_same_object(self) -> None:
+    def test_command_within_the_limits_is_admitted_unchanged(self) -> None:
         gate = CommandGate(THREE)
         c = HandCommand.position([0.5, 1.0, -2.0])
         assert gate.admit(c) is c

@@ -282,7 +282,7 @@ class _SlowRings(InspireService):
     hand = _SlowRing
 
 
-def test_a_slow_joint_is_told_from_a_slow_client() -> None:
+def test_slow_joints_are_warned_of_with_a_fast_client() -> None:
     plan = replace(plan_for("inspire_dfx"), phases=frozenset(["listen", "joint", "operator"]))
     result = run_mutant(_SlowRings, plan)
     verdicts = {r.verdict for r in result.results if r.requirement.id == "DFX-OPER-01"}

@@ -100,7 +100,7 @@ def test_names_outside_the_modules_of_ros_are_kept() -> None:
     assert "sequence<short, 6> angle_set;" in CTRL.omgidl
 
 
-def test_motors_of_a_message_and_back() -> None:
+def test_ftp_state_converts_to_motors_and_back() -> None:
     message = inspire_hand_state(
         [0] * N, [0, 1, 500, 999, 1000, 7], [100] * N, [0] * N, [1] * N, [2] * N, [31] * N
     )
@@ -282,7 +282,7 @@ def test_emulated_hands_meet_every_requirement() -> None:
 
 
 @pytest.mark.soak
-def test_a_hand_that_is_as_fast_as_its_manual_says_is_not_blamed() -> None:
+def test_hand_with_the_speed_of_the_manual_passes() -> None:
     """The profile has the 0.8 s of the DFX for the full travel, the manual 0.6 s."""
 
     class Quick(FtpHand):

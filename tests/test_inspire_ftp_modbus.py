@@ -83,7 +83,7 @@ def test_pymodbus_reads_the_areas_where_the_manual_has_them(emulated: Rh56TcpHan
     client.close()
 
 
-def test_a_finger_that_presses_feels_it_and_no_other(emulated: Rh56TcpHand) -> None:
+def test_only_the_pressing_finger_reports_pressure(emulated: Rh56TcpHand) -> None:
     with driver(emulated.path) as hand:
         assert hand.spec.n_sensors == len(PLACES)
         assert emulated.device.goals == [None] * N  # no motion
@@ -129,7 +129,7 @@ def test_speed_is_commanded_and_0_holds_a_joint(emulated: Rh56TcpHand) -> None:
         assert emulated.device.goals[0] != 200
 
 
-def test_without_areas_there_is_no_touch(emulated: Rh56TcpHand) -> None:
+def test_setting_areas_0_reports_no_pressure(emulated: Rh56TcpHand) -> None:
     with driver(emulated.path, areas=0) as hand:
         assert hand.spec.n_sensors == 0
         assert hand.exchange(HandCommand.brake(N)).pressure is None
@@ -157,7 +157,7 @@ def test_lost_answers_cost_an_exchange(emulated: Rh56TcpHand) -> None:
                 assert time.monotonic() < ends
 
 
-def test_a_hand_without_tactile_areas_feels_nothing() -> None:
+def test_hand_without_tactile_areas_reports_no_pressure() -> None:
     with Rh56TcpHand(Side.RIGHT) as plain:
         with driver(plain.path) as hand:
             assert felt(hand.exchange(HandCommand.brake(N))) == {}

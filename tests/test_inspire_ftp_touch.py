@@ -97,7 +97,7 @@ def felt(hand: SimInspireFtp, state: HandState) -> dict[str, int]:
     return {place: count for place, count in most.items() if count}
 
 
-def test_finger_that_presses_feels_it_and_no_other() -> None:
+def test_only_the_pressing_finger_of_the_simulated_hand_reports_pressure() -> None:
     clock = ManualClock()
     hand = SimInspireFtp(RIGHT, clock=clock, object_at=60.0)
     hand.open()
@@ -116,7 +116,7 @@ def test_finger_that_presses_feels_it_and_no_other() -> None:
         assert hold(opened, 100) == {}
 
 
-def test_free_hand_feels_nothing_at_its_ends() -> None:
+def test_hand_without_contact_reports_no_pressure_at_its_ends() -> None:
     clock = ManualClock()
     hand = SimInspireFtp(LEFT, clock=clock)
     hand.open()
@@ -127,7 +127,7 @@ def test_free_hand_feels_nothing_at_its_ends() -> None:
         assert felt(hand, state) == {}
 
 
-def test_hand_that_does_not_feel_sends_no_touch() -> None:
+def test_state_without_pressure_gives_no_touch_message() -> None:
     mapping = dialect_map(FTP, {LEFT: INSPIRE_FTP.spec(LEFT, io_rate=100.0)})
     view = StateView(HandState.from_values([0.5] * N, stamp=0.0), (0,) * N)
     assert mapping.encode_touch({LEFT: view}) is None
@@ -310,7 +310,7 @@ def test_doctor_reports_a_hand_of_another_model(served: str, asked: str, option:
     assert not {"DDS-UNPUBLISHED", "DDS-NOBODY", "DDS-OTHER-STACK"} & set(found)
 
 
-def test_doctor_has_nothing_to_say_of_the_right_client() -> None:
+def test_doctor_reports_no_finding_for_a_matching_client() -> None:
     spoken = ends(FTP, "hand", hand=True), ends(FTP, "client", hand=False)
     assert not found_in(*spoken[0], *spoken[1])
     # a client of each: the hand that is missing is not taken for the one that is there

@@ -160,7 +160,7 @@ def test_locked_rotor_stops_a_joint_until_it_is_cleared() -> None:
     assert angles(device) == (0,) * N
 
 
-def test_frames_of_others_and_unknown_registers() -> None:
+def test_frames_for_other_ids_are_ignored_and_unknown_registers_read_0() -> None:
     device = Rh56(number=2)
     assert device.handle(rh56.read(1, Register.ANGLE_ACT, 12)) is None
     assert device.handle(Frame(2, Operation.READ, 1000, b"")) is None

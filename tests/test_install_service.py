@@ -135,7 +135,7 @@ def _adapter(sys_folder: Path, serial: str) -> Path:
     return Path("/dev/ttyUSB0")
 
 
-def test_an_adapter_gets_a_stable_name(tmp_path: Path) -> None:
+def test_udev_rule_gives_an_adapter_a_stable_name(tmp_path: Path) -> None:
     rule = serial_rule(Side.LEFT, _adapter(tmp_path / "a", "FT9ABC"), tmp_path / "a")
     assert 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014", ATTRS{serial}=="FT9ABC"' in rule
     assert 'SYMLINK+="dexkit-left"' in rule

@@ -61,7 +61,7 @@ def test_wall_gives_way_by_force_over_stiffness(push: int) -> None:
     assert joint.contact == pytest.approx(push * 5.0)
 
 
-def test_wall_does_not_pull() -> None:
+def test_wall_exerts_no_pull_on_a_leaving_joint() -> None:
     joint = Joint(inertia=0.01, walls=(Wall(0.0, 1, 1000.0, 10.0),), q=-0.001)
     settle(joint, 0.1, 0.5)
     assert joint.q > 0.5

@@ -99,7 +99,7 @@ def test_packages_do_not_import_each_other(package: str) -> None:
         assert not others, f"{path.relative_to(ROOT)} imports {', '.join(others)}"
 
 
-def test_the_core_imports_none_of_them() -> None:
+def test_core_does_not_import_the_linked_packages() -> None:
     for path in files("dexkit"):
         if ROOT / "dexkit" / "cli" not in path.parents:
             assert not packages_imported(path), (

@@ -107,7 +107,7 @@ def test_legacy_recording_gets_its_verdicts() -> None:
         assert "only a live run" in reason or "does not apply to the dialect" in reason, name
 
 
-def test_the_figures_are_those_of_the_bytes() -> None:
+def test_figures_equal_those_computed_from_the_messages() -> None:
     s, result = session(), verdicts()
     gaps = np.diff(s.t)
 

@@ -276,7 +276,9 @@ class NoProcesses:
     def watch(self, stop: object, duration: float | None) -> None: ...
 
 
-def test_parts_of_a_robot_for_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_emulate_all_for_lerobot_starts_robot_hands_and_ports(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("dexkit.cli.emulate.all._Processes", NoProcesses)
     result = CliRunner().invoke(cli, ["emulate", "all", "--for", "lerobot", "--ports", "1,2,3"])
     assert result.exit_code == 0, result.output

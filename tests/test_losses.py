@@ -117,7 +117,9 @@ _HALF = frozenset(Random(2).sample(range(1000), 500))
         (lambda n: n not in _HALF, 500),  # half of them, from the start
     ],
 )
-def test_samples_that_a_steady_state_topic_lacks(kept: Callable[[int], bool], missing: int) -> None:
+def test_missing_samples_of_a_steady_topic_are_estimated(
+    kept: Callable[[int], bool], missing: int
+) -> None:
     losses = Losses()
     late = 0
     for n in range(1000):
@@ -339,7 +341,7 @@ def test_stopped_recorder_reports_its_losses(tmp_path: Path, buffer: str) -> Non
         assert about["lost_datagrams"] == "0"
 
 
-def test_full_disk_is_reported_with_the_numbers(tmp_path: Path) -> None:
+def test_full_disk_is_reported_with_the_number_of_messages_written(tmp_path: Path) -> None:
     """What it says was written is what can be read, and the exit code is an error."""
     domain = free_domain()
     out = tmp_path / "out.mcap"

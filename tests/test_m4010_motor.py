@@ -469,7 +469,7 @@ def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path, signum: signa
     assert not link.is_symlink()
 
 
-def test_hears_nothing_until_the_baud_rate_is_right(tmp_path: Path) -> None:
+def test_motor_answers_only_at_its_baud_rate(tmp_path: Path) -> None:
     """The vendor's service opens the port at another rate, too, and then changes it."""
     with Dex1Motors((Side.LEFT,), links={Side.LEFT: tmp_path / "l"}) as motors:
         counters = motors.bus(Side.LEFT).counters
@@ -493,7 +493,7 @@ def test_each_motor_can_have_its_own_line(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_faults_from_input_and_the_end_of_it(tmp_path: Path) -> None:
+def test_faults_are_read_from_input_until_its_end(tmp_path: Path) -> None:
     with emulated_dex1(process=True) as motors:
         assert isinstance(motors, Dex1Process)
         with serial.Serial(motors.path, m4010.BAUD_RATE, timeout=0) as port:

@@ -100,7 +100,7 @@ def test_screen_of_any_size_is_filled(width: int, height: int, scroll: int) -> N
 HANDS = closing_hands(0.2)
 
 
-def test_a_robot_takes_the_whole_width() -> None:
+def test_robot_fills_the_width_of_the_screen() -> None:
     view = HANDS.picture(0.1).subjects[0]
     joints = tuple(G1.joint(i) for i in G1.used)
     arrays = {
@@ -115,7 +115,7 @@ def test_a_robot_takes_the_whole_width() -> None:
     assert "l_shoulder_pitch" in "\n".join(lines)
 
 
-def test_texts_from_the_wire_cannot_steer_the_terminal() -> None:
+def test_names_from_dds_cannot_send_escapes_to_the_terminal() -> None:
     evil = "\x1b[2J\x07\nx"
     collector = closing_hands(0.2)
     collector.endpoint("k", "rt/dex3/left/cmd", "writer", evil)
@@ -215,7 +215,7 @@ def test_json_has_no_nan() -> None:
         (b"\x1b[?1;2c\x1b\xc3\xa4", []),
     ],
 )
-def test_keys_of_a_terminal(data: bytes, expected: list[str]) -> None:
+def test_terminal_bytes_are_decoded_to_keys(data: bytes, expected: list[str]) -> None:
     assert keys(data) == expected
 
 

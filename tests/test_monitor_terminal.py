@@ -155,7 +155,7 @@ def test_small_terminal_without_colours_is_resized_and_interrupted(tmp_path: Pat
 
 
 @pytest.mark.soak
-def test_colours_keys_and_a_recording(tmp_path: Path) -> None:
+def test_monitor_reacts_to_keys_and_records(tmp_path: Path) -> None:
     domain = free_domain()
     with DdsNode(domain) as node, Session(
         "--domain", domain, "--log", "a.mcap", columns=100, lines=30, folder=tmp_path,

@@ -113,7 +113,7 @@ def test_damaged_samples_raise_nothing_but_wire_errors(
         (b"\x09\x00\x00\x00ab\x00", "needs at least"),
     ],
 )
-def test_strings_that_are_none(tail: bytes, problem: str) -> None:
+def test_invalid_strings_are_refused(tail: bytes, problem: str) -> None:
     with pytest.raises(WireError, match=problem):
         decode(REQUEST, b"\x00\x01\x00\x00" + bytes(32) + tail)
 

@@ -103,7 +103,7 @@ def test_reads_and_writes_of_every_size(port: sdk.PortHandler) -> None:
     assert (len(data), *rest) == (21, *OK)
 
 
-def test_separate_tx_only_and_rx(port: sdk.PortHandler) -> None:
+def test_sdk_sends_and_receives_in_separate_calls(port: sdk.PortHandler) -> None:
     assert PACKETS.write1ByteTxOnly(port, 1, mx64.LED.address, 0) == sdk.COMM_SUCCESS
     port.is_using = False
     _come(port, 11)  # the status of the write, dropped by the next request

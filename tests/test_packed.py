@@ -160,7 +160,7 @@ def test_columns_are_right_when_a_value_begins_to_change(monkeypatch: pytest.Mon
     assert columns.extremes("system_v") == (0.0, 1.0)
 
 
-def test_one_odd_sample_leaves_the_small_members_of_the_others() -> None:
+def test_damaged_sample_does_not_affect_columns_of_the_others() -> None:
     mt = message_type("unitree_hg::msg::dds_::HandState_")
     payloads = []
     for i in range(6):

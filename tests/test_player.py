@@ -204,7 +204,7 @@ def test_messages_due_during_a_pause_are_not_sent_in_a_burst(
     assert stats.error_max < 1e-6
 
 
-def test_a_listener_that_blocks_makes_no_backlog(tmp_path: Path) -> None:
+def test_blocking_listener_causes_no_backlog(tmp_path: Path) -> None:
     """Each message takes longer than its distance; none goes out much later than is said."""
     clock = ManualClock()
     log = Log(clock)

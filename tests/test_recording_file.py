@@ -87,7 +87,7 @@ def test_a_new_recording_without_a_message_leaves_nothing(tmp_path: Path) -> Non
     assert os.listdir(tmp_path) == []
 
 
-def test_a_link_is_followed(tmp_path: Path) -> None:
+def test_symbolic_link_to_a_recording_is_followed(tmp_path: Path) -> None:
     target, link = tmp_path / "target.mcap", tmp_path / "link.mcap"
     old(target)
     link.symlink_to(target)
@@ -149,7 +149,7 @@ def test_the_old_file_was_deleted_and_another_began_there(tmp_path: Path) -> Non
     assert recorded(path) == [state(1.0)]
 
 
-def test_many_start_together_and_one_records(tmp_path: Path) -> None:
+def test_only_one_of_several_simultaneous_recorders_records(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     for existing in (False, True):
         if existing:
@@ -476,7 +476,9 @@ def test_changed_modification_time_alone_is_accepted(tmp_path: Path) -> None:
 
 
 @each("content", [None, b"", b"V", b"something else altogether"])
-def test_a_link_beside_is_not_followed(tmp_path: Path, content: bytes | None) -> None:
+def test_symbolic_link_in_place_of_the_partial_file_is_refused(
+    tmp_path: Path, content: bytes | None
+) -> None:
     path, victim = tmp_path / "a.mcap", tmp_path / "victim"
     before = old(path)
     if content is not None:
@@ -499,7 +501,7 @@ def test_part_path_that_is_no_file_is_refused(tmp_path: Path, make: Callable[[Pa
 
 
 @each("content", [b"V", b"short", b"a longer text"])
-def test_a_text_beside_is_kept(tmp_path: Path, content: bytes) -> None:
+def test_other_file_in_place_of_the_partial_file_is_kept(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.mcap"
     old(path)
     part(path).write_bytes(content)
@@ -508,7 +510,7 @@ def test_a_text_beside_is_kept(tmp_path: Path, content: bytes) -> None:
     assert part(path).read_bytes() == content
 
 
-def test_messages_outside_of_chunks_beside_are_kept(tmp_path: Path) -> None:
+def test_partial_file_with_unchunked_messages_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     old(path)
     with part(path).open("wb") as file:

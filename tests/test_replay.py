@@ -473,7 +473,7 @@ class Drive:
         return (c for _, p, c in self.sent if p is phase)
 
 
-def test_the_hand_is_led_to_the_first_pose_and_left_at_rest() -> None:
+def test_replay_ramps_to_the_first_pose_and_ends_at_rest() -> None:
     drive = Drive(plan_of(slow_wave()), Guards(ramp_speed=0.5), q=0.5)
     drive.until(Phase.END)
     machine = drive.machine
@@ -581,7 +581,7 @@ def test_a_distance_that_passes_stops_nothing() -> None:
     ),
     q=st.floats(0.0, 5.4),
 )
-def test_no_delay_of_the_program_makes_a_hand_leap(delays: list[float], q: float) -> None:
+def test_pause_of_the_program_causes_no_jump_of_commands(delays: list[float], q: float) -> None:
     """Whatever holds the program up: commands follow each other as in the session or the ramp.
 
     After a pause the first command is where the hand is now, and no state from before counts.

@@ -174,7 +174,7 @@ def test_a_failure_of_the_program_leaves_the_hand_at_rest() -> None:
     assert phases[-1] is Phase.LEAVE
 
 
-def test_after_a_pause_the_hand_is_led_from_where_it_is() -> None:
+def test_after_a_pause_replay_ramps_from_the_present_position() -> None:
     hand = Watched(q=2.0)
     with served(hand) as domain, DdsNode(domain) as node:
         machine = ReplayMachine(

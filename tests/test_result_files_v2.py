@@ -84,7 +84,7 @@ def test_result_of_version_2_is_reported_compared_and_written_as_version_3(tmp_p
 
 
 @pytest.mark.parametrize("key", ["results", "stage", "subject"])
-def test_a_damaged_one_is_refused(key: str, tmp_path: Path) -> None:
+def test_damaged_result_of_version_2_is_refused(key: str, tmp_path: Path) -> None:
     document = json.loads((FOLDER / "robot.json").read_text(encoding="utf-8"))
     document[key] = [1, {"side": 2, "requirement": 3}]
     (tmp_path / "x.json").write_text(json.dumps(document), encoding="utf-8")

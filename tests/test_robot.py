@@ -165,7 +165,7 @@ def test_turning_off_lets_it_coast(model: RobotModel) -> None:
     assert coasting.tau_est == 0
 
 
-def test_mode_of_another_kind_of_motor() -> None:
+def test_mode_of_another_motor_type_does_not_drive() -> None:
     """Strong motors of an H1 take 10, weak ones 1 (docs/sources/unitree-dex.md#a8)."""
     hip, elbow = H1.slot("left_hip_pitch"), H1.slot("left_elbow")
     order = low_cmd(H1, {hip: 0.4, elbow: 0.8}, mode=[1] * 20)
@@ -237,7 +237,7 @@ def test_garbage_is_rejected(model: RobotModel, data: bytes) -> None:
 
 
 @both
-def test_either_byte_order_and_an_unset_crc(model: RobotModel) -> None:
+def test_command_with_an_unset_crc_is_refused(model: RobotModel) -> None:
     bench = Bench(model)
     assert not bench.robot.command(encode(low_cmd(model)), 0.0)
     assert "(it was never set)" in bench.reports[0]

@@ -114,7 +114,7 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
         thread.join()
 
 
-def test_clients_of_another_robot(node: DdsNode) -> None:
+def test_client_of_another_robot_is_reported(node: DdsNode) -> None:
     with EmulatedRobot(G1, domain=node.domain) as robot, node.writer(H1.cmd_topic, H1.cmd_type):
         wait_until(robot.mismatches)
         (text,) = robot.mismatches()

@@ -58,7 +58,7 @@ def test_extremes_of_ranges_are_those_of_each_range() -> None:
     assert [len(c) for c in extremes(values, first[:0], last[:0])] == [0, 0]
 
 
-def test_a_sum_in_bulk_is_the_exact_one() -> None:
+def test_total_of_a_column_equals_fsum() -> None:
     rng = np.random.default_rng(3)
     for n in (1, 200, 201, 255, 256, 3000):
         x = rng.normal(size=n)

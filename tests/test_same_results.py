@@ -33,7 +33,7 @@ def test_percentile_of_long_columns() -> None:
         assert percentile(column, 99) == np.percentile(column, 99), n
 
 
-def test_medians_of_ranges() -> None:
+def test_medians_of_ranges_equal_those_of_single_ranges() -> None:
     random = np.random.default_rng(3)
     column = np.round(random.normal(size=3000), 1)
     column[::97], column[5::31], column[7], column[8] = np.nan, -0.0, np.inf, -np.inf

@@ -167,7 +167,7 @@ def test_a_new_gripper_has_nothing_wrong() -> None:
         ("dead", ["condition"], Verdict.FAULTY),
     ],
 )
-def test_wear_is_seen_in_exactly_its_figures(
+def test_each_wear_changes_only_its_figures(
     wear: str, figures: list[str], verdict: Verdict
 ) -> None:
     result = worn(wear)
@@ -363,7 +363,7 @@ def test_lost_motion_excludes_friction() -> None:
     assert math.isnan(measure.lost_motion([], above, 5.0, 5.0))
 
 
-def test_start_delay_and_speed_of_made_series() -> None:
+def test_start_delay_and_speed_are_measured_from_synthetic_series() -> None:
     t: Floats = np.arange(200, dtype=np.float64) / 100
     command: Floats = 0.1 * t
     q = np.maximum(command - 0.04, 0.0)  # moves once kp 5 gives 0.2
@@ -434,7 +434,7 @@ def test_figures_under_other_limits_are_not_compared() -> None:
     assert all(f.wear is None for f in again.figures)
 
 
-def test_nothing_measured_is_not_good() -> None:
+def test_selftest_without_measurements_is_incomplete() -> None:
     test, _ = examined("dex1", joints=[], turn=lambda t: None)
     empty = replace(result_of(test, {}), joints=())
     assert empty.verdict is Verdict.INCOMPLETE

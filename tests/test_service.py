@@ -127,7 +127,7 @@ def test_invalid_commands_are_counted_and_ignored() -> None:
     assert (core.accepted, core.rejected, core.clamped) == (2, 3, 1)
 
 
-def test_a_client_without_gains_is_counted_and_reported_the_setting(
+def test_commands_without_gains_are_counted_and_the_setting_is_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limp, "PERSISTENCE", 0.0)
@@ -387,7 +387,7 @@ def test_publishing_errors_are_counted_and_the_service_continues(
 
 
 class TestTwoHands:
-    def test_one_topic_pair_for_both(self) -> None:
+    def test_both_grippers_share_one_topic_pair(self) -> None:
         right, left, node = ScriptedHand(Side.RIGHT), ScriptedHand(Side.LEFT), FakeNode()
         d = dialect("unitree_actuator")
         motors = [unitree_go.MotorCmd_(q=q, kp=5.0) for q in (1.0, 2.0)]
@@ -493,7 +493,7 @@ class TestExchangePacing:
                 deadline = (math.floor(begin / self.PERIOD + 1e-6) + 1) * self.PERIOD
                 assert following == pytest.approx(max(end, deadline)), (late, begin)
 
-    def test_a_line_slower_than_the_period_is_never_idle(self) -> None:
+    def test_exchanges_longer_than_the_period_follow_without_a_pause(self) -> None:
         spans = self.run([0.0021] * 40)
         assert [a for a, _ in spans[1:]] == pytest.approx([b for _, b in spans[:-1]])
 
@@ -530,7 +530,7 @@ class TestDiagnose:
         ]
         assert diagnose(peers, self.GO, [Side.LEFT]) == []
 
-    def test_the_other_type_on_the_right_topic(self) -> None:
+    def test_client_with_another_type_on_the_topic_is_reported(self) -> None:
         (text,) = diagnose([FakeEndpoint(CMD, self.HG.cmd_type, "writer")], self.GO, [Side.LEFT])
         assert "HandCmd_" in text
         assert "never match" in text

@@ -226,7 +226,7 @@ class TestFailedExchanges:
         assert bench.exchange().q[0] == 3.0  # it goes on
         assert bench.core.counters.exchange_errors == 1
 
-    def test_missed_counts_from_the_last_good_one(self) -> None:
+    def test_missed_exchanges_are_counted_since_the_last_good_one(self) -> None:
         bench = Bench()
         for expected in (1, 2):
             bench.core.failed(HandTimeout("no answer"))

@@ -114,7 +114,7 @@ class TestCommand:
     def test_fewer_motors_than_seven_hold_no_command(self, count: int) -> None:
         assert mapping().command(message([0x10] * count), LEFT) is None
 
-    def test_of_more_the_first_seven_count(self) -> None:
+    def test_command_with_more_motors_uses_the_first_seven(self) -> None:
         m = mapping()
         commands = message([0x10 | i for i in range(9)])
         command = m.command(commands, LEFT)

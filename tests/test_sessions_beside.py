@@ -98,7 +98,7 @@ def test_the_true_times_are_found(tmp_path: Path, name: str, rate: float, noise:
 
 
 @pytest.mark.parametrize("name", ["dex1_pick_place", "dex3_pinch"])
-def test_commands_that_a_client_repeats_tell_the_time(tmp_path: Path, name: str) -> None:
+def test_frame_times_are_found_from_repeated_commands(tmp_path: Path, name: str) -> None:
     """xr_teleoperate sends a Dex1-1's commands at 200 Hz, and changes them at 30 Hz."""
     folder, at = beside(tmp_path / "e", name, rate=29, repeated=7)
     found = find_times(read_episode(folder), wire_of(name, 7))
@@ -205,7 +205,7 @@ def test_an_episode_beyond_the_recording_is_refused(tmp_path: Path, pick: Path) 
     assert "%" in output
 
 
-def test_hands_that_stand_still_tell_no_time(tmp_path: Path, pick: Path) -> None:
+def test_episode_without_motion_is_refused(tmp_path: Path, pick: Path) -> None:
     folder, _ = beside(tmp_path / "e", "dex1_pick_place", rate=28)
     found = json.loads((folder / "data.json").read_text())
     for item in found["data"]:

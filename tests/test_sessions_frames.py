@@ -423,7 +423,7 @@ def test_touch_is_in_datasets_and_episodes(tmp_path: Path) -> None:
     assert np.abs(right - made[:, 1062:]).max() < 0.01
 
 
-def test_no_frame_lies_in_a_gap_of_touch_and_short_lists_are_told(tmp_path: Path) -> None:
+def test_export_leaves_gaps_of_touch_out_and_reports_short_lists(tmp_path: Path) -> None:
     source = touched(tmp_path / "a.mcap", lost=range(20, 60), short=True)
     code, output = dexkit("export", source, "--to", "lerobot", "--out", tmp_path / "d")
     assert code == 1

@@ -301,7 +301,7 @@ def test_pictures_elsewhere_are_not_read(tmp_path: Path) -> None:
     assert not [t for t in open_trace(tmp_path / "e.mcap").topics if "color" in t]
 
 
-def test_picture_headers() -> None:
+def test_picture_formats_and_sizes_are_read() -> None:
     assert safe_path(Path("/tmp"), "a\x00b") is None
     for data, expected in ((jpeg(640, 480), ("jpeg", 640, 480, 3)), (png(4, 2), ("png", 4, 2, 3))):
         found = parse_picture(data)
@@ -312,7 +312,7 @@ def test_picture_headers() -> None:
     assert parse_picture(b"") is None
 
 
-def test_data_without_a_stream_are_kept_as_json(tmp_path: Path) -> None:
+def test_unknown_episode_data_are_kept_as_json(tmp_path: Path) -> None:
     found = document(frames=4, cameras=0)
     for i, item in enumerate(found["data"]):
         item["tactiles"] = {"left_ee": [i, 2, 3]}
@@ -327,7 +327,7 @@ def test_data_without_a_stream_are_kept_as_json(tmp_path: Path) -> None:
 # -- JSON lines ----------------------------------------------------------------------------------
 
 
-def test_json_lines_with_times(tmp_path: Path) -> None:
+def test_session_in_json_lines_keeps_its_times(tmp_path: Path) -> None:
     found = document(frames=10, cameras=0)
     lines = [json.dumps({"info": found["info"], "text": found["text"]})]
     for i, item in enumerate(found["data"]):
@@ -645,9 +645,7 @@ def of_states(path: Path, payload: bytes = b"") -> Path:
     ],
     ids=str,
 )
-def test_a_row_of_a_bag_that_is_no_message_is_left_out(
-    tmp_path: Path, change: str, why: str
-) -> None:
+def test_invalid_row_of_a_bag_is_left_out(tmp_path: Path, change: str, why: str) -> None:
     mt = message_type(HG)
     payload = mt.encode(mt.of_motors([MotorState_()] * 7))
     with sqlite3.connect(of_states(tmp_path / "b", payload)) as db:

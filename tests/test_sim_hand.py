@@ -35,7 +35,7 @@ def hold(
     return state
 
 
-def test_is_a_hand_and_is_registered() -> None:
+def test_sim_dex1_implements_hand_and_is_registered() -> None:
     assert isinstance(SimHand(), Hand)
     made = backend("sim-dex1").create(BackendOptions(Side.RIGHT, settings={"object": "40"}))
     assert made.spec.side is Side.RIGHT

@@ -206,7 +206,7 @@ def test_a_foreign_recording_without_checksums_is_read(tmp_path: Path) -> None:
     assert trace.notes == ["no checksum over the data section: damage there may not be noticed"]
 
 
-def test_odd_records_in_a_chunk_are_named(tmp_path: Path) -> None:
+def test_invalid_records_in_a_chunk_are_reported(tmp_path: Path) -> None:
     odd = {
         "chunk in chunk": (chunk(message(1, 1)), "does not belong there"),
         "no such kind": (record(0x10, b""), "does not belong there"),
@@ -264,7 +264,7 @@ def test_a_damaged_session_is_not_repeated(tmp_path: Path) -> None:
         Session.load(hurt_sample(tmp_path))
 
 
-def test_replay_sends_what_is_left_and_says_so(
+def test_replay_of_a_damaged_recording_sends_the_rest_and_warns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = [(CMD, T0 + i * 1_000_000, T0, cmd(0.1 * i)) for i in range(40)]

@@ -203,7 +203,7 @@ def test_the_exit_code_of_the_suite_is_the_steps(pretended: Runner, status: int)
     assert pretended.outputs == {"exit-code": str(status), "result": result, "report": ""}
 
 
-def test_lines_are_trimmed(pretended: Runner) -> None:
+def test_inputs_of_the_action_are_trimmed(pretended: Runner) -> None:
     ran = pretended(
         "Judge the hand",
         backend=" acme\r\n",

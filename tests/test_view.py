@@ -125,7 +125,7 @@ def test_names_from_the_wire_are_escaped() -> None:
         assert "&lt;img" in html
 
 
-def test_a_hand_tells_what_is_wrong() -> None:
+def test_page_shows_faults_and_second_client_of_a_hand() -> None:
     collector = closing_hands(1.0, faults=lambda t: {1: int(MotorError.OVERCURRENT)})
     collector.endpoint("k", "rt/dex3/right/cmd", "writer", "one (pid 1)")
     collector.endpoint("l", "rt/dex3/right/cmd", "writer", "two (pid 2)")
@@ -140,7 +140,7 @@ def test_a_hand_tells_what_is_wrong() -> None:
     assert "the state is 59.0 s old" in hand_table(old, "left")
 
 
-def test_times_for_people() -> None:
+def test_times_are_formatted_for_people() -> None:
     for value, text in ((0.0, "0 ms"), (0.0123, "12 ms"), (1.25, "1.2 s"), (250.4, "250 s"),
                         (float("nan"), "-")):  # fmt: skip
         assert seconds(value) == text
@@ -191,7 +191,7 @@ def test_page_shows_the_moment(page: Page) -> None:
     assert len(page._charts) == 2
 
 
-def test_what_has_not_changed_is_not_sent(page: Page) -> None:
+def test_unchanged_figures_are_not_sent_again(page: Page) -> None:
     page.go_to(0, 0.5)
     page.go_to(1, 0.5)
     page.step(20.0)

@@ -96,7 +96,7 @@ def told(name: str, found: Floats) -> str:
     )
 
 
-def test_costs_and_jitter_beside_two_hands(
+def test_viewer_of_two_hands_uses_little_processor_time(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:
     """2 x 1000 Hz in, 30 pictures a second out, in under a quarter of a core.

@@ -228,7 +228,7 @@ def test_what_cannot_be_decoded_is_counted() -> None:
     assert (topic.samples, topic.undecodable) == (3, 2)
 
 
-def test_who_publishes_and_topics_without_samples() -> None:
+def test_publishers_and_topics_without_samples_are_listed() -> None:
     collector = Collector()
     collector.endpoint("a", LEFT, "writer", "python (pid 7)")
     collector.endpoint("b", LEFT, "reader", "")
