@@ -85,7 +85,7 @@ def test_interface_that_is_not_there(text: str, error: type[Exception], said: st
     assert "this machine has: lo (127.0.0.1)" in raised.value.hint  # type: ignore[attr-defined]
 
 
-def test_unknown_peer_is_refused() -> None:
+def test_peer_that_is_not_known() -> None:
     with pytest.raises(DdsSetupError, match="the peer 'no such host' is not known"):
         resolve_peers(["no such host"])
 
@@ -303,7 +303,7 @@ def _until(predicate: Callable[[], bool], seconds: float = 200.0) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seconds", [2.0, 15.0], ids=["short", "longer than the lease"])
-def test_link_lost_in_motion_returns_without_motion(seconds: float) -> None:
+def test_link_that_goes_down_in_mid_motion(seconds: float) -> None:
     """State is back within 1 s of the link, and nothing moves that nobody asked for."""
     with _networked() as hosts:
         service = Program(
