@@ -401,7 +401,7 @@ def test_a_generated_archive_is_scored(tmp_path: Path) -> None:
     assert (found.good, found.found) == (1, len(FAULTS))
 
 
-def test_a_score_names_what_is_missed_and_wrongly_blamed(tmp_path: Path) -> None:
+def test_score_lists_missed_faults_and_wrongly_failed_sessions(tmp_path: Path) -> None:
     from tools.generate_archive import generate
     from tools.generate_archive.score import score
 

@@ -74,7 +74,7 @@ def test_an_object_that_is_not_copied_gets_the_same_record(memory: MemoryFileSys
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_an_object_that_vanishes_while_it_is_read_in_place(
+def test_object_that_vanishes_while_read_becomes_a_row(
     memory: MemoryFileSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory.pipe("/ranges/a.mcap", sample_path(SAMPLE).read_bytes())

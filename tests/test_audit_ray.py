@@ -27,7 +27,7 @@ LOOPBACK = "127.0.0.2"
 """Clients of Ray replace 127.0.0.1 by an address that other machines reach."""
 
 
-def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match="needs Ray"):
         Limits().cluster("auto")

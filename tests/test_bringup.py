@@ -186,7 +186,7 @@ def test_release_locks_every_motor_within_a_cycle(moving: Bring) -> None:
     assert moving.until_question() is not None
 
 
-def test_a_fault_ends_it_for_good(moving: Bring) -> None:
+def test_fault_ends_the_bringup_for_good(moving: Bring) -> None:
     moving.mcu.mechanics.fail(6, MotorError.OVERCURRENT)
     with pytest.raises(HandFault, match="overcurrent"):
         moving.cycles(3)

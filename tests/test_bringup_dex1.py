@@ -136,7 +136,7 @@ def test_release_brakes_within_a_cycle(tmp_path: Path) -> None:
     assert line.opening() == pytest.approx(at, abs=1e-3)
 
 
-def test_a_fault_of_any_motor_ends_it_for_good(tmp_path: Path) -> None:
+def test_fault_of_any_motor_ends_the_bringup_for_good(tmp_path: Path) -> None:
     for index in range(2):
         line, bring = moving(tmp_path)
         list(line.motors.values())[index]._faults = MotorError.OVERCURRENT

@@ -158,7 +158,7 @@ def test_failure_is_excused_only_at_all_its_places() -> None:
     assert not excuse(Once(None), GAP, failure(2.0, 4.0).if_late(0.1, 0.1), Side.LEFT).excused
 
 
-def test_places_beyond_the_shown_ones_count() -> None:
+def test_places_that_are_not_shown_count_too() -> None:
     """Six gaps: five while the machine was stalled, and one that is the hand's."""
     trace = copy_of(short_run())
     key = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")

@@ -115,7 +115,7 @@ def test_four_long_intervals_in_a_second_are_no_bursts() -> None:
     st.floats(0.0, 0.6),
     st.floats(1e-6, 1e-1),
 )
-def test_an_encoder_that_is_finer_than_a_step_has_no_larger_one(
+def test_encoder_found_finer_than_a_step_has_no_larger_step(
     counts: list[int], step: float, noise: float, limit: float
 ) -> None:
     rng = np.random.default_rng(len(counts))

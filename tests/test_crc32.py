@@ -53,7 +53,7 @@ words = st.lists(st.binary(min_size=4, max_size=4), max_size=40).map(b"".join)
 
 @settings(deadline=None)
 @given(words)
-def test_agrees_with_the_bitwise_one(data: bytes) -> None:
+def test_crc_equals_a_bitwise_computation(data: bytes) -> None:
     assert crc32_words(data) == bitwise(data)
     assert crc32_words(memoryview(bytearray(data))) == bitwise(data)
 

@@ -677,7 +677,7 @@ class TestExchange:
         ],
         ids=["short", "empty", "long", "longer", "crc", "head"],
     )
-    def test_a_damaged_frame_is_no_answer_and_the_next_one_is(self, damage: Any) -> None:
+    def test_damaged_answer_is_a_timeout_and_the_next_exchange_works(self, damage: Any) -> None:
         fake = FakeHand()
         device = RawDevice(fake)
         with serving(device) as server, hand_on(server) as hand:

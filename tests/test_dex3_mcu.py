@@ -249,7 +249,7 @@ def spoil_crc(frame: bytes) -> bytes:
         (lambda f: f * 3, "bad_size"),
     ],
 )
-def test_a_bad_frame_is_answered_and_moves_nothing(
+def test_invalid_frame_is_answered_and_moves_nothing(
     spoil: Callable[[bytes], bytes], counter: str
 ) -> None:
     bench = Bench()

@@ -480,7 +480,7 @@ def test_a_requested_hand_leaves_other_states_aside() -> None:
     assert "DDS-UNPUBLISHED" not in _ids(_seen(_waiting()), asked)
 
 
-def test_a_good_link_is_no_finding_and_cures_name_the_interface() -> None:
+def test_good_link_has_no_finding_and_remedies_name_the_interface() -> None:
     devices = Scope(devices_only=True)
     assert not [f for f in diagnose(_linked(), devices) if f.id.startswith("LINK-")]
     (found,) = [f for f in diagnose(_linked(rtt_95=0.04), devices) if f.id == "LINK-JITTER"]

@@ -112,7 +112,7 @@ def test_a_wrong_hand_is_named(backend: str, name: str, expected: str) -> None:
         ("sim-inspire-ftp", "inspire_ftp"),
     ],
 )
-def test_a_good_hand_is_not_named_and_another_model_is(backend: str, name: str) -> None:
+def test_doctor_reports_a_client_of_another_model_only(backend: str, name: str) -> None:
     other = "inspire_dfx" if name == "brainco" else "brainco"
     with served(backend, name) as domain:
         with operated(domain, name):

@@ -177,7 +177,7 @@ def test_both_hands_are_in_one_state(q: list[float], fill: Fill) -> None:
     assert not any((m.dq, m.ddq, m.tau_est) != (0.0, 0.0, 0.0) for m in sent.states)
 
 
-def test_one_served_hand_leaves_the_other_ones_places_0() -> None:
+def test_state_of_one_hand_leaves_the_motors_of_the_other_0() -> None:
     view = StateView(HandState.from_values([0.5] * N, stamp=0.0), (0,) * N)
     sent = STATES.decode(mapping(sides=(LEFT,)).encode({LEFT: view}))
     assert [m.q for m in sent.states] == [0.0] * N + [0.5] * N
@@ -233,7 +233,7 @@ def test_one_hand_alone_is_not_commanded() -> None:
     assert (topic, len(COMMANDS.decode(payload).cmds)) == ("rt/inspire/cmd", 12)
 
 
-def test_malformed_messages_are_whole_ones() -> None:
+def test_shorter_and_longer_commands_carry_both_hands() -> None:
     codec = MotorCodec(DFX)
     hands = {RIGHT: [Motor(0.1)] * N, LEFT: [Motor(0.2)] * N}
 

@@ -72,7 +72,9 @@ def test_driver_moves_the_emulated_hand_and_holds(emulated: Rh56TcpHand) -> None
     assert all(abs((goal or 0) - 500) <= 2 for goal in emulated.device.goals)
 
 
-def test_a_locked_hand_is_cleared_without_going_on_to_its_old_goal(emulated: Rh56TcpHand) -> None:
+def test_locked_hand_is_cleared_and_does_not_continue_to_its_old_goal(
+    emulated: Rh56TcpHand,
+) -> None:
     with driver(emulated.path) as hand:
         hand.exchange(HandCommand.position([0.0] * N))
         emulated.inject("locked")

@@ -87,7 +87,7 @@ def test_locked_joint_does_not_move() -> None:
     st.sampled_from([2e-4, 5e-4, 1e-3]),
 )
 @settings(deadline=None)
-def test_any_torque_keeps_it_between_its_stops(
+def test_joint_stays_between_its_stops_under_any_torque(
     torques: list[float], coulomb: float, viscous: float, dt: float
 ) -> None:
     """And two runs of the same are the same to the last bit."""

@@ -136,7 +136,7 @@ def test_missing_samples_of_a_steady_topic_are_estimated(
     assert losses.metadata()["missing about"] == str(found)
 
 
-def test_a_writer_that_catches_up_lacks_nothing_and_an_irregular_one_is_not_judged() -> None:
+def test_writer_that_catches_up_has_no_losses_and_irregular_writer_is_not_judged() -> None:
     losses = Losses()
     times = [T0 + n * 2 * MS for n in range(300)]
     times[100:110] = [T0 + 109 * 2 * MS + n for n in range(10)]  # stood still, then all at once

@@ -140,7 +140,7 @@ def test_a_held_object_stays_held_when_the_motor_brakes() -> None:
     assert host.bus.motors[0].mechanics.joint.contact > 0.3  # self-locking
 
 
-def test_brake_stops_it_at_once() -> None:
+def test_brake_stops_the_motor_at_once() -> None:
     host = Host(motor())
     host.drive(0.1, q=5.4, kp=5.0, kd=0.05)
     first = host.ask(MotorCmd(0))
@@ -322,7 +322,7 @@ def test_a_command_after_anything_is_answered(pieces: list[bytes]) -> None:
     st.floats(0, 1e4),
     st.floats(0, 1e4),
 )
-def test_any_command_keeps_it_finite_and_within_the_stops(
+def test_motor_stays_finite_and_within_its_stops_under_any_command(
     q: float, dq: float, tau: float, kp: float, kd: float
 ) -> None:
     host = Host(motor())
@@ -377,7 +377,7 @@ def test_each_fault_alters_the_answer_as_specified(spec: str, first: object) -> 
         ("overheat:for=20ms", MotorError.WINDING_OVERTEMPERATURE),
     ],
 )
-def test_an_error_brakes_it_and_passes(spec: str, bit: MotorError) -> None:
+def test_error_brakes_the_motor_until_it_ends(spec: str, bit: MotorError) -> None:
     host = Host(motor(), faults=(spec.replace(":", "@10ms:"),))
     assert host.drive(0.008, q=1.1, kp=5.0).merror == 0
     data = host.drive(0.01, q=5.0, kp=5.0)
@@ -400,7 +400,7 @@ def test_fault_applies_to_the_motor_with_its_id() -> None:
     assert right.q == pytest.approx(1.08)
 
 
-def test_holding_with_force_heats_it() -> None:
+def test_holding_with_force_heats_the_motor() -> None:
     one = motor(start=60.0, touch=40.0)
     host = Host(one)
     host.drive(0.5, q=0.5, kp=5.0)

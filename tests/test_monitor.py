@@ -47,7 +47,7 @@ def text_of(collector: Collector, at: float, width: int, height: int, **more: ob
         (nan, nan, "[-----+----]"),
     ],
 )
-def test_a_joint_between_its_limits(q: float, target: float, expected: str) -> None:
+def test_bar_shows_a_joint_between_its_limits(q: float, target: float, expected: str) -> None:
     found = "".join(text for text, _ in bar(ASCII, 12, -1.0, 1.0, q, target))
     assert len(found) == 12
     assert found == expected

@@ -419,7 +419,7 @@ def test_supply_sags_under_load() -> None:
     assert 110 <= read(target, mx64.PRESENT_INPUT_VOLTAGE) < 118
 
 
-def test_low_supply_makes_it_slower() -> None:
+def test_servo_is_slower_at_a_low_supply_voltage() -> None:
     times = []
     for volts in (11.1, 14.8):
         target = servo(start=0.0, supply_voltage=volts)

@@ -45,7 +45,9 @@ class Log:
     times=st.lists(st.integers(0, 20_000), min_size=1, max_size=30).map(sorted),
     speed=st.sampled_from([0.25, 1.0, 2.0, 7.5]),
 )
-def test_every_message_at_its_time_exactly(tmp_path: Path, times: list[int], speed: float) -> None:
+def test_player_sends_every_message_at_its_exact_time(
+    tmp_path: Path, times: list[int], speed: float
+) -> None:
     clock = ManualClock(100.0)
     log = Log(clock)
     player = Player(open_trace(trace_of(tmp_path, [float(t) for t in times])), speed=speed)

@@ -225,7 +225,7 @@ def test_jumps_are_refused_or_given_time(tmp_path: Path) -> None:
     assert np.diff(track.q[:, 0]).max() < 0.2
 
 
-def test_hands_stay_together_when_one_is_given_time(tmp_path: Path) -> None:
+def test_stretching_one_hand_keeps_both_hands_in_step(tmp_path: Path) -> None:
     q = np.where(np.arange(400) < 200, 0.5, 5.0)
     both = gripper(q) + gripper(slow_wave(), topic="rt/dex1/right/cmd")
     plan = prepare(session(tmp_path, both), Wishes(jumps="stretch")).plan
@@ -381,7 +381,7 @@ def test_sessions_without_a_hand_are_refused(tmp_path: Path) -> None:
         prepare(left, Wishes(sides=(RIGHT,)))
 
 
-def test_a_session_that_moves_nothing_is_noted(tmp_path: Path) -> None:
+def test_session_without_motion_is_noted(tmp_path: Path) -> None:
     assert levels(prepare(session(tmp_path, gripper(np.full(50, 2.0))))) == {"still": "note"}
     assert levels(prepare(session(tmp_path, gripper([2.0])))) == {"still": "note", "single": "note"}
 
@@ -395,7 +395,7 @@ def test_a_session_that_moves_nothing_is_noted(tmp_path: Path) -> None:
     pace=st.sampled_from([0.3, 1.0]),
     resample=st.sampled_from([None, 100.0]),
 )
-def test_a_cured_plan_asks_for_nothing_that_a_hand_cannot_do(
+def test_corrected_plan_stays_within_the_limits_of_the_hand(
     steps: list[tuple[int, float]], pace: float, resample: float | None
 ) -> None:
     t = np.cumsum([ms / 1000 for ms, _ in steps])

@@ -199,7 +199,7 @@ def test_after_a_pause_replay_ramps_from_the_present_position() -> None:
 
 
 @pytest.mark.parametrize("how", ["interrupt", pytest.param("key", marks=pytest.mark.soak)])
-def test_stopped_by_the_user_it_leaves_the_hand_at_rest(tmp_path: Path, how: str) -> None:
+def test_replay_stopped_by_the_user_leaves_the_hand_at_rest(tmp_path: Path, how: str) -> None:
     hand = Watched()
     main, terminal = pty.openpty()
     with served(hand) as domain:

@@ -154,7 +154,7 @@ def test_motor_that_is_off_is_limp(model: RobotModel) -> None:
 
 
 @both
-def test_turning_off_lets_it_coast(model: RobotModel) -> None:
+def test_joint_coasts_when_its_motor_is_turned_off(model: RobotModel) -> None:
     slot = model.slot("waist_yaw")
     bench = Bench(model)
     spin = {slot: {"kp": 0.0, "kd": 5.0, "dq": 3.0}}

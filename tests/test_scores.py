@@ -234,7 +234,7 @@ def test_other_runs_have_no_score_and_give_the_reason(changes: dict[str, Any], w
     assert why in score.sentence()
 
 
-def test_an_empty_hand_has_no_score_of_one_that_held_something() -> None:
+def test_run_without_an_object_does_not_get_the_score_of_one_with_it() -> None:
     empty = Stimulus(planned=Planned(PHASES), objects={Side.LEFT: None, Side.RIGHT: None})
     assert "nothing was held" in found((entry(),), stimulus=empty).sentence()
 

@@ -37,7 +37,7 @@ def counters(line: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_signals_end_it_cleanly(dds_domain: int, dds_node: DdsNode, number: int) -> None:
+def test_signals_end_the_service_cleanly(dds_domain: int, dds_node: DdsNode, number: int) -> None:
     def there() -> bool:
         return any(not e.own and e.topic.startswith("rt/dex1/") for e in dds_node.endpoints())
 

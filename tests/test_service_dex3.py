@@ -82,7 +82,7 @@ class TestModeByte:
     def test_correct_motor_ids_give_no_remark(self, high: int) -> None:
         assert mapping().remarks(message([high | i for i in range(N)]), LEFT) == ()
 
-    def test_mode_1_for_every_motor_locks_them_and_is_explained(self) -> None:
+    def test_mode_byte_1_for_every_motor_locks_all_and_is_explained(self) -> None:
         """A public client does this: id 1, status 0 of RIS_Mode."""
         assert understood([1] * N).is_brake
         (remark,) = mapping().remarks(message([1] * N), LEFT)
@@ -124,7 +124,7 @@ class TestCommand:
 
     @each("side", list(Side))
     @each("end", ["q_min", "q_max"])
-    def test_a_limit_as_float32_is_within_it(self, side: Side, end: str) -> None:
+    def test_position_at_the_limit_as_float32_is_accepted(self, side: Side, end: str) -> None:
         joints = DEX3_1.joints[side]
         commands = message()
         for motor, joint in zip(commands.motor_cmd, joints, strict=True):

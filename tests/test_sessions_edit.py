@@ -210,7 +210,7 @@ def test_two_runs_are_aligned_and_compared(tmp_path: Path) -> None:
     assert moved.joints[0].first_at is not None
 
 
-def test_a_hand_that_does_less_differs_where_it_does(tmp_path: Path) -> None:
+def test_diff_finds_where_a_hand_moves_less(tmp_path: Path) -> None:
     def session(path: Path, stuck_after: float) -> Path:
         t = np.arange(0, 6, 0.01)
         q = 2 + 1.5 * np.sin(t + 0.4 * t**1.5)

@@ -10,7 +10,7 @@ from dexkit.stop_signals import stop_on_signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_during_a_wait_ends_it(number: int) -> None:
+def test_signal_ends_a_wait_for_the_stop_request(number: int) -> None:
     with stop_on_signals() as request:
         with request.event._cond:  # as wait() holds it for moments
             signal.raise_signal(number)

@@ -197,7 +197,7 @@ def test_killed_recorder_leaves_a_readable_recording(tmp_path: Path) -> None:
     assert trace.endpoints[0].type_name == STATE_TYPE
 
 
-def test_record_says_what_it_saw_when_nothing_came(tmp_path: Path) -> None:
+def test_record_lists_endpoints_when_no_message_came(tmp_path: Path) -> None:
     from dexkit.dds import DdsNode
 
     domain = free_domain()

@@ -431,7 +431,7 @@ def test_a_missing_file_is_unreadable(tmp_path: Path) -> None:
         open_trace(tmp_path / "none.mcap")
 
 
-def test_a_bag_directory_is_its_one_file(tmp_path: Path) -> None:
+def test_directory_of_a_bag_is_read_as_its_single_file(tmp_path: Path) -> None:
     write(tmp_path / "bag_0.mcap", mcap_bytes(rows(10)))
     assert open_trace(tmp_path).message_count == len(rows(10))
     write(tmp_path / "bag_1.mcap", mcap_bytes(rows(10)))

@@ -267,7 +267,7 @@ def test_the_result_of_a_run_before_is_not_taken_for_this_one(pretended: Runner)
     assert "nothing was judged" in pretended.summary
 
 
-def test_an_installation_that_fails_ends_it(pretended: Runner) -> None:
+def test_failed_installation_ends_the_action(pretended: Runner) -> None:
     (pretended.home / "status").write_text("1")
     ran = pretended("Install dexkit and the backend", install="nothing-of-this-name")
     assert ran.returncode != 0

@@ -99,7 +99,7 @@ def test_a_click_on_a_failed_requirement_shows_its_fault(seen: Seen) -> None:
     assert browser.errors == []
 
 
-def test_a_recording_scrubs_and_its_hands_move(seen: Seen) -> None:
+def test_hands_move_when_a_recording_is_scrubbed(seen: Seen) -> None:
     browser, _ = seen
     browser.click("Hands")
     browser.click("+1 s")  # and pause

@@ -141,7 +141,7 @@ def test_rows_are_those_of_columns(counts: list[tuple[int, int]], spoilt: int, b
 # -- collector -------------------------------------------------------------------------------------
 
 
-def test_a_hand_with_its_command_and_faults() -> None:
+def test_picture_holds_command_and_faults_of_a_hand() -> None:
     collector = Collector()
     q = [0.0, 1.04, 0.5, -0.5, -1.74, -0.5, -0.5]
     bits = int(MotorError.WINDING_OVERTEMPERATURE | MotorError.HOST_SAW_MOTOR_TIMEOUT)
