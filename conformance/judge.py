@@ -100,14 +100,14 @@ def judge_layer(
     :param client: results of the requirements about the client, of every subject.
     """
     claims = claims or Claims()
-    whole = layer.whole(recording)
+    make_context, whole = layer.context.load(), layer.whole(recording)
     results: list[Result] = []
     for subject, view in layer.subjects(recording):
         found: dict[str, Result] = {}
         driven_by = [r for r in client if r.side == str(subject)]
         for requirement in requirements:
             judgement = Judgement(requirement, subject, claims, found, driven_by)
-            context = layer.context(recording, view, requirement)
+            context = make_context(recording, view, requirement)
             found[requirement.id] = _judge_one(layer, judgement, context, whole)
         results += found.values()
     order = {r.id: i for i, r in enumerate(requirements)}

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.layers import layer
 from dexkit.conformance.lost import Lost
 from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.touch import Touch
-from dexkit.conformance.usb import RECORD as USB_RECORD
 from dexkit.conformance.waits import Starvation
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
@@ -230,7 +230,7 @@ class Recording:
         samples = trace.load(wanted, decode=True) if topics else {}
         times = [s.log_time_ns for topic, s in samples.items() if topic in topics and len(s)]
         marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
-        usb = _usb(trace)
+        usb = layer("usb").decode(trace, None, ())
         if usb is not None:
             marks.append(usb.origin_ns)
         origin = min([int(t[0]) for t in times] + marks, default=0)
@@ -389,14 +389,6 @@ def joints_of(dialect: Dialect, side: Side) -> tuple[JointSpec, ...]:
     if not dialect.is_gripper:
         return joints
     return tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
-
-
-def _usb(trace: TraceLike) -> UsbRecording | None:
-    if USB_RECORD not in trace.metadata:
-        return None
-    from dexkit.conformance.usb.recording import UsbRecording  # few recordings have it
-
-    return UsbRecording.decode(trace)
 
 
 def _seconds(times: NDArray[np.int64], origin: int) -> Floats:

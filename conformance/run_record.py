@@ -18,7 +18,8 @@ from pathlib import Path
 
 from dexkit import __version__
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.requirements import LAYERS, Requirement, catalogue
+from dexkit.conformance.layers import LAYERS
+from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.errors import DexkitError
 from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import DIALECTS

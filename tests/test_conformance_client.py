@@ -307,7 +307,7 @@ def context(name: str, t: Floats, q: Floats, **columns: Floats) -> Context:
     recording = Recording(
         spoken, 0, float(t[-1]), {Side.LEFT: view}, [], [], None, judged=(Side.LEFT,)
     )
-    return layer("client").context(recording, view, requirement)
+    return layer("client").context.load()(recording, view, requirement)
 
 
 def judged(ctx: Context) -> Outcome:

@@ -11,9 +11,10 @@ import pytest
 
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.plots import PlotKind
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import CONFIDENCE, LAYERS, Kind, Level
+from dexkit.conformance.requirements import CONFIDENCE, Kind, Level
 from dexkit.conformance.results import VERSION, Load, Overall, Stage, Verdict
 from dexkit.hand import ROBOT, Side
 from dexkit.traces import open_trace, sample_path

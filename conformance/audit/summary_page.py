@@ -13,11 +13,12 @@ import numpy as np
 
 from dexkit import __version__
 from dexkit.conformance.audit.records import FINDING, FileRecord, State
+from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.report.charts import Line, chart
 from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import ANSWERS, VERDICTS
 from dexkit.conformance.report.tables import table, unbroken
-from dexkit.conformance.requirements import LAYERS, catalogue
+from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.conformance.run_record import catalogue_digest
 from dexkit.escaping import html as escape

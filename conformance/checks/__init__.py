@@ -14,10 +14,11 @@ tactile areas, :mod:`~.servos` and :mod:`~.servo_force` for position servos, and
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+from dexkit.conformance.layers import layer
 from dexkit.conformance.measure import Measure, Quantity
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Commands, Recording, SideView, States
@@ -28,7 +29,6 @@ from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
 
 __all__ = [
-    "CHECK_MODULES",
     "REGISTRY",
     "ROUNDING",
     "BaseContext",
@@ -40,30 +40,6 @@ __all__ = [
     "check_of",
     "rate_measure",
 ]
-
-_HAND = (
-    *("discovery", "timing", "fields", "members", "motion", "force", "consistency", "velocity"),
-    *("drive", "safety", "lifecycle", "tracking", "fingers", "each_joint", "pressure"),
-    *(
-        "operator",
-        "uncommanded",
-        "servos",
-        "servo_force",
-        "touch",
-        "firmness",
-        "grip",
-        "afterwards",
-    ),
-)
-CHECK_MODULES: Mapping[str, Sequence[str]] = {
-    "dds": tuple(f"{__name__}.{name}" for name in _HAND),
-    "robot": tuple(
-        f"{__name__}.{n}" for n in ("robot", "discovery", "timing", "fields", "lifecycle")
-    ),
-    "usb": ("dexkit.conformance.usb.checks",),
-    "client": (f"{__name__}.client",),
-}
-"""The modules that register the checks of each layer."""
 
 ROUNDING = 1e-3
 """Relative excess over a limit that is allowed for a saturated value: a drive clamped at the limit
@@ -377,11 +353,11 @@ def check_of(requirement: Requirement) -> Check:
     """The check registered for a requirement, else for the nearest requirement in its chain of
     ``like``.
 
-    Modules of checks are imported in order until one registers it.
+    The layer's modules of checks are imported in order until one registers it.
 
     :raises KeyError: there is none.
     """
-    modules = CHECK_MODULES[requirement.layer]
+    modules = layer(requirement.layer).checks
     for name in (requirement.id, *requirement.lineage):
         for module in modules:
             if name in REGISTRY:

@@ -1,12 +1,17 @@
 """The layers of judging: a hand's DDS topics, a robot's DDS topics, a hand's USB, and the client.
 
-A :class:`Layer` is the data by which the one engine (:mod:`dexkit.conformance.judge`) goes from a
-recording to verdicts. Each layer is in a module of its own, imported when it is asked for:
+A :class:`Layer` is the data by which the kit goes from a device to verdicts: how a recording is
+decoded (:func:`recording_of`), what is judged by which checks (:mod:`dexkit.conformance.judge`),
+which script is played to which reference, and how a wrong one is tried
+(:mod:`dexkit.conformance.mutants.matrix`). Each layer is in a module of its own:
 
 * :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
-* :mod:`~dexkit.conformance.layers.robot`: ``robot``, the low-level DDS topics of robots;
 * :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands;
+* :mod:`~dexkit.conformance.layers.robot`: ``robot``, the low-level DDS topics of robots;
 * :mod:`~dexkit.conformance.layers.client`: ``client``, the commands that a client sends to hands.
+
+These modules are imported with the requirements, and load checks, decoders, scripts, references and
+trials on first use.
 """
 
 from __future__ import annotations
@@ -16,25 +21,27 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from dexkit.conformance.checks import BaseContext, Outcome
-from dexkit.conformance.recording import Recording, TraceLike
-from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import Result
-from dexkit.conformance.robot import robot_in
-from dexkit.conformance.run_record import RECORD as RUN
-from dexkit.conformance.run_record import recorded_dialect, recorded_subjects
-from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.plots import Plot
+from dexkit.lazy import Lazy
 from dexkit.robots import ROBOTS
 from dexkit.topics import HAND_TOPICS
 
 if TYPE_CHECKING:
+    from dexkit.conformance.checks import BaseContext, Outcome
+    from dexkit.conformance.mutants.trials import Trial
+    from dexkit.conformance.recording import Recording, TraceLike
+    from dexkit.conformance.requirements import Requirement
+    from dexkit.conformance.results import Result
+    from dexkit.conformance.verdicts import Judgement
     from dexkit.hand import Subject
 
 __all__ = [
+    "LAYERS",
     "Layer",
     "Precondition",
     "claimed",
     "layer",
+    "layer_of_model",
     "not_blocked",
     "not_spoiled",
     "recording_of",
@@ -43,18 +50,21 @@ __all__ = [
 
 RecordingT = TypeVar("RecordingT")
 ViewT = TypeVar("ViewT")
-ContextT = TypeVar("ContextT", bound=BaseContext[Any, Any])
+ContextT = TypeVar("ContextT", bound="BaseContext[Any, Any]")
 
-Precondition = Callable[[Judgement, ContextT], "Result | None"]
+Precondition = Callable[["Judgement", ContextT], "Result | None"]
 """The result, where a requirement is not to be checked at all."""
+Decode = Callable[["TraceLike", "str | None", "Sequence[Subject]"], "RecordingT | None"]
 
 
 @dataclass(frozen=True)
 class Layer(Generic[RecordingT, ViewT, ContextT]):
     """The data by which one layer is judged.
 
-    :param name: one of :data:`~dexkit.conformance.requirements.LAYERS`; it selects the catalogue
-        and, in :data:`~dexkit.conformance.checks.CHECK_MODULES`, the checks.
+    :param name: one of :data:`LAYERS`; it selects the catalogue
+        (:func:`dexkit.conformance.requirements.catalogue`).
+    :param checks: the modules that register its checks.
+    :param plots: what shows a failure where neither the catalogue nor the check names a plot.
     :param decode: a recording's part that is about the layer; None where there is none. It takes
         the recording, the dialect's name (None for the one that the topics show) and the
         subjects to be judged (none for all that are there).
@@ -66,35 +76,40 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     :param whole: begin and end of the recording, seconds, as the place of failures that have
         none; None where such a failure cannot be excused by a busy machine.
     :param script: the stimulus script of a model, by the model's name.
-    :param reference: the simulated device of a model that meets every requirement, likewise.
+    :param reference: the simulated device or client of a model that meets every requirement,
+        likewise.
+    :param trial: how a wrong device or client is run and judged.
     """
 
     name: str
-    decode: Callable[[TraceLike, str | None, Sequence[Subject]], RecordingT | None]
+    checks: Sequence[str]
+    plots: tuple[Plot, ...]
+    decode: Decode[RecordingT]
     subjects: Callable[[RecordingT], Iterable[tuple[Subject, ViewT]]]
-    context: Callable[[RecordingT, ViewT, Requirement], ContextT]
+    context: Lazy[Callable[[RecordingT, ViewT, Requirement], ContextT]]
     preconditions: Sequence[Precondition[ContextT]]
     refine: Callable[[ContextT, Outcome], Outcome]
     whole: Callable[[RecordingT], tuple[float, float] | None]
-    script: Callable[[str], type]
-    reference: Callable[[str], type]
-
-    def requirements(self, model: str | None = None) -> tuple[Requirement, ...]:
-        """The layer's requirements, in their order.
-
-        :param model: only those of that model; None for all.
-        """
-        return catalogue(model, self.name)
+    script: Callable[[str], type[Any]]
+    reference: Callable[[str], type[Any]]
+    trial: Lazy[type[Trial]]
 
 
-_MODULES = {"dds": "hand", "robot": "robot", "usb": "usb", "client": "client"}
+_MODULES = {"dds": "hand", "usb": "usb", "robot": "robot", "client": "client"}
+LAYERS = tuple(_MODULES)
+"""The names of the layers."""
 
 
 def layer(name: str) -> Layer[Any, Any, Any]:
-    """The layer of that name, one of :data:`~dexkit.conformance.requirements.LAYERS`."""
+    """The layer of that name, one of :data:`LAYERS`."""
     module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
     found: Layer[Any, Any, Any] = module.LAYER
     return found
+
+
+def layer_of_model(model_name: str) -> Layer[Any, Any, Any]:
+    """The layer of a hand's or robot's DDS topics."""
+    return layer("robot" if model_name in ROBOTS else "dds")
 
 
 def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
@@ -107,15 +122,20 @@ def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Sub
     :raises UsageError: sides of a robot.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
-    run = trace.metadata.get(RUN, {})
-    name = dialect_name or recorded_dialect(run)
+    from dexkit.conformance import run_record
+    from dexkit.conformance.recording import Recording
+    from dexkit.conformance.robot import robot_in
+
+    run = trace.metadata.get(run_record.RECORD, {})
+    recorded = run_record.recorded_dialect(run)
+    name = dialect_name or recorded
     if name is None:
         topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
         found = None if topics & HAND_TOPICS else robot_in(trace)
         name = found.name if found else None
-    if not sides and name == recorded_dialect(run):
-        sides = recorded_subjects(run)
-    recording = layer("robot" if name in ROBOTS else "dds").decode(trace, name, sides)
+    if not sides and name == recorded:
+        sides = run_record.recorded_subjects(run)
+    recording = layer_of_model(name or "").decode(trace, name, sides)
     assert isinstance(recording, Recording), "only USB may be missing from a recording"
     return recording
 

@@ -7,13 +7,21 @@ purpose.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
-from dexkit.conformance.checks import Context
 from dexkit.conformance.layers import Layer, hand, not_blocked
-from dexkit.conformance.recording import Recording, SideView
+from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.errors import UsageError
 from dexkit.hand import Subject
+from dexkit.lazy import Lazy
+
+if TYPE_CHECKING:
+    from dexkit.conformance.checks import Context
+    from dexkit.conformance.recording import Recording, SideView
 
 __all__ = ["LAYER"]
+
+_REFERENCE: Lazy[type[Any]] = Lazy("dexkit.conformance.virtual.client:ReferenceClient")
 
 
 def _commanded(recording: Recording) -> Iterable[tuple[Subject, SideView]]:
@@ -21,20 +29,21 @@ def _commanded(recording: Recording) -> Iterable[tuple[Subject, SideView]]:
     return [(s, view) for s, view in hand.subjects(recording) if len(view.commands)]
 
 
-def _reference(model: str) -> type:
-    from dexkit.conformance.virtual.client import ReferenceClient
-
-    return ReferenceClient
+def _no_script(name: str) -> type[Any]:
+    raise UsageError("the kit plays no stimulus to a client", hint="record a session with it")
 
 
 LAYER: Layer[Recording, SideView, Context] = Layer(
     name="client",
+    checks=("dexkit.conformance.checks.client",),
+    plots=(Plot(PlotKind.POSITION),),
     decode=hand.LAYER.decode,
     subjects=_commanded,
-    context=Context,
+    context=Lazy("dexkit.conformance.checks:Context"),
     preconditions=(hand.applies_to_dialect, not_blocked),
     refine=lambda context, outcome: outcome,
     whole=hand.whole,
-    script=hand.LAYER.script,
-    reference=_reference,
+    script=_no_script,
+    reference=lambda name: _REFERENCE.load(),
+    trial=Lazy("dexkit.conformance.mutants.trials:ClientTrial"),
 )

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.layers import Layer, claimed, not_blocked, not_spoiled
-from dexkit.conformance.recording import Recording, SideView, TraceLike
-from dexkit.conformance.results import Result
-from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
+from dexkit.lazy import Lazy
 from dexkit.models import model
+
+if TYPE_CHECKING:
+    from dexkit.conformance.checks import Context, Outcome
+    from dexkit.conformance.recording import Recording, SideView, TraceLike
+    from dexkit.conformance.results import Result
+    from dexkit.conformance.verdicts import Judgement
 
 __all__ = ["LAYER", "applies_to_dialect", "recorded", "subjects", "whole", "with_silence"]
 
@@ -30,6 +35,8 @@ _REMEDY = {
 
 
 def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
+    from dexkit.conformance.recording import Recording
+
     hands = tuple(s for s in sides if isinstance(s, Side))
     if len(hands) < len(sides):
         raise UsageError("a hand is on the left or the right side", hint="give --side")
@@ -98,22 +105,25 @@ def with_silence(context: Context, outcome: Outcome) -> Outcome:
     )
 
 
-def _script(name: str) -> type:
-    return model(name).script.load()
-
-
-def _reference(name: str) -> type:
-    return model(name).reference.load()
-
-
 LAYER: Layer[Recording, SideView, Context] = Layer(
     name="dds",
+    checks=tuple(
+        f"dexkit.conformance.checks.{name}"
+        for name in (
+            *("discovery", "timing", "fields", "members", "motion", "force", "consistency"),
+            *("velocity", "drive", "safety", "lifecycle", "tracking", "fingers", "each_joint"),
+            *("pressure", "operator", "uncommanded", "servos", "servo_force", "touch"),
+            *("firmness", "grip", "afterwards"),
+        )
+    ),
+    plots=(Plot(PlotKind.POSITION),),
     decode=_decode,
     subjects=subjects,
-    context=Context,
+    context=Lazy("dexkit.conformance.checks:Context"),
     preconditions=(applies_to_dialect, claimed, recorded, not_spoiled, not_blocked),
     refine=with_silence,
     whole=whole,
-    script=_script,
-    reference=_reference,
+    script=lambda name: model(name).script.load(),
+    reference=lambda name: model(name).reference.load(),
+    trial=Lazy("dexkit.conformance.mutants.trials:HandTrial"),
 )

@@ -3,45 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from dexkit.conformance.checks.robot import RobotContext
 from dexkit.conformance.layers import Layer, claimed, hand, not_blocked
-from dexkit.conformance.recording import SideView, TraceLike
-from dexkit.conformance.robot import RobotRecording, robot_in, robot_recording
+from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import ROBOT, Subject
-from dexkit.robots import H1
+from dexkit.lazy import Lazy
+from dexkit.robots import H1, robot
+
+if TYPE_CHECKING:
+    from dexkit.conformance.checks.robot import RobotContext
+    from dexkit.conformance.recording import SideView, TraceLike
+    from dexkit.conformance.robot import RobotRecording
 
 __all__ = ["LAYER"]
 
+_REFERENCE: Lazy[type[Any]] = Lazy("dexkit.conformance.virtual.robot:ReferenceRobot")
+
 
 def _decode(trace: TraceLike, name: str | None, sides: Sequence[Subject]) -> RobotRecording:
+    from dexkit.conformance.robot import robot_in, robot_recording
+
     if sides not in ((), (ROBOT,)):
         raise UsageError("a robot has no sides", hint="leave --side out")
     found = name or (robot_in(trace) or H1).name
     return robot_recording(trace, found)
 
 
-def _script(model: str) -> type:
-    from dexkit.conformance.stimuli.robot import RobotScript
-
-    return RobotScript
-
-
-def _reference(model: str) -> type:
-    from dexkit.conformance.virtual.robot import ReferenceRobot
-
-    return ReferenceRobot
-
-
 LAYER: Layer[RobotRecording, SideView, RobotContext] = Layer(
     name="robot",
+    checks=tuple(
+        f"dexkit.conformance.checks.{name}"
+        for name in ("robot", "discovery", "timing", "fields", "lifecycle")
+    ),
+    plots=(Plot(PlotKind.POSITION),),
     decode=_decode,
     subjects=hand.subjects,
-    context=RobotContext,
+    context=Lazy("dexkit.conformance.checks.robot:RobotContext"),
     preconditions=(hand.applies_to_dialect, claimed, hand.recorded, not_blocked),
     refine=hand.with_silence,
     whole=hand.whole,
-    script=_script,
-    reference=_reference,
+    script=lambda name: robot(name).script.load(),
+    reference=lambda name: _REFERENCE.load(),
+    trial=Lazy("dexkit.conformance.mutants.trials:RobotTrial"),
 )

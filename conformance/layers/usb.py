@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 from dexkit.conformance.layers import Layer, claimed, not_blocked
-from dexkit.conformance.results import Result
-from dexkit.conformance.usb.checks import UsbContext
-from dexkit.conformance.usb.recording import UsbRecording, UsbSide
-from dexkit.conformance.verdicts import Judgement
+from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.hand import Subject
+from dexkit.lazy import Lazy
+
+if TYPE_CHECKING:
+    from dexkit.conformance.recording import TraceLike
+    from dexkit.conformance.results import Result
+    from dexkit.conformance.usb.checks import UsbContext
+    from dexkit.conformance.usb.recording import UsbRecording, UsbSide
+    from dexkit.conformance.verdicts import Judgement
 
 __all__ = ["LAYER"]
+
+_SCRIPT: Lazy[type[Any]] = Lazy("dexkit.conformance.stimuli.usb:UsbScript")
+_REFERENCE: Lazy[type[Any]] = Lazy("dexkit.conformance.virtual.usb:ReferenceDevice")
+
+
+def _decode(trace: TraceLike, name: str | None, sides: Sequence[Subject]) -> UsbRecording | None:
+    from dexkit.conformance.usb import RECORD
+
+    if RECORD not in trace.metadata:  # the others are read without this part of the kit
+        return None
+    from dexkit.conformance.usb.recording import UsbRecording
+
+    return UsbRecording.decode(trace)
 
 
 def _stimulus_applied(judgement: Judgement, context: UsbContext) -> Result | None:
@@ -21,28 +43,19 @@ def _stimulus_applied(judgement: Judgement, context: UsbContext) -> Result | Non
     return judgement.not_applicable(f"{reason}: {trouble}" if trouble else reason)
 
 
-def _script(model: str) -> type:
-    from dexkit.conformance.stimuli.usb import UsbScript
-
-    return UsbScript
-
-
-def _reference(model: str) -> type:
-    from dexkit.conformance.virtual.usb import ReferenceDevice
-
-    return ReferenceDevice
-
-
 LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     name="usb",
-    decode=lambda trace, dialect_name, sides: UsbRecording.decode(trace),
+    checks=("dexkit.conformance.usb.checks",),
+    plots=(Plot(PlotKind.ANSWERS), Plot(PlotKind.BYTES)),
+    decode=_decode,
     subjects=lambda recording: recording.sides.items(),
-    context=UsbContext,
+    context=Lazy("dexkit.conformance.usb.checks:UsbContext"),
     # not_blocked comes first: the script ends where a device no longer answers, and the first
     # failure is the reason of missing phases
     preconditions=(claimed, not_blocked, _stimulus_applied),
     refine=lambda context, outcome: outcome,
     whole=lambda recording: None,
-    script=_script,
-    reference=_reference,
+    script=lambda name: _SCRIPT.load(),
+    reference=lambda name: _REFERENCE.load(),
+    trial=Lazy("dexkit.conformance.mutants.trials:UsbTrial"),
 )

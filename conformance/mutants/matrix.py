@@ -17,8 +17,9 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
+from dexkit.conformance.layers import layer
 from dexkit.conformance.mutants import Mutant, mutants
-from dexkit.conformance.mutants.trials import TRIALS
+from dexkit.conformance.mutants.trials import Trial
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.console import Console
 from dexkit.documents import write_file
@@ -80,9 +81,13 @@ def print_list(console: Console, given: Sequence[Mutant]) -> None:
     console.print(f"{len(given)} wrong hands", highlight=False)
 
 
+def _trial_of(mutant: Mutant) -> Trial:
+    return layer(mutant.layer).trial.load()()
+
+
 def cost(mutant: Mutant) -> float:
     """Roughly how long a trial takes, in units of the shortest on DDS."""
-    return TRIALS[mutant.layer].cost(mutant)
+    return _trial_of(mutant).cost(mutant)
 
 
 def essential(given: Sequence[Mutant]) -> tuple[Mutant, ...]:
@@ -100,13 +105,13 @@ def try_one(mutant: Mutant, *, short: bool = False) -> Outcome:
 
     :param short: apply only the phases that show the fault, where that is fair.
     """
-    return Outcome.from_blame(mutant, TRIALS[mutant.layer].blamed(mutant, short=short))
+    return Outcome.from_blame(mutant, _trial_of(mutant).blamed(mutant, short=short))
 
 
 def _blamed(key: tuple[str, str, str]) -> set[str]:
     """Run a trial in a worker process, which gets the key: mixed classes cannot be pickled."""
     mutant = next(m for m in mutants() if m.key == key)
-    return TRIALS[mutant.layer].blamed(mutant, short=False)
+    return _trial_of(mutant).blamed(mutant, short=False)
 
 
 def ignore_interrupts() -> None:

@@ -32,7 +32,7 @@ C = TypeVar("C", bound=type[Any])
 class Mutant:
     """One wrong hand, robot, USB device or client.
 
-    :param layer: of its requirement, one of :data:`~dexkit.conformance.requirements.LAYERS`.
+    :param layer: of its requirement, one of :data:`~dexkit.conformance.layers.LAYERS`.
     :param made: the reference of the model with the fault in it.
     :param kills: the requirement that must fail or warn.
     :param also: requirements that cannot but fail or warn with it. No other may: that would be

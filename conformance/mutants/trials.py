@@ -8,14 +8,13 @@ session, and are judged together with them: no requirement of the hands may fail
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Protocol
 
 from dexkit.conformance.judge import judge, judge_layer
-from dexkit.conformance.layers import recording_of
-from dexkit.conformance.layers.usb import LAYER as USB
+from dexkit.conformance.layers import layer, recording_of
 from dexkit.conformance.mutants.registry import Mutant
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import Result, RunResult, Verdict
@@ -31,14 +30,14 @@ from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import DEX1_1, dialect, model
 from dexkit.robots import ROBOTS
 
-__all__ = ["TRIALS", "plan_for", "run_mutant", "run_usb_mutant"]
+__all__ = ["Trial", "plan_for", "run_mutant", "run_usb_mutant"]
 
 SESSION_SECONDS = 4.0
 _BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
 
 
 class Trial(Protocol):
-    """Functions that run and judge the wrong hands of a layer."""
+    """How the wrong hands of a layer are run and judged."""
 
     def cost(self, mutant: Mutant) -> float:
         """Roughly how long a run takes, in units of the shortest on DDS."""
@@ -104,7 +103,7 @@ def run_usb_mutant(
     device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
 ) -> list[Result]:
     """Judge a USB device on the virtual clock."""
-    return judge_layer(USB, run_virtual_usb(device(side)), requirements)
+    return judge_layer(layer("usb"), run_virtual_usb(device(side)), requirements)
 
 
 def _blamed(results: Sequence[Result]) -> set[str]:
@@ -202,14 +201,7 @@ class ClientTrial:
         """The requirements that fail or warn, the hands' included; there is no short form."""
         spoken = dialect(mutant.dialect) if mutant.dialect else model(mutant.model).dialects[0]
         trace = run_client(mutant.made, spoken)
-        result = judge(recording_of(trace, spoken.name, ()))
+        recording = layer(mutant.layer).decode(trace, spoken.name, ())
+        assert recording is not None, "only USB may be missing from a recording"
+        result = judge(recording)
         return _blamed([*result.results, *result.client])
-
-
-TRIALS: Mapping[str, Trial] = {
-    "dds": HandTrial(),
-    "robot": RobotTrial(),
-    "usb": UsbTrial(),
-    "client": ClientTrial(),
-}
-"""By layer."""

@@ -21,7 +21,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.conformance.layers import LAYERS, layer
+from dexkit.conformance.plots import Plot
 from dexkit.documents import parse_toml, read_toml
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.models import BUILT_IN, DIALECTS, HandModel, model, model_plugins
@@ -30,7 +31,6 @@ from dexkit.robots import ROBOTS, RobotModel, robot
 __all__ = [
     "CAPABILITIES",
     "CONFIDENCE",
-    "LAYERS",
     "Kind",
     "Level",
     "Requirement",
@@ -61,16 +61,6 @@ CAPABILITIES: Mapping[str, str] = {
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
-LAYERS = ("dds", "usb", "robot", "client")
-"""Layers of requirements: a hand's topics, its USB device, a robot's topics, or the commands of the
-client that drives a hand."""
-_PLOTS: Mapping[str, tuple[Plot, ...]] = {
-    "dds": (Plot(PlotKind.POSITION),),
-    "robot": (Plot(PlotKind.POSITION),),
-    "client": (Plot(PlotKind.POSITION),),
-    "usb": (Plot(PlotKind.ANSWERS), Plot(PlotKind.BYTES)),
-}
-"""By layer: what a failure shows where neither the catalogue nor the check names a plot."""
 _KEYS = {
     "id",
     "area",
@@ -173,7 +163,8 @@ class Requirement:
     :param after: requirements that must not have failed, or this one is blocked.
     :param dialects: the dialects that it applies to.
     :param tolerances: the figures that the check compares with.
-    :param layer: one of :data:`LAYERS`; a file's ``layer``, ``dds`` by default.
+    :param layer: one of :data:`~dexkit.conformance.layers.LAYERS`; a file's ``layer``, ``dds`` by
+        default.
     :param realtime: a machine that is short of processor time can make a good hand fail it; a
         failure is then not blamed on the hand.
     :param cause: likely cause of a failure: the usual mistake of vendors.
@@ -409,9 +400,10 @@ def _parse(
     if not isinstance(retired, list):
         raise UsageError(f"{origin}: retired is a list of ids")
     hand = _model_of(document)
-    layer = str(document.get("layer", "dds"))
-    if layer not in LAYERS:
+    layer_name = str(document.get("layer", "dds"))
+    if layer_name not in LAYERS:
         raise UsageError(f"{origin}: layer is one of {', '.join(LAYERS)}")
+    default_plots = layer(layer_name).plots
     dialect_names = (
         (hand.name,) if isinstance(hand, RobotModel) else tuple(d.name for d in hand.dialects)
     )
@@ -442,7 +434,7 @@ def _parse(
                 raise UsageError(f"{where}: {before} does not come before it")
             if kind is Kind.DROP_IN and found[before].kind is Kind.SAFETY:
                 raise UsageError(f"{where}: is drop-in, and cannot come after {before}: safety")
-        if "spoils" in entry and layer != "client":
+        if "spoils" in entry and layer_name != "client":
             raise UsageError(f"{where}: only a requirement about the client spoils others")
         for name in entry.get("dialects", []):
             if name not in DIALECTS:
@@ -467,7 +459,7 @@ def _parse(
             dialects=tuple(entry.get("dialects", dialect_names)),
             tolerances=tolerances,
             realtime=bool(entry.get("realtime", False)),
-            layer=layer,
+            layer=layer_name,
             cause=entry.get("cause", ""),
             expected=_filled(entry.get("expected", entry["sentence"]), tolerances, where),
             capability=entry.get("capability", ""),
@@ -475,7 +467,7 @@ def _parse(
             repeat=entry.get("repeat", 1),
             like=entry.get("like", ""),
             lineage=_lineage(entry, others),
-            plots=_plots(entry["plots"], where) if "plots" in entry else _PLOTS[layer],
+            plots=_plots(entry["plots"], where) if "plots" in entry else default_plots,
             spoils=tuple(entry.get("spoils", ())),
             kind=kind,
             original=entry.get("original", ""),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from dexkit.conformance.layers import layer_of_model
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.stimuli.recorded_session import Session
 from dexkit.conformance.stimuli.script import (
@@ -26,8 +27,6 @@ from dexkit.conformance.stimuli.script import (
     StartService,
     StopService,
 )
-from dexkit.models import model
-from dexkit.robots import ROBOTS
 
 __all__ = [
     "Action",
@@ -50,7 +49,8 @@ __all__ = [
 
 def script_class(model_name: str) -> type[Script[Any]]:
     """The script of a hand model or robot; the model decides for which subjects."""
-    return (ROBOTS.get(model_name) or model(model_name)).script.load()
+    made: type[Script[Any]] = layer_of_model(model_name).script(model_name)
+    return made
 
 
 def script_for(plan: Plan[S], report: Callable[[str], None] = lambda text: None) -> Script[S]:

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from dexkit.clock import RealClock
 from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.layers import layer
 from dexkit.conformance.phased_script import play
 from dexkit.conformance.run_queue import RunQueue, Watched
 from dexkit.conformance.stimuli.usb import (
@@ -36,6 +37,7 @@ from dexkit.conformance.usb.record import (
 from dexkit.conformance.usb.recording import Endpoint
 from dexkit.errors import ConformanceError
 from dexkit.hand import Side
+from dexkit.models import DEX3_1
 from dexkit.traces.recorder import Recorder
 
 __all__ = ["run"]
@@ -110,7 +112,7 @@ def _play(
         return SideRecord(
             descriptors, list(plan.buses), trouble="there is no pair of bulk endpoints"
         )
-    script = UsbScript(plan, report)
+    script: UsbScript = layer("usb").script(DEX3_1.name)(plan, report)
     player = _Player(side, host, pair, recorder, turn)
     try:
         if not play(script, player.carry_out, stop.is_set):

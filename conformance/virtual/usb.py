@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Mapping
 from functools import cache
 
+from dexkit.conformance.layers import layer
 from dexkit.conformance.phased_script import play
 from dexkit.conformance.stimuli.usb import BUSES as MAP
 from dexkit.conformance.stimuli.usb import (
@@ -349,7 +350,7 @@ def run_virtual_usb(device: ReferenceDevice, plan: Plan | None = None) -> UsbRec
     """
     plan = plan or Plan(device.side, burst=25, period=0.02)
     descriptors = device.descriptors()
-    script = UsbScript(plan)
+    script: UsbScript = layer("usb").script(DEX3_1.name)(plan)
     player = _Player(device)
     play(script, player.carry_out)
     record = SideRecord(descriptors, list(plan.buses), script.phases, script.trouble)
