@@ -377,6 +377,10 @@ class MotorCodec:
         table = columns.table([f"{where}[{i}]" for i in slots]) / scale
         return table if name in _LISTS[kind.name] else table * 0.0
 
+    def count(self, columns: Columns, sequence: str) -> NDArray[np.intp]:
+        """Motors in the sequence of each message; -1 where it does not decode."""
+        return columns.count(sequence)
+
     def _mine(self, motors: Sequence[Any], side: Subject) -> Sequence[Any] | None:
         first = self.dialect.index[side]
         mine = motors[first : first + self.joints]

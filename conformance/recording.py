@@ -41,6 +41,7 @@ __all__ = [
     "Recording",
     "SideView",
     "States",
+    "TopicDecoder",
     "TraceLike",
     "detect_dialect",
     "joints_of",
@@ -206,58 +207,30 @@ class Recording:
         :raises TraceUnsupported: its stimulus record, or its USB part, cannot be read.
         """
         chosen = dialect(dialect_name) if dialect_name else detect_dialect(trace)
-        stimulus = (
-            Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
-        )
-        present = {c.topic for c in trace.channels if c.message_count}
-        known = present | {e.topic for e in trace.endpoints}
-        judged = tuple(sides) or tuple(
-            s for s in Side if any(topic in known for topic in chosen.topics(s))
-        )
-        if not judged:
-            names = ", ".join(sorted(present)) or "no messages"
-            raise ConformanceError(
-                f"no {model(chosen.model).title} topic of dialect {chosen.name} in this recording",
-                hint=f"it has: {names}",
-            )
-        # the other side is decoded as well: checks of independence compare both
-        topics = {t for s in Side for t in chosen.topics(s)} & present
         slow = {s: chosen.low_rate_topic.format(side=s) for s in Side}
-        slow = {s: topic for s, topic in slow.items() if topic in present}
         felt = {s: chosen.touch_topic_of(s) for s in Side}
-        felt = {s: topic for s, topic in felt.items() if topic in present}
-        wanted = sorted({*topics, *slow.values(), *felt.values()})
-        samples = trace.load(wanted, decode=True) if topics else {}
-        times = [s.log_time_ns for topic, s in samples.items() if topic in topics and len(s)]
-        marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
-        usb = layer("usb").decode(trace, None, ())
-        if usb is not None:
-            marks.append(usb.origin_ns)
-        origin = min([int(t[0]) for t in times] + marks, default=0)
-        end = max([int(t[-1]) for t in times] + marks, default=0)
-        codec = MotorCodec(chosen)
-        with np.errstate(invalid="ignore"):  # NaN in a message is judged by the checks
-            views: dict[Subject, SideView] = {
-                s: SideView(
-                    s,
-                    _states(codec, s, samples.get(chosen.topics(s)[1]), origin),
-                    _commands(codec, s, samples.get(chosen.topics(s)[0]), origin),
-                    joints_of(chosen, s),
-                )
-                for s in sorted(Side, key=lambda s: s is not Side.LEFT)
-                if s in judged or any(topic in present for topic in chosen.topics(s))
-            }
+        title = f"{model(chosen.model).title} topic of dialect {chosen.name}"
+        found = TopicDecoder(
+            trace,
+            MotorCodec(chosen),
+            missing="" if sides else title,
+            more=[*slow.values(), *felt.values()],
+            usb=True,
+        )
+        judged = tuple(sides) or tuple(s for s in Side if found.knows(s))
+        # the other side is decoded as well: checks of independence compare both
+        views: dict[Subject, SideView] = {
+            s: found.view(s, joints_of(chosen, s))
+            for s in (Side.LEFT, Side.RIGHT)
+            if s in judged or not found.present.isdisjoint(chosen.topics(s))
+        }
         if not sides and (blank := [s for s in judged if _is_blank(views[s])]) != list(judged):
             judged = tuple(s for s in judged if s not in blank)
         else:
             blank = []
         # the kit itself publishes another type in the phase 'foreign'
-        phases = stimulus.phases if stimulus else []
-        foreign = {s for p in phases if p.name == "foreign" for s in p.sides}
-        own = {trace.mixed_types.get(chosen.topics(s)[0]) for s in foreign}
-        notes = [text for text in trace.warnings if text not in own]
-        if trace.truncated:
-            notes.append("the recording is unfinished; it is judged as far as it goes")
+        phases = found.stimulus.phases if found.stimulus else []
+        notes = found.notes({s for p in phases if p.name == "foreign" for s in p.sides})
         imported = trace.metadata.get(IMPORTED, {})
         if imported.get("clock") == NOMINAL or any(absent_fields(imported).values()):
             notes.append(
@@ -269,28 +242,15 @@ class Recording:
             f"taken for a service of one hand; --side {s} judges it all the same"
             for s in blank
         ]
+        touch = {s: found.of_type(topic, chosen.touch_type) for s, topic in felt.items()}
+        slow = {s: topic for s, topic in slow.items() if topic in found.present}
         return cls(
-            dialect=chosen,
-            origin_ns=origin,
-            duration=(end - origin) / 1e9,
+            **found.common(),
             sides=views,
-            channels=trace.channels,
-            endpoints=trace.endpoints,
-            stimulus=stimulus,
             judged=judged,
             notes=notes,
-            usb=usb.since(origin) if usb is not None else None,
-            run=trace.metadata.get(RUN, {}),
-            low_rate={
-                s: _states(codec, s, samples.get(topic), origin, topic) for s, topic in slow.items()
-            },
-            touch={
-                s: _touch(chosen, samples[topic], origin)
-                for s, topic in felt.items()
-                if topic in samples
-                and samples[topic].type_name == chosen.touch_type
-                and not samples[topic].problem
-            },
+            low_rate={s: found.states(s, topic) for s, topic in slow.items()},
+            touch={s: _touch(chosen, x, found.origin_ns) for s, x in touch.items() if x},
         )
 
     @property
@@ -356,6 +316,151 @@ class Recording:
         return self.stimulus.waits.starvation(subject, self.log_time(begin), self.log_time(end))
 
 
+class TopicDecoder:
+    """Decodes the topics of a dialect; hands and robots share it.
+
+    :param codec: has the topics of each subject, and reads the columns of their motors.
+    :param missing: what a recording lacks that has none of these topics; empty if it may.
+    :param more: other topics that are to be read, if they are there.
+    :param usb: decode what was transferred on USB as well.
+    :param payloads: keep the payloads; columns alone take a tenth of the memory.
+    :raises ConformanceError: there is no such topic.
+    :raises TraceUnsupported: the stimulus record, or the USB part, cannot be read.
+
+    :ivar present: the topics that have messages.
+    :ivar origin_ns: log time of second 0.
+    """
+
+    def __init__(
+        self,
+        trace: TraceLike,
+        codec: MotorCodec,
+        *,
+        missing: str,
+        more: Iterable[str] = (),
+        usb: bool = False,
+        payloads: bool = False,
+    ) -> None:
+        self._trace, self._codec = trace, codec
+        recorded = trace.metadata.get(RECORD)
+        self.stimulus = None if recorded is None else Stimulus.from_metadata(recorded)
+        self.present = {c.topic for c in trace.channels if c.message_count}
+        self._known = self.present | {e.topic for e in trace.endpoints}
+        own = {*codec.command_topics.values(), *codec.state_topics.values()}
+        if missing and own.isdisjoint(self._known):
+            raise ConformanceError(
+                f"no {missing} in this recording",
+                hint=f"it has: {', '.join(sorted(self.present)) or 'no messages'}",
+            )
+        topics = own & self.present
+        wanted = sorted(topics | set(more) & self.present)
+        self._samples = trace.load(wanted, decode=not payloads) if topics else {}
+        times = [s.log_time_ns for topic, s in self._samples.items() if topic in topics and len(s)]
+        marks = [p.begin_ns for p in self.stimulus.phases] if self.stimulus else []
+        found_usb = layer("usb").decode(trace, None, ()) if usb else None
+        if found_usb is not None:
+            marks.append(found_usb.origin_ns)
+        self.origin_ns = min([int(t[0]) for t in times] + marks, default=0)
+        self._end_ns = max([int(t[-1]) for t in times] + marks, default=0)
+        self._usb = None if found_usb is None else found_usb.since(self.origin_ns)
+
+    def common(self) -> dict[str, Any]:
+        """The arguments of a :class:`Recording` that do not depend on its subjects."""
+        return {
+            "dialect": self._codec.dialect,
+            "origin_ns": self.origin_ns,
+            "duration": (self._end_ns - self.origin_ns) / 1e9,
+            "channels": self._trace.channels,
+            "endpoints": self._trace.endpoints,
+            "stimulus": self.stimulus,
+            "usb": self._usb,
+            "run": self._trace.metadata.get(RUN, {}),
+        }
+
+    def knows(self, subject: Subject) -> bool:
+        """Whether the subject has a topic: messages, or an endpoint."""
+        return not self._known.isdisjoint(self._codec.dialect.topics(subject))
+
+    def notes(self, confused: Iterable[Subject]) -> list[str]:
+        """Remarks on the recording.
+
+        :param confused: subjects to which the kit itself publishes another type.
+        """
+        own = {self._trace.mixed_types.get(self._codec.command_topics[s]) for s in confused}
+        notes = [text for text in self._trace.warnings if text not in own]
+        if self._trace.truncated:
+            notes.append("the recording is unfinished; it is judged as far as it goes")
+        return notes
+
+    def of_type(self, topic: str, type_name: str) -> SampleArray | None:
+        """The samples of a topic, if it is there with that type and can be decoded."""
+        samples = self._samples.get(topic)
+        if samples is None or samples.type_name != type_name:
+            return None
+        return None if samples.problem and samples.decoded is None else samples
+
+    def view(self, subject: Subject, joints: tuple[JointSpec, ...]) -> SideView:
+        """The states and commands of a subject."""
+        states = self.states(subject, self._codec.state_topics[subject])
+        return SideView(subject, states, self._commands(subject), joints)
+
+    def states(self, subject: Subject, topic: str) -> States:
+        """The states of a subject on a topic."""
+        codec = self._codec
+        samples = self.of_type(topic, codec.dialect.state_type)
+        if samples is None:
+            t, none = np.empty(0), np.empty((0, codec.joints))
+            return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)
+        columns = samples.columns()
+
+        def column(name: str, unit: tuple[float, ...] = ()) -> Floats:
+            with np.errstate(invalid="ignore"):  # NaN in a message is judged by the checks
+                values = codec.column(columns, subject, codec.state, name)
+                return np.asarray(values * unit) if unit else values
+
+        speeds, torques = codec.dialect.speed_units, codec.dialect.torque_units
+        return States(
+            topic=topic,
+            t=_seconds(samples.log_time_ns, self.origin_ns),
+            sent=_sent(samples, self.origin_ns),
+            length=codec.count(columns, codec.state_sequence),
+            q=column("q"),
+            dq=column("dq", speeds),
+            ddq=column("ddq", speeds),
+            tau=column("tau_est", torques),
+            mode=column("mode"),
+            errors={i: str(e) for i, e in columns.errors.items()},
+            columns=columns,
+        )
+
+    def _commands(self, subject: Subject) -> Commands:
+        codec = self._codec
+        topic = codec.command_topics[subject]
+        samples = self.of_type(topic, codec.dialect.cmd_type)
+        if samples is None:
+            t, none = np.empty(0), np.empty((0, codec.joints))
+            count = np.empty(0, np.intp)
+            return Commands(topic, t, t, count, none, none, none, none, none, none)
+        columns = samples.columns()
+
+        def column(name: str) -> Floats:
+            with np.errstate(invalid="ignore"):
+                return codec.column(columns, subject, codec.command, name)
+
+        return Commands(
+            topic=topic,
+            t=_seconds(samples.log_time_ns, self.origin_ns),
+            sent=_sent(samples, self.origin_ns),
+            length=codec.count(columns, codec.command_sequence),
+            q=column("q"),
+            dq=column("dq"),
+            tau=column("tau"),
+            kp=column("kp"),
+            kd=column("kd"),
+            mode=column("mode"),
+        )
+
+
 def detect_dialect(trace: TraceLike) -> Dialect:
     """The dialect whose topics and types are in the recording.
 
@@ -395,37 +500,6 @@ def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
     return np.asarray((times - origin) / 1e9, dtype=np.float64)
 
 
-def _states(
-    codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int, topic: str = ""
-) -> States:
-    topic = topic or codec.dialect.topics(side)[1]
-    if samples is None or samples.type_name != codec.dialect.state_type:
-        t, none = np.empty(0), np.empty((0, codec.joints))
-        return States(topic, t, t, np.empty(0, np.intp), none, none, none, none, none)
-    columns = samples.decoded
-    if columns is None:
-        columns = codec.state.columns(samples.payloads)
-
-    def column(name: str, unit: tuple[float, ...] = ()) -> Floats:
-        values = codec.column(columns, side, codec.state, name)
-        return np.asarray(values * unit) if unit else values
-
-    speeds, torques = codec.dialect.speed_units, codec.dialect.torque_units
-    return States(
-        topic=topic,
-        t=_seconds(samples.log_time_ns, origin),
-        sent=_sent(samples, origin),
-        length=columns.count(codec.state_sequence),
-        q=column("q"),
-        dq=column("dq", speeds),
-        ddq=column("ddq", speeds),
-        tau=column("tau_est", torques),
-        mode=column("mode"),
-        errors={i: str(e) for i, e in columns.errors.items()},
-        columns=columns,
-    )
-
-
 def _touch(dialect: Dialect, samples: SampleArray, origin: int) -> Touch:
     hand = model(dialect.model)
     assert isinstance(hand, HandModel)  # a robot has no dialect with a touch topic
@@ -455,34 +529,6 @@ def _is_blank(view: SideView) -> bool:
     # the first rows nearly always tell
     return len(states) > 0 and not any(
         np.nan_to_num(a[:_SOME]).any() or np.nan_to_num(a[_SOME:]).any() for a in (*said, *drives)
-    )
-
-
-def _commands(codec: MotorCodec, side: Side, samples: SampleArray | None, origin: int) -> Commands:
-    topic = codec.dialect.topics(side)[0]
-    if samples is None or samples.type_name != codec.dialect.cmd_type:
-        none = np.empty((0, codec.joints))
-        count = np.empty(0, np.intp)
-        t = np.empty(0)
-        return Commands(topic, t, t, count, none, none, none, none, none, none)
-    columns = samples.decoded
-    if columns is None:
-        columns = codec.command.columns(samples.payloads)
-
-    def column(name: str) -> Floats:
-        return codec.column(columns, side, codec.command, name)
-
-    return Commands(
-        topic=topic,
-        t=_seconds(samples.log_time_ns, origin),
-        sent=_sent(samples, origin),
-        length=columns.count(codec.command_sequence),
-        q=column("q"),
-        dq=column("dq"),
-        tau=column("tau"),
-        kp=column("kp"),
-        kd=column("kd"),
-        mode=column("mode"),
     )
 
 

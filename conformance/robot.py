@@ -17,15 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.motor_messages import Motor, MotorCodec, Motors
-from dexkit.conformance.recording import Commands, Recording, SideView, States, TraceLike
-from dexkit.conformance.run_record import RECORD as RUN
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
-from dexkit.errors import ConformanceError, WireError
+from dexkit.conformance.recording import Recording, TopicDecoder, TraceLike
+from dexkit.errors import WireError
 from dexkit.hand import ROBOT, Floats, Subject
-from dexkit.messages import Columns, message_type
+from dexkit.messages import Columns, MessageType, message_type
 from dexkit.models import Dialect
 from dexkit.robots import H1, ROBOTS, RobotModel, robot
-from dexkit.traces import SampleArray
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.low_level import encode_with_crc, verify_payload
 
@@ -116,6 +113,15 @@ class RobotMotorCodec(MotorCodec):
         """Encode a command in the other family's type, with its CRC."""
         return encode_with_crc(self._message(self.foreign.name, motors))
 
+    def column(self, columns: Columns, side: Subject, kind: MessageType, name: str) -> Floats:
+        """A value of the used slots: shape (n, n_joints)."""
+        sequence = self.state_sequence if kind is self.state else self.command_sequence
+        return np.ascontiguousarray(columns[f"{sequence}[].{name}"].T[list(self.robot.used)]).T
+
+    def count(self, columns: Columns, sequence: str) -> NDArray[np.intp]:
+        """All motor slots: the messages have arrays; -1 where one does not decode."""
+        return np.where(columns.ok, self.robot.slots, -1).astype(np.intp)
+
     def _message(self, type_name: str, motors: Sequence[Motor]) -> Any:
         message = message_type(type_name).cls()
         for place, m in zip(message.motor_cmd, motors, strict=False):
@@ -135,12 +141,10 @@ def codec_for(dialect: Dialect) -> MotorCodec:
 class RobotRecording(Recording):
     """A recording of a robot, decoded.
 
-    :param low: its states, all members; None without any.
     :param payloads: of the states, likewise of the commands.
     """
 
     robot: RobotModel = H1
-    low: Columns | None = None
     payloads: Sequence[bytes] = field(default=(), repr=False)
     command_payloads: Sequence[bytes] = field(default=(), repr=False)
 
@@ -150,6 +154,11 @@ class RobotRecording(Recording):
     def model(self) -> RobotModel:
         """The robot's model."""
         return self.robot
+
+    @property
+    def low(self) -> Columns | None:
+        """The states, all members; None without any."""
+        return self.sides[ROBOT].states.columns
 
     @cached_property
     def intact(self) -> Flags:
@@ -190,111 +199,17 @@ def robot_recording(trace: TraceLike, name: str) -> RobotRecording:
     :raises ConformanceError: it has none of the robot's topics.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
-    model, dialect = robot(name), robot_dialect(name)
-    stimulus = Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
-    present = {c.topic for c in trace.channels if c.message_count}
-    topics = {model.cmd_topic, model.state_topic}
-    if not topics & (present | {e.topic for e in trace.endpoints}):
-        raise ConformanceError(
-            f"no topic of the {model.title} in this recording",
-            hint=f"it has: {', '.join(sorted(present)) or 'no messages'}",
-        )
-    samples = trace.load(sorted(topics & present)) if topics & present else {}
-    times = [s.log_time_ns for s in samples.values() if len(s)]
-    marks = [p.begin_ns for p in stimulus.phases] if stimulus else []
-    origin = min([int(t[0]) for t in times] + marks, default=0)
-    end = max([int(t[-1]) for t in times] + marks, default=0)
-    states = _samples_of_type(samples.get(model.state_topic), model.state_type)
-    commands = _samples_of_type(samples.get(model.cmd_topic), model.cmd_type)
-    low = states.columns() if states is not None else None
-    with np.errstate(invalid="ignore"):
-        hand = SideView(
-            ROBOT,
-            _states(model, states, low, origin),
-            _commands(model, commands, origin),
-            tuple(model.joint(slot) for slot in model.used),
-        )
-    own = trace.mixed_types.get(model.cmd_topic)
-    notes = [text for text in trace.warnings if text != own]
-    if trace.truncated:
-        notes.append("the recording is unfinished; it is judged as far as it goes")
+    codec = RobotMotorCodec(robot_dialect(name))
+    model, dialect = codec.robot, codec.dialect
+    found = TopicDecoder(trace, codec, missing=f"topic of the {model.title}", payloads=True)
+    states = found.of_type(dialect.state_topic, dialect.state_type)
+    commands = found.of_type(dialect.cmd_topic, dialect.cmd_type)
     return RobotRecording(
-        dialect=dialect,
-        origin_ns=origin,
-        duration=(end - origin) / 1e9,
-        sides={ROBOT: hand},
-        channels=trace.channels,
-        endpoints=trace.endpoints,
-        stimulus=stimulus,
+        **found.common(),
+        sides={ROBOT: found.view(ROBOT, tuple(model.joint(slot) for slot in model.used))},
         judged=(ROBOT,),
-        notes=notes,
+        notes=found.notes((ROBOT,)),
         robot=model,
-        low=low,
         payloads=states.payloads if states is not None else (),
         command_payloads=commands.payloads if commands is not None else (),
-        run=trace.metadata.get(RUN, {}),
-    )
-
-
-def _samples_of_type(samples: SampleArray | None, type_name: str) -> SampleArray | None:
-    if samples is None or samples.type_name != type_name or samples.problem:
-        return None
-    return samples
-
-
-def _times(samples: SampleArray, origin: int) -> tuple[Floats, Floats]:
-    sent = (samples.publish_time_ns - origin) / 1e9
-    sent[samples.publish_time_ns == 0] = np.nan
-    return (samples.log_time_ns - origin) / 1e9, sent
-
-
-def _used(columns: Columns, model: RobotModel, member: str) -> Floats:
-    return np.ascontiguousarray(columns[member].T[list(model.used)]).T
-
-
-def _states(
-    model: RobotModel, samples: SampleArray | None, columns: Columns | None, origin: int
-) -> States:
-    if samples is None or columns is None:
-        never, none = np.empty(0), np.empty((0, len(model.used)))
-        count = np.empty(0, np.intp)
-        return States(model.state_topic, never, never, count, none, none, none, none, none)
-    t, sent = _times(samples, origin)
-    return States(
-        topic=model.state_topic,
-        t=t,
-        sent=sent,
-        length=np.where(columns.ok, model.slots, -1).astype(np.intp),
-        q=_used(columns, model, "motor_state[].q"),
-        dq=_used(columns, model, "motor_state[].dq"),
-        ddq=_used(columns, model, "motor_state[].ddq"),
-        tau=_used(columns, model, "motor_state[].tau_est"),
-        mode=_used(columns, model, "motor_state[].mode"),
-        errors={i: str(e) for i, e in columns.errors.items()},
-        columns=columns,
-    )
-
-
-def _commands(model: RobotModel, samples: SampleArray | None, origin: int) -> Commands:
-    if samples is None:
-        none = np.empty((0, len(model.used)))
-        empty, count = np.empty(0), np.empty(0, np.intp)
-        return Commands(model.cmd_topic, empty, empty, count, none, none, none, none, none, none)
-    columns = samples.columns()
-
-    def column(name: str) -> Floats:
-        return _used(columns, model, f"motor_cmd[].{name}")
-
-    t, sent = _times(samples, origin)
-    return Commands(
-        topic=model.cmd_topic,
-        t=t,
-        sent=sent,
-        length=np.where(columns.ok, model.slots, -1).astype(np.intp),
-        q=column("q"),
-        dq=column("dq"),
-        tau=column("tau"),
-        kp=column("kp"),
-        kd=column("kd"),
-        mode=column("mode"),
     )
