@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
+from dexkit.conformance.layers import layer
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Load, Result, RunResult, Verdict
 from dexkit.conformance.stimulus_record import RECORD, Beats, Stall, Stimulus
+from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
+from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.hand import Side
 
 SUITE = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
@@ -25,6 +28,13 @@ def short_run() -> MemoryTrace:
     """A good left hand through listening, steps and silence."""
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", "silence"}))
     return run_virtual(plan, ReferenceService)
+
+
+def usb_run(device: ReferenceDevice) -> UsbRecording:
+    """A virtual run of the USB script with a device, decoded."""
+    recording = layer("usb").decode(run_virtual_usb(device), None, ())
+    assert isinstance(recording, UsbRecording)
+    return recording
 
 
 def copy_of(trace: MemoryTrace) -> MemoryTrace:

@@ -24,10 +24,9 @@ from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual
-from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
-from tests.conformance_helpers import copy_of, result_of, short_run
+from tests.conformance_helpers import copy_of, result_of, short_run, usb_run
 from tests.each import each
 from tests.report_helpers import HOSTILE, result_of_every_kind
 
@@ -252,7 +251,7 @@ def test_usb_failure_shows_bytes_joints_or_descriptors() -> None:
     every = catalogue("dex3-1", "usb")
     for device, title in kinds.items():
         kills = next(m.kills for m in mutants() if m.made is device)
-        usb = run_virtual_usb(device(Side.LEFT))
+        usb = usb_run(device(Side.LEFT))
         found = next(r for r in judge_layer(USB, usb, every) if r.requirement.id == kills)
         (figure,) = plots_of(found, replace(view, usb=usb))
         parsed(figure)

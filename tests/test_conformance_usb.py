@@ -38,13 +38,14 @@ from dexkit.conformance.usb.record import (
 )
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
-from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
+from dexkit.conformance.virtual.usb import ReferenceDevice
 from dexkit.errors import ConformanceError, TraceUnsupported
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 from dexkit.traces import open_trace
 from dexkit.traces.recorder import Recorder
 from dexkit.wire import crc32, dex3_usb
+from tests.conformance_helpers import usb_run
 from tests.each import each
 
 BY_NAME = {m.name: m for m in mutants("usb")}
@@ -133,7 +134,7 @@ def test_transfer_is_decoded_unchanged(data: bytes, status: int, when: int) -> N
 
 
 def test_recording_from_file_gives_same_verdicts(tmp_path: Path) -> None:
-    live = run_virtual_usb(ReferenceDevice(Side.RIGHT))
+    live = usb_run(ReferenceDevice(Side.RIGHT))
     (hand,) = live.sides.values()
     with Recorder(tmp_path / "run.mcap") as recorder:
         for transfer in hand.transfers:
@@ -169,7 +170,7 @@ def test_every_requirement_has_a_check_and_a_wrong_device() -> None:
     assert all(check_of(r) for r in usb())
     assert {m.kills for m in mutants("usb")} == ids
     kinds = set(DAMAGES)
-    hand = run_virtual_usb(ReferenceDevice(Side.LEFT)).sides[Side.LEFT]
+    hand = usb_run(ReferenceDevice(Side.LEFT)).sides[Side.LEFT]
     assert {p.params["kind"] for p in hand.phases("malformed")} == kinds
     assert {r.phase for r in usb()} - {None} <= {p.name for p in hand.record.phases}
 
@@ -182,7 +183,7 @@ def test_the_documented_schema_is_the_current_one() -> None:
 
 @pytest.mark.parametrize("side", list(Side))
 def test_reference_device_passes(side: Side) -> None:
-    results = judge_layer(USB, run_virtual_usb(ReferenceDevice(side)), usb())
+    results = judge_layer(USB, usb_run(ReferenceDevice(side)), usb())
     assert [r.explain() for r in results if r.verdict is not Verdict.PASS] == []
     assert len(results) == len(usb())
 
@@ -218,7 +219,7 @@ def test_failure_has_evidence_in_the_recording() -> None:
 def test_slow_rate_on_overloaded_machine_is_blocked() -> None:
     from dexkit.conformance.stimulus_record import Beats
 
-    recording = run_virtual_usb(BY_NAME["Slow"].made(Side.LEFT))
+    recording = usb_run(BY_NAME["Slow"].made(Side.LEFT))
     hand = recording.sides[Side.LEFT]
     first = min(p.begin_ns for p in hand.phases("burst"))
     for late_us, verdict in ((5_000, Verdict.BLOCKED), (100, Verdict.WARN)):
@@ -230,7 +231,7 @@ def test_slow_rate_on_overloaded_machine_is_blocked() -> None:
 
 
 def test_speed_is_not_judged_with_few_samples() -> None:
-    recording = run_virtual_usb(ReferenceDevice(Side.LEFT))
+    recording = usb_run(ReferenceDevice(Side.LEFT))
     hand = recording.sides[Side.LEFT]
     gone = {
         t.done_ns

@@ -103,7 +103,9 @@ def run_usb_mutant(
     device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
 ) -> list[Result]:
     """Judge a USB device on the virtual clock."""
-    return judge_layer(layer("usb"), run_virtual_usb(device(side)), requirements)
+    usb = layer("usb")
+    recording = usb.decode(run_virtual_usb(device(side)), None, ())
+    return judge_layer(usb, recording, requirements)
 
 
 def _blamed(results: Sequence[Result]) -> set[str]:

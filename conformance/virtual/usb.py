@@ -37,9 +37,18 @@ from dexkit.conformance.usb.frames import (
     Scale,
     crc,
 )
-from dexkit.conformance.usb.record import TIMED_OUT, Descriptors, SideRecord, Transfer
-from dexkit.conformance.usb.recording import UsbRecording, UsbSide
-from dexkit.conformance.virtual.topics import ORIGIN_NS, log_time_ns
+from dexkit.conformance.usb.record import (
+    RECORD,
+    SCHEMA_NAME,
+    TIMED_OUT,
+    Descriptors,
+    SideRecord,
+    Transfer,
+    UsbRecord,
+    topic,
+)
+from dexkit.conformance.virtual.memory_trace import MemoryTrace
+from dexkit.conformance.virtual.topics import log_time_ns
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
@@ -314,7 +323,7 @@ class _Player:
 
     def __init__(self, device: ReferenceDevice) -> None:
         self._device = device
-        self.transfers: list[Transfer] = []
+        self.trace = MemoryTrace()
 
     def carry_out(self, action: Action) -> Observation:
         """Carry out an action; the device's clock goes on by its duration."""
@@ -340,10 +349,12 @@ class _Player:
 
     def _put(self, begin: int, endpoint: int, status: int, requested: int, data: bytes) -> None:
         done = log_time_ns(self._device.now)
-        self.transfers.append(Transfer(begin, done, endpoint, status, requested, data))
+        transfer = Transfer(begin, done, endpoint, status, requested, data)
+        name = topic(self._device.side, inward=transfer.inward)
+        self.trace.put(name, SCHEMA_NAME, done, begin, transfer.payload())
 
 
-def run_virtual_usb(device: ReferenceDevice, plan: Plan | None = None) -> UsbRecording:
+def run_virtual_usb(device: ReferenceDevice, plan: Plan | None = None) -> MemoryTrace:
     """Play the script to a device in memory; the recording.
 
     :param plan: by default one with fewer commands than a live run: there is no noise here.
@@ -353,6 +364,6 @@ def run_virtual_usb(device: ReferenceDevice, plan: Plan | None = None) -> UsbRec
     script: UsbScript = layer("usb").script(DEX3_1.name)(plan)
     player = _Player(device)
     play(script, player.carry_out)
-    record = SideRecord(descriptors, list(plan.buses), script.phases, script.trouble)
-    side = UsbSide(plan.side, record, player.transfers, ORIGIN_NS)
-    return UsbRecording(ORIGIN_NS, {plan.side: side})
+    side = SideRecord(descriptors, list(plan.buses), script.phases, script.trouble)
+    player.trace.metadata[RECORD] = UsbRecord({plan.side: side}).to_metadata()
+    return player.trace
