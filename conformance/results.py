@@ -33,6 +33,7 @@ from dexkit.conformance.measured_q import MeasuredQ
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
 from dexkit.conformance.scores import NO_SCORE, Score
+from dexkit.hand import Side
 
 __all__ = [
     "FORMAT",
@@ -343,6 +344,12 @@ class RunResult:
     score: Score = NO_SCORE
     measured_q: tuple[MeasuredQ, ...] = ()
     manual_test: str = ""
+
+    @property
+    def hands(self) -> tuple[Side, ...]:
+        """The hands that were judged; none for a robot."""
+        names = self.subject.get("sides", "").split(", ")
+        return tuple(side for side in Side if str(side) in names)
 
     @property
     def partial(self) -> bool:

@@ -12,6 +12,9 @@ from typing import Any
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.requirements import CAPABILITIES, catalogue
 from dexkit.conformance.run_record import RECORD, run_record
+from dexkit.conformance.usb.record import RECORD as USB_RECORD
+from dexkit.conformance.usb.record import SCHEMA, SCHEMA_NAME, UsbRecord, topic
+from dexkit.conformance.usb.recording import UsbSide
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.hand import Side
 from dexkit.traces.recorder import Recorder
@@ -24,16 +27,6 @@ def write_run(path: Path) -> Path:
     """Write a run of the left hand, on a machine whose timer was always 1.234 ms late."""
     trace = copy_of(short_run())
     with_beats(trace, usual_us=1_234)
-    _write(trace, path)
-    return path
-
-
-def _write(trace: MemoryTrace, path: Path) -> None:
-    """Put a recording in memory into a file, with a run record."""
-    endpoints = {
-        f"{e.topic} {e.kind}": f"{e.reliability}, Durability.{e.durability}, type={e.type_name}"
-        for e in trace.endpoints
-    }
     about = run_record(
         backend="virtual",
         dialect="unitree_go",
@@ -43,12 +36,32 @@ def _write(trace: MemoryTrace, path: Path) -> None:
         requirements=catalogue("dex1-1", "dds"),
         claims=CLAIMS,
     )
+    trace.metadata[RECORD] = about
     with Recorder(path) as recorder:
-        for name, values in {**trace.metadata, "dds_endpoints": endpoints, RECORD: about}.items():
-            recorder.add_metadata(name, values)
-        for (topic, kind), rows in trace.rows.items():
-            for log_ns, sent_ns, data in rows:
-                assert recorder.put(topic, kind, data, log_ns, sent_ns)
+        write_trace(trace, recorder)
+    return path
+
+
+def write_trace(trace: MemoryTrace, recorder: Recorder) -> None:
+    """Put a recording in memory into a file."""
+    endpoints = {
+        f"{e.topic} {e.kind}": f"{e.reliability}, Durability.{e.durability}, type={e.type_name}"
+        for e in trace.endpoints
+    }
+    for name, values in {**trace.metadata, "dds_endpoints": endpoints}.items():
+        recorder.add_metadata(name, values)
+    for (name, kind), rows in trace.rows.items():
+        for log_ns, sent_ns, data in rows:
+            assert recorder.put(name, kind, data, log_ns, sent_ns)
+
+
+def write_usb(hand: UsbSide, recorder: Recorder) -> None:
+    """Put the USB transfers of a hand into a file."""
+    for transfer in hand.transfers:
+        name = topic(hand.side, inward=transfer.inward)
+        recorder.add_foreign_channel(name, SCHEMA_NAME, SCHEMA)
+        recorder.put(name, SCHEMA_NAME, transfer.payload(), transfer.done_ns, transfer.submitted_ns)
+    recorder.add_metadata(USB_RECORD, UsbRecord({hand.side: hand.record}).to_metadata())
 
 
 def checked(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,6 +15,9 @@ from rich.console import Console
 
 from dexkit.cli import cli
 from dexkit.conformance.judge import judge
+from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.mutants.robot import NoCrc
+from dexkit.conformance.mutants.usb import StaleCrc
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import badge_text, render_badge
 from dexkit.conformance.report.compare import (
@@ -30,12 +34,16 @@ from dexkit.conformance.requirements import Kind
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
+from dexkit.conformance.virtual import run_virtual
+from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.traces import open_trace, sample_path
+from dexkit.models import DEX3_1
+from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import short_run
 from tests.each import each
 from tests.report_helpers import HOSTILE, result_of_every_kind, run_named
+from tests.reproduction_helpers import write_trace, write_usb
 
 # ------------------------------------------------------------------------------- Markdown
 
@@ -281,6 +289,39 @@ def test_reports_are_rendered_again_from_result_file(judged: Path, tmp_path: Pat
     assert (tmp_path / link).resolve() == (judged / "run.mcap").resolve()
     assert "No gap in the state" in (tmp_path / "r.md").read_text()
     assert ElementTree.parse(tmp_path / "r.xml").getroot().tag == "testsuite"
+
+
+def write_robot(recorder: Recorder) -> str:
+    """Record a robot whose states have no CRC, and the requirement that it fails."""
+    plan = replace(plan_for("h1"), phases=frozenset[str]())
+    write_trace(run_virtual(plan, NoCrc), recorder)
+    return "H1-CRC-01"
+
+
+def write_hand_on_usb(recorder: Recorder) -> str:
+    """Record a good Dex3-1 whose USB device sends old checksums."""
+    plan = replace(plan_for("dex3", sides=(Side.LEFT,)), phases=frozenset[str]())
+    write_trace(run_virtual(plan, DEX3_1.reference.load()), recorder)
+    (usb,) = run_virtual_usb(StaleCrc(Side.LEFT)).sides.values()
+    write_usb(usb, recorder)
+    return "DEX3USB-CRC-01"
+
+
+@each("written", [write_robot, write_hand_on_usb])
+def test_page_of_a_robot_or_of_usb_is_drawn_from_the_recording_beside_its_result(
+    written: Callable[[Recorder], str], tmp_path: Path
+) -> None:
+    recording, result = tmp_path / "run.mcap", tmp_path / "result.json"
+    with Recorder(recording) as recorder:
+        failed = written(recorder)
+    first, again = tmp_path / "first.html", tmp_path / "again.html"
+    run("check", recording, "--json", result, "--html", first)
+    verdicts = {r.requirement.id: r.verdict for r in read_json(result).results}
+    assert verdicts[failed] is Verdict.FAIL
+    done = run("report", result, "--html", again)
+    assert done.exit_code == 0, done.output
+    assert "<svg" in again.read_text()
+    assert again.read_text() == first.read_text()
 
 
 def test_page_without_recording_has_no_plots(judged: Path, tmp_path: Path) -> None:

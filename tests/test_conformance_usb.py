@@ -28,13 +28,10 @@ from dexkit.conformance.stimuli.usb import BUSES, DAMAGES
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
 from dexkit.conformance.usb.record import (
-    RECORD,
     SCHEMA,
-    SCHEMA_NAME,
     TIMED_OUT,
     Transfer,
     UsbRecord,
-    topic,
 )
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.usb.run import run
@@ -47,6 +44,7 @@ from dexkit.traces.recorder import Recorder
 from dexkit.wire import crc32, dex3_usb
 from tests.conformance_helpers import usb_run
 from tests.each import each
+from tests.reproduction_helpers import write_usb
 
 BY_NAME = {m.name: m for m in mutants("usb")}
 ACCEPTABLE = {Verdict.PASS, Verdict.NOT_APPLICABLE}
@@ -137,13 +135,7 @@ def test_recording_from_file_gives_same_verdicts(tmp_path: Path) -> None:
     live = usb_run(ReferenceDevice(Side.RIGHT))
     (hand,) = live.sides.values()
     with Recorder(tmp_path / "run.mcap") as recorder:
-        for transfer in hand.transfers:
-            name = topic(Side.RIGHT, inward=transfer.inward)
-            recorder.add_foreign_channel(name, SCHEMA_NAME, SCHEMA)
-            recorder.put(
-                name, SCHEMA_NAME, transfer.payload(), transfer.done_ns, transfer.submitted_ns
-            )
-        recorder.add_metadata(RECORD, UsbRecord({Side.RIGHT: hand.record}).to_metadata())
+        write_usb(hand, recorder)
     trace = open_trace(tmp_path / "run.mcap")
     assert trace.warnings == []
     assert trace.topics == ["usb/dex3/right/in", "usb/dex3/right/out"]

@@ -11,7 +11,6 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.requirements import CAPABILITIES, Kind
 from dexkit.conformance.results import VERSION, Result, RunResult
-from dexkit.hand import Side
 from dexkit.traces import open_trace
 
 __all__ = ["claimed_differences", "judged_again", "verdict_differences"]
@@ -26,11 +25,8 @@ def judged_again(found: RunResult, recording: Path) -> tuple[RunResult, list[str
 
     :raises DexkitError: the recording cannot be read, or is not of that kind of hand.
     """
-    about = found.subject
-    names = about.get("sides", "").split(", ")
-    sides = tuple(side for side in Side if str(side) in names)
     trace = open_trace(recording)
-    view = recording_of(trace, about.get("dialect"), sides)
+    view = recording_of(trace, found.subject.get("dialect"), found.hands)
     claims = Claims()
     if found.claims is not None:
         claims = Claims({unit: found.claims.get(unit, False) for unit in CAPABILITIES})

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from dexkit.conformance.recording import Recording
     from dexkit.conformance.results import RunResult
 
-_SIDES = ("left", "right")
-
 
 def write_text(path: Path, text: str) -> None:
     """Write a report; ``-`` is standard output."""
@@ -113,15 +111,12 @@ def _matching_recording(path: Path, result: RunResult, *, given: bool) -> Record
 
     :raises UsageError: the recording that the user gave is not the one that was judged.
     """
-    from dexkit.conformance.recording import Recording
+    from dexkit.conformance.layers import recording_of
     from dexkit.conformance.report.labels import utc_date
-    from dexkit.hand import Side
     from dexkit.traces import open_trace
 
-    about = result.subject
-    sides = [Side(name) for name in about.get("sides", "").split(", ") if name in _SIDES]
     trace = open_trace(path)
-    view = Recording.decode(trace, dialect_name=about.get("dialect"), sides=sides)
+    view = recording_of(trace, result.subject.get("dialect"), result.hands)
     for text in trace.damage:
         click.echo(f"warning: {path}: {text}", err=True)
     when = utc_date(view.origin_ns).isoformat(timespec="seconds")
