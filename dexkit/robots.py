@@ -8,6 +8,7 @@ whose ``mode_machine`` is 5.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -18,6 +19,7 @@ from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
     from dexkit.conformance.stimuli.script import Script
+    from dexkit.kinematics import Skeleton
     from dexkit.robot_layout import RobotLayout
 
 __all__ = ["DQ_STOP", "G1", "H1", "Q_STOP", "ROBOTS", "RobotModel", "robot"]
@@ -45,7 +47,8 @@ class RobotModel:
     :param requirements: its requirement files, in dexkit's own folder.
     :param script: its stimulus script in the conformance kit.
     :param quick_seconds: seconds of stimulus of a quick conformance run.
-    :param layout: how it is drawn.
+    :param layout: how it is drawn in the docs.
+    :param skeleton: makes the joint axes and origins, for the viewer.
     :param joints: by motor slot; None where the slot is not used.
     :param enable: mode byte that lets the motor of a slot follow commands; 0 turns it off.
     :param client_gains: by slot, kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends.
@@ -72,6 +75,7 @@ class RobotModel:
     requirements: tuple[str, ...]
     quick_seconds: float
     layout: Lazy[RobotLayout]
+    skeleton: Lazy[Callable[[], Skeleton]]
     joints: tuple[JointSpec | None, ...]
     enable: tuple[int, ...]
     client_gains: tuple[tuple[float, float], ...]
@@ -216,6 +220,7 @@ H1 = RobotModel(
     requirements=("h1.toml",),
     quick_seconds=13.0,
     layout=Lazy("dexkit.robot_layout:H1"),
+    skeleton=Lazy("dexkit.models.skeletons:h1"),
     joints=_h1_joints,
     # docs/sources/unitree-dex.md#a8: 0x01 for weak motors (ankles, arms), 0x0A for the others
     enable=tuple(0x01 if i in _H1_WEAK else 0x0A for i in range(len(_H1_ORDER))),
@@ -286,6 +291,7 @@ G1 = RobotModel(
     requirements=("g1.toml",),
     quick_seconds=17.0,
     layout=Lazy("dexkit.robot_layout:G1"),
+    skeleton=Lazy("dexkit.models.skeletons:g1"),
     joints=_g1_joints,
     enable=(1,) * len(_G1_ORDER),  # docs/sources/unitree-dex.md#a8: 1 enable, 0 disable
     client_gains=tuple(_g1_gains(name) for name in _G1_ORDER),

@@ -66,17 +66,16 @@ LAB = "tools/lab/"
 
 
 def names_a_model(node: ast.expr) -> bool:
-    """Whether it is a model's or dialect's name, as text or as ``DEX1_1.name``."""
+    """Whether it is a model, as ``DEX1_1`` or ``robots.H1``, or its name or that of a dialect, as
+    text or as ``DEX1_1.name``.
+    """
     if isinstance(node, ast.Constant):
         return node.value in NAMES
     if isinstance(node, (ast.Tuple, ast.List, ast.Set)):
         return any(names_a_model(e) for e in node.elts)
-    return (
-        isinstance(node, ast.Attribute)
-        and node.attr == "name"
-        and isinstance(node.value, ast.Name)
-        and node.value.id in CONSTANTS
-    )
+    if isinstance(node, ast.Attribute):
+        return node.attr in CONSTANTS or (node.attr == "name" and names_a_model(node.value))
+    return isinstance(node, ast.Name) and node.id in CONSTANTS
 
 
 def by_name(source: str) -> list[int]:
@@ -102,7 +101,10 @@ def test_comparisons_and_tables_by_name_are_recognized() -> None:
     assert by_name('d in ("dex3", "dex5")') == [1]
     assert by_name('T = {"unitree_hg": 1}') == [1]
     assert by_name("T = {DEX3_1.name: 1}") == [1]
-    assert by_name("a.name == b.name\nT = {'side': 1}") == []
+    assert by_name("model is H1") == [1]
+    assert by_name("m == models.DEX5_1\nT = {G1: 1}") == [1, 2]
+    assert by_name("m in (DEX1_1, DEX3_1)") == [1]
+    assert by_name("a.name == b.name\nT = {'side': 1}\nt != G1.cmd_topic") == []
 
 
 def test_nothing_outside_the_profiles_depends_on_the_name_of_a_model_or_dialect() -> None:

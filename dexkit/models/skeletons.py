@@ -25,12 +25,12 @@ _RIGHT = math.pi / 2
 
 
 def skeleton_of(model: HandModel | RobotModel, side: Side | None = None) -> Skeleton:
-    """The skeleton of a hand or a robot: its profile's, or a schematic one.
+    """The skeleton of a hand or a robot: its profile's, or a schematic one of a hand.
 
     :param side: of a hand; None for a robot.
     """
     if isinstance(model, RobotModel):
-        return h1() if model is H1 else g1()
+        return model.skeleton.load()()
     assert side is not None
     if model.skeleton is not None:
         return model.skeleton.load()(side)
