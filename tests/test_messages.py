@@ -33,13 +33,18 @@ def test_the_sequence_of_motors_follows_from_the_layout() -> None:
     found = {
         kind.name: (kind.motor_sequence, kind.motor_type.cls)
         for kind in message_types()
-        if kind.layout.name in ("MotorCmds_", "MotorStates_", "HandCmd_", "HandState_")
+        if kind.layout.name
+        in ("MotorCmds_", "MotorStates_", "HandCmd_", "HandState_", "LowCmd_", "LowState_")
     }
     assert found == {
         "unitree_go::msg::dds_::MotorCmds_": ("cmds", go.MotorCmd_),
         "unitree_go::msg::dds_::MotorStates_": ("states", go.MotorState_),
         "unitree_hg::msg::dds_::HandCmd_": ("motor_cmd", hg.MotorCmd_),
         "unitree_hg::msg::dds_::HandState_": ("motor_state", hg.MotorState_),
+        "unitree_go::msg::dds_::LowCmd_": ("motor_cmd", go.MotorCmd_),
+        "unitree_go::msg::dds_::LowState_": ("motor_state", go.MotorState_),
+        "unitree_hg::msg::dds_::LowCmd_": ("motor_cmd", hg.MotorCmd_),
+        "unitree_hg::msg::dds_::LowState_": ("motor_state", hg.MotorState_),
     }
     with pytest.raises(UsageError, match="no sequence of motors"):
         _ = message_type("unitree_go::msg::dds_::MotorCmd_").motor_sequence

@@ -14,12 +14,16 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
 from dexkit.messages import message_type
-from dexkit.traces import open_trace, sample_path
+from dexkit.robots import ROBOTS, RobotModel
+from dexkit.traces import Recorder, open_trace, sample_path
 from dexkit.traces.sessions import tables
 from dexkit.traces.sessions.edit import Span, cut
+from dexkit.traces.sessions.streams import streams_of
 from dexkit.traces.writer import RecordingWriter, definition
+from dexkit.wire.low_level import encode_with_crc
 from tests.each import each
 from tests.messages_helpers import NAMES, messages
+from tests.robot_helpers import Bench, low_cmd
 from tests.test_sessions_import import dexkit
 
 T0 = 1_795_251_429_000_000_000
@@ -139,6 +143,32 @@ def test_several_recordings_are_exported_and_one_refused(tmp_path: Path, part: P
     assert (code, "bad.mcap: refused" in output) == (1, True)
     assert [p.name for p in (tmp_path / "all").iterdir()] == ["part"]
     assert dexkit("export", bad, "--to", "csv", "--out", tmp_path / "one")[0] == 2
+
+
+@each("robot", ROBOTS.values(), ids=list(ROBOTS))
+def test_the_motors_of_a_robot_become_streams(tmp_path: Path, robot: RobotModel) -> None:
+    path = tmp_path / "robot.mcap"
+    bench = Bench(robot)
+    knee = robot.slot("left_knee")
+    with Recorder(path) as recorder:
+        for i in range(20):
+            command = low_cmd(robot, {knee: 0.3 + 0.01 * i})
+            state = bench.run(0.02, command)
+            for topic, kind, message in (
+                (robot.cmd_topic, robot.cmd_type, command),
+                (robot.state_topic, robot.state_type, state),
+            ):
+                assert recorder.put(topic, kind, encode_with_crc(message), T0 + i * 20_000_000)
+    commands, states = streams_of(open_trace(path))
+    assert (commands.kind, states.kind) == ("command", "state")
+    assert commands.part == states.part == robot.name
+    assert commands.joints == tuple(robot.joint(slot).name for slot in robot.used)
+    column = robot.used.index(knee)
+    assert commands.values["q"][:, column] == pytest.approx(0.3 + 0.01 * np.arange(20))
+    assert states.values["q"][-1, column] == pytest.approx(state.motor_state[knee].q)
+    code, output = dexkit("export", path, "--to", "episodes", "--out", tmp_path / "e")
+    assert code == 0, output
+    assert dexkit("info", path, "--plot")[0] == 0
 
 
 def test_equal_values_are_distinguished(tmp_path: Path) -> None:

@@ -66,7 +66,8 @@ class MessageType:
     def motor_sequence(self) -> str:
         """Name of the member that holds the motors of a command or state: ``motor_cmd``.
 
-        Where each quantity has a list, that of the positions.
+        A robot's messages have a fixed array of them. Where each quantity has a list, that of the
+        positions.
 
         :raises UsageError: the type has no sequence of motors.
         """
@@ -137,7 +138,7 @@ class MessageType:
         for member in self.layout.fields:
             struct = member.type
             is_motor = isinstance(struct, layout.Struct) and struct.name in _MOTORS
-            if member.sequence and is_motor:
+            if is_motor and (member.sequence or member.array is not None):
                 return member
         raise UsageError(f"{self.name} has no sequence of motors")
 
