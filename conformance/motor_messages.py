@@ -20,7 +20,7 @@ from dexkit.messages import Columns, MessageType, message_type
 from dexkit.messages import layout as layouts
 from dexkit.models import DEX1_1, DEX3_1, Dialect, ModeByte, model
 
-__all__ = ["Motor", "MotorCodec", "Motors", "mode_byte"]
+__all__ = ["Motor", "MotorCodec", "Motors", "mode_byte", "sequence_of"]
 
 # The sequence of motors in a message, and the type of one of them. Written down here and not
 # taken from MessageType.motor_sequence: the kit's reading does not depend on what it tests.
@@ -43,6 +43,11 @@ _LISTS = {
 }
 _ANGLES = 1
 """The mode of a command whose angles count."""
+
+
+def sequence_of(type_name: str) -> str:
+    """Name of the member that holds the motors in a message of that type."""
+    return _SEQUENCE[type_name][0]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import STAIRS, held_s
 from dexkit.conformance.checks.timing import encoder_step
 from dexkit.conformance.median import median
+from dexkit.conformance.motor_messages import sequence_of
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
@@ -29,7 +30,7 @@ positions makes up to two steps, with a standard deviation of 0.7."""
 
 def _motors(ctx: Context, *names: str) -> list[str]:
     """Paths of this hand's motors' members."""
-    sequence = "motor_state" if ctx.recording.dialect.state_type.endswith(_HG) else "states"
+    sequence = sequence_of(ctx.recording.dialect.state_type)
     first = ctx.recording.dialect.index[ctx.side]
     return [f"{sequence}[{first + i}].{n}" for i in range(len(ctx.joints)) for n in names]
 

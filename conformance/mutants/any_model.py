@@ -6,7 +6,7 @@ import math
 from collections import deque
 from dataclasses import replace
 
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.motor_messages import Motor, sequence_of
 from dexkit.conformance.mutants.registry import BOTH, obeys_gains, takes_floats, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
@@ -785,7 +785,7 @@ class TakesAnyType(Service):
 
     def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
         message = message_type(type_name).decode(payload)
-        motors = message.motor_cmd if hasattr(message, "motor_cmd") else message.cmds
+        motors = getattr(message, sequence_of(type_name))
         for side in self.sides:
             if self.codec.command_topics[side] == topic:
                 first = self.dialect.index[side]

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from dexkit.hand import ROBOT, JointSpec, Side, Subject
-from dexkit.messages import message_type
-from dexkit.messages.layout import Struct
+from dexkit.messages import MessageType, message_type
 from dexkit.models import Dialect, HandModel, ModeByte, model
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.topics import roles
@@ -17,22 +16,21 @@ __all__ = ["Field", "Part", "parts_of"]
 NO_VALUE = 30000.0
 """Pressure of a slot without a sensor element (docs/sources/unitree-dex.md#b4)."""
 
-_GO_STATE = {
-    "q": "q",
-    "dq": "dq",
-    "ddq": "ddq",
-    "tau": "tau_est",
-    "temperature": "temperature",
-    # where dexkit's services put the motor error bits (docs/service.md); Unitree's leave it 0
-    "fault": "reserve[0]",
-    "mode": "mode",
+_STATE = {
+    "q": ("q",),
+    "dq": ("dq",),
+    "ddq": ("ddq",),
+    "tau": ("tau_est",),
+    "temperature": ("temperature",),
+    # where there is no motorstate, dexkit's services put the motor error bits into the first
+    # reserved word (docs/service.md); Unitree's leave it 0
+    "fault": ("motorstate", "reserve"),
+    "mode": ("mode",),
+    "voltage": ("vol",),
 }
-_HG_STATE = {
-    **_GO_STATE,
-    "temperature": "temperature[0]",
-    "voltage": "vol",
-    "fault": "motorstate",
-}
+"""The members of a motor's state that may hold a quantity; the first that it has does. Of an array
+the first element.
+"""
 _COMMAND = {name: name for name in ("q", "dq", "tau", "kp", "kd", "mode")}
 _UNITS = {
     "q": "rad",
@@ -129,7 +127,8 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
         fields += _motor_fields(
             type_name, kind, slots, units, hand.unit, hand.torque_unit, dialect.speed_units
         )
-    if type_name.startswith("unitree_hg") and kind != "cmd":
+    members = {f.name for f in message_type(type_name).layout.fields}
+    if "press_sensor_state" in members:
         fields += [
             Field(
                 f"press_sensor_state[{i}].pressure[{slot}]",
@@ -140,7 +139,9 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
             for i, sensor in enumerate(hand.sensors)
             for n, slot in enumerate(sensor.slots)
         ]
-        fields += [Field(name, name, name, -1, unit) for name, unit in _SUPPLY.items()]
+    fields += [
+        Field(name, name, name, -1, unit) for name, unit in _SUPPLY.items() if name in members
+    ]
     rate = {
         "cmd": hand.command_rate,
         "state": hand.state_rate,
@@ -177,23 +178,10 @@ def _motor_fields(
     :param speeds: that of dq, in units of q a second; empty for 1.
     """
     mt = message_type(type_name)
-    motors = next(
-        (
-            f.name
-            for f in mt.layout.fields
-            if isinstance(f.type, Struct) and any(m.name == "q" for m in f.type.fields)
-        ),
-        "",
-    )
-    if kind == "cmd":
-        members = _COMMAND
-    else:
-        members = _HG_STATE if type_name.startswith("unitree_hg") else _GO_STATE
+    members = _COMMAND if kind == "cmd" else _state_members(mt.motor_type)
     for number, (slot, joint) in enumerate(joints):
         for quantity, member in members.items():
-            place: tuple[str, int] | None = (f"{motors}[{slot}].{member}", 1)
-            if not motors:
-                place = mt.motor_place(member, slot)
+            place = mt.motor_place(member, slot)
             if place is None:
                 continue
             yield Field(
@@ -211,6 +199,17 @@ def _motor_fields(
                 )
                 / place[1],
             )
+
+
+def _state_members(motor: MessageType) -> dict[str, str]:
+    """The member that holds each quantity of a motor's state, of those that it has."""
+    fields = {f.name: f for f in motor.layout.fields}
+    found = {}
+    for quantity, names in _STATE.items():
+        name = next((n for n in names if n in fields), None)
+        if name is not None:
+            found[quantity] = name if fields[name].array is None else f"{name}[0]"
+    return found
 
 
 def _unit(quantity: str, unit: str, torque_unit: str) -> str:

@@ -13,7 +13,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -51,10 +50,7 @@ class Topic:
         """A member of a motor in each message, as a view that can be changed."""
         kind = message_type(self.type_name)
         message = kind.decode(self.payloads[0].tobytes())
-        motors = next(
-            v for k in ("states", "cmds", "motor_state", "motor_cmd") if (v := _member(message, k))
-        )
-        setattr(motors[joint], name, float(_SENTINEL))
+        setattr(getattr(message, kind.motor_sequence)[joint], name, float(_SENTINEL))
         at = kind.encode(message).index(_SENTINEL.tobytes())
         return self.payloads[:, at : at + 4].view(np.float32)[:, 0]
 
@@ -62,10 +58,6 @@ class Topic:
         """Keep some of the messages."""
         self.log, self.publish = self.log[which], self.publish[which]
         self.payloads = np.ascontiguousarray(self.payloads[which])
-
-
-def _member(message: Any, name: str) -> Any:
-    return getattr(message, name, None)
 
 
 @dataclass
@@ -258,8 +250,7 @@ def _short(session: Session, side: str, random: Random) -> None:
     kind = message_type(states.type_name)
     for at in random.integers(0, len(states.log), 3).tolist():
         message = kind.decode(states.payloads[at].tobytes())
-        name = "states" if hasattr(message, "states") else "motor_state"
-        setattr(message, name, getattr(message, name)[:-1])
+        setattr(message, kind.motor_sequence, kind.motors(message)[:-1])
         states.cut[at] = kind.encode(message)
 
 

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from dexkit.dds import DdsNode
-from dexkit.hand import Side
-from dexkit.messages import unitree_go as go
-from dexkit.messages import unitree_hg as hg
+from dexkit.hand import JointMode, Side
+from dexkit.messages import message_type
 from dexkit.models import dialect
 from tools.lab.guest.bench import Failed, wait_for
 
@@ -63,11 +62,12 @@ class Client:
 
     def _message(self, target: Sequence[float]) -> Any:
         kp, kd = self._gains
-        if self._dialect.cmd_type.endswith("HandCmd_"):
-            return hg.HandCmd_(
-                [hg.MotorCmd_(mode=i | 1 << 4, q=q, kp=kp, kd=kd) for i, q in enumerate(target)]
-            )
-        return go.MotorCmds_([go.MotorCmd_(mode=1, q=q, kp=kp, kd=kd) for q in target])
+        kind = message_type(self._dialect.cmd_type)
+        modes = [self._dialect.mode(i, JointMode.FOC) for i in range(len(target))]
+        motor = kind.motor_type.cls
+        return kind.of_motors(
+            [motor(mode=m, q=q, kp=kp, kd=kd) for m, q in zip(modes, target, strict=True)]
+        )
 
     def go(self, target: Sequence[float]) -> None:
         """Command ``target`` (rad), from now on."""
@@ -80,11 +80,7 @@ class Client:
     @property
     def motors(self) -> list[Any]:
         """The motors of the newest state."""
-        message = self._newest
-        found: list[Any] = (
-            message.motor_state if hasattr(message, "motor_state") else message.states
-        )
-        return found
+        return message_type(self._dialect.state_type).motors(self._newest)
 
     @property
     def q(self) -> list[float]:
