@@ -214,6 +214,25 @@ class Result:
         """The expected result, in a few words."""
         return self.requirement.expected or self.requirement.sentence
 
+    @property
+    def within_error(self) -> bool:
+        """Whether a failure was left open because the kit's measurement error explains it; the
+        reason then has the measure's sentence.
+        """
+        return (
+            self.verdict is Verdict.BLOCKED
+            and self.disturbance.load is not Load.TOO_BUSY
+            and self.measure is not None
+            and self.measure.explains_failure
+        )
+
+    @property
+    def measured(self) -> str:
+        """The measure in one sentence; empty without one, and where the reason has it."""
+        if self.measure is None or self.within_error:
+            return ""
+        return self.measure.sentence()
+
     def explain(self) -> str:
         """The result as the lines of a card; see :mod:`dexkit.conformance.report.card`."""
         from dexkit.conformance.report.card import Card

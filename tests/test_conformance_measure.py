@@ -73,7 +73,8 @@ def test_failure_within_the_kits_error_is_inconclusive(
     found = judged(seconds, error)
     assert found.measure is not None
     assert (found.verdict, found.measure.uncertain) == (verdict, uncertain)
-    assert found.retry is (verdict is Verdict.BLOCKED)
+    assert found.retry is found.within_error is (verdict is Verdict.BLOCKED)
+    assert Card.from_results([found]).as_text().count("with a limit of") == 1
     if verdict is Verdict.BLOCKED:
         assert "fails by less than the kit's measurement error of 0.002 s" in found.reason
         assert "a quieter machine or another run may decide it" in found.reason

@@ -123,8 +123,8 @@ class Card:
             side = result.side if len(self.results) > 1 else ""
             if result.observed:
                 yield Fact(Item.OBSERVED, result.observed, side)
-            if result.measure is not None and result.measure.sentence() not in result.reason:
-                yield Fact(Item.MEASURED, result.measure.sentence(), side)
+            if result.measured:
+                yield Fact(Item.MEASURED, result.measured, side)
             if result.reason:
                 yield Fact(Item.REASON, result.reason, side)
             for place in result.evidence:

@@ -535,9 +535,8 @@ def _cell(result: Result) -> str:
 
 
 def _seen(result: Result, link: str) -> str:
-    measured = result.measure.sentence() if result.measure is not None else ""
-    measured = "" if measured in result.reason else measured
-    text = ". ".join(t for t in (result.observed, measured, result.reason) if t) or result.figure
+    said = (result.observed, result.measured, result.reason)
+    text = ". ".join(t for t in said if t) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
