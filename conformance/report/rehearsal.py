@@ -94,9 +94,7 @@ def _findings(prepared: Prepared) -> str:
             unbroken(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
             unbroken(escape(f.where)),
             escape(f.text),
-            unbroken(f"<code>{escape(f.cure)}</code>")
-            if f.cure.startswith("--")
-            else escape(f.cure),
+            unbroken(f"<code>{escape(f.option)}</code>") if f.option else escape(f.advice),
         )
         for f in prepared.findings
     ]

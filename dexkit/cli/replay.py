@@ -307,7 +307,8 @@ def _print_session(session: RecordedCommands, prepared: Prepared) -> None:
         table.add_column(heading, no_wrap=True)
     table.add_column("what, and its cure", overflow="fold")
     for f in prepared.findings:
-        cure = f"\n[bold]{markup(f.cure)}[/]" if f.cure else ""
+        cure = f.option or f.advice
+        cure = f"\n[bold]{markup(cure)}[/]" if cure else ""
         level = f"[{_STYLES[str(f.level)]}]{f.level}[/]"
         table.add_row(markup(f.name), level, markup(f.where), markup(f.text) + cure)
     console.print(table)
@@ -327,7 +328,7 @@ def _age(first_ns: int) -> str:
 def _print_refusal(source: Path, prepared: Prepared) -> None:
     names = ", ".join(dict.fromkeys(f.name for f in prepared.refused))
     click.echo(f"refused: {names}", err=True)
-    hard = [f for f in prepared.refused if not f.cure.startswith("--")]
+    hard = [f for f in prepared.refused if not f.option]
     if prepared.cures and not hard:
         click.echo(f"  cured by: {' '.join(prepared.cures)}", err=True)
         click.echo("  see what that does: the same with --rehearse", err=True)

@@ -99,14 +99,16 @@ class Finding:
     :param name: e.g. ``thin-rate``.
     :param where: side and joint, or empty.
     :param text: what was found.
-    :param cure: the option that cures it, or what to do; empty where nothing has to be done.
+    :param option: the option that cures it, as it is given; empty where none does.
+    :param advice: what to do beside that, or what options there are; may be empty.
     """
 
     name: str
     level: Level
     text: str
     where: str = ""
-    cure: str = ""
+    option: str = ""
+    advice: str = ""
 
 
 @dataclass(frozen=True)
@@ -246,8 +248,7 @@ class Prepared:
     @property
     def cures(self) -> list[str]:
         """The options that cure what is refused, each once."""
-        given = [f.cure for f in self.refused if f.cure.startswith("--")]
-        return list(dict.fromkeys(given))
+        return list(dict.fromkeys(f.option for f in self.refused if f.option))
 
 
 def prepare(session: RecordedCommands, wishes: Wishes = Wishes()) -> Prepared:
@@ -271,22 +272,32 @@ class _Preparation:
 
     # -- findings
 
-    def note(self, name: str, text: str, where: str = "", cure: str = "") -> None:
-        self.found.findings.append(Finding(name, Level.NOTE, text, where, cure))
+    def note(self, name: str, text: str, where: str = "", advice: str = "") -> None:
+        self.found.findings.append(Finding(name, Level.NOTE, text, where, advice=advice))
 
-    def judge(self, name: str, text: str, cure: str, *, cured: bool, where: str = "") -> None:
+    def judge(
+        self,
+        name: str,
+        text: str,
+        option: str = "",
+        *,
+        cured: bool,
+        where: str = "",
+        advice: str = "",
+    ) -> None:
         """Add a finding that is cured, accepted or refused."""
         level = Level.REFUSED
         if cured:
             level = Level.CURED
         elif name in self.wishes.accept and name in ACCEPTABLE:
             level = Level.ACCEPTED
-        shown = cure if level is Level.REFUSED else ""
-        self.found.findings.append(Finding(name, level, text, where, shown))
+        if level is not Level.REFUSED:
+            option = advice = ""
+        self.found.findings.append(Finding(name, level, text, where, option, advice))
 
-    def refuse(self, name: str, text: str, cure: str = "", where: str = "") -> None:
+    def refuse(self, name: str, text: str, advice: str = "", where: str = "") -> None:
         """Add a finding that is always refused."""
-        self.found.findings.append(Finding(name, Level.REFUSED, text, where, cure))
+        self.found.findings.append(Finding(name, Level.REFUSED, text, where, advice=advice))
 
     # -- the steps
 
@@ -331,7 +342,7 @@ class _Preparation:
                 "nominal-time",
                 f"the source has no usable times: frames are played at {session.nominal_rate:g} a "
                 "second, which is what was asked for when it was recorded, not what was measured",
-                cure="--rate HZ states another rate, --pace 0.5 plays it slower",
+                advice="--rate HZ states another rate, --pace 0.5 plays it slower",
             )
         if session.others and session.dialect is not None:
             self.note("not-played", ", ".join(session.others))
@@ -373,7 +384,7 @@ class _Preparation:
         stale = ~odd & ~broken & (given.late > PAUSE)
         drop = self.wishes.invalid == "drop"
         out = odd | broken | given.backwards
-        cure = "--invalid drop"
+        option = "--invalid drop"
         if odd.all() and len(given):
             self.refuse(
                 "joints",
@@ -397,13 +408,13 @@ class _Preparation:
         }
         for name, (rows, text) in texts.items():
             if rows.any():
-                self.judge(name, text, cure, cured=drop, where=str(side))
+                self.judge(name, text, option, cured=drop, where=str(side))
         if stale.any():
             self.judge(
                 "stale",
                 f"{int(stale.sum())} of {len(odd)} commands were received up to "
                 f"{given.late[stale].max():.2f} s late, which no hand obeys" + _at(given.t, stale),
-                cure,
+                option,
                 cured=drop,
                 where=str(side),
             )
@@ -436,9 +447,10 @@ class _Preparation:
             "side",
             f"{mine:.0%} of the commands are outside the limits of the {side} hand, and "
             f"within those of the {other} one",
-            "leave out --swap-sides" if self.wishes.swap_sides else "--swap-sides",
+            "" if self.wishes.swap_sides else "--swap-sides",
             cured=False,
             where=str(side),
+            advice="leave out --swap-sides" if self.wishes.swap_sides else "",
         )
         return True
 
@@ -456,14 +468,14 @@ class _Preparation:
         kp, kd = np.array(self.model.gains).T
         cured = self.wishes.gains == "model"
         moves = np.ptp(track.q, axis=0) > _MOVES * limits.stroke
-        cure = "--gains model"
+        option = "--gains model"
         locked = ~track.driven
         if locked.any():
             self.judge(
                 "locked",
                 f"no motion: the mode byte locks {_joints(limits, locked)} in "
                 f"{locked.any(axis=1).mean():.0%} of the commands",
-                cure,
+                option,
                 cured=cured,
                 where=str(side),
             )
@@ -475,7 +487,7 @@ class _Preparation:
                 "zero-gains",
                 f"no motion: kp is 0 for {_joints(limits, limp)} in "
                 f"{limp.any(axis=1).mean():.0%} of the commands{still}",
-                cure,
+                option,
                 cured=cured,
                 where=str(side),
             )
@@ -493,7 +505,7 @@ class _Preparation:
                 "high-gains",
                 f"loud motors: {' and '.join(ranges)} for {limits.names[j]}, where the model's "
                 f"client sends {kp[j]:g} and {kd[j]:g}",
-                cure,
+                option,
                 cured=cured,
                 where=str(side),
             )
@@ -589,7 +601,7 @@ class _Preparation:
             "gaps",
             f"{len(gaps)} pauses of up to {dt[gaps].max():.2f} s; the pose is held in them",
             str(side),
-            cure="--max-gap S shortens them",
+            advice="--max-gap S shortens them",
         )
         return _inserted(track, gaps + 1, track.t[gaps + 1] - track.period, gaps)
 
