@@ -1,7 +1,8 @@
 """Convert a result file of version 2 into version 3.
 
 Version 2 had text where version 3 has data: the load of the machine stood at the beginning of
-``reason``, and joints were named in ``observed``. A robot's side and layer were called ``body``.
+``reason``, joints were named in ``observed``, and the backend's name showed a virtual run. A
+robot's side and layer were called ``body``.
 Nothing is checked here: :mod:`~dexkit.conformance.result_file` validates the result.
 """
 
@@ -29,8 +30,17 @@ def converted(document: dict[str, Any]) -> dict[str, Any]:
         found["results"] = [_result(e) if isinstance(e, dict) else e for e in document["results"]]
     if isinstance(document.get("stage"), dict):
         found["stage"] = {_renamed(side): s for side, s in document["stage"].items()}
-    if isinstance(document.get("subject"), dict) and document["subject"].get("sides") == "body":
-        found["subject"] = {**document["subject"], "sides": "robot"}
+    if isinstance(document.get("subject"), dict):
+        found["subject"] = _subject(document["subject"])
+    return found
+
+
+def _subject(about: dict[str, Any]) -> dict[str, Any]:
+    found = dict(about)
+    if found.get("sides") == "body":
+        found["sides"] = "robot"
+    if _text(found, "backend").startswith("virtual "):
+        found["device"] = "virtual"
     return found
 
 

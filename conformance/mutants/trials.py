@@ -95,7 +95,7 @@ def run_mutant(
     chosen = plan or plan_for()
     trace = run_virtual(chosen, service)
     recording = recording_of(trace, chosen.dialect.name, chosen.sides)
-    subject = {"backend": f"virtual {service.__name__}"}
+    subject = {"backend": f"virtual {service.__name__}", "device": "virtual"}
     return judge(recording, requirements=requirements, subject=subject)
 
 

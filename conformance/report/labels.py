@@ -159,7 +159,7 @@ def nature(result: RunResult) -> str:
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":
         return "emulated"
-    if name in (*SIMULATED, *ROBOT_EMULATORS) or name.startswith("virtual "):
+    if name in (*SIMULATED, *ROBOT_EMULATORS) or result.subject.get("device") == "virtual":
         return "simulated"
     return "" if name else "recorded"
 
