@@ -22,7 +22,9 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.marks import phase_marks, verdict_marks
 from dexkit.conformance.recording import Recording
 from dexkit.errors import ExtraMissing, UsageError
-from dexkit.hand import MotorError
+from dexkit.hand import MotorError, Side
+from dexkit.messages import encode, unitree_go
+from dexkit.models import INSPIRE_DFX
 from dexkit.traces import open_trace, sample_path
 from dexkit.view.process import viewer
 from dexkit.view.sources import Recorded
@@ -57,6 +59,10 @@ def test_a_live_page_follows_until_it_is_paused() -> None:
     assert line.advance(102.0, 3.0, 7.0) == 3.0  # the history no longer reaches back to 2 s
     line.toggle()
     assert line.advance(103.0, 3.0, 8.0) == 8.0
+    line.step(-1.0)
+    assert line.advance(104.0, 3.0, 9.0) == 7.0
+    line.restart()
+    assert line.advance(105.0, 3.0, 10.0) == 10.0
 
 
 def test_a_recording_plays_at_its_speed_to_its_end_and_again() -> None:
@@ -74,6 +80,10 @@ def test_a_recording_plays_at_its_speed_to_its_end_and_again() -> None:
     assert line.advance(60.1, 0.0, 10.0) == pytest.approx(0.5)
     line.seek(99.0)
     assert line.at == 10.0
+    line.restart()
+    assert (line.at, line.paused) == (0.0, False)
+    line.step(1.0)
+    assert (line.at, line.paused) == (1.0, True)
 
 
 # -- curves ----------------------------------------------------------------------------------------
@@ -188,7 +198,28 @@ def test_page_shows_the_moment(page: Page) -> None:
     assert len(first.figures) == len(second.figures) == 2
     assert "rt/dex3/right/state" in second.topics_html.content
     assert page._number.options[0] == "dex3/left/cmd  thumb_0 q  #1"
-    assert len(page._charts) == 2
+    assert [[c.name for c in chart.curves] for chart in page._charts] == [
+        [f"dex3/{side}/{kind}  thumb_0 q  #1" for kind in ("cmd", "state")]
+        for side in ("left", "right")
+    ]
+
+
+def test_numbers_of_both_hands_on_one_topic_can_be_charted() -> None:
+    from dexkit.view.browser_page import Page
+
+    (spoken,) = INSPIRE_DFX.dialects
+    topic = spoken.topics(Side.LEFT)[1]
+    state = unitree_go.MotorStates_([unitree_go.MotorState_() for _ in range(12)])
+    collector = Collector()
+    collector.take(topic, spoken.state_type, [encode(state)], [ns(0)], [0])
+    with Page([Recorded("one", collector)], port=0) as page:
+        page.step(0.0)
+        options = page._number.options
+        assert len(options) == len(collector.fields())
+        curves = [c for chart in page._charts for c in chart.curves]
+    name = topic.removeprefix("rt/")
+    assert [c.name for c in curves] == [f"{name} {side}  pinky q" for side in ("left", "right")]
+    assert [c.path for c in curves] == [f"states[{spoken.index[side]}].q" for side in Side]
 
 
 def test_unchanged_figures_are_not_sent_again(page: Page) -> None:
@@ -230,7 +261,7 @@ def test_view_beside_another_command_names_its_extra(monkeypatch: pytest.MonkeyP
 
 def test_command_serves_the_page_until_it_is_stopped() -> None:
     with running("view", sample_path("dex3_pinch"), "--no-open", "--port", "0") as process:
-        url = re.search(r"http://127\.0\.0\.1:(\d+)$", process.ready())
+        url = re.match(r"ready: http://127\.0\.0\.1:(\d+) shows dex3_pinch", process.ready())
         assert url is not None
         connection = HTTPConnection("127.0.0.1", int(url[1]), timeout=PATIENCE)
         connection.request("GET", "/")

@@ -60,8 +60,8 @@ def viewed(domain: int) -> Iterator[tuple[int, str]]:
     """``dexkit view`` of a domain: its process and the page's address."""
     with Tool("view", "--domain", str(domain), "--no-open", "--port", "0") as view:
         view.ready.wait(60)
-        assert " at " in view.ready_line, view.last_lines
-        yield view._process.pid, view.ready_line.rpartition(" at ")[2]
+        assert view.place, view.last_lines
+        yield view._process.pid, view.place
 
 
 def opened(browser: Browser, url: str) -> float:

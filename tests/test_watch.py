@@ -252,8 +252,8 @@ def test_too_many_topics_are_ignored() -> None:
 
 def test_curves_are_the_history_of_a_number() -> None:
     collector = closing_hands(2.0)
-    (name, field) = next(f for f in collector.fields() if f[1].name == "thumb_2 q")
-    assert (name, field.unit) == ("rt/dex3/left/cmd", "rad")
+    name, part, field = next(f for f in collector.fields() if f[2].name == "thumb_2 q")
+    assert (name, part.subject, field.unit) == ("rt/dex3/left/cmd", Side.LEFT, "rad")
     t, values = collector.curve(LEFT, "motor_state[2].q", 0.5, 1.0)
     assert len(t) == 51
     picture = collector.picture(1.0).subjects[0]

@@ -134,7 +134,7 @@ def command(
             timer.start()
         if to is None:
             page = stack.enter_context(Page(sources, host=host, port=port, skeletons=skeletons))
-            click.echo(f"ready: {what} at {page.url}")
+            click.echo(f"ready: {page.url} shows {what}")
             _open(page.url, open_browser)
             page.run(stop.event)
         elif out is not None:
@@ -148,7 +148,7 @@ def command(
         else:
             chosen = DEFAULT_PORT if port is None else port
             foxglove = stack.enter_context(contextlib.closing(FoxgloveViewer(host, chosen)))
-            click.echo(f"ready: {what} at {foxglove.url}")
+            click.echo(f"ready: {foxglove.url} shows {what}")
             while not stop.event.is_set():  # a recording begins again
                 forward(sources, foxglove, stop.event, skeletons=skeletons)
     click.echo("stopped")

@@ -8,11 +8,13 @@ import math
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from dexkit.errors import ExtraMissing, UsageError
+from dexkit.hand import Subject
 from dexkit.kinematics import Skeleton
 from dexkit.robots import RobotModel
 from dexkit.view.drawing import places
@@ -44,6 +46,12 @@ _CHARTS = 0.1
 _IDLE = 0.25  # seconds between looks while nobody has the page open
 _MOST_BUTTONS = 40
 _MOST_CHARTS = 8
+_BUTTONS: dict[str, Callable[[Transport], None]] = {
+    "Pause / go on": Transport.toggle,
+    "-1 s": lambda transport: transport.step(-1.0),
+    "+1 s": lambda transport: transport.step(1.0),
+    "Now / start": Transport.restart,
+}
 _NOTHING = '<p style="font:13px system-ui;margin:10px">No hand has been seen here yet.</p>'
 
 
@@ -195,21 +203,23 @@ class Page:
 
     def _controls(self, sources: list[Source]) -> list[GuiSliderHandle[float] | None]:
         gui = self._server.gui
-        pause = gui.add_button_group("", ("Pause / go on", "-1 s", "+1 s", "Now / start"))
+        pause = gui.add_button_group("", tuple(_BUTTONS))
 
         @pause.on_click
         def _(event: object) -> None:
             with self._lock:
-                self._press(str(pause.value))
+                for transport in self._transports:
+                    _BUTTONS[pause.value](transport)
 
         if not all(s.live for s in sources):
-            speed = gui.add_button_group("Speed", tuple(f"{s:g}" for s in SPEEDS))
+            speeds = {f"{s:g}": s for s in SPEEDS}
+            speed = gui.add_button_group("Speed", tuple(speeds))
 
             @speed.on_click
             def _(event: object) -> None:
                 with self._lock:
                     for transport in self._transports:
-                        transport.speed = float(speed.value)
+                        transport.speed = speeds[speed.value]
 
         sliders: list[GuiSliderHandle[float] | None] = []
         for number, source in enumerate(sources):
@@ -233,19 +243,6 @@ class Page:
                 transport.seek(slider.value + (transport.end if live else 0.0))
 
         return slid
-
-    def _press(self, what: str) -> None:
-        for transport in self._transports:
-            if what == "Now / start":
-                if transport.live:
-                    transport.paused = False
-                else:
-                    transport.seek(0.0)
-            elif what.endswith(" s"):
-                transport.seek(transport.at + float(what.removesuffix(" s")))
-                transport.paused = True
-            else:
-                transport.toggle()
 
     def _mark_buttons(self, number: int, source: Source) -> None:
         gui = self._server.gui
@@ -409,28 +406,25 @@ class Page:
         """Offer every number in the choice, and chart the first joint of each hand."""
         many = len(self._shown) > 1
         self._choices = {}
+        first: dict[tuple[str, Subject], dict[str, Curve]] = {}
         for number, shown in enumerate(self._shown, 1):
-            for topic, each in shown.source.collector.fields():
-                name = f"{topic.removeprefix('rt/')}  {each.name}" + (
-                    f"  #{number}" if many else ""
-                )
+            fields = shown.source.collector.fields()
+            shared = Counter(topic for topic, _ in {(t, part.subject) for t, part, _ in fields})
+            for topic, part, each in fields:
+                whose = f" {part.subject}" if shared[topic] > 1 else ""
+                name = f"{topic.removeprefix('rt/')}{whose}  {each.name}"
+                name += f"  #{number}" if many else ""
                 curve = Curve(shown.source.collector, topic, each.path, name)
                 self._choices.setdefault(name, curve)
+                if (each.quantity, each.index) == ("q", 0) and part.kind != "low":
+                    of_hand = first.setdefault((part.model.name, part.subject), {})
+                    of_hand.setdefault(topic, curve)
         options = tuple(self._choices) or ("-",)
         self._number.options = options
         if self._charts:
             return
-        positions = [name for name in options if name.endswith((" q", " q  #1", " q  #2"))]
-        by_hand: dict[str, list[str]] = {}
-        for name in positions:
-            hand, _, rest = name.rpartition("/")
-            by_hand.setdefault(hand, []).append(rest)
-        for hand, rests in list(by_hand.items())[:2]:
-            kinds: dict[str, str] = {}
-            for rest in rests:
-                kinds.setdefault(rest.partition("  ")[0], rest)
-            curves = [self._choices[f"{hand}/{rest}"] for rest in kinds.values()]
-            self._add_chart(curves)
+        for curves in list(first.values())[:2]:
+            self._add_chart(list(curves.values()))
 
 
 def _title(view: SubjectView, source: str) -> str:

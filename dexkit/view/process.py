@@ -31,6 +31,5 @@ def viewer(
         raise ExtraMissing("the page needs the package viser", hint="pip install 'dexkit[view]'")
     with Tool("view", "--domain", str(domain), "--interface", interface) as tool:
         tool.wait_ready(stop or threading.Event())
-        if url := tool.ready_line.rpartition(" at ")[2]:
-            report(f"view: {url}")
+        report(f"view: {tool.place}")
         yield

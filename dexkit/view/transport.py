@@ -61,6 +61,18 @@ class Transport:
         if self.live:
             self.paused = True
 
+    def step(self, seconds: float) -> None:
+        """Pause this much later, or earlier."""
+        self.seek(self.at + seconds)
+        self.paused = True
+
+    def restart(self) -> None:
+        """Follow now again; a recording jumps to its begin."""
+        if self.live:
+            self.paused = False
+        else:
+            self.seek(0.0)
+
     def toggle(self) -> None:
         """Pause, or go on; a recording at its end starts again."""
         self.paused = not self.paused

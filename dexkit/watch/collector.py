@@ -383,9 +383,12 @@ class Collector:
         views += [self._silent_view(name) for name in sorted(silent)]
         return Picture(at, tuple(sorted(views, key=lambda v: v.name)), tuple(self._subjects(at)))
 
-    def fields(self) -> list[tuple[str, Field]]:
-        """Every number that has a history, with its topic, in the order of topics."""
-        return [(t.name, f) for _, t in sorted(self._topics.items()) for f in t.fields]
+    def fields(self) -> list[tuple[str, Part, Field]]:
+        """Every number that has a history, with its topic and the part that it belongs to, in the
+        order of topics.
+        """
+        topics = [topic for _, topic in sorted(self._topics.items())]
+        return [(t.name, part, f) for t in topics for part in t.parts for f in part.fields]
 
     def curve(self, topic: str, path: str, begin: float, end: float) -> tuple[Floats, Floats]:
         """The history of a number in [begin, end]: times and values, copies.
