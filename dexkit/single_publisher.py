@@ -119,6 +119,7 @@ class SolePublisher:
         self._verb, self._hint = verb, hint
         self._force, self._yields = force, yields
         self._phase = _Phase.SEARCH
+        self._heard = ""
         self._claim: Claim | None = None
         self._known_rivals: set[str] = set()
         self._logged: set[str] = set()
@@ -129,12 +130,20 @@ class SolePublisher:
 
     # -- start and stop
 
-    def search(self) -> None:
+    def search(self, heard: Callable[[], str] = lambda: "") -> None:
         """Look for other publishers, before the own writers are made.
 
+        :param heard: asked at the end: a topic on which samples of another program have arrived,
+            or an empty text. Every writer of it counts then, and one that is not discovered, too.
         :raises TopicConflict: another program publishes there.
         """
         self._wait(SEARCH)
+        if not self._force and (topic := heard()):
+            self._heard = topic
+            self.check()
+            self.lost = True  # it has gone meanwhile, or is not discovered
+            node = next(t.node for t in self._node_topics if topic in t.topics)
+            raise TopicConflict(self._sentence("", topic, node), hint=self._hint)
 
     def announce(self) -> bytes:
         """User data for the own writers: the claim, made at the first call."""
@@ -204,12 +213,15 @@ class SolePublisher:
         return next((self._describe(*found) for found in self._other_writers()), None)
 
     def _describe(self, topics: NodeTopics, other: Any) -> str:
-        who = other.process or "another program"
-        domain = getattr(topics.node, "domain", None)
+        return self._sentence(other.process, other.topic, topics.node)
+
+    def _sentence(self, process: str, topic: str, node: Any) -> str:
+        who = process or "another program"
+        domain = getattr(node, "domain", None)
         where = "" if domain is None else f" on domain {domain}"
         if self._phase is _Phase.RUN:
-            return f"{who} {self._verb} {other.topic}{where}, too"
-        return f"{who} already {self._verb} {other.topic}{where}"
+            return f"{who} {self._verb} {topic}{where}, too"
+        return f"{who} already {self._verb} {topic}{where}"
 
     def _other_writers(self) -> Iterable[tuple[NodeTopics, Any]]:
         for topics in self._node_topics:
@@ -217,7 +229,11 @@ class SolePublisher:
                 if e.kind != "writer" or e.own or e.topic not in topics.topics:
                     continue
                 claim = Claim.decode(e.user_data)
-                if topics.counts(e) if claim is None else claim != self._claim:
+                if claim is None:
+                    counts = e.topic == self._heard or topics.counts(e)
+                else:
+                    counts = claim != self._claim
+                if counts:
                     yield topics, e
 
     def _gives_way_to(self, other: Any) -> bool:

@@ -211,6 +211,28 @@ def test_publisher_gives_way_to_one_without_a_claim() -> None:
             assert one.describe_rival() is None
 
 
+def test_a_publisher_that_is_heard_counts_whatever_is_discovered() -> None:
+    def sole(**options: bool) -> tuple[FakeNode, SolePublisher]:
+        node = FakeNode({"v": Seen("v", process="idle")})
+        topics = NodeTopics(node, {TOPIC}, lambda endpoint: False)
+        return node, SolePublisher([topics], hint="stop it", **options)
+
+    _, one = sole()
+    one.search()  # a writer that writes nothing
+    assert one.describe_rival() is None
+    _, one = sole()
+    with pytest.raises(TopicConflict, match=f"idle already publishes {TOPIC} on domain 1"):
+        one.search(lambda: TOPIC)
+    node, one = sole()
+    node.known.clear()
+    with pytest.raises(TopicConflict, match=f"another program already publishes {TOPIC}") as e:
+        one.search(lambda: TOPIC)
+    assert (e.value.hint, one.lost) == ("stop it", True)
+    _, one = sole(force=True)
+    one.search(lambda: TOPIC)
+    assert not one.lost
+
+
 def test_invalid_claims_are_ignored() -> None:
     mine = Claim.now()
     assert Claim.decode(mine.encode()) == mine

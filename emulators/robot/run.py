@@ -78,7 +78,6 @@ class EmulatedRobot:
         self._force = force
         self._ages = SampleAges()
         self._watch = PauseWatch(self._clock)
-        self._heard = False  # a state of somebody else
         self._sole: SolePublisher | None = None
         self._remote_every = round(model.state_rate / model.remote_rate)
         self._writer: Writer | None = None
@@ -137,11 +136,12 @@ class EmulatedRobot:
         try:
             model = self.model
             sole = self._sole = SolePublisher(
-                [NodeTopics(node, {model.state_topic}, self._is_same_type)],
+                [NodeTopics(node, {model.state_topic}, self._is_of_another_robot)],
                 hint="stop the other robot, choose another --domain, or add --force",
                 force=self._force,
             )
-            self._refuse_other_publisher(node, sole)
+            with node.reader(model.state_topic, model.state_type) as states:
+                sole.search(lambda: model.state_topic if states.take() else "")
             claim = sole.announce()
             self._remote = node.writer(model.remote_topic, model.remote_type)
             self._writer = node.writer(model.state_topic, model.state_type, user_data=claim)
@@ -185,25 +185,11 @@ class EmulatedRobot:
             self._own_node.close()
             self._own_node = None
 
-    def _refuse_other_publisher(self, node: DdsNode, sole: SolePublisher) -> None:
-        """Count only writers whose states arrive: some clients have a state writer that they never
-        use.
+    def _is_of_another_robot(self, endpoint: Endpoint) -> bool:
+        """Whether a writer of the state counts although no state of it has arrived: one of another
+        type, which cannot arrive. Some clients have a state writer that they never use.
         """
-        model = self.model
-        with node.reader(model.state_topic, model.state_type) as reader:
-            sole.search()
-            if not reader.take() or self._force:
-                return
-        self._heard = True
-        sole.check()
-        raise TopicConflict(  # it has gone meanwhile, or is not discovered
-            f"another program already publishes {model.state_topic} on domain {self.domain}",
-            hint="stop the other robot, choose another --domain, or add --force",
-        )
-
-    def _is_same_type(self, endpoint: Endpoint) -> bool:
-        """A writer of another type is another robot's; its states cannot arrive."""
-        return self._heard or endpoint.type_name != self.model.state_type
+        return endpoint.type_name != self.model.state_type
 
     def _tick(self, missed: int) -> None:
         if self.failure is not None:
