@@ -29,7 +29,6 @@ from dexkit.hand import Side
 
 __all__ = [
     "DEX3_FAULTS",
-    "FAULT_KINDS",
     "M4010_FAULTS",
     "MX64_FAULTS",
     "REVO2_FAULTS",
@@ -185,9 +184,6 @@ RH56_TCP_FAULTS = FaultFamily(
 
 REVO2_FAULTS = FaultFamily("revo2", (_DROP, _CORRUPT, _DELAY, _UNPLUG), max_id=0)
 """Faults of an emulated BrainCo Revo2."""
-
-FAULT_KINDS: dict[str, FaultKind] = {kind.name: kind for kind in MX64_FAULTS.kinds}
-"""The kinds of the MX-64 by name."""
 
 _SPEC = re.compile(r"(?P<kind>[a-z-]+)(?:@(?P<time>[^:]+))?(?::(?P<args>.*))?", re.DOTALL)
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)(ms|s)?")

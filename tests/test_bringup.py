@@ -134,7 +134,7 @@ def test_bringup_finds_the_motors_of_random_wirings(seed: int, tmp_path: Path) -
     for joint, sign, (bus, number) in zip(
         DEX3_1.joints[Side.LEFT], wiring.mounting.signs, wiring.bus_map.motors, strict=True
     ):
-        assert findings.motor_of(joint.name) == f"{bus}.{number}"
+        assert findings.motors_of(joint.name) == [f"{bus}.{number}"]
         assert findings.motors[f"{bus}.{number}"].sign == sign
 
 

@@ -17,8 +17,8 @@ from dexkit.conformance.requirements import Kind, Level, catalogue
 from dexkit.conformance.results import Overall, RunResult, Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
-from dexkit.conformance.virtual.original import OriginalService
 from dexkit.hand import Side
+from tests.original_service import OriginalService
 
 NOT_MET = "Not met: "
 """How the catalogue begins to say what the original does where it does not meet a requirement."""

@@ -23,7 +23,7 @@ from click.testing import CliRunner
 from dexkit.child_processes import command_line
 from dexkit.cli.emulate import command
 from dexkit.emulators.dex3_mcu import Dex3Process
-from dexkit.emulators.faults import FAULT_KINDS
+from dexkit.emulators.faults import MX64_FAULTS
 from dexkit.emulators.mx64 import (
     Bus,
     EmulatedProcess,
@@ -229,7 +229,7 @@ def test_helper_reports_why_it_did_not_start() -> None:
     with pytest.raises(EmulatorError) as caught, emulated_ezgripper(process=True, faults=["fire"]):
         pass
     assert "fire" in caught.value.hint
-    assert all(kind in caught.value.hint for kind in FAULT_KINDS)
+    assert all(kind.name in caught.value.hint for kind in MX64_FAULTS.kinds)
 
 
 def test_helper_gives_up_waiting_for_a_silent_emulator() -> None:

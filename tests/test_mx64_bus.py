@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.emulators.faults import FAULT_KINDS, FaultSchedule, grammar, parse_fault
+from dexkit.emulators.faults import MX64_FAULTS, FaultSchedule, grammar, parse_fault
 from dexkit.emulators.mx64 import Bus
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 from dexkit.errors import UsageError
@@ -439,7 +439,7 @@ def test_faults_of_the_bus_are_parsed(
 def test_invalid_fault_error_lists_allowed_faults(text: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse_fault(text)
-    assert all(kind in caught.value.hint for kind in FAULT_KINDS)
+    assert all(kind.name in caught.value.hint for kind in MX64_FAULTS.kinds)
     assert caught.value.hint == grammar()
 
 

@@ -5,8 +5,6 @@ takes a fraction of a second. They prove the checks: the references
 (:mod:`~dexkit.conformance.virtual.gripper`, :mod:`~dexkit.conformance.virtual.fingers`,
 :mod:`~dexkit.conformance.virtual.robot`, :mod:`~dexkit.conformance.virtual.usb`) meet every
 requirement, and each wrong hand in :mod:`dexkit.conformance.mutants` changes one thing.
-:mod:`~dexkit.conformance.virtual.original` behaves as Unitree's own service: it meets the drop-in
-requirements, and not all of the safety requirements.
 """
 
 from dexkit.conformance.virtual.memory_trace import MemoryTrace

@@ -54,15 +54,6 @@ class Findings:
     sensors: dict[str, str | None] = field(default_factory=dict)
     answers: dict[str, str] = field(default_factory=dict)
 
-    def motor_of(self, joint: str) -> str:
-        """Address of a joint's motor.
-
-        :raises KeyError: it has not been found.
-        """
-        for address in self.motors_of(joint):
-            return address
-        raise KeyError(joint)
-
     def motors_of(self, joint: str) -> list[str]:
         """Addresses of all motors that move a joint."""
         return [address for address, found in self.motors.items() if found.joint == joint]

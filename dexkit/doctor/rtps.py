@@ -24,7 +24,6 @@ __all__ = [
     "BUILTIN_ENDPOINTS",
     "SEDP_PUBLICATIONS",
     "SEDP_SUBSCRIPTIONS",
-    "SPDP_READER",
     "SPDP_WRITER",
     "AckNack",
     "Data",
@@ -52,7 +51,6 @@ __all__ = [
 ]
 
 SPDP_WRITER = bytes.fromhex("000100c2")
-SPDP_READER = bytes.fromhex("000100c7")
 SEDP_PUBLICATIONS = bytes.fromhex("000003c2")
 SEDP_SUBSCRIPTIONS = bytes.fromhex("000004c2")
 _PARTICIPANT = bytes.fromhex("000001c1")

@@ -19,7 +19,7 @@ from dexkit.traces.sessions.align import Alignment, Track, align
 from dexkit.traces.sessions.resample import interpolate
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 
-__all__ = ["Comparison", "JointDifference", "TopicCounts", "align_traces", "compare"]
+__all__ = ["Comparison", "JointDifference", "TopicCounts", "compare"]
 
 LEAST_CORRELATION = 0.9
 """Lowest confidence at which two recordings count as one session."""
@@ -139,15 +139,11 @@ def compare(
     )
 
 
-def align_traces(a: Trace, b: Trace) -> Alignment:
+def _alignment(a: Trace, b: Trace, ones: Sequence[Stream], others: Sequence[Stream]) -> Alignment:
     """Find by how much B is later than A, by its commands, else by its states.
 
     :raises UsageError: they have no motion in common, or it is not the same.
     """
-    return _alignment(a, b, streams_of(a), streams_of(b))
-
-
-def _alignment(a: Trace, b: Trace, ones: Sequence[Stream], others: Sequence[Stream]) -> Alignment:
     found = None
     for kind in (COMMAND, STATE):
         tracks = [
