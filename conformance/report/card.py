@@ -120,15 +120,7 @@ class Card:
         if need.original:
             yield Fact(Item.ORIGINAL, need.original)
         for result in self.results:
-            side = result.side if len(self.results) > 1 else ""
-            if result.observed:
-                yield Fact(Item.OBSERVED, result.observed, side)
-            if result.measured:
-                yield Fact(Item.MEASURED, result.measured, side)
-            if result.reason:
-                yield Fact(Item.REASON, result.reason, side)
-            for place in result.evidence:
-                yield Fact(Item.WHERE, _described(place), side, place)
+            yield from self.findings(result)
         causes = self.causes
         for sides, cause in causes:
             yield Fact(Item.CAUSE, cause, sides if len(causes) > 1 else "")
@@ -140,6 +132,18 @@ class Card:
         if self.verdict in (Verdict.FAIL, Verdict.WARN) or blocked_by_load:
             yield Fact(Item.TRY, self.requirement.advice)
             yield Fact(Item.SOURCE, self.source)
+
+    def findings(self, result: Result) -> Iterator[Fact]:
+        """The lines about one of the results: what was seen, and where."""
+        side = result.side if len(self.results) > 1 else ""
+        if result.observed:
+            yield Fact(Item.OBSERVED, result.observed, side)
+        if result.measured:
+            yield Fact(Item.MEASURED, result.measured, side)
+        if result.reason:
+            yield Fact(Item.REASON, result.reason, side)
+        for place in result.evidence:
+            yield Fact(Item.WHERE, _described(place), side, place)
 
     def as_text(self) -> str:
         """The card as lines of plain text."""

@@ -503,8 +503,9 @@ def _requirement(need: Requirement, group: list[Result], link: str, catalogue: s
     verdict = worst(r.verdict for r in group)
     css = VERDICTS[verdict].css
     cells = "".join(_cell(r) for r in group)
-    seen = "".join(_seen(r, link) for r in group)
-    card = (
+    card = Card.from_results(group)
+    seen = "".join(_seen(card, r, link) for r in group)
+    trouble = (
         f'<p><a href="#card-{escape(need.id)}">What is wrong, and what to try</a></p>'
         if any(r.verdict in _TROUBLE and not r.blocked_by for r in group)
         else ""
@@ -519,9 +520,9 @@ def _requirement(need: Requirement, group: list[Result], link: str, catalogue: s
         f'<span class="title">{escape(need.title)} '
         f'<span class="dim">{need.level}{kind}</span></span>'
         f"{cells}</summary>"
-        f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{card}'
+        f'<div class="more"><p><b>{escape(need.sentence)}</b></p>{seen}{trouble}'
         f"<p>{escape(need.rationale)}</p>{original}"
-        f'<p class="dim">Source: {escape(Card.from_results(group).source)}</p>'
+        f'<p class="dim">Source: {escape(card.source)}</p>'
         f"{more}</div></details>"
     )
 
@@ -534,9 +535,9 @@ def _cell(result: Result) -> str:
     )
 
 
-def _seen(result: Result, link: str) -> str:
-    said = (result.observed, result.measured, result.reason)
-    text = ". ".join(t for t in said if t) or result.figure
+def _seen(card: Card, result: Result, link: str) -> str:
+    facts = list(card.findings(result))
+    text = ". ".join(f.text for f in facts if f.place is None) or result.figure
     figures = "".join(
         f"<span>{escape(name)} <b>{escape(text)}</b></span>"
         for name, text in (quantity(k, v) for k, v in result.values.items())
@@ -544,7 +545,7 @@ def _seen(result: Result, link: str) -> str:
     return (
         f"<p><b>{escape(result.side)}:</b> {escape(text)}</p>"
         + (f'<p class="figures">{figures}</p>' if figures else "")
-        + "".join(_place(e, link) for e in result.evidence)
+        + "".join(_place(f.place, link) for f in facts if f.place is not None)
     )
 
 
