@@ -44,6 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     Each also has a long name, ``--dexkit-NAME``. It is the only one where another plug-in of the
     environment has the short name, so that pytest does not fail there.
     """
+    from dexkit import option_texts as texts
     from dexkit.models import BUILT_IN, DIALECTS
     from dexkit.robots import ROBOTS
 
@@ -109,7 +110,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         metavar="PREFIX",
-        help="only requirements whose id begins so (DEX1-RATE)",
+        help=_as_in_pytest(f"{texts.REQUIRE}, e.g. DEX1-RATE"),
     )
     add(
         "quick",
@@ -121,23 +122,28 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="every stimulus ten times, some ten minutes: what appears late or only sometimes",
     )
-    add("list", action="store_true", help="print the requirements that are selected, and end")
+    add("list", action="store_true", help=_as_in_pytest(texts.LIST))
     add(
         "capabilities",
         metavar="FILE.toml",
-        help="what the vendor claims; the rest is reported as not claimed (docs/capabilities.md)",
+        help=_as_in_pytest(f"{texts.CAPABILITIES} (docs/capabilities.md)"),
     )
-    add("level", choices=["must", "should", "info"], help="only requirements at least this binding")
+    add("level", choices=texts.LEVELS, help=_as_in_pytest(texts.LEVEL))
+    add("grade", choices=texts.GRADES, help=_as_in_pytest(texts.GRADE))
+    add("json", metavar="FILE", help=_as_in_pytest(texts.RESULT))
+    add("report", metavar="FILE.html", help=_as_in_pytest(texts.PAGE))
     add(
-        "grade",
-        choices=["drop-in", "safety"],
-        help="which grade decides the exit code (default: both); all requirements are judged",
+        "markdown",
+        metavar="FILE.md",
+        help=_as_in_pytest(f"{texts.SUMMARY}, for a comment or a wiki"),
     )
-    add("json", metavar="FILE", help="write the result file")
-    add("report", metavar="FILE.html", help="write the report page")
-    add("markdown", metavar="FILE.md", help="write a summary in Markdown, for a comment or a wiki")
     add("recording", metavar="FILE.mcap", help="keep the recording")
     add("view", action="store_true", help="show the run on a page in the browser")
+
+
+def _as_in_pytest(text: str) -> str:
+    """A help text in the form of pytest's own: no capital at first, no full stop at the end."""
+    return text[0].lower() + text[1:].removesuffix(".")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import Number, quiet_option
+from dexkit.cli.options import Number, jobs_option, out_option, quiet_option
 from dexkit.cli.status_line import StatusLine
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
@@ -25,13 +25,8 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
 
 @click.command("audit")
 @click.argument("locations", nargs=-1, required=True, metavar="PATH|URL...")
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("audit-out"),
-    show_default=True,
-    metavar="DIR",
-    help="Folder for journal, tables and page. Results of unchanged files are reused.",
+@out_option(
+    "audit-out", "Folder for journal, tables and page. Results of unchanged files are reused."
 )
 @click.option("--fresh", is_flag=True, help="Judge all files again.")
 @click.option(
@@ -57,9 +52,7 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     help="Group sessions also by this key of their metadata, in addition to robot, operator, task "
     "and site; may be repeated.",
 )
-@click.option(
-    "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
-)
+@jobs_option()
 @click.option(
     "--ray",
     is_flag=False,

@@ -6,22 +6,14 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import grade_option
+from dexkit.cli.options import grade_option, output_option
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
 
 
 @click.command("badge")
 @click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    default="badge.svg",
-    show_default=True,
-    metavar="FILE.svg",
-    help="Where to write it; - prints it.",
-)
+@output_option("FILE.svg", "Where to write it; - prints it.", "badge.svg")
 @grade_option(
     "Draw only the badge of this grade. The drop-in badge is never drawn alone if safety failed.  "
     "[default: both, side by side]"

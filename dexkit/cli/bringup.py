@@ -15,7 +15,16 @@ from dexkit.backends import BackendOptions, backend, list_backends
 from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
 from dexkit.bringup.script import describe
 from dexkit.cli.held_key import Terminal
-from dexkit.cli.options import FILE, Number, set_option, setting, side_option, usb_option
+from dexkit.cli.options import (
+    FILE,
+    Number,
+    device_option,
+    dry_run_option,
+    set_option,
+    setting,
+    side_option,
+    usb_option,
+)
 from dexkit.cli.remarks import remark
 from dexkit.clock import Rate
 from dexkit.errors import HandTimeout, UsageError
@@ -33,11 +42,7 @@ _LOST_ANSWERS = 3
 @click.command("bringup")
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Hand to bring up.", required=True)
-@click.option(
-    "--device",
-    metavar="PATH|SERIAL",
-    help="Serial number, address or port of the device.",
-)
+@device_option("Serial number, address or port of the device.")
 @set_option("Setting of the backend, e.g. config=FILE; 'dexkit backends' lists the settings.")
 @usb_option("USB hand")
 @click.option(
@@ -53,7 +58,7 @@ _LOST_ANSWERS = 3
     metavar="RAD/S",
     help="Speed of every motion.  [default: the backend's]",
 )
-@click.option("--dry-run", is_flag=True, help="Only print the plan; open and move nothing.")
+@dry_run_option("Only print the plan; open and move nothing.")
 @click.option("--restart", is_flag=True, help="Forget what an earlier bring-up has found.")
 @click.option(
     "--answers",

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.options import Number, one_side_option
+from dexkit.cli.options import Number, device_option, dry_run_option, one_side_option
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
 from dexkit.drivers.ezgripper.bus import ServoBus
@@ -66,7 +66,7 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
 
 @click.command()
 @click.argument("gripper", type=click.Choice(["ezgripper", "dex1-serial"]), default="ezgripper")
-@click.option("--device", metavar="PATH|SERIAL", help="Serial port, or its USB serial number.")
+@device_option("Serial port, or its USB serial number.")
 @one_side_option(
     "Side of the gripper. Required for dex1-serial; for an EZGripper it selects the adapter "
     "that the file names for this side."
@@ -133,11 +133,7 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
     type=click.Path(dir_okay=False, path_type=Path),
     help="File to store in, instead of the user's.",
 )
-@click.option(
-    "--dry-run",
-    is_flag=True,
-    help="Only print the servo's state: nothing moves, nothing is written.",
-)
+@dry_run_option("Only print the servo's state: nothing moves, nothing is written.")
 @click.option("--yes", is_flag=True, help="Do not ask whether the gripper is empty.")
 @click.option("--show", is_flag=True, help="Print the stored values, and stop.")
 @click.pass_context

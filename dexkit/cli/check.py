@@ -7,18 +7,23 @@ from pathlib import Path
 
 import click
 
+from dexkit import option_texts
 from dexkit.cli.options import (
-    FILE,
     dialect_option,
     grade_option,
     html_option,
+    json_file_option,
     junit_option,
+    level_option,
+    list_option,
     require_option,
+    side_option,
     verbose_option,
 )
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
 from dexkit.errors import ConformanceError, UsageError
+from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.robots import ROBOTS
 
@@ -30,42 +35,29 @@ from dexkit.robots import ROBOTS
     metavar="IN.mcap",
     required=False,
 )
-@click.option(
-    "--side",
-    type=click.Choice(["left", "right", "both"]),
-    help="Hands to judge. Default: those of the run, else all hands in the recording.",
-)
+@side_option("Hands to judge. Default: those of the run, else all hands in the recording.")
 @dialect_option(
     "Dialect of the hand, or model of the robot; auto takes it from topics and types.",
     default="auto",
     others=("auto", *ROBOTS),
 )
 @require_option("DEX1-RATE")
-@click.option(
-    "--level",
-    type=click.Choice(["must", "should", "info"], case_sensitive=False),
-    help="Only requirements at least this binding.",
-)
-@grade_option(
-    "Grade that decides the exit code. Default: both. All requirements are judged and shown."
-)
+@level_option()
+@grade_option(option_texts.GRADE)
 @click.option(
     "--capabilities",
     type=click.Path(path_type=Path),
     metavar="FILE.toml",
-    help="What the vendor claims; the rest is reported as not claimed. Default: what the "
-    "recording of a run says",
+    help=f"{option_texts.CAPABILITIES}. Default: what the recording of a run says",
 )
-@click.option(
-    "--list", "list_only", is_flag=True, help="Print the requirements that are selected, and end."
-)
-@click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the result file.")
+@list_option(option_texts.LIST)
+@json_file_option(option_texts.RESULT)
 @junit_option()
 @html_option()
 @verbose_option("Also print what could not be judged, and why.")
 def command(
     recording: Path | None,
-    side: str | None,
+    sides: tuple[Side, ...] | None,
     dialect: str,
     require: tuple[str, ...],
     level: str | None,
@@ -91,7 +83,6 @@ def command(
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.layers import recording_of
-    from dexkit.conformance.recording import sides_of
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import Kind, catalogue, select
     from dexkit.conformance.robot import robot_in
@@ -108,7 +99,7 @@ def command(
         for text in trace.damage:
             click.echo(f"warning: {text}", err=True)
         wanted = None if dialect == "auto" else dialect
-        view = recording_of(trace, wanted, sides_of(side) if side else ())
+        view = recording_of(trace, wanted, sides or ())
         robot = robot_in(trace) if dialect == "auto" and view.layer != "robot" else None
         also = f"there is a robot, too: judge it with --dialect {robot.name}" if robot else ""
         model_name = view.model.name

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import DOMAIN, view_option
+from dexkit.cli.options import domain_option, out_option, view_option
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
 from dexkit.stop_signals import stop_on_signals
@@ -27,21 +27,14 @@ _INTRO = (
 
 
 @click.command("demo")
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("demo-out"),
-    show_default=True,
-    metavar="DIR",
-    help="Where to write report.html, recording.mcap and result.json.",
-)
+@out_option("demo-out", "Where to write report.html, recording.mcap and result.json.")
 @click.option(
     "--backend",
     default="ezgripper",
     show_default=True,
     help="Backend to demonstrate, with an emulated device.",
 )
-@click.option("--domain", type=DOMAIN, help="DDS domain.  [default: a free one]")
+@domain_option("DDS domain.  [default: a free one]")
 @view_option()
 def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
     """Run the conformance suite on two emulated EZGrippers; takes about 90 seconds.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dexkit.cli.options import FILE, Number, json_option, topic_option
+from dexkit.cli.options import FILE, Number, html_option, json_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
@@ -41,12 +41,8 @@ __all__ = ["command"]
 )
 @topic_option("Compare", "all")
 @json_option("Print JSON.")
-@click.option(
-    "--html",
-    "html_path",
-    type=FILE,
-    metavar="FILE",
-    help="Write a page with the curves of both overlaid, the most different joints first.",
+@html_option(
+    "Write a page with the curves of both overlaid, the most different joints first.", report=False
 )
 def command(
     a: Path,

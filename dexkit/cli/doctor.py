@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import (
-    DOMAIN,
     Number,
+    devices_option,
     dialect_option,
+    domain_option,
     found_interface,
+    interfaces_option,
     json_option,
     network_options,
     peer_addresses,
@@ -56,10 +58,8 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 
 
 @click.command("doctor")
-@click.option(
-    "--domain",
-    type=DOMAIN,
-    help="Domain of the client: 0 is the robot, 1 xr_teleoperate's simulation.  [default: any]",
+@domain_option(
+    "Domain of the client: 0 is the robot, 1 xr_teleoperate's simulation.  [default: any]"
 )
 @click.option(
     "--scan",
@@ -69,12 +69,8 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     metavar="RANGE",
     help="Also examine these domains; none for no others.",
 )
-@click.option(
-    "--interface",
-    "interfaces",
-    multiple=True,
-    metavar="IF",
-    help="Examine this network interface (name, address or prefix) as well as lo; may be repeated.",
+@interfaces_option(
+    "Examine this network interface (name, address or prefix) as well as lo; may be repeated."
 )
 @network_options()
 @click.option(
@@ -86,13 +82,7 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand model.  [default: any]"
 )
 @dialect_option("Only this dialect.  [default: any]")
-@click.option(
-    "--device",
-    "devices",
-    multiple=True,
-    metavar="PATH",
-    help="Also examine a serial port and ask for servos on it, 'usb', or usbip://HOST:PORT.",
-)
+@devices_option("Also examine a serial port and ask for servos on it, 'usb', or usbip://HOST:PORT.")
 @json_option("Print JSON (docs/doctor.md).")
 @click.option("--watch", is_flag=True, help="Repeat the examination until Ctrl-C.")
 @click.option(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from dexkit.cli.options import FILE, json_option
+from dexkit.cli.options import FILE, html_option, json_option
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
 
@@ -77,12 +77,8 @@ def summary(trace: Trace) -> dict[str, Any]:
 @click.option(
     "--plot", is_flag=True, help="Draw commands, states and rates over time in the terminal."
 )
-@click.option(
-    "--html",
-    "html_path",
-    type=FILE,
-    metavar="FILE",
-    help="Write a page with their curves; several files are drawn beside each other.",
+@html_option(
+    "Write a page with their curves; several files are drawn beside each other.", report=False
 )
 def command(files: tuple[Path, ...], as_json: bool, plot: bool, html_path: Path | None) -> int:
     """Show the topics, types, rates, gaps and damage of recordings.

@@ -12,12 +12,15 @@ import click
 
 from dexkit.backends import backend
 from dexkit.cli.options import (
-    DOMAIN,
-    Number,
     devices_by_side,
+    devices_option,
     dialect_option,
+    domain_option,
+    dry_run_option,
+    interface_option,
     set_option,
     side_option,
+    wait_for_interface_option,
 )
 from dexkit.documents import write_file
 from dexkit.errors import OutputError, UsageError
@@ -32,32 +35,15 @@ _UNITS, _RULES = Path("/etc/systemd/system"), Path("/etc/udev/rules.d")
 @click.command("install-service")
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Which hand; both writes one unit for each.", required=True)
-@click.option(
-    "--device",
-    "devices",
-    multiple=True,
-    metavar="PATH",
-    help="Serial port of the hand now; with --side both left=PATH and right=PATH. A udev rule "
-    "gives it the name /dev/dexkit-SIDE.",
+@devices_option(
+    "Serial port of the hand now; with --side both left=PATH and right=PATH. A udev rule "
+    "gives it the name /dev/dexkit-SIDE."
 )
 @set_option("Setting of the backend, as of 'dexkit serve'.")
 @dialect_option("As for 'dexkit serve'.")
-@click.option("--domain", type=DOMAIN, default=0, show_default=True, help="DDS domain.")
-@click.option(
-    "--interface",
-    default="lo",
-    show_default=True,
-    metavar="IF",
-    help="Network interface: name, address or prefix, e.g. 192.168.123.0/24.",
-)
-@click.option(
-    "--wait-for-interface",
-    type=Number(min=0),
-    default=600.0,
-    show_default=True,
-    metavar="S",
-    help="How long a start waits for the interface.",
-)
+@domain_option("DDS domain.", 0)
+@interface_option("Network interface: name, address or prefix, e.g. 192.168.123.0/24.")
+@wait_for_interface_option("How long a start waits for the interface.", 600.0)
 @click.option(
     "--user", metavar="NAME", help="User that runs the service.  [default: the installing user]"
 )
@@ -68,7 +54,7 @@ _UNITS, _RULES = Path("/etc/systemd/system"), Path("/etc/udev/rules.d")
     metavar="DIR",
     help="Write all files here.  [default: /etc/systemd/system and /etc/udev/rules.d]",
 )
-@click.option("--dry-run", is_flag=True, help="Print the files, write nothing.")
+@dry_run_option("Print the files, write nothing.")
 def command(
     backend_name: str,
     sides: tuple[Side, ...],

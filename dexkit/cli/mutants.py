@@ -11,7 +11,16 @@ import click
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from dexkit.cli.options import FILE, dialect_option, require_option, verbose_option
+from dexkit.cli.options import (
+    FILE,
+    dialect_option,
+    jobs_option,
+    json_file_option,
+    list_option,
+    require_option,
+    seed_option,
+    verbose_option,
+)
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
@@ -88,12 +97,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
 @click.option(
     "--good", is_flag=True, help="With --generated: good hands, which must not be blamed."
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**31),
-    default=1,
-    help="With --generated: seed of the random choice.  [default: 1]",
-)
+@seed_option("--generated", 1)
 @click.option("--quick", is_flag=True, help="With --generated: judge them in quick runs.")
 @click.option(
     "--thorough",
@@ -111,16 +115,9 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
 @click.option(
     "--from", "source", metavar="FILE_OR_MODULE", help="Try the hands of a Python file or module."
 )
-@click.option(
-    "--list",
-    "listed",
-    is_flag=True,
-    help="Only list the hands, with model, requirement and sides.",
-)
-@click.option("--json", "json_path", type=FILE, metavar="FILE", help="Write the score as JSON.")
-@click.option(
-    "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
-)
+@list_option("Only list the hands, with model, requirement and sides.")
+@json_file_option("Write the score as JSON.")
+@jobs_option()
 @verbose_option("Print the fault of every wrong hand.")
 def command(
     model: str | None,
@@ -134,7 +131,7 @@ def command(
     names: tuple[str, ...],
     resume: Path | None,
     source: str | None,
-    listed: bool,
+    list_only: bool,
     json_path: Path | None,
     jobs: int | None,
     verbose: bool,
@@ -165,7 +162,7 @@ def command(
             "--model cannot be combined with --from: the file's hands have their models",
             hint="leave out --model",
         )
-    if listed and (json_path or source is not None or resume):
+    if list_only and (json_path or source is not None or resume):
         raise UsageError(
             "--list tries no hand; it can be combined with --model, --require and --generated"
         )
@@ -191,7 +188,7 @@ def command(
         if generated is not None:
             spoken = dialects(model, dialect)
             hands += (sample_good if good else sample)(generated, seed, spoken)
-        if listed:
+        if list_only:
             for each in hands:
                 grade = "good" if each.good else "wrong"
                 console.print(f"{grade:5}  {each.name}", markup=False, highlight=False)
@@ -204,7 +201,7 @@ def command(
     from dexkit.conformance.mutants.matrix import Score, chosen, print_list
 
     requirements, trials = chosen(model, require)
-    if listed:
+    if list_only:
         print_list(console, trials)
         return
     score = Score(requirements)

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import click
 
+from dexkit import option_texts
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 from dexkit.hand import Side
@@ -24,24 +25,41 @@ __all__ = [
     "Number",
     "any_baudrate_option",
     "dds_options",
+    "device_option",
     "devices_by_side",
+    "devices_option",
     "dialect_option",
+    "domain_option",
+    "dry_run_option",
     "duration_option",
     "fault_options",
     "force_option",
     "found_interface",
     "grade_option",
+    "host_option",
     "html_option",
+    "id_option",
+    "interface_option",
+    "interfaces_option",
+    "jobs_option",
+    "json_file_option",
     "json_option",
     "junit_option",
     "latency_timer_option",
+    "level_option",
     "line_time_option",
+    "link_option",
+    "links_option",
+    "list_option",
     "markdown_option",
     "network_options",
     "object_option",
     "one_side_option",
+    "out_option",
+    "output_option",
     "overwrite_option",
     "peer_addresses",
+    "port_option",
     "quiet_option",
     "real_time_option",
     "recording_option",
@@ -56,6 +74,7 @@ __all__ = [
     "usb_option",
     "verbose_option",
     "view_option",
+    "wait_for_interface_option",
     "wait_option",
     "wiring_option",
 ]
@@ -69,6 +88,10 @@ class Number(click.FloatRange):
     """
 
     _LARGEST = 1e9  # seconds: 30 years
+
+    def _describe_range(self) -> str:
+        """The range for the help; empty without bounds, where click would write ``x<=None``."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -116,24 +139,46 @@ def dds_options(
     :param domain_default_text: what ``--help`` prints where there is no fixed default.
     """
     suffix = f"  [default: {domain_default_text}]" if domain_default_text else ""
-    domain = click.option(
-        "--domain",
-        type=DOMAIN,
-        default=default_domain,
-        show_default=default_domain is not None,
-        help=f"DDS domain: 0 is the robot, 1 xr_teleoperate's simulation.{suffix}",
+    domain = domain_option(
+        f"DDS domain: 0 is the robot, 1 xr_teleoperate's simulation.{suffix}", default_domain
     )
-    interface = click.option(
-        "--interface",
-        default="lo",
-        show_default=True,
-        metavar="IF",
-        callback=_interface,
-        help="Network interface: name, address or prefix (192.168.123.0/24). Traffic stays on "
+    interface = interface_option(
+        "Network interface: name, address or prefix (192.168.123.0/24). Traffic stays on "
         "this machine unless one is named.",
+        callback=_interface,
     )
     network = network_options()
     return lambda function: domain(interface(network(function)))
+
+
+def domain_option(help: str, default: int | None = None) -> Callable[[F], F]:
+    """``--domain``.
+
+    :param default: None for none, and for no default in ``--help``.
+    """
+    return click.option(
+        "--domain", type=DOMAIN, default=default, show_default=default is not None, help=help
+    )
+
+
+def interface_option(
+    help: str,
+    *,
+    callback: Callable[[click.Context, click.Parameter, str], str] | None = None,
+) -> Callable[[F], F]:
+    """``--interface``, by default loopback.
+
+    :param callback: resolves the text to an interface of this machine; without it the text is
+        passed on.
+    """
+    return click.option(
+        "--interface", default="lo", show_default=True, metavar="IF", callback=callback, help=help
+    )
+
+
+def interfaces_option(help: str) -> Callable[[F], F]:
+    """``--interface``, repeated, as ``interfaces``."""
+    return click.option("--interface", "interfaces", multiple=True, metavar="IF", help=help)
 
 
 def network_options() -> Callable[[F], F]:
@@ -148,17 +193,31 @@ def network_options() -> Callable[[F], F]:
         callback=_set_peers,
         help="Call this machine by unicast, for networks without multicast; may be repeated.",
     )
-    wait = click.option(
-        "--wait-for-interface",
-        type=Number(min=0),
-        default=0.0,
-        metavar="S",
+    wait = wait_for_interface_option(
+        "Wait up to S seconds for a network interface that is not up yet.",
         is_eager=True,
         expose_value=False,
         callback=lambda ctx, param, value: ctx.meta.__setitem__(_WAIT, value),
-        help="Wait up to S seconds for a network interface that is not up yet.",
     )
     return lambda function: peer(wait(function))
+
+
+def wait_for_interface_option(
+    help: str, default: float = 0.0, **attributes: Any
+) -> Callable[[F], F]:
+    """``--wait-for-interface S``.
+
+    :param attributes: further ones of :func:`click.option`.
+    """
+    return click.option(
+        "--wait-for-interface",
+        type=Number(min=0),
+        default=default,
+        show_default=default > 0,
+        metavar="S",
+        help=help,
+        **attributes,
+    )
 
 
 _PEERS, _WAIT = "dexkit.peers", "dexkit.wait_for_interface"
@@ -297,8 +356,16 @@ def session_options() -> Callable[[F], F]:
 
 def grade_option(help: str) -> Callable[[F], F]:
     """``--grade``: one of the two grades, as text, or None."""
-    # literal, because the conformance package is imported only when a command runs
-    return click.option("--grade", type=click.Choice(["drop-in", "safety"]), help=help)
+    return click.option("--grade", type=click.Choice(option_texts.GRADES), help=help)
+
+
+def level_option() -> Callable[[F], F]:
+    """``--level``: one of the three levels, as text, or None."""
+    return click.option(
+        "--level",
+        type=click.Choice(option_texts.LEVELS, case_sensitive=False),
+        help=option_texts.LEVEL,
+    )
 
 
 # ------------------------------------------------------------------------------ hands
@@ -321,6 +388,16 @@ def one_side_option(help: str, *, required: bool = False) -> Callable[[F], F]:
     return click.option(
         "--side", type=click.Choice(list(map(str, Side))), required=required, help=help
     )
+
+
+def device_option(help: str) -> Callable[[F], F]:
+    """``--device`` of the commands for one device."""
+    return click.option("--device", metavar="PATH|SERIAL", help=help)
+
+
+def devices_option(help: str) -> Callable[[F], F]:
+    """``--device``, repeated, as ``devices``; :func:`devices_by_side` reads them."""
+    return click.option("--device", "devices", multiple=True, metavar="PATH", help=help)
 
 
 def usb_option(hands: str) -> Callable[[F], F]:
@@ -444,6 +521,37 @@ def view_option() -> Callable[[F], F]:
     )
 
 
+def dry_run_option(help: str) -> Callable[[F], F]:
+    """``--dry-run``."""
+    return click.option("--dry-run", is_flag=True, help=help)
+
+
+def jobs_option() -> Callable[[F], F]:
+    """``--jobs N``, or None."""
+    return click.option(
+        "--jobs", type=click.IntRange(1, 1024), help="Processes.  [default: one per processor]"
+    )
+
+
+def list_option(help: str) -> Callable[[F], F]:
+    """``--list``, as ``list_only``."""
+    return click.option("--list", "list_only", is_flag=True, help=help)
+
+
+def host_option(help: str) -> Callable[[F], F]:
+    """``--host ADDRESS`` of what is served by TCP, by default to this machine only."""
+    return click.option(
+        "--host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help=help
+    )
+
+
+def port_option(help: str, default: int | None = None) -> Callable[[F], F]:
+    """``--port N`` of what is served by TCP; None is the command's own choice."""
+    return click.option(
+        "--port", type=click.IntRange(0, 65535), default=default, metavar="N", help=help
+    )
+
+
 def quiet_option() -> Callable[[F], F]:
     """``--quiet``."""
     return click.option("--quiet", is_flag=True, help="Warnings only; no status line.")
@@ -465,15 +573,41 @@ def json_option(help: str) -> Callable[[F], F]:
     return click.option("--json", "as_json", is_flag=True, help=help)
 
 
-def html_option() -> Callable[[F], F]:
-    """``--report FILE`` or ``--html FILE``, as ``html_path``."""
+def json_file_option(help: str) -> Callable[[F], F]:
+    """``--json FILE`` of the commands that write their result, as ``json_path``."""
+    return click.option("--json", "json_path", type=FILE, metavar="FILE", help=help)
+
+
+def html_option(help: str = option_texts.PAGE, *, report: bool = True) -> Callable[[F], F]:
+    """``--html FILE``, as ``html_path``.
+
+    :param report: the page is a report, and ``--report`` is another name of the option.
+    """
+    names = ("--report", "--html") if report else ("--html",)
+    return click.option(*names, "html_path", type=FILE, metavar="FILE", help=help)
+
+
+def output_option(metavar: str, help: str, default: str | None = None) -> Callable[[F], F]:
+    """``-o``, ``--output``: the only file that a command writes."""
     return click.option(
-        "--report",
-        "--html",
-        "html_path",
+        *("-o", "--output"),
         type=FILE,
-        metavar="FILE",
-        help="Write a report page (HTML).",
+        default=default,
+        show_default=default is not None,
+        metavar=metavar,
+        help=help,
+    )
+
+
+def out_option(default: str, help: str) -> Callable[[F], F]:
+    """``--out DIR``: the folder for all that a command writes."""
+    return click.option(
+        "--out",
+        type=click.Path(file_okay=False, path_type=Path),
+        default=Path(default),
+        show_default=True,
+        metavar="DIR",
+        help=help,
     )
 
 
@@ -490,7 +624,7 @@ def markdown_option(default: str = "") -> Callable[[F], F]:
         "markdown_path",
         type=FILE,
         metavar="FILE",
-        help=f"Write a summary in Markdown; - prints it.{suffix}",
+        help=f"{option_texts.SUMMARY}; - prints it.{suffix}",
     )
 
 
@@ -519,14 +653,39 @@ def require_option(example: str) -> Callable[[F], F]:
         "--require",
         multiple=True,
         metavar="PREFIX",
-        help=f"Only requirements whose id begins with PREFIX, e.g. {example}; may be repeated.",
+        help=f"{option_texts.REQUIRE}, e.g. {example}; may be repeated.",
     )
 
 
 # ------------------------------------------------------------------------------ emulated devices
 
 
-def seed_option(what: str) -> Callable[[F], F]:
+def link_option(help: str, *, required: bool = True) -> Callable[[F], F]:
+    """``--link PATH``: the name that clients of an emulated serial device open."""
+    return click.option("--link", required=required, metavar="PATH", help=help)
+
+
+def links_option(help: str) -> Callable[[F], F]:
+    """``--link PATH``, repeated, as ``links``: of several serial lines."""
+    return click.option("--link", "links", required=True, multiple=True, metavar="PATH", help=help)
+
+
+def id_option(ids: range, help: str, default: int | None = None) -> Callable[[F], F]:
+    """``--id N`` of an emulated serial device, as ``number``.
+
+    :param ids: those that there are.
+    """
+    return click.option(
+        "--id",
+        "number",
+        type=click.IntRange(ids[0], ids[-1]),
+        default=default,
+        metavar="N",
+        help=help,
+    )
+
+
+def seed_option(what: str, default: int = 0) -> Callable[[F], F]:
     """``--seed N``.
 
     :param what: what is random.
@@ -534,7 +693,7 @@ def seed_option(what: str) -> Callable[[F], F]:
     return click.option(
         "--seed",
         type=click.IntRange(0, 2**32 - 1),
-        default=0,
+        default=default,
         show_default=True,
         help=f"Seed of the random numbers of {what}.",
     )

@@ -15,9 +15,11 @@ from dexkit.cli.options import (
     FILE,
     Number,
     dds_options,
+    device_option,
     dialect_option,
     force_option,
     html_option,
+    json_file_option,
     one_side_option,
     quiet_option,
     set_option,
@@ -48,7 +50,7 @@ whose client asks for all of it, are tried at it."""
 @click.argument("backend_name", metavar="[BACKEND]", required=False)
 @click.option("--external", is_flag=True, help="Test a hand that is already served on DDS.")
 @one_side_option("Hand to test.", required=True)
-@click.option("--device", metavar="PATH", help="Path or serial number of the device.")
+@device_option("Path or serial number of the device.")
 @set_option("Setting of the backend; 'dexkit backends' lists them.")
 @dialect_option("With --external: the dialect of the hand.")
 @click.option(
@@ -82,13 +84,7 @@ whose client asks for all of it, are tried at it."""
 @click.option(
     "--baseline", type=FILE, metavar="FILE", help="JSON of an earlier run of the same hand."
 )
-@click.option(
-    "--json",
-    "json_path",
-    type=FILE,
-    metavar="FILE",
-    help="Where to write the result.  [default: selftest-MODEL-SIDE-TIME.json]",
-)
+@json_file_option("Where to write the result.  [default: selftest-MODEL-SIDE-TIME.json]")
 @html_option()
 @dds_options()
 @wait_option("With --external: wait up to S seconds for the hand.")

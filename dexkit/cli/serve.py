@@ -17,6 +17,7 @@ from dexkit.cli.options import (
     Number,
     dds_options,
     devices_by_side,
+    devices_option,
     dialect_option,
     force_option,
     quiet_option,
@@ -50,13 +51,7 @@ _LONELY = 10.0  # seconds without a client before a hint
 @click.command("serve")
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Hand to serve; both needs a device for each.", required=True)
-@click.option(
-    "--device",
-    "devices",
-    multiple=True,
-    metavar="PATH",
-    help="Path or serial number of the device; with --side both left=PATH and right=PATH.",
-)
+@devices_option("Path or serial number of the device; with --side both left=PATH and right=PATH.")
 @set_option(
     "Setting of the backend, e.g. object=40; left.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."

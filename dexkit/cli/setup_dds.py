@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING
 
 import click
 
+from dexkit.cli.options import dry_run_option
 from dexkit.errors import DdsInstallError, OutputError
 from dexkit.escaping import REMARK, one_line
 
@@ -43,7 +44,7 @@ __all__ = ["command"]
 @click.option(
     "--replace", is_flag=True, help="Replace an installed cyclonedds that works, or is not 0.10.x."
 )
-@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
+@dry_run_option("Print what would be done, and do nothing.")
 @click.option(
     "--log",
     type=click.Path(dir_okay=False, path_type=Path),

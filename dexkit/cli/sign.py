@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import recording_option
+from dexkit.cli.options import output_option, recording_option
 from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
@@ -36,13 +36,7 @@ from dexkit.escaping import one_line
     show_default=True,
     help="Signing program; it must be installed.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FILE.zip",
-    help="Where to write the archive.  [default: RESULT.zip]",
-)
+@output_option("FILE.zip", "Where to write the archive.  [default: RESULT.zip]")
 def command(
     result: Path,
     recording: Path | None,

@@ -18,6 +18,7 @@ from dexkit.cli.options import (
     duration_option,
     force_option,
     json_option,
+    list_option,
     side_option,
     wait_option,
 )
@@ -53,7 +54,7 @@ _MS = 1e3
 
 @click.command("teleop")
 @click.argument("profile_name", metavar="PROFILE", required=False)
-@click.option("--list", "list_profiles", is_flag=True, help="List the profiles and exit.")
+@list_option("List the profiles and exit.")
 @dialect_option(
     "Dialect of the hands: "
     + "; ".join(f"{', '.join(d.name for d in m.dialects)} ({m.name})" for m in MODELS.values())
@@ -92,7 +93,7 @@ _MS = 1e3
 @json_option("Print the measurements as JSON (docs/teleop.md).")
 def command(
     profile_name: str | None,
-    list_profiles: bool,
+    list_only: bool,
     dialect: str,
     domain: int,
     interface: str,
@@ -118,7 +119,7 @@ def command(
     Exit codes: 0 done, 1 the hand gave no state, fell silent, or is commanded by another program,
     2 wrong usage, 130 interrupted.
     """
-    if list_profiles:
+    if list_only:
         _list()
         return 0
     if profile_name is None:

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import FILE, dds_options, duration_option, topic_option
+from dexkit.cli.options import (
+    FILE,
+    dds_options,
+    duration_option,
+    host_option,
+    port_option,
+    topic_option,
+)
 from dexkit.cli.status_line import StatusLine
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.escaping import REMARK, one_line
@@ -35,19 +42,10 @@ __all__ = ["command", "recorded"]
 )
 @topic_option("Listen to", "every topic of a known type, also those that appear later")
 @dds_options()
-@click.option(
-    "--host",
-    default="127.0.0.1",
-    show_default=True,
-    metavar="ADDRESS",
-    help="Bind the page to this address. It has no password: anyone on the network could see it.",
+@host_option(
+    "Bind the page to this address. It has no password: anyone on the network could see it."
 )
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    metavar="N",
-    help="TCP port of the page; 0 for any.  [default: the first free one from 8720]",
-)
+@port_option("TCP port of the page; 0 for any.  [default: the first free one from 8720]")
 @click.option(
     "--open/--no-open",
     "open_browser",

@@ -7,7 +7,14 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, serve
-from dexkit.cli.options import Number, object_option, side_option, start_option, wiring_option
+from dexkit.cli.options import (
+    Number,
+    links_option,
+    object_option,
+    side_option,
+    start_option,
+    wiring_option,
+)
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
@@ -18,15 +25,10 @@ __all__ = ["emulate_dex1_motor"]
 
 @click.command("dex1-motor", context_settings={"show_default": True})
 @side_option("Motor to emulate: id 0 is the right one, 1 the left one.", default="left")
-@click.option(
-    "--link",
-    "links",
-    multiple=True,
-    required=True,
-    metavar="PATH",
-    help="Link that clients open. With --side both, one for a line with both motors, or "
+@links_option(
+    "Link that clients open. With --side both, one for a line with both motors, or "
     "left=PATH and right=PATH for a line each. usbip://HOST:PORT for an FTDI adapter (FT232H) on "
-    "USB/IP, which has a latency timer of its own.",
+    "USB/IP, which has a latency timer of its own."
 )
 @object_option("Percent of opening at which the jaws touch an object")
 @start_option("Opening at first.", 20.0)

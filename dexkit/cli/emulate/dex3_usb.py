@@ -13,7 +13,9 @@ from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.cli.options import (
     FILE,
     fault_options,
+    host_option,
     object_option,
+    port_option,
     real_time_option,
     seed_option,
     side_option,
@@ -49,14 +51,9 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     metavar="S",
     help="Serial number; with --side both, give two.  [default: 2024061800 and 2024061801]",
 )
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=3240, help="TCP port; 0 takes a free one."
-)
-@click.option(
-    "--host",
-    default="127.0.0.1",
-    metavar="ADDRESS",
-    help="Address to serve on. Any client that reaches it can move the hand: there is no password.",
+@port_option("TCP port; 0 takes a free one.", 3240)
+@host_option(
+    "Address to serve on. Any client that reaches it can move the hand: there is no password."
 )
 @object_option("Percent of closing at which the fingers touch an object")
 @start_option("Percent of closing at first.  [default: at rest, about 20]")

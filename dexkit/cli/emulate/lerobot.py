@@ -8,7 +8,7 @@ import time
 
 import click
 
-from dexkit.cli.options import DOMAIN, duration_option, quiet_option
+from dexkit.cli.options import domain_option, duration_option, quiet_option
 from dexkit.cli.status_line import StatusLine, log_to_stderr
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.robots import G1
@@ -29,9 +29,7 @@ ports_option = click.option(
 
 
 @click.command("lerobot-g1", context_settings={"show_default": True})
-@click.option(
-    "--domain", type=DOMAIN, default=0, help="DDS domain of the emulated G1, on loopback."
-)
+@domain_option("DDS domain of the emulated G1, on loopback.", 0)
 @click.option(
     "--address",
     default=LOOPBACK,

@@ -18,6 +18,7 @@ from dexkit.cli.options import (
     fault_options,
     latency_timer_option,
     line_time_option,
+    link_option,
     object_option,
     real_time_option,
     seed_option,
@@ -33,12 +34,9 @@ __all__ = ["emulate_mx64"]
 
 
 @click.command("mx64", context_settings={"show_default": True})
-@click.option(
-    "--link",
-    required=True,
-    metavar="PATH",
-    help="Link that clients open; usbip://HOST:PORT for an FTDI adapter (FT232R) on USB/IP, which "
-    "has a latency timer of its own.",
+@link_option(
+    "Link that clients open; usbip://HOST:PORT for an FTDI adapter (FT232R) on USB/IP, which "
+    "has a latency timer of its own."
 )
 @click.option(
     "--id",

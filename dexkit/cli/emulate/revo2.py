@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
-from dexkit.cli.options import object_option, side_option, start_option
+from dexkit.cli.options import id_option, link_option, object_option, side_option, start_option
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import revo2
@@ -17,16 +17,10 @@ __all__ = ["emulate_revo2"]
 
 @click.command("revo2", context_settings={"show_default": True})
 @side_option("Hand to emulate.", default="right")
-@click.option("--link", required=True, metavar="PATH", help="Link that clients open.")
+@link_option("Link that clients open.")
 @object_option("Percent of closing at which the joints touch an object")
 @start_option("Percent of closing at first; by default a relaxed pose.")
-@click.option(
-    "--id",
-    "number",
-    type=click.IntRange(revo2.IDS[0], revo2.IDS[-1]),
-    metavar="N",
-    help="Its Modbus unit; by default 126 of a left hand and 127 of a right one.",
-)
+@id_option(revo2.IDS, "Its Modbus unit; by default 126 of a left hand and 127 of a right one.")
 @line_options(
     "hand", baudrate=revo2.BAUD_RATE, most=5_000_000, faults="unplug@5s:for=2s, drop:p=0.1"
 )

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
-from dexkit.cli.options import object_option, side_option, start_option
+from dexkit.cli.options import id_option, link_option, object_option, side_option, start_option
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
@@ -20,7 +20,7 @@ _SERIAL_ONLY = ("number", "baudrate", "line_time", "latency_timer", "any_baudrat
 
 @click.command("rh56", context_settings={"show_default": True})
 @side_option("Hand to emulate.", default="right")
-@click.option("--link", metavar="PATH", help="Link that clients open: the hand's serial line.")
+@link_option("Link that clients open: the hand's serial line.", required=False)
 @click.option(
     "--modbus-tcp",
     "tcp",
@@ -31,14 +31,7 @@ _SERIAL_ONLY = ("number", "baudrate", "line_time", "latency_timer", "any_baudrat
 @click.option("--tactile", is_flag=True, help="With --modbus-tcp: an RH56DFTP, with its areas.")
 @object_option("Percent of closing at which the joints touch an object")
 @start_option("Percent of closing at first; by default a relaxed pose.")
-@click.option(
-    "--id",
-    "number",
-    type=click.IntRange(rh56.IDS[0], rh56.IDS[-1]),
-    default=1,
-    metavar="N",
-    help="Its id on the line.",
-)
+@id_option(rh56.IDS, "Its id on the line.", 1)
 @line_options(
     "hand",
     baudrate=rh56.BAUD_RATE,

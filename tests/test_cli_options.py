@@ -1,0 +1,102 @@
+"""Test options of the command line: those of several commands are written once."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+from click.testing import CliRunner
+
+from dexkit.cli import cli
+from dexkit.cli.options import Number
+
+COMMANDS = Path(__file__).parent.parent / "dexkit" / "cli"
+SHARED = "options"
+
+DIFFERENT = {
+    "--baudrate": (
+        {"calibrate", "emulate/mx64", "emulate/serving"},
+        "the values differ: any or auto, those of the servo's table, any up to the line's most",
+    ),
+    "--force": ({SHARED, "calibrate"}, "calibrate measures a force"),
+    "--from": (
+        {SHARED, "bridge", "cut", "mutants"},
+        "a format, a dialect, a time, a file of hands",
+    ),
+    "--hand": ({SHARED, "mutants"}, "a model, and the name of a generated hand"),
+    "--id": (
+        {SHARED, "calibrate", "emulate/mx64"},
+        "the id of one device, one or auto, and several on one line",
+    ),
+    "--link": ({SHARED, "doctor"}, "a path, and the host at the other end of a network"),
+    "--log": ({"monitor", "setup_dds"}, "a recording, and the output of programs"),
+    "--model": ({"doctor", "mutants"}, "short names of hands, and hands and robots"),
+    "--out": (
+        {SHARED, "export", "view"},
+        "a folder with a default, a folder that must be named, a file or an address",
+    ),
+    "--speed": (
+        {"bringup", "calibrate", "replay", "selftest"},
+        "rad/s, whether to measure it, a factor of time, a part of the full speed",
+    ),
+    "--to": (
+        {"bridge", "cut", "export", "view"},
+        "a dialect, a time, a format, a program",
+    ),
+}
+"""Options that mean different things in the modules that declare them: which, and what."""
+
+
+def declared(path: Path) -> set[str]:
+    """Names of the options that a module declares with ``click.option``."""
+    return {
+        name
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "click.option"
+        for text in ast.walk(ast.Tuple(list(node.args)))
+        if isinstance(text, ast.Constant) and str(text.value).startswith("-")
+        for name in str(text.value).split("/")
+    }
+
+
+def test_options_of_several_commands_are_written_once() -> None:
+    where = defaultdict(set)
+    for path in sorted(COMMANDS.rglob("*.py")):
+        module = path.relative_to(COMMANDS).with_suffix("").as_posix()
+        for name in declared(path):
+            where[name].add(module)
+    assert len(where) > 100
+    found = {name: modules for name, modules in where.items() if len(modules) > 1}
+    assert found == {name: modules for name, (modules, _) in DIFFERENT.items()}, (
+        "write it in dexkit/cli/options.py, or say here how the meanings differ"
+    )
+
+
+def test_number_without_bounds_has_no_range_in_the_help() -> None:
+    assert repr(Number()) == "<Number >"
+    assert repr(Number(min=0)) == "<Number x>=0>"
+    assert repr(Number(max=1)) == "<Number x<=1>"
+    for command in ("cut", "diff"):
+        assert "None" not in CliRunner().invoke(cli, [command, "--help"]).output
+
+
+def test_plugin_shares_the_texts_of_its_options() -> None:
+    """The option of ``pytest`` and that of ``dexkit check`` say the same."""
+    from dexkit import option_texts
+    from dexkit.conformance import plugin
+
+    said: dict[str, str] = {}
+
+    class Parser:
+        def getgroup(self, *_: str) -> Parser:
+            return self
+
+        def addoption(self, name: str, *_: str, **attributes: object) -> None:
+            said[name] = str(attributes["help"])
+
+    plugin.pytest_addoption(Parser())  # type: ignore[arg-type]
+    for name in ("capabilities", "grade", "level", "list", "require"):
+        text = getattr(option_texts, name.upper()).removesuffix(".")
+        assert text[1:] in said[f"--{name}"], name
+    assert said["--level"] == "only requirements at least this binding"
