@@ -15,8 +15,9 @@ from __future__ import annotations
 import os
 import termios
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import serial
 
@@ -37,6 +38,8 @@ __all__ = [
     "ServoSilent",
 ]
 
+T = TypeVar("T")
+
 BITS_PER_BYTE = 10
 """8N1: start bit, eight data bits, stop bit."""
 
@@ -47,6 +50,7 @@ _STATUS = 11
 _LONGEST_REQUEST = 64
 """Bytes that may still be in the transmit buffer when the wait for the answer begins."""
 _PING_DATA = 3  # model number (2), firmware (1)
+_SILENT = "does not answer"
 
 
 @dataclass
@@ -63,6 +67,14 @@ class BusStatistics:
     timeouts: int = 0
     corrupt: int = 0
     retries: int = 0
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Why an attempt has no answer: servos, and what they do."""
+
+    who: int | str
+    what: str
 
 
 @dataclass(frozen=True)
@@ -356,24 +368,17 @@ class ServoBus:
         """
         params = address.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(servo_ids)
         request = dynamixel.encode(BROADCAST_ID, Instruction.SYNC_READ, params)
-        statistics = self.statistics
-        expected = len(servo_ids) * (_STATUS + length)
-        missing: list[int] = []
-        for attempt in range(1 + self.retries):
-            statistics.transactions += 1
-            statistics.retries += attempt > 0
-            with port_errors(self.path):
-                self._send(request)
-                found = self._receive_all(servo_ids, length, self._deadline(expected))
+
+        def receive(deadline: float) -> dict[int, bytes] | _Problem:
+            found = self._receive_all(servo_ids, length, deadline)
             missing = [servo_id for servo_id in servo_ids if servo_id not in found]
             if not missing:
                 return found
-            statistics.timeouts += 1
-        raise ServoSilent(
-            f"servo {' and '.join(map(str, missing))} on {self.path} does not answer "
-            f"({1 + self.retries} attempt(s) at {self.baudrate} baud)",
-            hint="check power, cable, id and baud rate",
-        )
+            self.statistics.timeouts += 1
+            return _Problem(" and ".join(map(str, missing)), _SILENT)
+
+        expected = len(servo_ids) * (_STATUS + length)
+        return self._ask(request, expected, receive, 1 + self.retries)
 
     def _receive_all(
         self, servo_ids: Sequence[int], length: int, deadline: float
@@ -420,38 +425,57 @@ class ServoBus:
         retries: int | None = None,
     ) -> tuple[bool, bytes]:
         """Send an instruction, with retries; return (alert bit, data of length ``answer``)."""
-        attempts = 1 + (self.retries if retries is None else retries)
-        statistics = self.statistics
+
+        def receive(deadline: float) -> tuple[bool, bytes] | _Problem:
+            packet = self._receive(servo_id, deadline)
+            if packet is None:
+                self.statistics.timeouts += 1
+                return _Problem(servo_id, _SILENT)
+            if not packet.crc_ok:
+                self.statistics.corrupt += 1
+                return _Problem(servo_id, "answers with damaged packets")
+            number = packet.error_number
+            if not number:
+                data = packet.data
+                if len(data) == answer:
+                    return packet.alert, data
+            elif number != dynamixel.ErrorNumber.CRC:
+                raise ServoError(_describe_refusal(servo_id, instruction, params, number), number)
+            self.statistics.corrupt += 1
+            if number:
+                return _Problem(servo_id, "receives damaged packets")
+            # for example a late answer to an earlier instruction
+            return _Problem(servo_id, "answers with packets of the wrong length")
+
         request = dynamixel.encode(servo_id, instruction, params)
-        problem = ""
+        attempts = 1 + (self.retries if retries is None else retries)
+        return self._ask(request, _STATUS + answer, receive, attempts)
+
+    def _ask(
+        self, request: bytes, size: int, receive: Callable[[float], T | _Problem], attempts: int
+    ) -> T:
+        """Send ``request`` until its answer is intact.
+
+        :param size: bytes of the whole answer.
+        :param receive: takes the answer until a deadline (monotonic seconds), and counts what is
+            wrong with it.
+        :raises ServoSilent: no attempt had an intact answer.
+        :raises HandLost: the port has gone away.
+        """
+        statistics = self.statistics
+        problem = None
         for attempt in range(attempts):
             statistics.transactions += 1
             statistics.retries += attempt > 0
             with port_errors(self.path):
                 self._send(request)
-                packet = self._receive(servo_id, self._deadline(_STATUS + answer))
-            if packet is None:
-                statistics.timeouts += 1
-                problem = "does not answer"
-                continue
-            if not packet.crc_ok:
-                statistics.corrupt += 1
-                problem = "answers with damaged packets"
-                continue
-            number = packet.error_number
-            if number == dynamixel.ErrorNumber.CRC:
-                statistics.corrupt += 1
-                problem = "receives damaged packets"
-                continue
-            if number:
-                raise ServoError(_describe_refusal(servo_id, instruction, params, number), number)
-            if len(packet.data) == answer:
-                return packet.alert, packet.data
-            # for example a late answer to an earlier instruction
-            statistics.corrupt += 1
-            problem = "answers with packets of the wrong length"
+                answer = receive(self._deadline(size))
+            if not isinstance(answer, _Problem):
+                return answer
+            problem = answer
+        assert problem is not None, "at least one attempt"
         raise ServoSilent(
-            f"servo {servo_id} on {self.path} {problem} "
+            f"servo {problem.who} on {self.path} {problem.what} "
             f"({attempts} attempt(s) at {self.baudrate} baud)",
             hint="check power, cable, id and baud rate",
         )
