@@ -101,17 +101,24 @@ def test_the_units_are_right_on_both_ends() -> None:
                 np.sign(state.dq[1:]).tolist()
                 == np.sign(GOAL[Side.LEFT] - np.array(DEX3_1.rest_q[Side.LEFT])).tolist()[1:]
             )
-            drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.01)
-            time.sleep(0.3)
-            state = hand.exchange(go(GOAL[Side.LEFT]))
-            assert state.q == pytest.approx(mechanics.q, abs=1e-3)
+            drive(
+                hand,
+                go(GOAL[Side.LEFT]),
+                lambda s: (
+                    np.abs(s.q - GOAL[Side.LEFT]).max() < 0.01
+                    and np.abs(s.q - mechanics.q).max() < 1e-3
+                ),
+            )
             # a torque of its own, held against nothing but the gains: kp (q - q_now) + tau = 0
             push = 0.15
-            pushed = go(GOAL[Side.LEFT], tau=push)
-            for _ in range(600):
-                state = hand.exchange(pushed)
-                time.sleep(0.001)
-            assert state.q - GOAL[Side.LEFT] == pytest.approx(np.full(7, push / 1.5), abs=0.02)
+            drive(
+                hand,
+                go(GOAL[Side.LEFT], tau=push),
+                lambda s: (
+                    np.abs(s.q - GOAL[Side.LEFT] - push / 1.5).max() < 0.02
+                    and np.abs(s.dq).max() < 0.02
+                ),
+            )
 
 
 def test_opening_and_closing_move_nothing() -> None:

@@ -296,9 +296,13 @@ def test_port_survives_clients_that_come_and_go() -> None:
     with emulated_ezgripper() as gripper:
         for _ in range(5):
             assert ping(gripper.path)
+        assert isinstance(gripper, EmulatedThread)
+        counters = gripper.bus.counters
+        seen = counters.bytes_in
         with client(gripper.path) as opened:
             os.write(opened.fd, PING[:5])
-        time.sleep(0.01)
+            wait_for(lambda: counters.bytes_in == seen + 5)
+        time.sleep(2 * Firmware().byte_gap)  # silence on the line, which ends the packet
         assert ping(gripper.path)
 
 
@@ -381,7 +385,6 @@ def test_protocol_1_firmware(tmp_path: Path) -> None:
         client(gripper.path) as opened,
     ):
         assert opened.ask(PING, 0.2) is None
-        time.sleep(0.01)
         os.write(opened.fd, bytes.fromhex("ffff010201fb"))
         data = b""
         while len(data) < 6:

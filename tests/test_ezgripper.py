@@ -12,6 +12,7 @@ import select
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,9 @@ from click.testing import CliRunner
 from dexkit.backends import BackendOptions
 from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
+from dexkit.descriptors import wait_readable
 from dexkit.drivers.ezgripper import Calibrate, EZGripper, GripperSettings, calibration, settings
+from dexkit.drivers.ezgripper import bus as bus_module
 from dexkit.drivers.ezgripper import gripper as gripper_module
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus, ServoError
 from dexkit.drivers.ezgripper.calibration import CalibrationFailed
@@ -36,7 +39,7 @@ from dexkit.drivers.ezgripper.discovery import (
     latency_warning,
 )
 from dexkit.drivers.ezgripper.gripper import ZeroGains
-from dexkit.drivers.ezgripper.servo import line_time
+from dexkit.drivers.ezgripper.servo import exchange_bytes, line_time
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.mx64 import (
     Bus,
@@ -1068,14 +1071,29 @@ def test_default_latency_timer_is_slow_but_works(tmp_path: Path) -> None:
         drive(hand, HALF, at(2.7))
 
 
-def test_waiting_exchange_uses_little_processor_time(tmp_path: Path) -> None:
+def test_waiting_exchange_blocks_until_bytes_arrive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes no processor time meanwhile; the SDK's own loop asks the port again and again."""
+    waits: list[bool] = []
+
+    def wait(descriptors: Sequence[int], seconds: float) -> list[int]:
+        ready = wait_readable(descriptors, seconds)
+        waits.append(bool(ready))
+        return ready
+
     with (
         emulated_ezgripper(process=True, latency_timer=16e-3) as gripper,
         gripper_on(gripper.path, configured(tmp_path)) as hand,
     ):
-        used = time.thread_time()
-        started = time.monotonic()
+        monkeypatch.setattr(bus_module, "wait_readable", wait)
+        statistics = hand.bus_statistics
+        transactions, timeouts = statistics.transactions, statistics.timeouts
         for _ in range(50):
             exchange(hand, BRAKE)
-        # the SDK's own loop would use all of it
-        assert time.thread_time() - used < 0.3 * (time.monotonic() - started)
+        _, answer = exchange_bytes()
+        transactions = statistics.transactions - transactions
+        assert transactions >= 50
+        # one wait for an answer, and another one for each part that comes by itself
+        assert transactions <= len(waits) <= transactions * answer
+        assert waits.count(False) <= statistics.timeouts - timeouts, "it waits for bytes only"

@@ -9,8 +9,10 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, IndexType, Writer
 
+from dexkit.errors import TraceError
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
+from dexkit.traces import open_trace
 
 CMD_TYPE = "unitree_go::msg::dds_::MotorCmds_"
 STATE_TYPE = "unitree_go::msg::dds_::MotorStates_"
@@ -25,6 +27,15 @@ def cmd(q: float) -> bytes:
 
 def state(q: float, tau: float = 0.0) -> bytes:
     return message_type(STATE_TYPE).encode(MotorStates_([MotorState_(q=q, tau_est=tau)]))
+
+
+def messages_on_disk(path: Path, topic: str) -> int:
+    """Messages in a recording that is being written; 0 before it can be read."""
+    try:
+        trace = open_trace(path)
+    except TraceError:
+        return 0
+    return len(trace.samples(topic)) if topic in trace.topics else 0
 
 
 @dataclass(frozen=True)
