@@ -11,6 +11,7 @@ import importlib
 import re
 import subprocess
 import sys
+import venv
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,17 +24,21 @@ from dexkit.conformance.mutants import mutants, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import chosen, cost, try_one
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Overall
+from dexkit.dds import DdsNode
 from dexkit.errors import ModelBroken, UsageError
 from dexkit.hand import Side
 from dexkit.lazy import Lazy
 from dexkit.models import BUILT_IN, DIALECTS, MODELS, model, model_plugins
 from dexkit.robots import ROBOTS
-from tests.dds_helpers import free_domain
+from tests.dds_helpers import free_domain, take_until
 from tests.optional import UV
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "twofinger-hand"
+EXAMPLE_PACKAGE = "twofinger_hand"
 NAME, DIALECT, BACKEND = "twofinger-1", "twofinger", "sim-twofinger"
+STATE_TYPE = "unitree_hg::msg::dds_::HandState_"
 ENTRIES = """\
 [dexkit.models]
 twofinger-1 = twofinger_hand.profile:TWOFINGER_1
@@ -344,6 +349,39 @@ def live(*command: str, timeout: float = 400.0) -> subprocess.CompletedProcess[s
     )
 
 
+def serves_states(python: Path, *arguments: str) -> None:
+    """``dexkit ARGUMENTS`` publishes states of both hands, and ends as it is asked to."""
+    domain = free_domain()
+    command = [str(python), "-m", "dexkit", *arguments, "--domain", str(domain)]
+    with DdsNode(domain) as node, subprocess.Popen(command, cwd="/") as process:
+        try:
+            for side in Side:
+                states = node.reader(f"rt/{DIALECT}/{side}/state", STATE_TYPE)
+                take_until(states, lambda samples: len(samples) >= 10)
+        finally:
+            process.terminate()
+        assert process.wait(PATIENCE) == 0
+
+
+def site_packages(home: Path) -> Path:
+    """The packages of an environment, among them dexkit as it is here."""
+    (packages,) = home.glob("lib/python*/site-packages")
+    own = [path for path in sys.path if path.endswith("site-packages")]
+    # commands that the kit starts take no PYTHONPATH
+    (packages / "dexkit.pth").write_text("\n".join([*own, str(ROOT)]))
+    return packages
+
+
+def test_robot_with_the_hands_of_another_package_publishes_states(tmp_path: Path) -> None:
+    """``emulate all`` starts ``serve``; each finds the package by its entry points."""
+    home = tmp_path / "env"
+    venv.create(home, symlinks=True)
+    packages = site_packages(home)
+    Packages(packages).install("twofinger-hand", ENTRIES)
+    (packages / EXAMPLE_PACKAGE).symlink_to(EXAMPLE / EXAMPLE_PACKAGE)
+    serves_states(home / "bin" / "python", "emulate", "all", "--hands", DIALECT)
+
+
 @pytest.mark.soak
 def test_the_installed_example_is_served_and_judged(tmp_path: Path) -> None:
     """In an environment of its own, which has dexkit, and the example as pip installs it."""
@@ -355,11 +393,10 @@ def test_the_installed_example_is_served_and_judged(tmp_path: Path) -> None:
     ):
         done = live(str(UV), *arguments)
         assert done.returncode == 0, done.stderr
-    # dexkit as it is here; commands that the kit starts take no PYTHONPATH
-    (packages,) = home.glob("lib/python*/site-packages")
-    own = [path for path in sys.path if path.endswith("site-packages")]
-    (packages / "dexkit.pth").write_text("\n".join([*own, str(ROOT)]))
+    site_packages(home)
     assert "Two-finger hand" in live(str(python), "-m", "dexkit", "models").stdout
+    serves_states(python, "serve", BACKEND, "--side", "both")
+    serves_states(python, "emulate", "all", "--hands", DIALECT)
     report = tmp_path / "report.html"
     suite = live(
         *(str(python), "-m", "pytest", "--pyargs", "dexkit.conformance", "-c", "/dev/null"),
