@@ -40,7 +40,12 @@ from tests.slow_hand import SLOW
 ROOT = Path(__file__).parent.parent
 
 ATTEMPTS = 5
-"""Runs of a suite that a busy machine may leave inconclusive: its report says to run it again."""
+"""Runs of a suite, about 20 s each on an idle machine, which a busy one may leave inconclusive.
+
+An idle machine needs one. A command that is late does not reach the gripper, and what it should
+have shown is left open: it was not judged, so no record can stand for it, and the report says to
+run it again. A test asks for each verdict, so it does that, and fails after the last run.
+"""
 
 
 def suite(*arguments: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
