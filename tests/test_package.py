@@ -178,7 +178,7 @@ def test_without_dds_everything_else_works(version: str, wheel: Path, tmp_path: 
     python = optional.python(version)
     if python is None:
         pytest.skip(f"no Python {version} on this machine")
-    newer = Installed.make(tmp_path, python, wheel)
+    newer = Installed.make(tmp_path, python, wheel, "[dynamixel]")
     code = (
         "from dexkit.messages import message_type;"
         "m = message_type('unitree_go::msg::dds_::MotorCmds_');"
