@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from benchmarks import Result
-from dexkit.conformance.audit.audit import Audit, Limits, Outcome, Runner, in_this_process
+from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, Runner, in_this_process
 from dexkit.conformance.audit.cluster import THIS_MACHINE
 from dexkit.conformance.audit.journal import Journal
 from dexkit.models import BUILT_IN, HandModel
@@ -56,7 +56,7 @@ def run() -> list[Result]:
         return found
 
 
-def _audit(archive: Path, out: Path, runner: Runner) -> tuple[Outcome, float]:
+def _audit(archive: Path, out: Path, runner: Runner) -> tuple[AuditProgress, float]:
     """What it came to, and seconds of processor time of this process."""
     begin = time.process_time()
     outcome = Audit([str(archive)], out).run(runner)
@@ -64,7 +64,7 @@ def _audit(archive: Path, out: Path, runner: Runner) -> tuple[Outcome, float]:
     return outcome, time.process_time() - begin
 
 
-def _facts(out: Path, outcome: Outcome, own: float) -> list[tuple[Path, dict[str, Any]]]:
+def _facts(out: Path, outcome: AuditProgress, own: float) -> list[tuple[Path, dict[str, Any]]]:
     """Path and facts of each file that was judged to its end, without the first.
 
     :param own: processor time of the auditing process, of which each file gets its share.
@@ -111,7 +111,7 @@ def _rate(files: Iterable[dict[str, Any]]) -> float:
     return float(sum(f["duration_s"] for f in every) / sum(f["cpu_s"] for f in every))
 
 
-def _scaling(one: Outcome, many: Outcome, cores: int) -> Result:
+def _scaling(one: AuditProgress, many: AuditProgress, cores: int) -> Result:
     part = one.seconds / many.seconds / cores
     return Result(
         f"dexkit audit, {cores} processes",
@@ -127,7 +127,7 @@ def _scaling(one: Outcome, many: Outcome, cores: int) -> Result:
     )
 
 
-def _ray(many: Outcome, ray: Outcome, cores: int) -> Result:
+def _ray(many: AuditProgress, ray: AuditProgress, cores: int) -> Result:
     return Result(
         f"dexkit audit --ray local, {cores} processors",
         ray.seconds,

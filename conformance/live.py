@@ -31,6 +31,7 @@ from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.run_record import run_record
 from dexkit.conformance.stimuli import (
     Action,
+    CommandSession,
     Join,
     Leave,
     Observation,
@@ -39,7 +40,6 @@ from dexkit.conformance.stimuli import (
     Role,
     Script,
     Send,
-    Session,
     StartService,
     StopService,
     script_for,
@@ -77,7 +77,7 @@ class LiveOptions:
 
     rig: RigOptions
     phases: frozenset[str]
-    session: Session | None = None
+    session: CommandSession | None = None
     force: bool = False
     usb: bool = False
     rounds: int = 1

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.layers import layer
-from dexkit.conformance.lost import Lost
 from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.run_record import RECORD as RUN
@@ -303,7 +303,7 @@ class Recording:
             return None
         return self.stimulus.time_error(self.log_time(begin), self.log_time(end))
 
-    def lost(self, begin: float, end: float) -> Lost | None:
+    def lost(self, begin: float, end: float) -> Lateness | None:
         """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
         if self.stimulus is None:
             return None

@@ -28,7 +28,7 @@ from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.run_queue import MOST_FILES
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.stimuli.recorded_session import Session
+from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.digests import sha256_of_file
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
@@ -355,7 +355,9 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
     session = None
     if "replay" in phases:
         session = (
-            Session.load(options.trace) if options.trace else Session.default(options.dialect.model)
+            CommandSession.load(options.trace)
+            if options.trace
+            else CommandSession.default(options.dialect.model)
         ).for_hand(options.dialect)
     usb = any(r.layer == "usb" for r in options.requirements)
     run = RunKind.THOROUGH if options.thorough else RunKind.DEFAULT

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.lost import Lost
+from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.waits import Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
@@ -135,9 +135,9 @@ class Beats:
         median, high = np.percentile(there, [50, 99])
         return float(median), float(high)
 
-    def lost(self, begin_ns: int, end_ns: int) -> Lost | None:
+    def lost(self, begin_ns: int, end_ns: int) -> Lateness | None:
         """Lateness in [begin, end] beyond that of an idle machine; None if it is not known."""
-        return Lost.beyond_idle(self._in(begin_ns, end_ns))
+        return Lateness.beyond_idle(self._in(begin_ns, end_ns))
 
     def _in(self, begin_ns: int, end_ns: int) -> Floats:
         """Lateness, seconds, of the beats that were due before the end and came after the begin."""

@@ -47,7 +47,7 @@ from typing import Protocol
 
 from dexkit.conformance.checks import Late, Outcome
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.lost import IDLE, Lost
+from dexkit.conformance.lateness import IDLE, Lateness
 from dexkit.conformance.measure import Measure
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
@@ -99,7 +99,7 @@ class Machine(Protocol):
         """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         ...
 
-    def lost(self, begin: float, end: float) -> Lost | None:
+    def lost(self, begin: float, end: float) -> Lateness | None:
         """Lateness of the kit's own timer in it, s; None if unknown."""
         ...
 
@@ -239,7 +239,7 @@ def _late(machine: Machine, failure: _Failure) -> Excuse:
     share = min(machine.starved(failure.begin, failure.end), 1.0)
     if lost is None:
         return Excuse()
-    measured = lost.of(failure.how)
+    measured = lost.figure(failure.how)
     harder = HARDEST * (1.0 + share)
     explained = harder * measured
     was = f"the kit's own timer was late by {_ms(measured)} {_HOW[failure.how]} there"
@@ -269,7 +269,7 @@ def _starved(machine: Machine, subject: Subject, failure: _Failure) -> Excuse:
     there = machine.starvation(subject, failure.begin - before, failure.end)
     if there is None:
         return Excuse()
-    measured = there.lost.of(failure.how)
+    measured = there.lost.figure(failure.how)
     explained = AGAIN * measured
     if failure.how == "total":
         explained = min(explained, HOPS * there.longest)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dexkit.conformance.lost import Lost
+from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.rows import Rows
 from dexkit.conformance.sums import total
 from dexkit.documents import parse_json
@@ -68,7 +68,7 @@ class Starvation:
     :param worst: the process that waited most.
     """
 
-    lost: Lost
+    lost: Lateness
     longest: float
     worst: Worst
 
@@ -143,7 +143,7 @@ class Waits:
         if not self._of(subject):
             return None
         part = self.others(begin_ns, end_ns)
-        lost = Lost.beyond_idle(part * self.delays(subject, begin_ns, end_ns))
+        lost = Lateness.beyond_idle(part * self.delays(subject, begin_ns, end_ns))
         if lost is None:
             return None
         waited = [self._waited(p, begin_ns, end_ns) for p in self._of(subject)]

@@ -14,7 +14,7 @@ from dexkit.emulators.faults import Fault, FaultFamily, parse_fault
 from dexkit.emulators.line_server import LineServer
 from dexkit.emulators.serial_line import BITS_PER_BYTE, LineCounters, SerialLine
 
-__all__ = ["AskedDevice", "RequestCounters", "RequestLine", "ServedDevice"]
+__all__ = ["RequestCounters", "RequestDevice", "RequestLine", "ServedDevice"]
 
 _BYTE_GAP = 5e-3  # s after which a frame begun is dropped; assumed
 
@@ -23,7 +23,7 @@ FoundFrameT = TypeVar("FoundFrameT", covariant=True)
 ServedT = TypeVar("ServedT", bound="ServedDevice")
 
 
-class AskedDevice(Protocol):
+class RequestDevice(Protocol):
     """A device that answers requests, without its serial line."""
 
     @property
@@ -74,7 +74,7 @@ class RequestLine(SerialLine, Generic[FrameT]):
 
     def __init__(
         self,
-        device: AskedDevice,
+        device: RequestDevice,
         parser: Parser[FrameT],
         answer: Callable[[FrameT], bytes | None],
         *,

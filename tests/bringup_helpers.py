@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dexkit.bringup import Drive, Effort, Findings, Question, Session, Snapshot
+from dexkit.bringup import BringupSession, Drive, Effort, Findings, Question, Snapshot
 from dexkit.clock import ManualClock
 from dexkit.drivers.dex3_usb.bringup import Dex3Bench
 from dexkit.drivers.dex3_usb.settings import Dex3Settings
@@ -44,7 +44,7 @@ class Bring:
         self.begin(Findings())
 
     def begin(self, findings: Findings) -> None:
-        self.session = Session(self.bench.plan, self.bench.motors, findings, self.effort)
+        self.session = BringupSession(self.bench.plan, self.bench.motors, findings, self.effort)
         self.drive: Drive | None = None
         self.seen: list[np.ndarray] = [self.mcu.mechanics.q]  # type: ignore[type-arg]
 

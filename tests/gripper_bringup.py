@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session
+from dexkit.bringup import Bench, BringupSession, Drive, Effort, Findings, Question
 from dexkit.clock import ManualClock
 
 PERIOD = 0.02
@@ -33,7 +33,7 @@ class Watched:
 
     def begin(self, findings: Findings) -> None:
         """A session that goes on from ``findings``."""
-        self.session = Session(self.bench.plan, self.bench.motors, findings, self.effort)
+        self.session = BringupSession(self.bench.plan, self.bench.motors, findings, self.effort)
         self.drive: Drive | None = None
         self.seen = [self._opening()]
         self.moved: set[str] = set()

@@ -13,14 +13,14 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from dexkit.cli import main
 from dexkit.conformance.audit import objects, sessions
-from dexkit.conformance.audit.audit import Audit, Outcome, in_this_process
+from dexkit.conformance.audit.audit import Audit, AuditProgress, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.journal import Journal
 from dexkit.conformance.audit.records import FINDING, FileRecord, State
-from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.tables import FILE, FINDINGS, have_parquet
-from dexkit.conformance.audit.workers import Lost, Pool
+from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.errors import DexkitError, OutputError, UsageError
@@ -45,7 +45,7 @@ def small(path: Path, count: int = 40) -> Path:
     return path
 
 
-def audited(folder: Path, out: Path, **options: Any) -> tuple[Outcome, dict[str, FileRecord]]:
+def audited(folder: Path, out: Path, **options: Any) -> tuple[AuditProgress, dict[str, FileRecord]]:
     outcome = Audit([str(folder)], out, **options).run(in_this_process)
     with Journal(out / "journal.jsonl") as journal:
         found = [journal.read(entry) for entry in journal.entries.values()]
@@ -54,7 +54,7 @@ def audited(folder: Path, out: Path, **options: Any) -> tuple[Outcome, dict[str,
 
 def test_a_file_gets_the_verdicts_of_dexkit_check(tmp_path: Path) -> None:
     path = copied(tmp_path, "a.mcap", "dex1_hand_dropout")
-    found = examine(Task(Session("a.mcap", str(path), path.stat().st_size, "1")))
+    found = examine(Task(SessionFile("a.mcap", str(path), path.stat().st_size, "1")))
     result = judge(recording_of(open_trace(path), None, ()))
     assert found.state is State.JUDGED
     assert (found.overall, found.exit_code) == (str(result.overall), result.exit_code())
@@ -115,9 +115,9 @@ def test_unusable_file_becomes_a_row(tmp_path: Path) -> None:
 
 def test_exit_code_follows_fail_on() -> None:
     def code(fail_on: str, **counts: int) -> int:
-        return Outcome(total=2, done=2, **counts).exit_code(fail_on)
+        return AuditProgress(total=2, done=2, **counts).exit_code(fail_on)
 
-    assert Outcome().exit_code("fail") == 2  # nothing was done, which is not a pass
+    assert AuditProgress().exit_code("fail") == 2  # nothing was done, which is not a pass
     assert [code(on, failing=1, unusable=1) for on in ("never", "fail", "unusable")] == [0, 1, 1]
     assert [code(on, unusable=1, warned=1) for on in ("fail", "unusable", "warn")] == [0, 2, 2]
     assert [code(on, warned=1) for on in ("unusable", "warn")] == [0, 1]
@@ -194,7 +194,7 @@ def test_a_stop_leaves_a_partial_result_that_the_next_audit_completes(tmp_path: 
         small(archive / f"{count}.mcap", count)
     stop: list[bool] = []
 
-    def after_two(outcome: Outcome) -> None:
+    def after_two(outcome: AuditProgress) -> None:
         if outcome.done == 2:
             stop.append(True)
 
@@ -250,7 +250,7 @@ def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         records = {
             Path(s.name).stem: examine(Task(s, max_size=len(data)))
             for s in found
-            if isinstance(s, Session)
+            if isinstance(s, SessionFile)
         }
         again = [examine(Task(s, records["good"].sha256)) for s in found if "good" in s.name]  # type: ignore[union-attr]
     finally:
@@ -264,12 +264,12 @@ def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         "flaky": "judged",
         "replaced": "unavailable",
     }
-    local = examine(Task(Session("x", str(tmp_path / "local.mcap"), len(data), "")))
+    local = examine(Task(SessionFile("x", str(tmp_path / "local.mcap"), len(data), "")))
     assert records["good"].findings == local.findings
     assert records["good"].sha256 == local.sha256
     assert records["broken"].error == "RuntimeError: the storage has a fault"
     assert not again[0].findings
-    assert all(isinstance(s, Session) and s.tag for s in found)
+    assert all(isinstance(s, SessionFile) and s.tag for s in found)
     (missing,) = find("memory://nowhere")
     assert isinstance(missing, FileRecord)
     assert missing.state is State.GONE
@@ -286,7 +286,7 @@ def test_exception_in_the_judging_becomes_a_row(
         raise KeyError("a mistake")
 
     monkeypatch.setattr("dexkit.conformance.audit.examine.judge", wrong)
-    found = examine(Task(Session("a", str(path), 1, "1")))
+    found = examine(Task(SessionFile("a", str(path), 1, "1")))
     assert (found.state, found.exit_code) == (State.FAILED, 2)
     assert "KeyError: 'a mistake'" in found.error
     assert not found.state.final
@@ -301,7 +301,7 @@ def test_processes_may_die_hang_and_grow() -> None:
         "grow": "no memory",
         **{name: name.upper() for name in "abc"},
     }
-    assert isinstance(found["die"], Lost)
+    assert isinstance(found["die"], WorkerLost)
     pool = Pool(work, jobs=1, seconds=0.0)
     assert dict(pool.run(["hang"])) == {"hang": "it took longer than 0 s"}
     assert not dict(Pool(work, jobs=1).run(["hang"], stop=True))
@@ -312,7 +312,7 @@ def test_files_that_cannot_be_examined_are_tried_again(tmp_path: Path) -> None:
     audit = Audit([str(tmp_path / "a.mcap")], tmp_path / "out", parquet=False)
 
     def lose(tasks: Any, stop: object) -> Any:
-        yield from ((task, Lost("its process died (SIGKILL)")) for task in tasks)
+        yield from ((task, WorkerLost("its process died (SIGKILL)")) for task in tasks)
 
     outcome = audit.run(lose)
     assert (outcome.done, outcome.unusable, outcome.exit_code()) == (1, 1, 2)

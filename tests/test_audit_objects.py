@@ -22,7 +22,7 @@ from dexkit.conformance.audit import objects
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.objects import Object, RangeFile
 from dexkit.conformance.audit.records import FileRecord, State
-from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.traces import sample_path
 
 SAMPLE = "dex1_legacy_v1_1"
@@ -65,7 +65,7 @@ def test_an_object_that_is_not_copied_gets_the_same_record(memory: MemoryFileSys
     memory.pipe("/ranges/a.mcap", data)
     memory.pipe("/ranges/cut.mcap", data[: len(data) // 2])
     for session in find("memory://ranges"):
-        assert isinstance(session, Session)
+        assert isinstance(session, SessionFile)
         copied, in_place = examine(Task(session)), examine(Task(session, max_size=100))
         for record in (copied, in_place):
             assert record.state is State.JUDGED
@@ -79,7 +79,7 @@ def test_object_that_vanishes_while_read_becomes_a_row(
 ) -> None:
     memory.pipe("/ranges/a.mcap", sample_path(SAMPLE).read_bytes())
     (session,) = find("memory://ranges")
-    assert isinstance(session, Session)
+    assert isinstance(session, SessionFile)
     genuine = Object.part
     for error, state in (
         (FileNotFoundError(2, "gone"), "gone"),
@@ -207,7 +207,7 @@ def test_audit_reads_objects_of_an_s3_bucket(monkeypatch: pytest.MonkeyPatch) ->
             files.pipe_file(f"archive/day/{name}.mcap", data)
         found = list(find("s3://archive"))
         assert [s.name for s in found] == [f"s3://archive/day/{n}.mcap" for n in "ab"]
-        a, b = (s for s in found if isinstance(s, Session))
+        a, b = (s for s in found if isinstance(s, SessionFile))
         assert a.tag == b.tag != ""
         files.rm_file("archive/day/b.mcap")
         records = [examine(Task(a)), examine(Task(a, max_size=1000)), examine(Task(b))]

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from dexkit.conformance.audit.audit import Audit, Limits, Outcome, in_this_process
+from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, in_this_process
 from dexkit.conformance.audit.journal import Journal
 from dexkit.conformance.audit.records import FileRecord
 from dexkit.errors import ConformanceError, UsageError
@@ -80,7 +80,7 @@ def test_a_node_is_killed_and_nothing_is_lost_or_done_twice(
     files = archive(tmp_path / "archive")
     killed: list[int] = []
 
-    def kill_a_node(outcome: Outcome) -> None:
+    def kill_a_node(outcome: AuditProgress) -> None:
         if outcome.done == 3:
             cluster.remove_node(second, allow_graceful=False)
             killed.append(outcome.done)
@@ -100,7 +100,7 @@ def test_stopped_audit_keeps_results_and_the_next_one_continues(
     files = archive(tmp_path / "archive")
     stop: list[bool] = []
 
-    def after_four(outcome: Outcome) -> None:
+    def after_four(outcome: AuditProgress) -> None:
         if outcome.done == 4:
             stop.append(True)
 

@@ -24,7 +24,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import layer, recording_of
 from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.mutants import Mutant, mutants
-from dexkit.conformance.mutants.matrix import Outcome as Trial
+from dexkit.conformance.mutants.matrix import WrongHandResult as Trial
 from dexkit.conformance.mutants.matrix import try_one
 from dexkit.conformance.recording import Commands, Recording, SideView, States, joints_of
 from dexkit.conformance.report.html import render

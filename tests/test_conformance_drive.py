@@ -10,7 +10,7 @@ from dexkit.conformance.mutants.generated import parse
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.selection import length
-from dexkit.conformance.stimuli import Session, phases_for
+from dexkit.conformance.stimuli import CommandSession, phases_for
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
@@ -100,5 +100,5 @@ def test_a_default_run_of_hands_is_short_enough() -> None:
     """90 s, less the start of the service and the hands' own time to arrive: 3 s and more."""
     for name in ("dex1-1", "dex3-1"):
         stimuli = length(name, phases_for(catalogue(name)))
-        session = Session.default(name).duration if MODELS[name].session else 0.0
+        session = CommandSession.default(name).duration if MODELS[name].session else 0.0
         assert stimuli + session <= 87.0, name

@@ -21,7 +21,7 @@ from dexkit.conformance.layers import recording_of
 from dexkit.conformance.live import LiveOptions, record_run
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
-from dexkit.conformance.mutants.matrix import Outcome, try_one
+from dexkit.conformance.mutants.matrix import WrongHandResult, try_one
 from dexkit.conformance.mutants.robot import CdrCrc, NoCrc, WaitsForCommands
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
@@ -133,7 +133,7 @@ def _one_of_each() -> list[Mutant]:
 
 @pytest.mark.parametrize("mutant", _one_of_each(), ids=lambda m: f"{m.model}-{m.name}")
 def test_wrong_robot_fails_its_requirement(mutant: Mutant) -> None:
-    assert try_one(mutant, short=True) == Outcome(mutant), mutant.summary
+    assert try_one(mutant, short=True) == WrongHandResult(mutant), mutant.summary
 
 
 @each("name", NAMES)

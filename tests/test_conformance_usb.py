@@ -20,7 +20,7 @@ from dexkit.conformance.checks import check_of
 from dexkit.conformance.judge import judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import mutants
-from dexkit.conformance.mutants.matrix import Outcome, try_one
+from dexkit.conformance.mutants.matrix import WrongHandResult, try_one
 from dexkit.conformance.mutants.trials import run_usb_mutant
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Load, Verdict
@@ -183,7 +183,7 @@ def test_reference_device_passes(side: Side) -> None:
 @pytest.mark.parametrize("name", BY_NAME)
 def test_wrong_device_fails_only_its_requirements(name: str) -> None:
     mutant = BY_NAME[name]
-    assert try_one(mutant) == Outcome(mutant), mutant.summary
+    assert try_one(mutant) == WrongHandResult(mutant), mutant.summary
 
 
 def test_script_ends_early_without_answers() -> None:

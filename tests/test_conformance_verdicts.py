@@ -16,7 +16,7 @@ from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.judge import judge
-from dexkit.conformance.lost import Lost
+from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.operator import LateState
 from dexkit.conformance.recording import Recording
@@ -42,20 +42,20 @@ def blame(outcome: Outcome) -> Excuse:
     return Excuse()
 
 
-IDLE = Lost(0.0, 0.0, 0.0)
-LATE = Lost(total=0.1, mean=0.001, p99=0.01)
+IDLE = Lateness(0.0, 0.0, 0.0)
+LATE = Lateness(total=0.1, mean=0.001, p99=0.01)
 
 
 class Machine:
     """A machine with given lateness and given part of the time with waiting programs."""
 
-    def __init__(self, lost: Lost | None, starved: float = 0.0) -> None:
+    def __init__(self, lost: Lateness | None, starved: float = 0.0) -> None:
         self._lost, self._starved = lost, starved
 
     def starved(self, begin: float, end: float) -> float:
         return self._starved
 
-    def lost(self, begin: float, end: float) -> Lost | None:
+    def lost(self, begin: float, end: float) -> Lateness | None:
         return self._lost
 
     def starvation(self, subject: Subject, begin: float, end: float) -> None:
@@ -63,7 +63,7 @@ class Machine:
 
 
 PRESSED = Machine(IDLE, starved=1.0)
-FITS = Machine(Lost(9.0, 0.009, 0.1), starved=0.8)
+FITS = Machine(Lateness(9.0, 0.009, 0.1), starved=0.8)
 BUSY_ONE = Machine(LATE, starved=1.0)
 
 
@@ -99,18 +99,18 @@ def gap(seconds: float) -> Outcome:
         (GAP, gap(0.45), Machine(LATE), False),
         (GAP, gap(0.25), Machine(LATE), True),
         # occasional lateness does not change a mean
-        (RATE, rate(150.0), Machine(Lost(0.06, 0.0006, 0.06), starved=0.2), False),
+        (RATE, rate(150.0), Machine(Lateness(0.06, 0.0006, 0.06), starved=0.2), False),
         # irregular, but the hand is never fast
         (RATE, rate(180.0, best=0.0), FITS, True),
         (RATE, rate(50.0, best=0.0), FITS, True),
         (RATE, rate(50.0, best=0.015), FITS, False),
         (RATE, rate(180.0, best=0.0005), FITS, True),
-        (RATE, rate(50.0, best=0.015), Machine(Lost(9.0, 0.009, 0.1, best=0.004), 1.0), True),
+        (RATE, rate(50.0, best=0.015), Machine(Lateness(9.0, 0.009, 0.1, best=0.004), 1.0), True),
         # not known
         (GAP, gap(0.2), Machine(None, starved=1.0), False),
         # load excuses neither too high a rate nor failures without a relation to time
         (RATE, failure(2.0).if_late(math.inf, how="mean"), BUSY_ONE, False),
-        (MOVE, gap(0.2), Machine(Lost(1.0, 1.0, 1.0), starved=1.0), False),
+        (MOVE, gap(0.2), Machine(Lateness(1.0, 1.0, 1.0), starved=1.0), False),
         # a failure without a size is as large as its place
         (GAP, failure(1.3), BUSY_ONE, True),
         (GAP, failure(2.0), BUSY_ONE, False),
@@ -141,7 +141,7 @@ def test_failure_on_busy_machine_states_unexplained_part() -> None:
 def test_larger_failure_needs_more_lateness_to_be_excused(
     lost: float, share: float, size: float, more: float
 ) -> None:
-    machine = Machine(Lost(lost, lost, lost), share)
+    machine = Machine(Lateness(lost, lost, lost), share)
     small, large = (
         excuse(machine, GAP, failure(2.0).if_late(x), Side.LEFT) for x in (size, size + more)
     )
@@ -151,7 +151,7 @@ def test_larger_failure_needs_more_lateness_to_be_excused(
 
 def test_failure_is_excused_only_at_all_its_places() -> None:
     class Once(Machine):
-        def lost(self, begin: float, end: float) -> Lost | None:
+        def lost(self, begin: float, end: float) -> Lateness | None:
             return LATE if end < 3 else IDLE
 
     assert excuse(Once(None), GAP, failure(2.0).if_late(0.1), Side.LEFT).excused

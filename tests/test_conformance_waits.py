@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from dexkit.conformance import run_queue
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.judge import judge
-from dexkit.conformance.lost import IDLE, Lost
+from dexkit.conformance.lateness import IDLE, Lateness
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.gripper import Inverted, NanVelocity, Percent
 from dexkit.conformance.recording import Recording
@@ -65,8 +65,8 @@ class Machine:
     def starved(self, begin: float, end: float) -> float:
         return 0.0
 
-    def lost(self, begin: float, end: float) -> Lost | None:
-        return Lost(0.0, 0.0, 0.0)
+    def lost(self, begin: float, end: float) -> Lateness | None:
+        return Lateness(0.0, 0.0, 0.0)
 
     def starvation(self, subject: Subject, begin: float, end: float) -> Starvation | None:
         return self._waits.starvation(subject, round(begin * 1e9), round(end * 1e9))

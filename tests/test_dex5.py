@@ -27,7 +27,7 @@ from dexkit.models import DEX5_1, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.topics import roles
 from dexkit.traces import Recorder, open_trace, sample_path
 
@@ -256,7 +256,7 @@ def write(path: Path, seconds: float = 6.0) -> None:
     clock = ManualClock()
     hands = {s: SimDex5(s, clock=clock) for s in Side}
     maps = {s: dialect_map(dialect, {s: hand.spec}) for s, hand in hands.items()}
-    client, wire = client_for(dialect), ClientWire(dialect)
+    client, wire = client_for(dialect), ClientCodec(dialect)
     operator = Operator(profile(PROFILE, DEX5_1.name), dialect, most=MOST)
     decode = message_type(dialect.cmd_type).decode
     commands = {s: HandCommand.brake(hand.spec.n_joints) for s, hand in hands.items()}

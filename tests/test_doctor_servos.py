@@ -19,7 +19,7 @@ from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import dialect, model
 from dexkit.teleop.client import JointCommand
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from tests.dds_helpers import free_domain
 from tests.patience import PATIENCE
 
@@ -44,7 +44,7 @@ def served(backend: str, name: str) -> Iterator[int]:
 def operated(domain: int, name: str) -> Iterator[None]:
     """A client that moves the hands to and fro in eight seconds, the right one two seconds late."""
     spoken, ended = dialect(name), threading.Event()
-    wire, joints = ClientWire(spoken), len(model(spoken.model).joints[LEFT])
+    wire, joints = ClientCodec(spoken), len(model(spoken.model).joints[LEFT])
 
     def operate() -> None:
         began = time.monotonic()

@@ -38,7 +38,7 @@ from dexkit.models import INSPIRE_DFX, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.topics import roles
 from dexkit.watch.fields import parts_of
 from tests.each import each
@@ -225,7 +225,7 @@ def test_one_hand_alone_is_not_commanded() -> None:
         with pytest.raises(UsageError, match="moves both hands") as caught:
             attempt()
         assert caught.value.hint == "choose both sides"
-    wire, client = ClientWire(DFX), client_for("inspire_dfx")
+    wire, client = ClientCodec(DFX), client_for("inspire_dfx")
     client.receive(0.0, dict.fromkeys(Side, (0.5,) * N))
     commands = client.step(0.01, {}, {})
     assert wire.encode({LEFT: commands[LEFT]}) == []

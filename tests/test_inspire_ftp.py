@@ -32,7 +32,7 @@ from dexkit.models import INSPIRE_DFX, INSPIRE_FTP, MODELS, dialect
 from dexkit.service.dialects import DialectMap, StateView, dialect_map
 from dexkit.service.ftp_map import FtpMap
 from dexkit.teleop import client_for
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.topics import roles
 from dexkit.traces.names import dds_type
 from dexkit.watch.fields import parts_of
@@ -233,7 +233,7 @@ def test_client_waits_for_either_hand_and_begins_open() -> None:
     assert set(client.missing) == set(Side)
     client.receive(0.02, {LEFT: (0.0,) * N, RIGHT: (0.5,) * N})
     commands = client.step(0.03, {}, {})
-    sent = dict(ClientWire(FTP).encode(commands))
+    sent = dict(ClientCodec(FTP).encode(commands))
     assert set(sent) == {"rt/inspire_hand/ctrl/l", "rt/inspire_hand/ctrl/r"}
     for payload in sent.values():
         # as the genuine client: every list is there

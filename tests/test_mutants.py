@@ -12,7 +12,14 @@ from dexkit.cli.mutants import command
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.layers import layer
 from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
-from dexkit.conformance.mutants.matrix import Outcome, Score, chosen, cost, essential, try_one
+from dexkit.conformance.mutants.matrix import (
+    Score,
+    WrongHandResult,
+    chosen,
+    cost,
+    essential,
+    try_one,
+)
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.errors import UsageError
@@ -77,13 +84,13 @@ OF_EACH_CHECK = {
 
 @pytest.mark.parametrize("given", OF_EACH_CHECK.values(), ids=name_of)
 def test_wrong_hand_fails_its_requirement(given: Mutant) -> None:
-    assert try_one(given, short=True) == Outcome(given), given.summary
+    assert try_one(given, short=True) == WrongHandResult(given), given.summary
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("given", mutants(), ids=name_of)
 def test_wrong_hand_fails_only_its_requirements(given: Mutant) -> None:
-    assert try_one(given) == Outcome(given), given.summary
+    assert try_one(given) == WrongHandResult(given), given.summary
 
 
 def test_every_must_has_a_wrong_hand() -> None:
@@ -118,7 +125,7 @@ def test_third_of_the_requirements_forbid_something(layer_name: str, model: str)
 # ------------------------------------------------------------------------------- the matrix
 
 
-def score_of(*outcomes: Outcome) -> Score:
+def score_of(*outcomes: WrongHandResult) -> Score:
     score = Score(select(catalogue(), prefixes=["DEX1-FIELD-02"]))
     score.outcomes += outcomes
     return score
@@ -132,11 +139,11 @@ def test_a_requirement_without_a_wrong_hand_is_an_error() -> None:
 
 def test_missed_and_extra_failures_are_errors() -> None:
     (nan,) = (t for t in mutants() if t.kills == "DEX1-FIELD-02")
-    assert score_of(Outcome(nan)).perfect
-    survivor = score_of(Outcome(nan, missed=("DEX1-FIELD-02",)))
+    assert score_of(WrongHandResult(nan)).perfect
+    survivor = score_of(WrongHandResult(nan, missed=("DEX1-FIELD-02",)))
     assert survivor.unproven
     assert not survivor.perfect
-    assert not score_of(Outcome(nan, wrongly=("DEX1-MOVE-01",))).perfect
+    assert not score_of(WrongHandResult(nan, wrongly=("DEX1-MOVE-01",))).perfect
 
 
 def test_selection_by_model_includes_usb_and_topics() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.stimuli import Action, Observation, Plan, Send, Session, script_for
+from dexkit.conformance.stimuli import Action, CommandSession, Observation, Plan, Send, script_for
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
 from dexkit.teleop import Dex1Client
@@ -25,7 +25,7 @@ def driven(phase: str, after: int) -> Iterator[tuple[str, int, Send]]:
     plan = Plan(
         dialect=GO,
         sides=BOTH,
-        session=Session.default(GO.model).first_seconds(4.0),
+        session=CommandSession.default(GO.model).first_seconds(4.0),
         phases=frozenset({"replay"}),
     )
     script = script_for(plan)

@@ -33,8 +33,16 @@ from dexkit.traces import open_trace, sample_path
 from dexkit.traces.replay import prepare as preparation
 from dexkit.traces.replay.commands import RecordedCommands, read_session, read_trace
 from dexkit.traces.replay.machine import HOLD, End, Guards, Phase, ReplayMachine
-from dexkit.traces.replay.prepare import Finding, Level, Plan, Prepared, Track, Wishes, prepare
-from dexkit.traces.replay.states import HandSeen, StateWire
+from dexkit.traces.replay.prepare import (
+    Finding,
+    Level,
+    Plan,
+    Prepared,
+    ReplayOptions,
+    Track,
+    prepare,
+)
+from dexkit.traces.replay.states import DecodedHand, HandStateCodec
 from tests.each import each
 from tests.session_helpers import document, episode, hand_waves, whole
 from tests.test_sessions_import import NAMES, dataset
@@ -136,7 +144,7 @@ def test_session_without_gains_is_refused_and_played_with_the_models_gains(tmp_p
     moved = rehearse(found.plan).figures()[LEFT]
     assert moved[0].commanded > 2
     assert moved[0].moved < 0.1
-    cured = prepare(limp, Wishes(gains="model"))
+    cured = prepare(limp, ReplayOptions(gains="model"))
     assert levels(cured) == {"zero-gains": "cured"}
     assert cured.plan is not None
     assert rehearse(cured.plan).figures()[LEFT][0].moved > 2
@@ -147,7 +155,7 @@ def test_session_without_gains_is_refused_and_played_with_the_models_gains(tmp_p
     assert found.plan is not None
     assert not found.plan.tracks[LEFT].driven.any()
     assert max(f.moved for f in rehearse(found.plan).figures()[LEFT]) < 0.1
-    cured = prepare(locked, Wishes(gains="model"))
+    cured = prepare(locked, ReplayOptions(gains="model"))
     assert cured.plan is not None
     assert cured.plan.tracks[LEFT].driven.all()
     assert max(f.moved for f in rehearse(cured.plan).figures()[LEFT]) > 0.5
@@ -161,9 +169,9 @@ def test_session_with_high_gains_and_thin_rate_is_refused_and_corrected(tmp_path
     assert levels(found) == {"high-gains": "refused", "thin-rate": "refused"}
     assert found.cures == ["--gains model", "--resample 100"]
     assert all("loud motors" in f.text for f in found.findings)
-    half = prepare(loud, Wishes(gains="model"))
+    half = prepare(loud, ReplayOptions(gains="model"))
     assert levels(half) == {"high-gains": "cured", "thin-rate": "refused"}
-    cured = prepare(loud, Wishes(gains="model", resample=100.0))
+    cured = prepare(loud, ReplayOptions(gains="model", resample=100.0))
     assert not cured.refused
     assert found.plan is not None
     assert cured.plan is not None
@@ -186,17 +194,17 @@ def test_gains_that_are_negative_are_refused(tmp_path: Path) -> None:
 
 def test_a_thin_rate_by_a_slow_pace_is_found(tmp_path: Path) -> None:
     calm = session(tmp_path, gripper(slow_wave()))
-    assert prepare(calm, Wishes(pace=0.5)).findings == []
-    assert levels(prepare(calm, Wishes(pace=0.25))) == {"thin-rate": "refused"}
-    played = prepare(calm, Wishes(pace=0.25, resample=200.0)).plan
+    assert prepare(calm, ReplayOptions(pace=0.5)).findings == []
+    assert levels(prepare(calm, ReplayOptions(pace=0.25))) == {"thin-rate": "refused"}
+    played = prepare(calm, ReplayOptions(pace=0.25, resample=200.0)).plan
     assert played is not None
     assert played.duration == pytest.approx(399 / 200 / 0.25)
 
 
 def test_faster_than_recorded_is_refused_unless_it_is_accepted(tmp_path: Path) -> None:
     calm = session(tmp_path, gripper(slow_wave()))
-    assert levels(prepare(calm, Wishes(pace=2.0))) == {"pace": "refused"}
-    assert levels(prepare(calm, Wishes(pace=2.0, accept=["pace"]))) == {"pace": "accepted"}
+    assert levels(prepare(calm, ReplayOptions(pace=2.0))) == {"pace": "refused"}
+    assert levels(prepare(calm, ReplayOptions(pace=2.0, accept=["pace"]))) == {"pace": "accepted"}
 
 
 def test_positions_outside_the_limits_are_refused_or_clamped(tmp_path: Path) -> None:
@@ -205,7 +213,7 @@ def test_positions_outside_the_limits_are_refused_or_clamped(tmp_path: Path) -> 
     assert levels(found) == {"limits": "refused"}
     assert "gripper" in found.findings[0].text
     assert "limits 0 to 5.4" in found.findings[0].text
-    plan = prepare(wide, Wishes(limit="clamp")).plan
+    plan = prepare(wide, ReplayOptions(limit="clamp")).plan
     assert plan is not None
     q = plan.tracks[LEFT].q
     assert (q.min(), q.max()) == (0.0, 5.4)
@@ -217,7 +225,7 @@ def test_jumps_are_refused_or_given_time(tmp_path: Path) -> None:
     found = prepare(jumping)
     assert levels(found) == {"jumps": "refused"}
     assert "1 place" in found.findings[0].text
-    plan = prepare(jumping, Wishes(jumps="stretch")).plan
+    plan = prepare(jumping, ReplayOptions(jumps="stretch")).plan
     assert plan is not None
     track = plan.tracks[LEFT]
     assert plan.duration == pytest.approx(399 / 200 - 0.005 + 4.5 / 24.0, abs=1e-3)
@@ -228,7 +236,7 @@ def test_jumps_are_refused_or_given_time(tmp_path: Path) -> None:
 def test_stretching_one_hand_keeps_both_hands_in_step(tmp_path: Path) -> None:
     q = np.where(np.arange(400) < 200, 0.5, 5.0)
     both = gripper(q) + gripper(slow_wave(), topic="rt/dex1/right/cmd")
-    plan = prepare(session(tmp_path, both), Wishes(jumps="stretch")).plan
+    plan = prepare(session(tmp_path, both), ReplayOptions(jumps="stretch")).plan
     assert plan is not None
     left, right = plan.tracks[LEFT], plan.tracks[RIGHT]
     assert left.t[-1] == pytest.approx(right.t[-1], abs=1e-4)
@@ -245,13 +253,13 @@ def test_the_pose_is_held_in_pauses(tmp_path: Path) -> None:
     moved = [(t, log + (3_000_000_000 if i >= 200 else 0), 0, d) for i, (t, log, _, d) in
              enumerate(rows)]  # fmt: skip
     paused = session(tmp_path, moved)
-    found = prepare(paused, Wishes(resample=200.0))
+    found = prepare(paused, ReplayOptions(resample=200.0))
     assert levels(found) == {"gaps": "note"}
     assert found.plan is not None
     track = found.plan.tracks[LEFT]
     held = (track.t > 1.0) & (track.t < 3.9)
     assert np.ptp(track.q[held]) < 1e-6
-    shorter = prepare(paused, Wishes(max_gap=0.5)).plan
+    shorter = prepare(paused, ReplayOptions(max_gap=0.5)).plan
     assert shorter is not None
     assert shorter.duration == pytest.approx(399 / 200 - 0.005 + 0.5, abs=1e-3)
 
@@ -263,9 +271,9 @@ def test_a_session_of_the_other_hand_is_recognised(tmp_path: Path) -> None:
     assert named(found)["side"].level is Level.REFUSED
     assert levels(found) == {"side": "refused"}
     assert found.cures == ["--swap-sides"]
-    again = prepare(wrong, Wishes(accept=["side"], swap_sides=False))
+    again = prepare(wrong, ReplayOptions(accept=["side"], swap_sides=False))
     assert levels(again) == {"side": "accepted"}
-    swapped = prepare(wrong, Wishes(swap_sides=True))
+    swapped = prepare(wrong, ReplayOptions(swap_sides=True))
     assert not swapped.refused
     assert swapped.plan is not None
     assert swapped.plan.sides == (RIGHT,)
@@ -294,7 +302,7 @@ def test_unsendable_commands_are_refused_or_left_out(tmp_path: Path) -> None:
         found = prepare(broken)
         assert found.cures == ["--invalid drop"], (name, found.findings)
         assert name in levels(found)
-        cured = prepare(broken, Wishes(invalid="drop"))
+        cured = prepare(broken, ReplayOptions(invalid="drop"))
         assert not cured.refused, name
         assert cured.plan is not None
         assert len(cured.plan.tracks[LEFT]) == len(q) - dropped, name
@@ -304,7 +312,7 @@ def test_unsendable_commands_are_refused_or_left_out(tmp_path: Path) -> None:
 def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> None:
     q = slow_wave(20)
     q[10:] = 1e38
-    found = prepare(session(tmp_path, gripper(q)), Wishes(jumps="stretch", resample=200.0))
+    found = prepare(session(tmp_path, gripper(q)), ReplayOptions(jumps="stretch", resample=200.0))
     assert {f.name for f in found.refused} == {"limits"}
     assert found.plan is not None
     assert found.plan.duration < 1.0
@@ -312,7 +320,7 @@ def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> Non
     rows[3] = (CMD, T0 + 10**14, T0 + 10**14, rows[3][3])
     paused = session(tmp_path, rows)
     with pytest.raises(UsageError, match="more than 1,000,000"):
-        prepare(paused, Wishes(resample=200.0))
+        prepare(paused, ReplayOptions(resample=200.0))
     plan = prepare(paused).plan
     assert plan is not None
     with pytest.raises(UsageError, match="too long to be rehearsed"):
@@ -340,14 +348,14 @@ def test_commands_to_a_hand_with_other_joints_are_refused(tmp_path: Path) -> Non
 
 
 def test_another_model_is_refused(tmp_path: Path) -> None:
-    found = prepare(session(tmp_path, gripper(slow_wave())), Wishes(dialect="dex3"))
+    found = prepare(session(tmp_path, gripper(slow_wave())), ReplayOptions(dialect="dex3"))
     assert levels(found) == {"model": "refused"}
     assert found.plan is None
 
 
 def test_a_gripper_of_another_dialect_gets_its_radians(tmp_path: Path) -> None:
     plan = prepare(
-        session(tmp_path, gripper([0.0, 2.7, 5.4], hz=2.0)), Wishes(dialect="unitree_hg")
+        session(tmp_path, gripper([0.0, 2.7, 5.4], hz=2.0)), ReplayOptions(dialect="unitree_hg")
     )
     assert plan.plan is not None
     assert plan.plan.tracks[LEFT].q[:, 0] == pytest.approx([0, math.pi, 2 * math.pi], abs=1e-5)
@@ -363,7 +371,7 @@ def test_a_session_of_states_is_refused_or_played(tmp_path: Path) -> None:
     found = prepare(states)
     assert levels(found) == {"only-states": "refused"}
     assert found.cures == ["--play states"]
-    played = prepare(states, Wishes(states=True))
+    played = prepare(states, ReplayOptions(states=True))
     assert not played.refused
     assert played.plan is not None
     assert played.plan.tracks[LEFT].q[:, 0] == pytest.approx(slow_wave(), abs=1e-6)
@@ -378,7 +386,7 @@ def test_sessions_without_a_hand_are_refused(tmp_path: Path) -> None:
         prepare(read_session(inspire))
     left = session(tmp_path, gripper(slow_wave()))
     with pytest.raises(UsageError, match="nothing to play on the right hand"):
-        prepare(left, Wishes(sides=(RIGHT,)))
+        prepare(left, ReplayOptions(sides=(RIGHT,)))
 
 
 def test_session_without_motion_is_noted(tmp_path: Path) -> None:
@@ -402,7 +410,7 @@ def test_corrected_plan_stays_within_the_limits_of_the_hand(
     q = np.array([[x] for _, x in steps])
     found = prepare(
         _recorded(t - t[0], q),
-        Wishes(pace=pace, resample=resample, limit="clamp", jumps="stretch", gains="model"),
+        ReplayOptions(pace=pace, resample=resample, limit="clamp", jumps="stretch", gains="model"),
     )
     assert {f.name for f in found.refused} <= {"thin-rate"}
     assert found.plan is not None
@@ -446,14 +454,14 @@ class Drive:
         self.machine = ReplayMachine(plan, guards)
         self.now, self.q = 100.0, q
         self.follows = self.answers = True
-        self.seen = HandSeen((q,), (0.0,), (0,))
+        self.seen = DecodedHand((q,), (0.0,), (0,))
         self.sent: list[tuple[float, Phase, JointCommand]] = []
 
     def turn(self, delay: float = 0.0) -> list[JointCommand]:
         machine = self.machine
         self.now = machine.wakes_at(self.now) + delay
         if self.answers:
-            machine.receive(self.now, LEFT, HandSeen((self.q,), (0.0,), self.seen.fault))
+            machine.receive(self.now, LEFT, DecodedHand((self.q,), (0.0,), self.seen.fault))
         phase = machine.phase
         found = [motors[0] for motors in machine.step(self.now).values()]
         for sent in found:
@@ -500,7 +508,7 @@ def test_fingers_are_locked_at_the_end() -> None:
     now, modes = 0.0, []
     while machine.phase is not Phase.END:
         now = machine.wakes_at(now)
-        machine.receive(now, LEFT, HandSeen(DEX3_1.rest_q[LEFT], (0.0,) * 7, (0,) * 7))
+        machine.receive(now, LEFT, DecodedHand(DEX3_1.rest_q[LEFT], (0.0,) * 7, (0,) * 7))
         phase = machine.phase
         modes += [(phase, [m.mode for m in x]) for x in machine.step(now).values()]
     assert (Phase.PLAY, [0x10 | i for i in range(7)]) in modes
@@ -510,12 +518,12 @@ def test_fingers_are_locked_at_the_end() -> None:
 def test_nothing_is_sent_before_a_state_and_none_that_is_no_state() -> None:
     machine = ReplayMachine(plan_of(slow_wave()))
     assert machine.step(0.0) == {}
-    machine.receive(0.1, LEFT, HandSeen((math.nan,), (0.0,)))
+    machine.receive(0.1, LEFT, DecodedHand((math.nan,), (0.0,)))
     assert (machine.step(0.1), machine.missing) == ({}, (LEFT,))
     fingers_machine = ReplayMachine(
         Plan("test", DEX3, {LEFT: Track(*(np.zeros((1, 7)) for _ in range(7)))})  # type: ignore[arg-type]
     )
-    fingers_machine.receive(0.0, LEFT, HandSeen((0.0,) * 7, (0.0,) * 7))
+    fingers_machine.receive(0.0, LEFT, DecodedHand((0.0,) * 7, (0.0,) * 7))
     assert fingers_machine.missing == (LEFT,)  # clients take all 0 for no state
     machine.stop(End.ASKED, "stopped")
     assert machine.phase is Phase.END
@@ -523,7 +531,7 @@ def test_nothing_is_sent_before_a_state_and_none_that_is_no_state() -> None:
 
 def test_fault_silence_or_distance_stops_the_replay() -> None:
     def fault(drive: Drive) -> None:
-        drive.seen = HandSeen((drive.q,), (0.0,), (int(MotorError.OVERCURRENT),))
+        drive.seen = DecodedHand((drive.q,), (0.0,), (int(MotorError.OVERCURRENT),))
 
     def silence(drive: Drive) -> None:
         drive.answers = False
@@ -557,7 +565,7 @@ def test_fault_silence_or_distance_stops_the_replay() -> None:
 
 def test_a_hand_with_a_fault_is_not_moved_at_all() -> None:
     drive = Drive(plan_of(slow_wave()))
-    drive.seen = HandSeen((1.0,), (0.0,), (int(MotorError.MOS_TEMPERATURE),))
+    drive.seen = DecodedHand((1.0,), (0.0,), (int(MotorError.MOS_TEMPERATURE),))
     drive.until(Phase.END)
     assert drive.sent == []
     assert drive.machine.end is End.FAULT
@@ -647,7 +655,7 @@ def test_a_loop_ramps_back_to_the_first_pose() -> None:
 
 
 def test_states_of_each_dialect_are_read() -> None:
-    wire = StateWire(DEX3)
+    wire = HandStateCodec(DEX3)
     motors = [HgState(mode=0x10 | i, q=0.1 * i, tau_est=0.2) for i in range(7)]
     motors[2].motorstate = int(MotorError.WINDING_OVERTEMPERATURE)
     motors[4].mode |= 0x80
@@ -656,10 +664,12 @@ def test_states_of_each_dialect_are_read() -> None:
     names = [j.name for j in DEX3_1.joints[LEFT]]
     assert seen.q[1] == pytest.approx(0.1)
     assert seen.problem(names) == "thumb_2 reports winding_overtemperature"
-    assert HandSeen(seen.q, seen.tau, (), seen.tripped).problem(names).endswith("stopped middle_1")
+    assert (
+        DecodedHand(seen.q, seen.tau, (), seen.tripped).problem(names).endswith("stopped middle_1")
+    )
     short = message_type(HAND_STATE).encode(HandState_(motors[:6]))
     assert wire.seen(DEX3_STATE, short) == {}
-    actuator = StateWire(dialect("unitree_actuator"))
+    actuator = HandStateCodec(dialect("unitree_actuator"))
     both = MotorStates_([MotorState_(q=1.0), MotorState_(q=2.0, reserve=(4, 0))])
     found = actuator.seen("rt/unitree_actuator/state", message_type(STATE_TYPE).encode(both))
     assert (found[RIGHT].q, found[LEFT].q) == ((1.0,), (2.0,))
@@ -673,7 +683,7 @@ def test_both_hands_of_a_shared_message_are_always_in_it() -> None:
     for _ in range(900):
         now = machine.wakes_at(now)
         for side in Side:
-            machine.receive(now, side, HandSeen((0.5,), (0.0,)))
+            machine.receive(now, side, DecodedHand((0.5,), (0.0,)))
         commands = machine.step(now)
         assert set(commands) in (set(), set(Side))
     assert machine.phase is Phase.PLAY

@@ -22,7 +22,7 @@ from dexkit.clock import ManualClock
 from dexkit.conformance.report.selftest import findings, render_selftest
 from dexkit.conformance.selftest import measure
 from dexkit.conformance.selftest.bench import LEAD, Setup
-from dexkit.conformance.selftest.external import HandWire
+from dexkit.conformance.selftest.external import ExternalHandCodec
 from dexkit.conformance.selftest.figures import KINDS, Figure
 from dexkit.conformance.selftest.live import run
 from dexkit.conformance.selftest.machine import End, SelfTest
@@ -31,8 +31,8 @@ from dexkit.conformance.selftest.procedure import Procedure
 from dexkit.conformance.selftest.result import (
     SCHEMA,
     Condition,
+    ElementResponse,
     SelfTestResult,
-    Touch,
     Verdict,
     check_baseline,
     read_result,
@@ -291,12 +291,12 @@ def test_every_element_is_found_by_touch() -> None:
 
     found, _ = examined("dex3", joints=[], touch=True, change=pressed, turn=remember)
     result = result_of(found, {})
-    lacking = {(e.packet, e.slot) for e in result.elements if e.touch is Touch.DEAD}
+    lacking = {(e.packet, e.slot) for e in result.elements if e.touch is ElementResponse.DEAD}
     assert lacking == dead
-    assert sum(e.touch is Touch.ANSWERS for e in result.elements) == 33 - len(dead)
+    assert sum(e.touch is ElementResponse.ANSWERS for e in result.elements) == 33 - len(dead)
     assert {e.before for e in result.elements} == {None}
     before = replace(
-        result, elements=tuple(replace(e, touch=Touch.ANSWERS) for e in result.elements)
+        result, elements=tuple(replace(e, touch=ElementResponse.ANSWERS) for e in result.elements)
     )
     since = result_of(found, {}, baseline=before)
     assert {(e.packet, e.slot) for e in since.elements if e.worn} == dead
@@ -406,7 +406,7 @@ def test_the_schema_names_every_value() -> None:
     assert schema["properties"]["verdict"]["enum"] == [str(v) for v in Verdict]
     assert schema["properties"]["ended"]["enum"] == [str(e) for e in End]
     assert defs["condition"]["enum"] == [str(c) for c in Condition]
-    assert defs["touch"]["enum"] == [str(t) for t in Touch]
+    assert defs["touch"]["enum"] == [str(t) for t in ElementResponse]
     names = defs["joint"]["properties"]["figures"]["propertyNames"]["enum"]
     assert names == [kind.name for kind in KINDS]
 
@@ -481,7 +481,7 @@ def test_efforts_are_named_by_what_the_hand_reports(case: tuple[str, str]) -> No
 def test_a_dialect_that_commands_both_hands_is_refused() -> None:
     for spoken in (d for m in BUILT_IN for d in m.dialects if d.commands_both):
         with pytest.raises(UsageError, match="moves both hands"):
-            HandWire(spoken, Side.LEFT)
+            ExternalHandCodec(spoken, Side.LEFT)
 
 
 @each("spoken", [d for m in BUILT_IN for d in m.dialects if not d.commands_both])
@@ -489,7 +489,7 @@ def test_the_wire_of_every_dialect(spoken: Dialect) -> None:
     profile = model(spoken.model)
     spec = profile.spec(Side.LEFT, io_rate=100.0)
     n = spec.n_joints
-    wire, service = HandWire(spoken, Side.LEFT), dialect_map(spoken, {Side.LEFT: spec})
+    wire, service = ExternalHandCodec(spoken, Side.LEFT), dialect_map(spoken, {Side.LEFT: spec})
     q = spec.q_min + 0.4 * (spec.q_max - spec.q_min)
     kp, kd = np.array(profile.gains).T
     dq = 0.2 * np.array([j.dq_max for j in spec.joints])

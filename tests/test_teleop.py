@@ -32,7 +32,7 @@ from dexkit.teleop import (
     tracking_figures,
 )
 from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.traces import open_trace, sample_path
 from tests.each import each
 
@@ -404,7 +404,7 @@ def test_dex3_commands_are_the_targets_independent_of_the_state() -> None:
 
 def test_the_recorded_dex3_commands_are_those_of_the_model() -> None:
     rec = recording("dex3_pinch")
-    wire = ClientWire(DIALECTS["dex3"])
+    wire = ClientCodec(DIALECTS["dex3"])
     for side in (LEFT, RIGHT):
         topic = wire.command_topics[side]
         payloads = open_trace(sample_path("dex3_pinch")).load([topic])[topic].payloads
@@ -417,7 +417,7 @@ def test_the_recorded_dex3_commands_are_those_of_the_model() -> None:
 
 
 def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
-    wire = ClientWire(GO)
+    wire = ClientCodec(GO)
     topic = wire.command_topics[LEFT]
     payloads = open_trace(sample_path("dex1_pick_place")).load([topic])[topic].payloads
     q = recording("dex1_pick_place").sides[LEFT].commands.q[:, 0]
@@ -437,7 +437,7 @@ def test_positions_are_decoded(name: str) -> None:
 
     spoken = DIALECTS[name]
     joints = len(MODELS[spoken.model].joints[LEFT])
-    kit, wire = MotorCodec(spoken), ClientWire(spoken)
+    kit, wire = MotorCodec(spoken), ClientCodec(spoken)
     wanted: dict[Side, Sequence[float]] = {
         LEFT: [0.25 * (i + 1) for i in range(joints)],
         RIGHT: [2.0 + 0.25 * i for i in range(joints)],

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType
 from dexkit.cli import main
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.stimuli.recorded_session import Session
+from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.messages import message_type
 from dexkit.messages.columns import Columns
@@ -261,7 +261,7 @@ def test_info_and_check_answer_damage_with_an_exit_code(
 
 def test_a_damaged_session_is_not_repeated(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match="damaged"):
-        Session.load(hurt_sample(tmp_path))
+        CommandSession.load(hurt_sample(tmp_path))
 
 
 def test_replay_of_a_damaged_recording_sends_the_rest_and_warns(

@@ -10,18 +10,18 @@ from pathlib import Path
 from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
 from dexkit.conformance.audit.journal import Entry, Journal
 from dexkit.conformance.audit.records import FileRecord, State
-from dexkit.conformance.audit.sessions import Session, find
+from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.tables import write_tables
-from dexkit.conformance.audit.workers import Lost, Pool
+from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.documents import write_file
 
-__all__ = ["FAIL_ON", "Audit", "Limits", "Outcome", "Progress", "Runner", "in_this_process"]
+__all__ = ["FAIL_ON", "Audit", "AuditProgress", "Limits", "Progress", "Runner", "in_this_process"]
 
 FAIL_ON = ("never", "fail", "unusable", "warn")
 """Findings that make the exit code non-zero; each level includes those before it."""
 
-Runner = Callable[[Iterable[Task], object], "Iterator[tuple[Task, FileRecord | Lost]]"]
+Runner = Callable[[Iterable[Task], object], "Iterator[tuple[Task, FileRecord | WorkerLost]]"]
 """Examines files until a stop request is true: in processes, or on a cluster."""
 
 
@@ -61,7 +61,7 @@ def in_this_process(tasks: Iterable[Task], stop: object) -> Iterator[tuple[Task,
 
 
 @dataclass
-class Outcome:
+class AuditProgress:
     """Progress and results of an audit.
 
     :param total: files; ``done`` of them have a record, ``reused`` from an audit before.
@@ -120,7 +120,7 @@ class Outcome:
         return 1 if level >= 3 and self.warned else 0
 
 
-Progress = Callable[[Outcome], None]
+Progress = Callable[[AuditProgress], None]
 """Is called after each file with how far the audit is; it must not change what it gets."""
 
 
@@ -153,19 +153,21 @@ class Audit:
         self._limits, self._fresh, self._parquet = limits, fresh, parquet
         self._before: dict[str, Entry] = {}  # of changed files, which may be the same inside
 
-    def run(self, runner: Runner, stop: object = None, progress: Progress | None = None) -> Outcome:
+    def run(
+        self, runner: Runner, stop: object = None, progress: Progress | None = None
+    ) -> AuditProgress:
         """Examine new and changed files, and write tables and page, also after a stop.
 
         :param stop: ends it early when it becomes true.
         :raises OutputError: something cannot be written.
         """
         begin = time.monotonic()
-        outcome = Outcome()
-        sessions: dict[str, Session] = {}
+        outcome = AuditProgress()
+        sessions: dict[str, SessionFile] = {}
         problems: dict[str, FileRecord] = {}
         for location in self.locations:
             for found in find(location, self._working_folder):
-                if isinstance(found, Session):
+                if isinstance(found, SessionFile):
                     sessions.setdefault(found.name, found)
                 else:
                     problems[found.name] = found
@@ -190,7 +192,7 @@ class Audit:
         return outcome
 
     def _tasks(
-        self, journal: Journal, sessions: dict[str, Session], outcome: Outcome
+        self, journal: Journal, sessions: dict[str, SessionFile], outcome: AuditProgress
     ) -> list[Task]:
         """The files to be examined, largest first; counts those that need not be."""
         settings = settings_key(self._labels)
@@ -207,9 +209,9 @@ class Audit:
             tasks.append(Task(session, known, self._labels, self._limits.max_size))
         return sorted(tasks, key=lambda t: (-t.session.size, t.session.name))
 
-    def _record(self, journal: Journal, task: Task, result: FileRecord | Lost) -> FileRecord:
+    def _record(self, journal: Journal, task: Task, result: FileRecord | WorkerLost) -> FileRecord:
         session = task.session
-        if isinstance(result, Lost):
+        if isinstance(result, WorkerLost):
             state = State.TOO_LARGE if "longer" in result else State.FAILED
             record = FileRecord(session.name, session.size, session.tag, state, error=result)
         elif task.known and result.sha256 == task.known:
@@ -221,7 +223,7 @@ class Audit:
         journal.add(record)
         return record
 
-    def _write(self, journal: Journal, names: Sequence[str], outcome: Outcome) -> None:
+    def _write(self, journal: Journal, names: Sequence[str], outcome: AuditProgress) -> None:
         summary = Summary()
         for record in journal.records(names):
             summary.add(record)

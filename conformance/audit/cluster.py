@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from dexkit.conformance.audit.examine import Task, examine, settings_key
 from dexkit.conformance.audit.records import FileRecord
-from dexkit.conformance.audit.workers import Lost
+from dexkit.conformance.audit.workers import WorkerLost
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.escaping import one_line
 
@@ -65,7 +65,9 @@ class Cluster:
         self._examine = ray.remote(num_cpus=1, max_retries=_AGAIN)(_examine)
         self._limits = limits
 
-    def run(self, tasks: Iterable[Task], stop: object) -> Iterator[tuple[Task, FileRecord | Lost]]:
+    def run(
+        self, tasks: Iterable[Task], stop: object
+    ) -> Iterator[tuple[Task, FileRecord | WorkerLost]]:
         """Examine files until a stop request is true; yields each once, in any order."""
         ray, waiting = self._ray, iter(tasks)
         pending: dict[Any, Task] = {}
@@ -95,15 +97,17 @@ class Cluster:
                     ray.cancel(reference, force=True)
             self.close()
 
-    def _result(self, reference: Any) -> FileRecord | Lost:
+    def _result(self, reference: Any) -> FileRecord | WorkerLost:
         ray = self._ray
         try:
-            found: FileRecord | Lost = ray.get(reference)
+            found: FileRecord | WorkerLost = ray.get(reference)
         except ray.exceptions.RayTaskError as error:
-            return Lost(f"a node of the cluster cannot do it: {one_line(str(error.cause), 500)}")
+            return WorkerLost(
+                f"a node of the cluster cannot do it: {one_line(str(error.cause), 500)}"
+            )
         except ray.exceptions.RayError as error:
             # its process or node died, and did again each time
-            return Lost(f"its process died ({type(error).__name__})")
+            return WorkerLost(f"its process died ({type(error).__name__})")
         return found
 
     def close(self) -> None:
@@ -135,7 +139,7 @@ class _TooLong(BaseException):
     """Ends a task; no handler of errors catches it."""
 
 
-def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileRecord | Lost:
+def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileRecord | WorkerLost:
     """Examine a file in a process of the cluster.
 
     :param settings: those of the audit; a node with another dexkit would judge differently.
@@ -158,7 +162,7 @@ def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileReco
         signal.setitimer(signal.ITIMER_REAL, seconds)
         return examine(task)
     except _TooLong:
-        return Lost(f"it took longer than {seconds:g} s")
+        return WorkerLost(f"it took longer than {seconds:g} s")
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)

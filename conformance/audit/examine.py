@@ -14,7 +14,7 @@ import numpy as np
 
 from dexkit import __version__
 from dexkit.conformance.audit.records import FileRecord, State, finding_of
-from dexkit.conformance.audit.sessions import Session, opened, problem_of
+from dexkit.conformance.audit.sessions import SessionFile, opened, problem_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
@@ -43,7 +43,7 @@ class Task:
     :param max_size: bytes of an object that are copied; larger ones are read by ranges.
     """
 
-    session: Session
+    session: SessionFile
     known: str = ""
     labels: tuple[str, ...] = LABELS
     max_size: int = 2**33

@@ -19,7 +19,7 @@ from dexkit.escaping import one_line
 from dexkit.temporary_folder import TemporaryFolder
 from dexkit.traces.container import OpenFile
 
-__all__ = ["Session", "TooLarge", "find", "is_url", "opened", "problem_of"]
+__all__ = ["SessionFile", "TooLarge", "find", "is_url", "opened", "problem_of"]
 
 _SUFFIX = ".mcap"
 _SPARE = 1 << 28  # bytes that a copy leaves free in the temporary folder
@@ -30,7 +30,7 @@ class TooLarge(DexkitError):
 
 
 @dataclass(frozen=True)
-class Session:
+class SessionFile:
     """A file that is to be judged.
 
     :param name: how the rows call it; ``place`` is the path or URL itself.
@@ -48,7 +48,7 @@ def is_url(location: str) -> bool:
     return "://" in location
 
 
-def find(location: str, working_folder: Path | None = None) -> Iterator[Session | FileRecord]:
+def find(location: str, working_folder: Path | None = None) -> Iterator[SessionFile | FileRecord]:
     """The sessions at a location, by name; a record for each place that cannot be looked into.
 
     Of a folder those are the files that end in ``.mcap``; links to folders are not followed.
@@ -78,16 +78,16 @@ def find(location: str, working_folder: Path | None = None) -> Iterator[Session 
         yield problem_of(os.fsdecode(error.filename or location), error)
 
 
-def _session_of(name: Path, path: Path) -> Session | FileRecord:
+def _session_of(name: Path, path: Path) -> SessionFile | FileRecord:
     try:
         status = path.stat()
     except OSError as error:
         return problem_of(str(name), error)
     text = one_line(name.as_posix(), 4096)
-    return Session(text, str(path), status.st_size, str(status.st_mtime_ns))
+    return SessionFile(text, str(path), status.st_size, str(status.st_mtime_ns))
 
 
-def _find_objects(url: str) -> Iterator[Session | FileRecord]:
+def _find_objects(url: str) -> Iterator[SessionFile | FileRecord]:
     files, root = file_system(url)
     try:
         found: dict[str, dict[str, Any]] = files.find(root, detail=True)
@@ -106,7 +106,7 @@ def _find_objects(url: str) -> Iterator[Session | FileRecord]:
         except Exception as error:
             yield problem_of(place, error)
             continue
-        yield Session(one_line(place, 4096), place, int(info.get("size") or 0), tag_of(info))
+        yield SessionFile(one_line(place, 4096), place, int(info.get("size") or 0), tag_of(info))
 
 
 def problem_of(name: str, error: BaseException) -> FileRecord:
@@ -133,7 +133,7 @@ def problem_of(name: str, error: BaseException) -> FileRecord:
 
 
 @contextlib.contextmanager
-def opened(session: Session, most: int) -> Iterator[tuple[Path, OpenFile | None, str]]:
+def opened(session: SessionFile, most: int) -> Iterator[tuple[Path, OpenFile | None, str]]:
     """The file's path, what opens it if it is not there, and its SHA-256.
 
     An object is copied to the temporary folder, block by block; the copy is removed behind it. One

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, TypeVar
 
-__all__ = ["Lost", "Pool"]
+__all__ = ["Pool", "WorkerLost"]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -34,7 +34,7 @@ _ENVIRONMENT = {
 """Environment of the processes, unless the user has set it."""
 
 
-class Lost(str):
+class WorkerLost(str):
     """Text: how the process of a task ended without a result."""
 
     __slots__ = ()
@@ -67,7 +67,7 @@ class _Worker(Generic[T, R]):
 class Pool(Generic[T, R]):
     """Processes that do tasks.
 
-    A task whose process dies or takes too long is given back as :class:`Lost`; a new process
+    A task whose process dies or takes too long is given back as :class:`WorkerLost`; a new process
     does the next one.
 
     :param work: a function of a module; what it raises ends its process.
@@ -88,7 +88,7 @@ class Pool(Generic[T, R]):
         self._jobs = jobs or len(os.sched_getaffinity(0))
         self._workers: list[_Worker[T, R]] = []
 
-    def run(self, tasks: Iterable[T], stop: object = None) -> Iterator[tuple[T, R | Lost]]:
+    def run(self, tasks: Iterable[T], stop: object = None) -> Iterator[tuple[T, R | WorkerLost]]:
         """Do the tasks; yield each with its result as they are done, in any order.
 
         :param stop: ends it early when it becomes true; what is not done then is left out.
@@ -110,7 +110,7 @@ class Pool(Generic[T, R]):
                     if worker.task is not None and time.monotonic() > worker.deadline:
                         task = worker.task
                         self._remove(worker)
-                        yield task, Lost(f"it took longer than {self._seconds:g} s")
+                        yield task, WorkerLost(f"it took longer than {self._seconds:g} s")
         finally:
             for worker in self._workers:
                 worker.process.terminate()  # all of them, before any is waited for
@@ -135,7 +135,7 @@ class Pool(Generic[T, R]):
         worker.task, worker.deadline = task, time.monotonic() + self._seconds
         return True
 
-    def _take(self, worker: _Worker[T, R]) -> tuple[T, R | Lost]:
+    def _take(self, worker: _Worker[T, R]) -> tuple[T, R | WorkerLost]:
         task = worker.task
         assert task is not None
         try:
@@ -145,7 +145,7 @@ class Pool(Generic[T, R]):
             code = worker.process.exitcode
             self._remove(worker)
             how = f"exit code {code}" if code is None or code >= 0 else _signal_name(-code)
-            return task, Lost(f"its process died ({how})")
+            return task, WorkerLost(f"its process died ({how})")
         worker.task = None
         return task, result
 

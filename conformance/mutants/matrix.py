@@ -24,11 +24,11 @@ from dexkit.conformance.requirements import Level, Requirement, catalogue, selec
 from dexkit.console import Console
 from dexkit.documents import write_file
 
-__all__ = ["Outcome", "Score", "chosen", "cost", "essential", "print_list", "try_one"]
+__all__ = ["Score", "WrongHandResult", "chosen", "cost", "essential", "print_list", "try_one"]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class WrongHandResult:
     """Result of the trial of a wrong hand.
 
     :param missed: requirements that should have failed or warned, and did not.
@@ -40,7 +40,7 @@ class Outcome:
     wrongly: tuple[str, ...] = ()
 
     @classmethod
-    def from_blame(cls, mutant: Mutant, blamed: set[str]) -> Outcome:
+    def from_blame(cls, mutant: Mutant, blamed: set[str]) -> WrongHandResult:
         """Compare the requirements that failed or warned with those that were declared."""
         due = {mutant.kills, *mutant.also}
         return cls(mutant, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
@@ -100,12 +100,12 @@ def essential(given: Sequence[Mutant]) -> tuple[Mutant, ...]:
     return tuple(found.values())
 
 
-def try_one(mutant: Mutant, *, short: bool = False) -> Outcome:
+def try_one(mutant: Mutant, *, short: bool = False) -> WrongHandResult:
     """Run a wrong hand on a virtual clock, and judge it by every requirement.
 
     :param short: apply only the phases that show the fault, where that is fair.
     """
-    return Outcome.from_blame(mutant, _trial_of(mutant).blamed(mutant, short=short))
+    return WrongHandResult.from_blame(mutant, _trial_of(mutant).blamed(mutant, short=short))
 
 
 def _blamed(key: tuple[str, str, str]) -> set[str]:
@@ -124,11 +124,11 @@ class Score:
     """The matrix: the outcome of every trial, by requirement."""
 
     requirements: Sequence[Requirement]
-    outcomes: list[Outcome] = field(default_factory=list)
+    outcomes: list[WrongHandResult] = field(default_factory=list)
 
     def run(
         self, given: Sequence[Mutant], stop: object = None, jobs: int | None = None
-    ) -> Iterator[Outcome]:
+    ) -> Iterator[WrongHandResult]:
         """Run the trials in worker processes; yield each outcome when it is done.
 
         :param stop: ends it early when it becomes true.
@@ -141,13 +141,15 @@ class Score:
             waiting = {pool.submit(_blamed, mutant.key): mutant for mutant in ordered}
             while waiting and not stop:
                 for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
-                    self.outcomes.append(Outcome.from_blame(waiting.pop(future), future.result()))
+                    self.outcomes.append(
+                        WrongHandResult.from_blame(waiting.pop(future), future.result())
+                    )
                     yield self.outcomes[-1]
         finally:
             # not as a context manager, which would run the waiting trials
             pool.shutdown(cancel_futures=True)
 
-    def killers(self, requirement: Requirement) -> list[Outcome]:
+    def killers(self, requirement: Requirement) -> list[WrongHandResult]:
         """The trials that prove a requirement."""
         return [
             o

@@ -20,7 +20,7 @@ from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import RunKind
-from dexkit.conformance.stimuli import Plan, Session, phases_for, script_class
+from dexkit.conformance.stimuli import CommandSession, Plan, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.virtual import TopicDevice, run_virtual
@@ -50,10 +50,10 @@ class Trial(Protocol):
 
 
 @cache
-def _session(model_name: str) -> Session | None:
+def _session(model_name: str) -> CommandSession | None:
     if not model(model_name).session:
         return None
-    return Session.default(model_name).first_seconds(SESSION_SECONDS)
+    return CommandSession.default(model_name).first_seconds(SESSION_SECONDS)
 
 
 def plan_for(

@@ -16,10 +16,10 @@ from dexkit.conformance.selftest.bench import Series
 from dexkit.conformance.selftest.figures import BY_NAME, KINDS, Figure, Unit, Wear
 from dexkit.conformance.selftest.result import (
     Condition,
+    ElementResponse,
     ElementResult,
     JointResult,
     SelfTestResult,
-    Touch,
     Verdict,
 )
 from dexkit.escaping import html as escape
@@ -42,7 +42,10 @@ _WRONG = {
 _PLOT = 200  # pixels across a plot where several are side by side
 _TRAVEL, _FORCE = "full travel", "full force"  # units of a profile
 _EFFORTS = {"A": "current", _FORCE: "force"}  # what a hand reports in the place of torques, by unit
-_LACKS = {Touch.DEAD: "does not answer to touch", Touch.NO_VALUE: "has no value"}
+_LACKS = {
+    ElementResponse.DEAD: "does not answer to touch",
+    ElementResponse.NO_VALUE: "has no value",
+}
 
 
 @dataclass(frozen=True)
@@ -278,7 +281,7 @@ def _elements(result: SelfTestResult) -> str:
     heads = ("element", "touch", "at rest", "noise", "pressed")
     rows = []
     for e in result.elements:
-        css = "bad" if e.faulty or e.worn else "na" if e.touch is Touch.UNTESTED else "ok"
+        css = "bad" if e.faulty or e.worn else "na" if e.touch is ElementResponse.UNTESTED else "ok"
         rows.append(
             (
                 unbroken(escape(_element(e))),
@@ -464,9 +467,9 @@ def print_selftest(result: SelfTestResult) -> None:
         view.add_row(markup(joint.name), f"[{style}]{joint.condition}[/]", *cells)
     Console(width=max(console.width, 118)).print(view)
     if result.touched:
-        counts = {t: sum(e.touch is t for e in result.elements) for t in Touch}
+        counts = {t: sum(e.touch is t for e in result.elements) for t in ElementResponse}
         texts: Sequence[str] = [
-            f"{n} {'answer' if t is Touch.ANSWERS else t}" for t, n in counts.items() if n
+            f"{n} {'answer' if t is ElementResponse.ANSWERS else t}" for t, n in counts.items() if n
         ]
         console.print(f"tactile elements: {', '.join(texts)}")
     for f in findings(result):

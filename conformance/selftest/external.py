@@ -22,7 +22,7 @@ from dexkit.messages import message_type
 from dexkit.models import Dialect, ModeByte, model
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.teleop.client import JointCommand
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.watch.fields import NO_VALUE
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from dexkit.dds import DdsNode, Reader
 
-__all__ = ["ExternalHand", "HandWire"]
+__all__ = ["ExternalHand", "ExternalHandCodec"]
 
 _NAP = 0.05
 _RATE_TIME = 0.5
@@ -39,7 +39,7 @@ _SLOWEST = 5.0
 _SILENT = 1.0
 
 
-class HandWire:
+class ExternalHandCodec:
     """Commands to one side of a dialect, and its states, in the model's units.
 
     :raises UsageError: a command of this dialect moves both hands.
@@ -55,7 +55,7 @@ class HandWire:
         profile = model(spoken.model)
         self._joints = profile.joints[side]
         n = len(self._joints)
-        self._client = ClientWire(spoken)
+        self._client = ClientCodec(spoken)
         self._state = message_type(spoken.state_type)
         self.command_topic, self.state_topic = spoken.topics(side)
         self._torque = np.array(spoken.torque_units or (1.0,) * n)
@@ -157,7 +157,7 @@ class ExternalHand:
         clock: Clock | None = None,
     ) -> None:
         profile = model(spoken.model)
-        self._node, self._wire = node, HandWire(spoken, side)
+        self._node, self._wire = node, ExternalHandCodec(spoken, side)
         self._stop, self._waiting, self._force = stop, waiting, force
         self._clock = clock or RealClock()
         self._spec = profile.spec(side, io_rate=profile.state_rate)

@@ -27,10 +27,10 @@ __all__ = [
     "SCHEMA",
     "VERSION",
     "Condition",
+    "ElementResponse",
     "ElementResult",
     "JointResult",
     "SelfTestResult",
-    "Touch",
     "Verdict",
     "check_baseline",
     "read_result",
@@ -73,7 +73,7 @@ class Condition(str, Enum):
         return self.value
 
 
-class Touch(str, Enum):
+class ElementResponse(str, Enum):
     """Response of a tactile element."""
 
     ANSWERS = "answers"
@@ -124,22 +124,22 @@ class ElementResult:
     packet: int
     slot: int
     place: str
-    touch: Touch
+    touch: ElementResponse
     rest: float
     noise: float
     peak: float
-    before: Touch | None = None
+    before: ElementResponse | None = None
     noisier: bool = False
 
     @property
     def faulty(self) -> bool:
         """Whether the element does not answer, or has no value."""
-        return self.touch in (Touch.DEAD, Touch.NO_VALUE)
+        return self.touch in (ElementResponse.DEAD, ElementResponse.NO_VALUE)
 
     @property
     def worn(self) -> bool:
         """Whether it has become worse since the earlier run."""
-        return self.noisier or (self.faulty and self.before is Touch.ANSWERS)
+        return self.noisier or (self.faulty and self.before is ElementResponse.ANSWERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class SelfTestResult:
         if any(j.worn for j in self.joints) or any(e.worn for e in self.elements):
             return Verdict.WORN
         measured = any(not math.isnan(f.value) for j in self.joints for f in j.figures)
-        untouched = self.touched and any(e.touch is Touch.UNTESTED for e in self.elements)
+        untouched = self.touched and any(e.touch is ElementResponse.UNTESTED for e in self.elements)
         if self.ended is not End.DONE or self.spoiled or not measured or untouched:
             return Verdict.INCOMPLETE
         return Verdict.GOOD
@@ -329,11 +329,11 @@ def _element_of(data: dict[str, Any]) -> ElementResult:
         packet=data["packet"],
         slot=data["slot"],
         place=data["place"],
-        touch=Touch(data["touch"]),
+        touch=ElementResponse(data["touch"]),
         rest=_value(data["rest"]),
         noise=_value(data["noise"]),
         peak=_value(data["peak"]),
-        before=None if data["before"] is None else Touch(data["before"]),
+        before=None if data["before"] is None else ElementResponse(data["before"]),
         noisier=data["noisier"],
     )
 
@@ -444,11 +444,11 @@ def _condition(joint: JointFound, chosen: bool) -> Condition:
 
 def _judge_element(element: ElementFound, old: ElementResult | None) -> ElementResult:
     if math.isnan(element.rest):
-        touch = Touch.NO_VALUE
+        touch = ElementResponse.NO_VALUE
     elif element.answered is None:
-        touch = Touch.UNTESTED
+        touch = ElementResponse.UNTESTED
     else:
-        touch = Touch.ANSWERS if element.answered else Touch.DEAD
+        touch = ElementResponse.ANSWERS if element.answered else ElementResponse.DEAD
     times, more = _NOISIER
     return ElementResult(
         packet=element.packet,

@@ -12,7 +12,7 @@ from typing import Any
 
 from dexkit.conformance.layers import layer_of_model
 from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.stimuli.recorded_session import Session
+from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimuli.script import (
     Action,
     Join,
@@ -30,6 +30,7 @@ from dexkit.conformance.stimuli.script import (
 
 __all__ = [
     "Action",
+    "CommandSession",
     "Join",
     "Leave",
     "Observation",
@@ -38,7 +39,6 @@ __all__ = [
     "Role",
     "Script",
     "Send",
-    "Session",
     "StartService",
     "StopService",
     "phases_for",

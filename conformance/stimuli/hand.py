@@ -12,7 +12,7 @@ from dexkit.command_age import PAUSE
 from dexkit.conformance.motor_messages import MotorCodec, Motors
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli.operator import OPERATOR, operate
-from dexkit.conformance.stimuli.recorded_session import Session
+from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -440,7 +440,7 @@ class HandScript(Script[Side]):
         for ended in (phase, *beside):
             self._end(ended)
 
-    def _replay(self, session: Session) -> Steps:
+    def _replay(self, session: CommandSession) -> Steps:
         sides = [s for s in self.plan.sides if s in session.sides]
         if not sides:
             return

@@ -15,7 +15,7 @@ from dexkit.hand import Side
 from dexkit.models import DEX1_1, Dialect, model
 from dexkit.traces import open_trace, sample_path
 
-__all__ = ["DEFAULT_SECONDS", "Session"]
+__all__ = ["DEFAULT_SECONDS", "CommandSession"]
 
 DEFAULT_SECONDS = 5.5
 FINGERS_SECONDS = 3.9
@@ -23,7 +23,7 @@ FINGERS_SECONDS = 3.9
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class CommandSession:
     """The commands of a recording, in its own dialect's radians."""
 
     name: str
@@ -32,7 +32,7 @@ class Session:
     commands: dict[Side, Commands]
 
     @classmethod
-    def load(cls, path: Path, *, seconds: float | None = None) -> Session:
+    def load(cls, path: Path, *, seconds: float | None = None) -> CommandSession:
         """The commands of a recording, from the first one on.
 
         :param seconds: no more than so much of it; None for all.
@@ -67,7 +67,7 @@ class Session:
         )
 
     @classmethod
-    def default(cls, hand_model: str = DEX1_1.name) -> Session:
+    def default(cls, hand_model: str = DEX1_1.name) -> CommandSession:
         """The session of that model's profile.
 
         :raises ConformanceError: it has none.
@@ -82,7 +82,7 @@ class Session:
         fingers = not model(hand_model).dialects[0].is_gripper
         return cls.load(path, seconds=FINGERS_SECONDS if fingers else DEFAULT_SECONDS)
 
-    def for_hand(self, target: Dialect) -> Session:
+    def for_hand(self, target: Dialect) -> CommandSession:
         """The session itself, if a hand of that dialect can be asked to repeat it.
 
         :raises ConformanceError: it was recorded with another model.
@@ -95,9 +95,9 @@ class Session:
             hint="give a session of the same model: --trace FILE.mcap",
         )
 
-    def first_seconds(self, seconds: float) -> Session:
+    def first_seconds(self, seconds: float) -> CommandSession:
         """Only the beginning of it."""
-        return Session(
+        return CommandSession(
             self.name,
             self.dialect,
             min(seconds, self.duration),

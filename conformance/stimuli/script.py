@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Generic, TypeVar
 
 from dexkit.conformance.phased_script import PhasedScript, play
-from dexkit.conformance.stimuli.recorded_session import Session
+from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
 from dexkit.models import Dialect, model
@@ -144,7 +144,7 @@ class Plan(Generic[S_co]):
     dialect: Dialect
     sides: tuple[S_co, ...]
     objects: Mapping[Subject, float] = field(default_factory=dict)
-    session: Session | None = None
+    session: CommandSession | None = None
     phases: frozenset[str] = frozenset()
     rounds: int = 1
 

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.lost import Lost
+from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.stimulus_record import Beats, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
@@ -309,6 +309,6 @@ class UsbRecording:
         late = self.lateness(begin, end)
         return None if late is None else late[1]
 
-    def lost(self, begin: float, end: float) -> Lost | None:
+    def lost(self, begin: float, end: float) -> Lateness | None:
         """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
         return self.beats.lost(self.log_time(begin), self.log_time(end))

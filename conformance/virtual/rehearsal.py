@@ -10,10 +10,10 @@ import numpy as np
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, model
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.traces.replay.machine import Guards, Phase, ReplayMachine
 from dexkit.traces.replay.prepare import Plan, joint_limits
-from dexkit.traces.replay.states import HandSeen, StateWire
+from dexkit.traces.replay.states import DecodedHand, HandStateCodec
 
 __all__ = ["JointFigures", "Rehearsal", "Rehearsed", "rehearse"]
 
@@ -141,7 +141,7 @@ class _Log:
         self.playing: list[float] = []
         self.command: tuple[float, ...] = (float("nan"),) * joints
 
-    def note(self, now: float, seen: HandSeen, *, playing: bool) -> None:
+    def note(self, now: float, seen: DecodedHand, *, playing: bool) -> None:
         """Record a state, and the last command before it."""
         self.t.append(now)
         self.rows.append((self.command, seen.q, seen.tau))
@@ -162,7 +162,7 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     machine = ReplayMachine(plan, Guards(**{**vars(guards), "loop": False}))
     spoken: Dialect = plan.dialect
     service = model(spoken.model).reference.load()(spoken, plan.sides, {})
-    encode, states = ClientWire(spoken), StateWire(spoken)
+    encode, states = ClientCodec(spoken), HandStateCodec(spoken)
     topics = {states.topics[s] for s in plan.sides}
     joints = len(model(spoken.model).joints[Side.LEFT])
     logs = {s: _Log(joints) for s in plan.sides}

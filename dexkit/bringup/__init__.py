@@ -11,11 +11,12 @@ from dexkit.bringup.dead_man import DeadMan
 from dexkit.bringup.findings import Findings
 from dexkit.bringup.motion import Effort
 from dexkit.bringup.script import Question
-from dexkit.bringup.session import Session
+from dexkit.bringup.session import BringupSession
 from dexkit.bringup.settings_file import SettingsFile
 
 __all__ = [
     "Bench",
+    "BringupSession",
     "DeadMan",
     "Drive",
     "Effort",
@@ -24,7 +25,6 @@ __all__ = [
     "Plan",
     "Question",
     "Reading",
-    "Session",
     "SettingsFile",
     "Snapshot",
     "Zero",

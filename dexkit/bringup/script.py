@@ -16,7 +16,16 @@ from dexkit.bringup.findings import Findings, MotorFound, TravelFound
 from dexkit.bringup.motion import End, Go
 from dexkit.errors import HandFault
 
-__all__ = ["AGAIN", "Action", "Locate", "Question", "Touch", "describe", "script", "travel_key"]
+__all__ = [
+    "AGAIN",
+    "Action",
+    "Locate",
+    "PressRequest",
+    "Question",
+    "describe",
+    "script",
+    "travel_key",
+]
 
 AGAIN = "again"
 NOTHING = "nothing"
@@ -50,7 +59,7 @@ class Locate:
 
 
 @dataclass(frozen=True)
-class Touch:
+class PressRequest:
     """Wait until the person presses one place; ``known`` are the sensors of other places."""
 
     key: str
@@ -58,7 +67,7 @@ class Touch:
     known: frozenset[str]
 
 
-Action: TypeAlias = Go | Locate | Question | Touch
+Action: TypeAlias = Go | Locate | Question | PressRequest
 _Script: TypeAlias = Generator[Action, Any, None]
 
 
@@ -105,7 +114,7 @@ def script(plan: Plan, motors: Sequence[str], findings: Findings) -> _Script:
         if place not in findings.sensors:
             known = frozenset(a for a in findings.sensors.values() if a)
             key = f"sensor {place}"
-            findings.sensors[place] = yield Touch(key, place, known)
+            findings.sensors[place] = yield PressRequest(key, place, known)
 
 
 def travel_key(joint: JointChoice, motor: str) -> str:

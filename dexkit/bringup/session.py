@@ -1,7 +1,8 @@
 """Run the script of a bring-up on the caller's clock; sans-IO.
 
-The caller sends what :meth:`Session.step` says, answers :attr:`Session.question` when there is one,
-and asks again. At most one motor is driven, and only in a step with the dead-man key held.
+The caller sends the commands that :meth:`BringupSession.step` returns, answers
+:attr:`BringupSession.question` when there is one, and calls it again. At most one motor is driven,
+and only in a step with the dead-man key held.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from collections.abc import Sequence
 from dexkit.bringup.bench import Drive, Plan, Snapshot
 from dexkit.bringup.findings import Findings
 from dexkit.bringup.motion import Effort, End, Go, Mover, check_motors
-from dexkit.bringup.script import AGAIN, Action, Locate, Question, Touch, script
+from dexkit.bringup.script import AGAIN, Action, Locate, PressRequest, Question, script
 from dexkit.errors import HandFault, UsageError
 
-__all__ = ["SKIP", "Session"]
+__all__ = ["SKIP", "BringupSession"]
 
 SKIP = "skip"
 _PRESSED = 3000.0
@@ -25,7 +26,7 @@ _PRESS_PATIENCE = 20.0
 """Seconds to wait for a touch; then it is asked for again."""
 
 
-class Session:
+class BringupSession:
     """One bring-up.
 
     :param motors: addresses of the motors that answer.
@@ -67,7 +68,7 @@ class Session:
             self.doing, self.moves = action.why, True
         elif isinstance(action, Locate):
             self._locate = action.motor
-        elif isinstance(action, Touch):
+        elif isinstance(action, PressRequest):
             self._touch = _TouchWatch(action)
             self.question = Question(
                 action.key, f"Press the {action.place} when told. Ready?", ("yes", SKIP)
@@ -152,7 +153,7 @@ class Session:
 class _TouchWatch:
     """Finds the one sensor whose pressure rises and stays."""
 
-    def __init__(self, action: Touch) -> None:
+    def __init__(self, action: PressRequest) -> None:
         self.action = action
         self._rest: dict[str, float] = {}
         self._begin = math.nan

@@ -17,7 +17,7 @@ from dexkit.errors import ConformanceError
 from dexkit.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from dexkit.conformance.audit.audit import Outcome
+    from dexkit.conformance.audit.audit import AuditProgress
 
 _STATUS_PERIOD = 0.2  # seconds
 _FAIL_ON = ("never", "fail", "unusable", "warn")
@@ -135,7 +135,7 @@ def command(
     status = StatusLine(quiet)
     last = 0.0
 
-    def progress(outcome: Outcome) -> None:
+    def progress(outcome: AuditProgress) -> None:
         nonlocal last
         if status and time.monotonic() - last >= _STATUS_PERIOD:
             last = time.monotonic()
@@ -157,7 +157,7 @@ def command(
     sys.exit(outcome.exit_code(fail_on))
 
 
-def _status(outcome: Outcome) -> str:
+def _status(outcome: AuditProgress) -> str:
     rest = outcome.remaining_s
     parts = [f"{outcome.done:,} of {outcome.total:,} files"]
     if outcome.seconds:
@@ -174,7 +174,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def _print(console: Console, outcome: Outcome) -> None:
+def _print(console: Console, outcome: AuditProgress) -> None:
     console.print(
         f"{outcome.done:,} of {outcome.total:,} files, {outcome.recorded_s / 3600:,.2f} h: "
         f"{outcome.failing} with a failure, {outcome.unusable} not usable or inconclusive, "

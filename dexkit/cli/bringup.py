@@ -12,7 +12,7 @@ import click
 
 from dexkit import documents
 from dexkit.backends import BackendOptions, backend, list_backends
-from dexkit.bringup import Bench, Drive, Effort, Findings, Question, Session, Snapshot
+from dexkit.bringup import Bench, BringupSession, Drive, Effort, Findings, Question, Snapshot
 from dexkit.bringup.script import describe
 from dexkit.cli.held_key import Terminal
 from dexkit.cli.options import (
@@ -129,7 +129,7 @@ def command(
             findings = Findings() if restart else bench.load()
             _print_facts(bench)
             _print_plan(bench, effort, bench.motors, attended=not unattended)
-            session = Session(bench.plan, bench.motors, findings, effort)
+            session = BringupSession(bench.plan, bench.motors, findings, effort)
             _Run(bench, session, terminal, known, stop).run()
             _print_result(bench, session)
         finally:
@@ -167,7 +167,7 @@ class _Run:
     def __init__(
         self,
         bench: Bench,
-        session: Session,
+        session: BringupSession,
         terminal: Terminal | None,
         answers: Mapping[str, str],
         stop: StopRequest,
@@ -278,7 +278,7 @@ def _print_plan(bench: Bench, effort: Effort, motors: tuple[str, ...], *, attend
     click.echo(f"  what is found goes to {bench.where}")
 
 
-def _print_result(bench: Bench, session: Session) -> None:
+def _print_result(bench: Bench, session: BringupSession) -> None:
     click.echo("found:")
     for name, text in bench.settings(session.findings).items():
         click.echo(f"  {name}={text}")

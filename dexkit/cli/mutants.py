@@ -32,11 +32,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from dexkit.conformance.mutants.generated.campaign import Campaign, Trial
-    from dexkit.conformance.mutants.matrix import Outcome, Score
+    from dexkit.conformance.mutants.matrix import Score, WrongHandResult
     from dexkit.conformance.mutants.outsiders import Verdicts
 
 
-def _follow(total: int, found: Iterator[Outcome | Trial | Verdicts], stop: StopRequest) -> None:
+def _follow(
+    total: int, found: Iterator[WrongHandResult | Trial | Verdicts], stop: StopRequest
+) -> None:
     """Show the progress of trials. Raises `click.Abort` when a signal stopped them."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:

@@ -209,13 +209,13 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
     from dexkit.models import model
     from dexkit.traces.replay.commands import read_session
     from dexkit.traces.replay.machine import Guards
-    from dexkit.traces.replay.prepare import Wishes, prepare
+    from dexkit.traces.replay.prepare import ReplayOptions, prepare
     from dexkit.traces.sessions.episodes import Options
 
     if given["hand"] not in (None, "none"):
         model(given["hand"])  # refused before anything is read
     options = Options(rate=given["rate"], hand=given["hand"], correct=not given["keep_sides"])
-    wishes = Wishes(
+    wishes = ReplayOptions(
         sides=given["sides"],
         dialect=given["dialect"],
         pace=given["pace"],

@@ -41,7 +41,7 @@ from dexkit.teleop import (
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
-    from dexkit.teleop.live import Session
+    from dexkit.teleop.live import TeleopSession
 
 __all__ = ["command"]
 
@@ -189,9 +189,9 @@ def _profile(name: str, spoken: Dialect) -> Profile:
     """
     if not name.endswith(".mcap"):
         return profile(name, spoken.model)
-    from dexkit.conformance.stimuli import Session as Recorded
+    from dexkit.conformance.stimuli import CommandSession
 
-    found = Recorded.load(Path(name)).for_hand(spoken)
+    found = CommandSession.load(Path(name)).for_hand(spoken)
     scale = 1.0 if found.dialect.name == spoken.name else spoken.q_open / found.dialect.q_open
     series: dict[Side, tuple[list[float], list[Pose]]] = {
         side: (
@@ -270,7 +270,7 @@ class _Progress:
         self._duration = duration
         self._tty = sys.stderr.isatty()
 
-    def __call__(self, seconds: float, session: Session) -> None:
+    def __call__(self, seconds: float, session: TeleopSession) -> None:
         if self._tty:
             rates = ", ".join(f"{s} {session.command_rate(s):.0f} Hz" for s in session.sides)
             click.echo(
@@ -283,12 +283,12 @@ class _Progress:
             click.echo("\r\033[K", nl=False, err=True)
 
 
-def _silent_sides(session: Session, end: float) -> list[Side]:
+def _silent_sides(session: TeleopSession, end: float) -> list[Side]:
     last = {s: rows[-1][0] for s, rows in session.states.items() if rows}
     return [s for s in session.sides if last.get(s, -math.inf) < end - _SILENT]
 
 
-def _report(session: Session, operator: Operator, nominal: float, *, as_json: bool) -> None:
+def _report(session: TeleopSession, operator: Operator, nominal: float, *, as_json: bool) -> None:
     model = model_by_name(operator.dialect.model)
     found: dict[str, Any] = {}
     for side in session.sides:

@@ -9,12 +9,12 @@ from dexkit.messages import message_type
 from dexkit.models import Dialect, model
 from dexkit.teleop.client import JointCommand, Pose
 
-__all__ = ["ClientWire"]
+__all__ = ["ClientCodec"]
 
 _LIMP = JointCommand(0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class ClientWire:
+class ClientCodec:
     """Encodes commands and reads states of one dialect.
 
     :ivar command_topics: by side; ``state_topics`` likewise.

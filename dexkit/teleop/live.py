@@ -29,18 +29,18 @@ from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, model
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.teleop.client import JointCommand, Pose, TeleopClient
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.teleop.profiles import Operator
 from dexkit.teleop.tracking import TrackingFigures, tracking_figures
 
-__all__ = ["LiveClient", "Session"]
+__all__ = ["LiveClient", "TeleopSession"]
 
 _LEAVING = 0.25  # seconds of commands to stay where it is, at the end
 _NAP = 0.1
 
 
 @dataclass
-class Session:
+class TeleopSession:
     """Commands and states of a session, in seconds from the operator's start, without pauses.
 
     :ivar pauses: when the client was paused, and for how many seconds.
@@ -108,7 +108,7 @@ class LiveClient:
     def __init__(self, node: DdsNode, client: TeleopClient, *, force: bool = False) -> None:
         self._node = node
         self._client = client
-        self._wire = ClientWire(client.dialect)
+        self._wire = ClientCodec(client.dialect)
         self._arrived = threading.Event()
         self._watch = PauseWatch(RealClock())
         dialect: Dialect = client.dialect
@@ -170,15 +170,15 @@ class LiveClient:
         operator: Operator,
         duration: float,
         stop: threading.Event,
-        progress: Callable[[float, Session], object] = lambda seconds, session: None,
-    ) -> Session:
+        progress: Callable[[float, TeleopSession], object] = lambda seconds, session: None,
+    ) -> TeleopSession:
         """Run the operator's motion for some seconds, or until stopped.
 
         After a pause of this program it continues where it was.
 
         :param progress: called about twice a second.
         """
-        session = Session(self._client.sides)
+        session = TeleopSession(self._client.sides)
         period = self._client.period
         start = reported = seen = time.monotonic()
         self._watch.restart()
@@ -266,7 +266,7 @@ class LiveClient:
                     found.update((s, q) for s, q in states.items() if s in self._client.sides)
         return found
 
-    def _sleep(self, until: float, start: float, session: Session) -> None:
+    def _sleep(self, until: float, start: float, session: TeleopSession) -> None:
         """Sleep until the next turn, while the receiving thread does its work."""
         while True:
             now = time.monotonic()

@@ -14,7 +14,7 @@ from pathlib import Path
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants import Mutant
-from dexkit.conformance.mutants.matrix import Outcome
+from dexkit.conformance.mutants.matrix import WrongHandResult
 from dexkit.traces import open_trace
 from dexkit.traces.samples import SAMPLES, sample_path
 
@@ -44,13 +44,13 @@ def key(mutant: Mutant) -> str:
     return f"{mutant.layer} {mutant.model} {mutant.name} ({mutant.kills})"
 
 
-def blamed(outcome: Outcome) -> list[str]:
+def blamed(outcome: WrongHandResult) -> list[str]:
     """The requirements that find fault with a wrong hand."""
     due = {outcome.mutant.kills, *outcome.mutant.also}
     return sorted(due - set(outcome.missed) | set(outcome.wrongly))
 
 
-def blamed_sets(outcomes: Iterable[Outcome]) -> dict[str, list[str]]:
+def blamed_sets(outcomes: Iterable[WrongHandResult]) -> dict[str, list[str]]:
     """:func:`blamed` of each wrong hand."""
     return {key(o.mutant): blamed(o) for o in sorted(outcomes, key=lambda o: key(o.mutant))}
 

@@ -30,7 +30,7 @@ from dexkit.models import Dialect, model
 from dexkit.service import HandService
 from dexkit.service.hand_core import HandCore
 from dexkit.teleop.client import JointCommand
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.rig import LocalNode, WaitTimeout, open_files, until
 
@@ -55,7 +55,7 @@ def command(dialect: Dialect, part: float) -> bytes:
         )
         for i, (j, (kp, kd)) in enumerate(zip(hand.joints[SIDE], hand.gains, strict=True))
     ]
-    ((_, payload),) = ClientWire(dialect).encode({SIDE: motors})
+    ((_, payload),) = ClientCodec(dialect).encode({SIDE: motors})
     return payload
 
 

@@ -12,10 +12,10 @@ from dexkit.command_age import PAUSE, PauseWatch
 from dexkit.errors import TopicConflict, WireError
 from dexkit.models import DIALECTS
 from dexkit.single_publisher import NodeTopics, SolePublisher
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.traces.player import SPIN
 from dexkit.traces.replay.machine import Commands, End, Phase, ReplayMachine
-from dexkit.traces.replay.states import StateWire
+from dexkit.traces.replay.states import HandStateCodec
 
 if TYPE_CHECKING:
     import threading
@@ -41,8 +41,8 @@ class LiveReplay:
 
         self.node, self.machine = node, machine
         plan = machine.plan
-        self._encode = ClientWire(plan.dialect)
-        self._states = StateWire(plan.dialect)
+        self._encode = ClientCodec(plan.dialect)
+        self._states = HandStateCodec(plan.dialect)
         self.command_topics = tuple(
             dict.fromkeys(self._encode.command_topics[s] for s in plan.sides)
         )
@@ -78,7 +78,9 @@ class LiveReplay:
         seen = {(e.topic, e.type_name) for e in self.node.endpoints() if e.kind == "writer"}
         spoken = self.machine.plan.dialect
         for d in DIALECTS.values():
-            sides = [s for s, topic in StateWire(d).topics.items() if (topic, d.state_type) in seen]
+            sides = [
+                s for s, topic in HandStateCodec(d).topics.items() if (topic, d.state_type) in seen
+            ]
             if sides and d == spoken:
                 return f"there is the {' and '.join(map(str, sides))} hand: --side, --swap-sides"
             if sides:

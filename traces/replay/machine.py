@@ -33,7 +33,7 @@ from dexkit.hand import JointMode, Side
 from dexkit.models import ModeByte, model
 from dexkit.teleop.client import JointCommand, client_for
 from dexkit.traces.replay.prepare import Plan, Track, joint_limits
-from dexkit.traces.replay.states import HandSeen
+from dexkit.traces.replay.states import DecodedHand
 
 __all__ = [
     "HOLD",
@@ -158,7 +158,7 @@ class ReplayMachine:
         self._times: dict[Side, list[float]] = {s: t.t.tolist() for s, t in plan.tracks.items()}
         self._next = dict.fromkeys(plan.sides, 0)
         """Index of each hand's first command that is not yet due."""
-        self._seen: dict[Side, tuple[float, HandSeen]] = {}
+        self._seen: dict[Side, tuple[float, DecodedHand]] = {}
         self._sent: dict[Side, tuple[float, Sequence[JointCommand]]] = {}
         self._far_since: dict[tuple[Side, int], float] = {}
         self._not_before = -math.inf
@@ -182,7 +182,7 @@ class ReplayMachine:
 
     # -- inputs
 
-    def receive(self, now: float, side: Side, seen: HandSeen) -> None:
+    def receive(self, now: float, side: Side, seen: DecodedHand) -> None:
         """Note a state. A state that is not finite is ignored."""
         if side in self._rows and now >= self._not_before and all(map(math.isfinite, seen.q)):
             self._seen[side] = (now, seen)

@@ -1,7 +1,7 @@
 """Check the commands of a session before they reach a hand, and correct what options allow.
 
 Each problem is a :class:`Finding` with a name. It is *refused*, unless an option cures it
-(:class:`Wishes`) or it is accepted by name. The result is a :class:`Plan`.
+(:class:`ReplayOptions`) or it is accepted by name. The result is a :class:`Plan`.
 
 Rates, velocities and gaps are calculated at the chosen pace and in the dialect of the driven hand.
 """
@@ -33,8 +33,8 @@ __all__ = [
     "Level",
     "Plan",
     "Prepared",
+    "ReplayOptions",
     "Track",
-    "Wishes",
     "joint_limits",
     "prepare",
 ]
@@ -112,7 +112,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class ReplayOptions:
     """Options of a replay.
 
     :param sides: hands to drive; None for all that it commands.
@@ -251,7 +251,7 @@ class Prepared:
         return list(dict.fromkeys(f.option for f in self.refused if f.option))
 
 
-def prepare(session: RecordedCommands, wishes: Wishes = Wishes()) -> Prepared:
+def prepare(session: RecordedCommands, wishes: ReplayOptions = ReplayOptions()) -> Prepared:
     """Check a session, correct it as the options say, and make the plan.
 
     :raises SessionError: it has no hand that dexkit knows.
@@ -262,7 +262,7 @@ def prepare(session: RecordedCommands, wishes: Wishes = Wishes()) -> Prepared:
 
 
 class _Preparation:
-    def __init__(self, session: RecordedCommands, wishes: Wishes) -> None:
+    def __init__(self, session: RecordedCommands, wishes: ReplayOptions) -> None:
         self.session, self.wishes = session, wishes
         self.model: HandModel = session.model
         assert session.dialect is not None

@@ -10,13 +10,13 @@ from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, ModeByte, model
 
-__all__ = ["HandSeen", "StateWire"]
+__all__ = ["DecodedHand", "HandStateCodec"]
 
 Values = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class HandSeen:
+class DecodedHand:
     """One state of a hand.
 
     :param q: rad; ``tau`` N·m; per joint.
@@ -44,7 +44,7 @@ class HandSeen:
         return ""
 
 
-class StateWire:
+class HandStateCodec:
     """Decodes the states of a dialect."""
 
     def __init__(self, spoken: Dialect) -> None:
@@ -56,7 +56,7 @@ class StateWire:
         self._ris = spoken.mode_byte is ModeByte.RIS
         self.topics = {s: spoken.topics(s)[1] for s in Side}
 
-    def seen(self, topic: str, data: bytes) -> dict[Side, HandSeen]:
+    def seen(self, topic: str, data: bytes) -> dict[Side, DecodedHand]:
         """The hands in a state message; a hand beyond its end is left out.
 
         :raises WireError: it is not of the dialect's state type.
@@ -71,8 +71,8 @@ class StateWire:
                 found[side] = self._hand(mine)
         return found
 
-    def _hand(self, motors: Sequence[Any]) -> HandSeen:
-        return HandSeen(
+    def _hand(self, motors: Sequence[Any]) -> DecodedHand:
+        return DecodedHand(
             q=tuple(m.q for m in motors),
             tau=tuple(m.tau_est * unit for m, unit in zip(motors, self._units, strict=True)),
             # the second word is a motor's own, the first one of a gripper's reserve

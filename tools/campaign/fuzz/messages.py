@@ -26,7 +26,7 @@ from dexkit.messages.packed import Packed
 from dexkit.models import DIALECTS, model
 from dexkit.service.dialects import dialect_map
 from dexkit.service.hand_core import HandCore
-from dexkit.teleop.client_codec import ClientWire
+from dexkit.teleop.client_codec import ClientCodec
 from dexkit.traces import names as trace_names
 from dexkit.traces import schemas
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
@@ -182,7 +182,7 @@ def _bridge(rng: random.Random, scratch: Path) -> Target:
 
 def _teleop(rng: random.Random, scratch: Path) -> Target:
     spoken = rng.choice(list(DIALECTS.values()))
-    wire = ClientWire(spoken)
+    wire = ClientCodec(spoken)
     topics = list(wire.state_topics.values())
 
     def run(data: bytes) -> None:

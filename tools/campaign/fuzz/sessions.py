@@ -16,11 +16,19 @@ from mcap.writer import CompressionType
 
 from dexkit.conformance.audit.examine import Task, examine
 from dexkit.conformance.audit.records import FileRecord, State
-from dexkit.conformance.audit.sessions import Session
+from dexkit.conformance.audit.sessions import SessionFile
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.traces.replay.commands import read_session
 from dexkit.traces.replay.machine import Guards
-from dexkit.traces.replay.prepare import ACCEPTABLE, GAINS, INVALID, JUMPS, LIMIT, Wishes, prepare
+from dexkit.traces.replay.prepare import (
+    ACCEPTABLE,
+    GAINS,
+    INVALID,
+    JUMPS,
+    LIMIT,
+    ReplayOptions,
+    prepare,
+)
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.recordings import damage
 from tools.generate_archive import Session as Generated
@@ -102,7 +110,7 @@ def _audited(rng: random.Random, scratch: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        record = examine(Task(Session("x", str(path), len(data), "")))
+        record = examine(Task(SessionFile("x", str(path), len(data), "")))
         if record.state is State.FAILED:
             raise Difference(record.error)
         if FileRecord.of_line(record.as_line()).as_line() != record.as_line():
@@ -114,8 +122,8 @@ def _audited(rng: random.Random, scratch: Path) -> Target:
 def _replayed(rng: random.Random, scratch: Path) -> Target:
     path = scratch / "x.mcap"
 
-    def wishes() -> Wishes:
-        return Wishes(
+    def wishes() -> ReplayOptions:
+        return ReplayOptions(
             pace=rng.choice((0.5, 1.0, 3.0)),
             gains=rng.choice(GAINS),
             resample=rng.choice((None, 30.0, 200.0)),

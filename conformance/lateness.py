@@ -9,14 +9,14 @@ import numpy as np
 from dexkit.conformance.sums import mean, total
 from dexkit.hand import Floats
 
-__all__ = ["IDLE", "Lost"]
+__all__ = ["IDLE", "Lateness"]
 
 IDLE = 1e-3
 """Seconds by which timers are late on an idle machine."""
 
 
 @dataclass(frozen=True)
-class Lost:
+class Lateness:
     """Lateness of the kit's timer in an interval, beyond that on an idle machine.
 
     :param total: all of it, seconds: what one thing that happened then may have waited.
@@ -30,13 +30,13 @@ class Lost:
     p99: float
     best: float = 0.0
 
-    def of(self, how: str) -> float:
+    def figure(self, how: str) -> float:
         """The figure for a delay of that kind; see :class:`~dexkit.conformance.checks.Late`."""
         figures = {"total": self.total, "chain": self.total, "mean": self.mean, "p99": self.p99}
         return figures[how]
 
     @classmethod
-    def beyond_idle(cls, late: Floats) -> Lost | None:
+    def beyond_idle(cls, late: Floats) -> Lateness | None:
         """Of these times of lateness, seconds, each beyond :data:`IDLE`; None if there are none."""
         if not len(late):
             return None
