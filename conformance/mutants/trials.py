@@ -126,11 +126,11 @@ class TopicTrial(ABC):
     def plan(self, mutant: Mutant, *, short: bool = False) -> Plan[Subject]:
         """The phases that show the fault: all, or those that its requirements need."""
         full = self._full(mutant)
+        every = catalogue(mutant.model, mutant.layer)
         if mutant.brief or (short and not mutant.whole):
-            ids = [mutant.kills, *mutant.also]
-            needed = select(catalogue(mutant.model, mutant.layer), prefixes=ids)
+            needed = select(every, prefixes=[mutant.kills, *mutant.also])
             return replace(full, phases=self._short(mutant, needed))
-        if "-OPER-" not in mutant.kills:
+        if not any(r.id == mutant.kills and r.phase == OPERATOR for r in every):
             # eleven seconds without a finding that other phases do not give
             full = replace(full, phases=full.phases - {OPERATOR})
         return full
