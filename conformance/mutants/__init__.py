@@ -22,24 +22,24 @@ from dexkit.conformance.mutants import (
 )
 from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
-from dexkit.models import model_plugins
+from dexkit.models import MODELS
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
 MODULES = (any_model, gripper, fingers, servos, touch, operator, clients, robot, usb)
-"""Modules that declare wrong hands."""
+"""Modules that declare wrong hands of more than one model, or of one with its own mechanics."""
 
 
 @cache
 def mutants(layer: str | None = None) -> tuple[Mutant, ...]:
-    """Every wrong hand, of other packages' models as well.
+    """Every wrong hand: of the modules here, and of those that the models' profiles name.
 
     :param layer: only those of that layer.
     :raises ModelBroken: the wrong hands of another package's model cannot be loaded.
     """
     if layer is None:
-        for plugin in model_plugins():
-            if plugin.model and plugin.model.wrong_hands:
-                plugin.model.wrong_hands.load()
+        for model in MODELS.values():
+            if model.wrong_hands:
+                model.wrong_hands.load()
         return expand()
     return tuple(m for m in mutants() if m.layer == layer)

@@ -204,7 +204,7 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-04", "DEX5-GAIN-03"), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-04",), whole=True)
 @wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
 @wrong_hand("DFX-FRESH-01", also=("DFX-SIDE-01",), whole=True)
 class StaleState(Service):
@@ -222,9 +222,7 @@ class StaleState(Service):
 
 
 @wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
-@wrong_hand(
-    ("DEX1-FRESH-01", "DEX5-FRESH-01", "BRAINCO-FRESH-01"), also=("FTP-SAFE-10",), whole=True
-)
+@wrong_hand(("DEX1-FRESH-01", "BRAINCO-FRESH-01"), also=("FTP-SAFE-10",), whole=True)
 class StaleLater(StaleState):
     """Measures five times a second from 12 s on."""
 
@@ -254,7 +252,7 @@ class FrozenAtFirst(Service):
         return self.first.setdefault(sides, newest) if frozen else newest
 
 
-@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), also=("DEX1-FIELD-20", "DEX5-FIELD-19"), whole=True)
+@wrong_hand(("DEX1-FRESH-02", "DEX3-FRESH-02"), also=("DEX1-FIELD-20",), whole=True)
 class FreezesOnce(Service):
     """Publishes the same values for 0.3 s when it first begins to move."""
 
@@ -276,7 +274,7 @@ class FreezesOnce(Service):
     ("DEX1-FRESH-03", "DEX3-FRESH-03"),
     also=(
         *("DEX1-FIELD-06", "DEX1-FIELD-16", "DEX1-FIELD-17", "DEX1-MOVE-06"),
-        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-16", "DEX3-MOVE-06", "DEX5-FIELD-17"),
+        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-16", "DEX3-MOVE-06"),
     ),
     whole=True,
 )
@@ -308,8 +306,7 @@ class SwapsBuffers(Service):
         return newest if self.turn % 2 or self.ended else past[0][1]
 
 
-# of a Dex5-1, the first requirement that finds that nothing moves is about the mode byte
-@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01"))
+@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01"))
 class Frozen(Service):
     """Publishes its first measurement forever, at full rate."""
 
@@ -393,7 +390,6 @@ class Swapped(Service):
 @wrong_hand("BRAINCO-MOVE-06", also=("BRAINCO-PATH-01", "BRAINCO-WDOG-03"))
 # slower: it does not come far meanwhile
 @wrong_hand("DFX-MOVE-06", also=("DFX-WDOG-03",))
-@wrong_hand("DEX5-MOVE-06", also=("DEX5-MODE-07", "DEX5-PATH-01", "DEX5-WDOG-03"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -482,10 +478,7 @@ class HomesWhenRestarted(_Moves):
 
 @wrong_hand(
     ("DEX1-STILL-01", "DEX3-STILL-01"),
-    also=(
-        *("DEX1-FIELD-19", "DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),
-        "DEX5-SAFE-11",
-    ),
+    also=(*("DEX1-FIELD-19", "DEX1-PATH-01", "DEX3-PATH-01", "DEX1-SAFE-05", "DEX3-SAFE-06"),),
     sides=BOTH,
     whole=True,
     where=obeys_gains,

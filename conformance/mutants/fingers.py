@@ -1,8 +1,7 @@
 """Wrong hands of several joints.
 
 Each is mixed into the reference service of a model, and its ``hand_fault``, if it has one, into
-the mechanics of the reference's hands. A Dex5-1 has separate declarations where its lower gains
-make other requirements fail: it oscillates less, and comes to rest more slowly.
+the mechanics of the reference's hands.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import numpy as np
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.registry import BOTH, obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Sample
-from dexkit.conformance.virtual.dex5 import Dex5Service
 from dexkit.conformance.virtual.fingers import (
     Dex3Service,
     FingerHand,
@@ -177,7 +175,7 @@ class JumpsOnce(_Timed):
             motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
 
 
-@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-19", "DEX5-FORCE-09"))
+@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-19",))
 class ShakenVelocity(_Timed):
     """For some seconds has an oscillation on dq that q does not make."""
 
@@ -274,11 +272,6 @@ class _Filled(FingerService):
         "DEX3-GAIN-05",
         "DEX3-SAFE-06",
     ),
-    whole=True,
-)
-@wrong_hand(
-    "DEX5-FIELD-20",
-    also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-04", "DEX5-GAIN-05"),
     whole=True,
 )
 class ShowsTheGoalNearIt(FingerService):
@@ -534,7 +527,9 @@ class LongQuaternion(FingerService):
 # ------------------------------------------------------------------------------------ motion
 
 
-def _reordered(order: tuple[int, ...]) -> Callable[[tuple[Motor, ...]], tuple[Motor, ...]]:
+def reordered(order: tuple[int, ...]) -> Callable[[tuple[Motor, ...]], tuple[Motor, ...]]:
+    """A function that puts a command's motors into this order of their indices."""
+
     def reorder(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
         return tuple(motors[i] for i in order)
 
@@ -547,16 +542,8 @@ class IndexFirst(Dex3Service):
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         if side is Side.RIGHT:
-            motors = _reordered((0, 1, 2, 5, 6, 3, 4))(motors)
+            motors = reordered((0, 1, 2, 5, 6, 3, 4))(motors)
         super().motors(side, motors)
-
-
-@wrong_hand("DEX5-JOINT-01")
-class ThumbFirst(FingerService):
-    """Obeys commands thumb first, as the URDF numbers the fingers."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        super().motors(side, _reordered((*range(4, 20), *range(4)))(motors))
 
 
 @wrong_hand("DEX3-JOINT-01")
@@ -586,7 +573,6 @@ class OneJointBackwards(FingerService):
 
 
 @wrong_hand("DEX3-MOVE-02", also=("DEX3-FORCE-09",))
-@wrong_hand("DEX5-MOVE-02")
 class OtherScale(FingerService):
     """Moves only 75 % of the way from its rest pose."""
 
@@ -608,7 +594,6 @@ class _Hunts(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-03", also=("DEX3-FORCE-09",), whole=True, where=obeys_gains)
-@wrong_hand("DEX5-MOVE-03", whole=True)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
@@ -622,7 +607,6 @@ class _Weak(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-04", where=obeys_gains)
-@wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))
 class Slow(FingerService):
     """Has high friction: it moves slowly."""
 
@@ -641,7 +625,6 @@ class _Springy(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-05", also=("DEX3-PATH-01",), where=obeys_gains)
-@wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01", "DEX5-PATH-01"))
 class Undamped(FingerService):
     """Applies 15 % of kd where kp is not 0."""
 
@@ -649,7 +632,6 @@ class Undamped(FingerService):
 
 
 @wrong_hand("DEX3-SIDE-01", also=("DEX3-MOVE-07",), sides=BOTH)
-@wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)
 @wrong_hand("BRAINCO-SIDE-01", also=("BRAINCO-MOVE-02",), sides=BOTH)
 class Coupled(FingerService):
     """The goal of the left hand's first finger leaks into the right one's."""
@@ -705,7 +687,6 @@ class _Creeps(FingerHand):
 
 
 @wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04", "DFX-CMD-01"))
-@wrong_hand("DEX5-MOVE-07", also=("DEX5-FORCE-09",))
 class Creeps(FingerService):
     """One joint moves the last part of the way to its goal slowly."""
 
@@ -751,7 +732,6 @@ class _GainsOfFirst(FingerHand):
 
 
 @wrong_hand("DEX3-GAIN-02", also=("DEX3-GAIN-03", "DEX3-SAFE-06"))
-@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))
 class GainsOfFirstMotor(FingerService):
     """Uses the gains of its first motor for all."""
 
@@ -766,7 +746,6 @@ class _GainsOfNeighbour(FingerHand):
 
 
 @wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01", "DEX3-SAFE-06"))
-@wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-FORCE-09", "DEX5-SAFE-06"))
 class GainsOfTheMotorBefore(FingerService):
     """Uses the gains of the motor before in each."""
 
@@ -837,7 +816,7 @@ class _TorqueOfNeighbour(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04", "DEX3-HOLD-01", "DEX5-FIELD-18"))
+@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04", "DEX3-HOLD-01"))
 class TorqueOfTheMotorBefore(FingerService):
     """Adds the torque that is commanded to the motor before, in each."""
 
@@ -938,7 +917,7 @@ class _ZeroIsNoChange(FingerHand):
         return np.where(status == 0, self.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX5-MODE-07"))
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
 class ZeroIsNoChange(FingerService):
     """Keeps a joint driven that is switched off: takes 0 for "as before"."""
 
@@ -952,7 +931,7 @@ class _OneStaysOn(FingerHand):
         return np.where(last & (status == 0), self.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX5-MODE-07"))
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
 class LastJointStaysOn(FingerService):
     """Keeps its last joint driven when it is switched off."""
 
@@ -981,19 +960,6 @@ class StaysOnForALaterClient(FingerService):
             driven = tuple(replace(m, mode=m.mode | self.codec.mode(0)) for m in motors)
             self.seen[side] = motors, driven
         super().motors(side, self.seen[side][1])
-
-
-class _AnyModeDrives(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        _, guarded = super().understood(mode)
-        return np.where(mode != 0, 1, 0), guarded
-
-
-@wrong_hand("DEX5-MODE-07")
-class AnyModeDrives(FingerService):
-    """Drives a joint with any mode but 0."""
-
-    hand_fault = _AnyModeDrives
 
 
 @wrong_hand("DEX3-MODE-05")
@@ -1030,18 +996,6 @@ class OneBitOfStatus(Dex3Service):
     hand_fault = _AnyStatus
 
 
-class _Ris(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        return (mode >> 4) & 7, mode >= 0x80
-
-
-@wrong_hand("DEX5-MODE-01")
-class DecodesRis(FingerService):
-    """Decodes the mode byte as a Dex3-1's: 1 is id 1 with status 0, which locks."""
-
-    hand_fault = _Ris
-
-
 @wrong_hand("DEX3-MODE-04")
 class GoesById(FingerService):
     """Sorts a command's motors by the id in their mode byte."""
@@ -1056,22 +1010,12 @@ class GoesById(FingerService):
 
 
 @wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-07",), sides=BOTH)
-@wrong_hand("DEX5-FORCE-01", also=("DEX5-FORCE-03", "DEX5-FORCE-07"), sides=BOTH)
 class TurnedForce(FingerService):
     """Publishes tau_est with the wrong sign."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] = -motors["tau_est"]
-
-
-@wrong_hand("DEX5-FORCE-03", sides=BOTH)
-class FingersInNewtonMetres(FingerService):
-    """Publishes the fingers' torques in N m, as the other joints'."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] *= self.torque_units[: len(motors)]
 
 
 @wrong_hand("DEX3-FORCE-04", also=("DEX3-FORCE-07",))
@@ -1172,7 +1116,7 @@ class ForceOfLargerMotor(Dex3Service):
         motors["tau_est"] *= 1.9
 
 
-class _OtherInContact(FingerHand):
+class OtherInContact(FingerHand):
     """Applies another torque in contact, until the next command."""
 
     joints: tuple[int, ...]
@@ -1190,7 +1134,9 @@ class _OtherInContact(FingerHand):
         super().move(dt, pull)
 
 
-class _Boosts(_OtherInContact):
+class Boosts(OtherInContact):
+    """Applies two and a half times the torque in contact."""
+
     factor = 2.5
 
     def __init__(self, *args: Any) -> None:
@@ -1200,7 +1146,7 @@ class _Boosts(_OtherInContact):
         self.changed()
 
 
-class _BoostsIndex(_Boosts):
+class _BoostsIndex(Boosts):
     joints = (5, 6)
 
 
@@ -1211,18 +1157,7 @@ class OneFingerBoosts(Dex3Service):
     hand_fault = _BoostsIndex
 
 
-class _BoostsLittle(_Boosts):
-    joints = (13, 14, 15)
-
-
-@wrong_hand("DEX5-FORCE-08", sides=BOTH)
-class LittleFingerBoosts(Dex5Service):
-    """Its little finger presses with two and a half times the torque where it is blocked."""
-
-    hand_fault = _BoostsLittle
-
-
-class _WeakThumb(_OtherInContact):
+class _WeakThumb(OtherInContact):
     joints = (1, 2)
     factor = 0.35
 
@@ -1232,74 +1167,6 @@ class ThumbGivesIn(Dex3Service):
     """Its thumb presses with a third of the torque where it is blocked."""
 
     hand_fault = _WeakThumb
-
-
-class _WeakRing(_OtherInContact):
-    joints = (9, 10, 11)
-    factor = 0.35
-
-
-@wrong_hand("DEX5-FORCE-08", sides=BOTH)
-class RingFingerGivesIn(Dex5Service):
-    """Its ring finger presses with a third of the torque where it is blocked."""
-
-    hand_fault = _WeakRing
-
-
-class _FadingGrip(FingerHand):
-    pressed = 0.0
-
-    def step(self, dt: float) -> None:
-        self.rests = False
-        super().step(dt)
-        touches = self.touches and any(abs(c) > 0.005 for c in self.contact)
-        self.pressed += dt if touches else 0.0
-
-    def take(self, rows: Floats, mode: Ints) -> None:
-        self.pressed = 0.0
-        super().take(rows, mode)
-
-    def move(self, dt: float, pull: list[float]) -> None:
-        super().move(dt, [0.3 * p for p in pull] if self.pressed > 0.9 else pull)
-
-
-@wrong_hand("DEX5-FORCE-06", also=("DEX5-FORCE-03",), sides=BOTH, whole=True)
-class GripFades(Dex5Service):
-    """Presses with a third of the torque after 0.9 s of contact: a limit of the mean current."""
-
-    hand_fault = _FadingGrip
-
-
-class _OwnTimeouts(FingerHand):
-    joints: tuple[int, ...]
-    """Those without a time-out."""
-
-    def expire(self) -> None:
-        status = self.status.copy()
-        super().expire()
-        self.status[list(self.joints)] = status[list(self.joints)]
-
-
-class _FingersGoOn(_OwnTimeouts):
-    joints = tuple(range(16))
-
-
-@wrong_hand("DEX5-WDOG-04", sides=BOTH, whole=True)
-class FingersGoOn(Dex5Service):
-    """Only its thumb releases without commands; the fingers press on."""
-
-    hand_fault = _FingersGoOn
-
-
-class _OneGoesOn(_OwnTimeouts):
-    joints = (15,)
-
-
-@wrong_hand("DEX5-WDOG-04", sides=BOTH, whole=True)
-class OneJointGoesOn(Dex5Service):
-    """The last joint of its little finger presses on without commands."""
-
-    hand_fault = _OneGoesOn
 
 
 @wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-FORCE-10", "DEX3-MOVE-09"), sides=BOTH)
@@ -1319,15 +1186,6 @@ class MilliNewtonMetres(FingerService):
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] *= 1e3
-
-
-@wrong_hand("DEX5-FORCE-02", also=("DEX5-FORCE-03",), sides=BOTH)
-class ThumbInTheFingersUnit(FingerService):
-    """Publishes the torques of the thumb in mN m, as those of the fingers."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"][16:] *= 1e3
 
 
 @wrong_hand("DEX3-FORCE-09")
@@ -1401,7 +1259,7 @@ class _NanPerJoint(FingerHand):
 
 
 @wrong_hand("DEX3-SAFE-01", also=("DEX3-SAFE-03",))
-@wrong_hand(("DEX5-SAFE-01", "BRAINCO-SAFE-01"))
+@wrong_hand("BRAINCO-SAFE-01", brief=True)
 class RejectsOnlyTheBadJoint(FingerService):
     """Ignores only the joint whose command is NaN, and moves the others."""
 
@@ -1547,9 +1405,7 @@ class _LatchesWithoutGuard(FingerHand):
 
 
 @wrong_hand("DEX3-WDOG-03", also=("DEX3-MODE-02", "DEX3-MOVE-08"))
-@wrong_hand(
-    ("DEX5-WDOG-03", "BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"), also=("DEX5-MODE-02",)
-)
+@wrong_hand(("BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"), brief=True)
 class StuckAfterSilence(FingerService):
     """Obeys no command after a silence without protection."""
 
@@ -1599,7 +1455,6 @@ class _SleepsWithoutGuard(FingerHand):
 
 # it sleeps through the step after the bad commands as well
 @wrong_hand("DEX3-WDOG-03")
-@wrong_hand("DEX5-WDOG-03")
 class SleepsWithoutGuard(FingerService):
     """Ignores commands for 2 s after a silence without protection."""
 

@@ -94,18 +94,6 @@ class SaturatingGain(ReferenceService):
     ),
     where=obeys_gains,
 )
-@wrong_hand(
-    "DEX5-OPER-02",
-    also=(
-        "DEX5-ABUSE-01",
-        "DEX5-CMD-01",
-        "DEX5-FORCE-09",
-        "DEX5-LOAD-02",
-        "DEX5-MODE-07",
-        "DEX5-SAFE-06",
-        "DEX5-SAFE-11",
-    ),
-)
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
 
@@ -129,7 +117,7 @@ class CoarseTargets(_Coarse, ReferenceService):
 
 
 @wrong_hand("DEX3-OPER-04", also=("DEX3-MOVE-04",))
-@wrong_hand(("DEX5-OPER-04", "BRAINCO-OPER-04"))
+@wrong_hand("BRAINCO-OPER-04", brief=True)
 class CoarseFingers(_Coarse, FingerService):
     """Moves to the nearest of 21 positions."""
 
@@ -228,8 +216,6 @@ class _OpenEnd(_PerJoint):
 
 @wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05"))
 @wrong_hand("BRAINCO-OPER-01", also=("BRAINCO-OPER-05",))
-# its session begins at the open end
-@wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01", "DEX5-MOVE-08", "DEX5-MODE-05"))
 class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range per second."""
 
@@ -257,17 +243,5 @@ class Springs(_OpenEnd, FingerService):
 
 @wrong_hand("DEX3-OPER-05", also=("DEX3-CMD-01", "DEX3-GAIN-04", "DEX3-MODE-02", "DEX3-TRACK-02"))
 @wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",))
-# its delay is long compared with the steps of the light joints
-@wrong_hand(
-    "DEX5-OPER-05",
-    also=(
-        "DEX5-CMD-01",
-        "DEX5-GAIN-04",
-        "DEX5-GAIN-05",
-        "DEX5-MODE-02",
-        "DEX5-OPER-02",
-        "DEX5-TRACK-02",
-    ),
-)
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""

@@ -113,6 +113,7 @@ DEX5_1 = HandModel(
     requirements=("dex5.toml", "dex5_client.toml"),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
+    wrong_hands=Lazy("dexkit.conformance.mutants.dex5"),
     quick_seconds=20.0,
     # first flexing joints of four fingers: none of them shares its motor
     roles=JointRoles(driven=(1, 5), slow=(9, 13)),

@@ -338,8 +338,9 @@ class HandModel:
     :param reference: service on a virtual clock that does everything right.
     :param scored_hands: how many generated wrong hands its runs are scored by; only the models of
         dexkit itself are scored.
-    :param wrong_hands: of a model of another package, the module whose classes have the decorator
-        ``dexkit.conformance.mutants.wrong_hand``: they prove its requirements.
+    :param wrong_hands: the module with the wrong hands of this model alone, which have the
+        decorator ``dexkit.conformance.mutants.wrong_hand``; None where the shared ones prove its
+        requirements.
 
     :param layout: how it is drawn; None for a gripper, and where no drawing is needed.
     :param skeleton: makes the joint axes and origins of a side; None where they are not known, and
