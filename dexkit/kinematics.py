@@ -71,6 +71,14 @@ class Box:
     size: Vector
     along: Vector = (1.0, 0.0, 0.0)
 
+    @classmethod
+    def between(cls, segment: int, low: Vector, high: Vector) -> Box:
+        """The box between two opposite corners, in the segment's frame."""
+        a, b = np.array(low), np.array(high)
+        x, y, z = ((a + b) / 2).tolist()
+        dx, dy, dz = (b - a).tolist()
+        return cls(segment, (x, y, z), (dx, dy, dz))
+
 
 @dataclass(frozen=True)
 class Element:
