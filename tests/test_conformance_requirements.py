@@ -106,6 +106,14 @@ def test_like_entry_inherits_missing_keys() -> None:
         parse(LIKE)
 
 
+def test_entry_is_of_the_layer_of_the_requirement_that_it_is_like() -> None:
+    found = {r.layer: r.like for r in requirements._requirements("dex5.toml")}
+    assert found == {"dds": "DEX3-OPER-05", "client": "DEX1-CLIENT-13"}
+    # over two files, of which the first names no layer
+    ftp = {r.id: r.layer for r in requirements._requirements("inspire_ftp.toml")}
+    assert (ftp["FTP-TOPIC-01"], ftp["FTP-CLIENT-01"]) == ("dds", "client")
+
+
 def test_expected_is_the_sentence_unless_given() -> None:
     (requirement,) = parse(GOOD)
     assert requirement.expected == requirement.sentence

@@ -4,7 +4,8 @@ What one model has in common with another is written once: an entry with ``like 
 inherits all keys that it does not give from that requirement of another file, which may be like a
 third one. Its id is the same with this model's prefix, unless it gives another; ids and topics of
 the other model in the texts are turned into this model's; tolerances are taken one by one. Where it
-names no source of its own, it is an inference from the other's.
+names no source of its own, it is an inference from the other's. It is of the other's layer, unless
+its file names one, so that one file holds what a hand and what its client must do.
 
 All other parts take them from here: checks (which read their tolerances), pytest ids,
 selection, reports and the catalogue in docs/conformance.md.
@@ -477,7 +478,8 @@ def _parse(
 
 @cache
 def _files() -> dict[str, tuple[str, str]]:
-    """Model and layer of each requirement file, by its path, which is a name for dexkit's own.
+    """Model and layer of each requirement file, by its path, which is a name for dexkit's own. The
+    layer is empty where the file names none, and holds what is ``like`` requirements of several.
 
     Those of dexkit come first, by name. A file of another package that cannot be read is left out:
     it must not affect the others. :func:`catalogue` of its model raises what is wrong with it.
@@ -513,10 +515,10 @@ def _plugin_files(hand: HandModel) -> dict[str, tuple[str, str]]:
 
 
 def _head(name: str) -> tuple[str, str]:
-    """Model and layer of a file."""
+    """Model of a file, and the layer that it names."""
     path = Path(__file__).parent / name
     head = parse_toml(path.read_text(encoding="utf-8").partition("[[")[0], path.name)
-    return _model_of(head).name, str(head.get("layer", "dds"))
+    return _model_of(head).name, str(head.get("layer", ""))
 
 
 @cache
@@ -541,7 +543,7 @@ def _ancestors(entry: Mapping[str, Any]) -> dict[str, Any]:
     name = str(entry.get("like", ""))
     if not name:
         return {}
-    file = next((file for file in _own_files() if name in _written(file)), None)
+    file = _file_of(name)
     if file is None:
         return {}
     theirs = _written(file)[name]
@@ -550,14 +552,35 @@ def _ancestors(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, name: _entries(document, found, file)[0]}
 
 
+def _file_of(name: str) -> str | None:
+    """The file of dexkit's own in which a requirement is."""
+    return next((file for file in _own_files() if name in _written(file)), None)
+
+
+def _layer_of(entry: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+    """The layer that an entry's file names, else that of the requirement that it is like."""
+    if "layer" in document or "like" not in entry:
+        return str(document.get("layer", "dds"))
+    file = _file_of(str(entry["like"]))
+    return "dds" if file is None else _layer_of(_written(file)[entry["like"]], _document(file))
+
+
 @cache
 def _requirements(name: str) -> tuple[Requirement, ...]:
     """Those of one file; the others are read only if it takes something from them."""
     document = _document(name)
     others: dict[str, Any] = {}
+    by_layer: dict[str, list[Any]] = {}
     for entry in document["requirement"]:
         others |= _ancestors(entry)
-    return _parse(document, name, others)
+        by_layer.setdefault(_layer_of(entry, document), []).append(entry)
+    return tuple(
+        requirement
+        for layer, entries in by_layer.items()
+        for requirement in _parse(
+            {**document, "layer": layer, "requirement": entries}, name, others
+        )
+    )
 
 
 @cache
@@ -574,8 +597,9 @@ def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requ
     return tuple(
         requirement
         for name, about in _files().items()
-        if model in (None, about[0]) and layer in (None, about[1])
+        if model in (None, about[0]) and (layer is None or about[1] in ("", layer))
         for requirement in _requirements(name)
+        if layer in (None, requirement.layer)
     )
 
 

@@ -117,7 +117,7 @@ DEX3_1 = HandModel(
     sensors=_SENSORS,
     # inferred: the sources give a topic and no rate (docs/sources/unitree-dex.md#a1)
     low_rate=20.0,
-    requirements=("dex3.toml", "dex3_usb.toml", "dex3_client.toml"),
+    requirements=("dex3.toml", "dex3_usb.toml"),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.fingers:Dex3Service"),
     quick_seconds=15.0,

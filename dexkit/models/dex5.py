@@ -112,7 +112,7 @@ DEX5_1 = HandModel(
     # and fingers less one in each finger, and what a finger of four joints shares is its two outer
     # ones. Uncertain.
     shared_motors=((2, 3), (6, 7), (10, 11), (14, 15)),
-    requirements=("dex5.toml", "dex5_client.toml"),
+    requirements=("dex5.toml",),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
     wrong_hands=Lazy("dexkit.conformance.mutants.dex5"),
