@@ -1,4 +1,5 @@
-"""Backends by name: the entry-point group ``dexkit.backends`` and ``package.module:Object``.
+"""Backends by name: the entry-point group ``dexkit.backends``, the simulated hands of the profiles
+in dexkit, and ``package.module:Object``.
 
 A backend is a :class:`Backend`: a description and a factory that makes a
 :class:`~dexkit.hand.Hand` from :class:`BackendOptions`. A plug-in package registers one under
@@ -19,13 +20,14 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dexkit import __version__
 from dexkit.errors import BackendBroken, BackendConflict, DexkitError, UnknownBackend, UsageError
 from dexkit.hand import Hand, HandSpec, Side
 from dexkit.lazy import Lazy
+from dexkit.models import BUILT_IN
 from dexkit.plugins import entry_points, import_object, is_own, origin, where
 
 if TYPE_CHECKING:
@@ -175,19 +177,42 @@ class BackendInfo:
     error: str = ""
 
 
-def _select(name: str, registered: Iterable[EntryPoint]) -> EntryPoint | None:
-    unique = {(e.value, origin(e)): e for e in registered if e.name == name}
-    entries = list(unique.values())
-    own = [e for e in entries if is_own(e)]
+@dataclass(frozen=True, order=True)
+class _Registered:
+    """A name and what it stands for; dexkit's own come first.
+
+    :param origin: distribution that registered it, with its version.
+    :param target: ``package.module:Object``.
+    """
+
+    foreign: bool
+    name: str
+    target: str
+    origin: str
+
+
+def _registered() -> list[_Registered]:
+    """Every backend that has a name, once."""
+    found = {_Registered(not is_own(e), e.name, e.value, origin(e)) for e in entry_points(GROUP)}
+    for model in BUILT_IN:
+        if model.simulated_by:
+            target = model.simulated_by.target
+            found.add(_Registered(False, model.simulator, target, f"dexkit {__version__}"))
+    return sorted(found)
+
+
+def _select(name: str, registered: Iterable[_Registered]) -> _Registered | None:
+    entries = [e for e in registered if e.name == name]
+    own = [e for e in entries if not e.foreign]
     if own and len(entries) > len(own):
-        others = ", ".join(origin(e) for e in entries if not is_own(e))
+        others = ", ".join(e.origin for e in entries if e.foreign)
         raise BackendConflict(
             f"backend {name!r} is built in, and {others} registers the same name",
             hint=f"uninstall that package, or name its hand as package.module:Object "
             f"instead of {name!r}",
         )
     if len(entries) > 1 and not own:
-        owners = ", ".join(origin(e) for e in entries)
+        owners = ", ".join(e.origin for e in entries)
         raise BackendConflict(
             f"backend {name!r} is registered by more than one package: {owners}",
             hint="uninstall one, or name the hand as package.module:Object",
@@ -288,7 +313,7 @@ def backend(name: str) -> Backend:
         if here not in sys.path and "" not in sys.path:
             sys.path.append(here)
         return _load(name)
-    registered = entry_points(GROUP)
+    registered = _registered()
     entry = _select(name, registered)
     if entry is None:
         known = ", ".join(sorted({e.name for e in registered})) or "none"
@@ -296,23 +321,20 @@ def backend(name: str) -> Backend:
             f"no backend {name!r}",
             hint=f"installed: {known}; see 'dexkit backends', or give package.module:Object",
         )
-    return _load(entry.value)
+    return _load(entry.target)
 
 
 def list_backends() -> list[BackendInfo]:
     """Every registered backend, built-in and plug-in, with its error if it cannot be used."""
     rows = []
-    registered = entry_points(GROUP)
-    for entry in sorted(
-        {(e.name, e.value, origin(e)): e for e in registered}.values(),
-        key=lambda e: (not is_own(e), e.name),
-    ):
+    registered = _registered()
+    for entry in registered:
         loaded: Backend | None = None
         error = ""
         try:
             _select(entry.name, registered)
-            loaded = _load(entry.value)
+            loaded = _load(entry.target)
         except (BackendBroken, BackendConflict) as exc:
             error = exc.message
-        rows.append(BackendInfo(entry.name, origin(entry), entry.value, loaded, error))
+        rows.append(BackendInfo(entry.name, entry.origin, entry.target, loaded, error))
     return rows

@@ -71,6 +71,7 @@ BRAINCO_REVO2 = HandModel(
     roles=JointRoles(driven=(), slow=(0, 3)),
     objects={Side.RIGHT: 60.0},
     simulator="sim-brainco",
+    simulated_by=Lazy("dexkit.emulators.sim_brainco:sim_brainco"),
     # ring and little finger move as the middle one does
     fingers=("thumb", "thumb", "index", "middle", "middle", "middle"),
     client_forks=True,

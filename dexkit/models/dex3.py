@@ -126,6 +126,7 @@ DEX3_1 = HandModel(
     objects={Side.RIGHT: 60.0},
     session="dex3_pinch",
     simulator="sim-dex3",
+    simulated_by=Lazy("dexkit.emulators.sim_dex3:sim_dex3"),
     scored_hands=ScoredHands(quick=40, default=40, thorough=10),
     fingers=3 * ("thumb",) + 2 * ("middle",) + 2 * ("index",),
     client_forks=True,

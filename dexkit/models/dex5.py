@@ -123,6 +123,7 @@ DEX5_1 = HandModel(
     objects={Side.RIGHT: 60.0},
     session="dex5_synthetic",
     simulator="sim-dex5",
+    simulated_by=Lazy("dexkit.emulators.sim_dex5:sim_dex5"),
     # ring and little finger move as the middle one does
     fingers=4 * ("index",) + 12 * ("middle",) + 4 * ("thumb",),
     client_forks=True,

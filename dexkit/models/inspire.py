@@ -59,6 +59,7 @@ INSPIRE_DFX = HandModel(
     roles=JointRoles(driven=(), slow=(1, 3)),
     objects={Side.RIGHT: 60.0},
     simulator="sim-inspire-dfx",
+    simulated_by=Lazy("dexkit.emulators.sim_inspire:sim_inspire_dfx"),
     # ring and little finger move as the middle one does
     fingers=("middle", "middle", "middle", "index", "thumb", "thumb"),
     client_forks=True,
@@ -121,5 +122,6 @@ INSPIRE_FTP = replace(
     requirements=("inspire_ftp.toml",),
     reference=Lazy("dexkit.conformance.virtual.inspire:FtpService"),
     simulator="sim-inspire-ftp",
+    simulated_by=Lazy("dexkit.emulators.sim_inspire:sim_inspire_ftp"),
     client_option="inspire_ftp",
 )

@@ -20,6 +20,7 @@ from dexkit.hand import HandSpec, JointMode, JointSpec, Side, Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
+    from dexkit.backends import Backend
     from dexkit.conformance.stimuli.script import Script
     from dexkit.conformance.virtual import Service
     from dexkit.kinematics import Skeleton
@@ -313,6 +314,8 @@ class HandModel:
     :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
     :param shared_motors: joints that one motor moves, by index; the others have one each.
     :param simulator: name of the backend that simulates it, with the setting ``object``; or empty.
+    :param simulated_by: that backend, of a model of dexkit itself; another package registers its
+        by an entry point of ``dexkit.backends``.
 
     **Teleoperation.**
 
@@ -373,6 +376,7 @@ class HandModel:
     joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
     shared_motors: tuple[tuple[int, ...], ...] = ()
     simulator: str = ""
+    simulated_by: Lazy[Backend] | None = None
     client: Lazy[type[TeleopClient]] = _FINGER_CLIENT
     operator_profiles: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = _FINGER_PROFILES
     fingers: tuple[str, ...] = ()
