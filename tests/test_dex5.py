@@ -1,10 +1,11 @@
 """Test the Dex5-1: joints, dialect, simulated hand, client and synthetic session.
 
-``python -m tests.test_dex5`` writes the session to traces/samples again.
+``python -m tests.test_dex5`` writes the session and its labels to traces/samples again.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from itertools import islice
 from pathlib import Path
@@ -29,7 +30,7 @@ from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.client_codec import ClientCodec
 from dexkit.topics import roles
-from dexkit.traces import Recorder, open_trace, sample_path
+from dexkit.traces import Recorder, open_trace, sample_path, samples
 
 DEX5 = dialect("dex5")
 STATES, COMMANDS = message_type(DEX5.state_type), message_type(DEX5.cmd_type)
@@ -319,4 +320,14 @@ def test_synthetic_session_is_judged_as_dex5() -> None:
 
 
 if __name__ == "__main__":
-    write(sample_path("dex5_synthetic"))
+    session = Path(samples.__file__).with_name("dex5_synthetic.mcap")
+    write(session)
+    labels = session.with_name("labels.json")
+    every = json.loads(labels.read_text())
+    operator_starts = CLIENT_STARTS + profile(PROFILE, DEX5_1.name).lead_in
+    every[session.name] = {
+        "first_message_ns": open_trace(session).first_ns,
+        "operator_zero_ns": EPOCH_NS + round(operator_starts * 1e9),
+        "events": [],
+    }
+    labels.write_text(json.dumps(every, indent=1) + "\n")

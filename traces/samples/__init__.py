@@ -14,18 +14,11 @@ from dexkit.errors import UsageError
 
 __all__ = ["SAMPLES", "SampleEvent", "SampleLabels", "sample_labels", "sample_path"]
 
-#: Names of the shipped recordings.
-SAMPLES: tuple[str, ...] = (
-    "dex1_pick_place",
-    "dex1_idle_then_startle",
-    "dex1_hand_dropout",
-    "dex1_legacy_v1_1",
-    "dex3_pinch",
-    "brainco_grip",
-    "inspire_dfx_grip",
-    "inspire_ftp_grip",
-    "dex5_synthetic",
+_FOLDER = resources.files(__name__)
+SAMPLES: tuple[str, ...] = tuple(
+    sorted(f.name[:-5] for f in _FOLDER.iterdir() if f.name.endswith(".mcap"))
 )
+"""Names of the shipped recordings: those in this folder."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +56,7 @@ def sample_path(name: str) -> Path:
 
     :raises UsageError: there is none of that name.
     """
-    return Path(str(resources.files(__name__) / f"{_check(name)}.mcap"))
+    return Path(str(_FOLDER / f"{_check(name)}.mcap"))
 
 
 def sample_labels(name: str) -> SampleLabels:
@@ -72,7 +65,7 @@ def sample_labels(name: str) -> SampleLabels:
     :raises UsageError: there is none of that name.
     """
     stem = _check(name)
-    text = (resources.files(__name__) / "labels.json").read_text(encoding="utf-8")
+    text = (_FOLDER / "labels.json").read_text(encoding="utf-8")
     entry = json.loads(text)[f"{stem}.mcap"]
     return SampleLabels(
         first_message_ns=entry["first_message_ns"],
