@@ -87,7 +87,7 @@ class TestCommandLine:
         error = result.exception
         assert isinstance(error, UsageError)
         assert error.exit_code == 2
-        hands = "dex1-1, dex3-1, dex5-1, brainco-revo2, inspire-dfx, inspire-ftp"
+        hands = ", ".join(hand.name for hand in BUILT_IN)
         assert error.hint == f"known: {hands}, h1, g1"
 
     def test_json_is_complete_and_documented(self) -> None:

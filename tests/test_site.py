@@ -23,9 +23,17 @@ LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 def test_every_document_is_in_the_navigation() -> None:
     text = (ROOT / "tools/site/mkdocs.yml").read_text()
     listed = {name for name in NAV.findall(text) if "/index" not in name} - {"index.md"}
+    listed |= set(hooks.hand_pages())
     docs = {str(p.relative_to(ROOT / "docs")) for p in (ROOT / "docs").rglob("*.md")}
     assert docs - listed == set()
     assert {name for name in listed - docs if not name.startswith(("api", "requirements"))} == set()
+
+
+def test_pages_of_hands_are_added_to_the_navigation_once() -> None:
+    config = {"nav": ["index.md", {"Hands and robots": ["models.md", "dex3.md"]}]}
+    (_, section) = hooks.on_config(config)["nav"]
+    pages = ["models.md", "dex3.md", "dex5.md", "brainco.md", "inspire.md"]
+    assert section == {"Hands and robots": pages}
 
 
 @pytest.fixture(scope="module")

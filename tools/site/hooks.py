@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.models import BUILT_IN
 from tools.generate.requirement_pages import PAGES, catalogue_entry
 
-__all__ = ["on_files", "on_page_content", "on_page_markdown"]
+__all__ = ["on_config", "on_files", "on_page_content", "on_page_markdown"]
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+HANDS = "Hands and robots"
 API = {
     "dexkit.hand": "Hands: joints, states, commands",
     "dexkit.backends": "Backends",
@@ -29,6 +31,19 @@ API = {
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 _ROLE = re.compile(r":(?:class|mod|func|meth|data|attr|exc):<code>~?(\.?[\w.]*\.)?~?([^<]*)</code>")
 _CODE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
+
+
+def on_config(config: Any) -> Any:
+    """Add the pages of hands to their section."""
+    (section,) = (s[HANDS] for s in config["nav"] if HANDS in s)
+    section += [page for page in hand_pages() if page not in section]
+    return config
+
+
+def hand_pages() -> list[str]:
+    """The page of each model that has one of its own, ``dex5.md`` of a Dex5-1."""
+    names = (f"{hand.short_name}.md" for hand in BUILT_IN)
+    return [name for name in names if (ROOT / "docs" / name).exists()]
 
 
 def on_files(files: Any, config: Any) -> Any:
