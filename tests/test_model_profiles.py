@@ -270,11 +270,21 @@ def test_the_simulated_example_is_driven_by_the_model_of_the_client(example: Pac
     assert "pinch" in {p.name for p in profiles_for(NAME)}
 
 
+WRONG_TYPES = """
+    dialects=(
+        replace(DEX5_1.dialects[0], name="bad", model="bad-1", state_type="a::B_"),
+    ),
+"""
 BAD_PROFILE = """
 from dataclasses import replace
 from dexkit.models import DEX5_1, DEX3_1
 MODEL = replace(DEX5_1, name="bad-1", {change})
 """
+
+
+def test_profiles_of_dexkit_meet_what_is_asked_of_others() -> None:
+    for hand in BUILT_IN:
+        assert dexkit.models._checked(hand, hand.name) is hand
 
 
 @pytest.mark.parametrize(
@@ -290,6 +300,7 @@ MODEL = replace(DEX5_1, name="bad-1", {change})
         ("bad-1", BAD_PROFILE.format(change=""), "its dialect dex5 is of 'dex5-1'"),
         ("bad-1", BAD_PROFILE.format(change="joints={}"), "it has no joints"),
         ("bad-1", BAD_PROFILE.format(change="rest_q=DEX3_1.rest_q"), "rest_q of the left hand"),
+        ("bad-1", BAD_PROFILE.format(change=WRONG_TYPES), "has to use the types unitree_hg"),
     ],
 )
 def test_a_broken_model_says_why_and_affects_no_other(

@@ -67,11 +67,6 @@ GROUP = "dexkit.models"
 BUILT_IN = (DEX1_1, DEX3_1, DEX5_1, BRAINCO_REVO2, INSPIRE_DFX, INSPIRE_FTP)
 """The models of dexkit itself."""
 
-_HAND_TYPES = (
-    ("unitree_hg::msg::dds_::HandCmd_", "unitree_hg::msg::dds_::HandState_"),
-    ("unitree_go::msg::dds_::MotorCmds_", "unitree_go::msg::dds_::MotorStates_"),
-)
-"""Types of commands and states of hands of several joints; the latter for position servos."""
 _lock = threading.RLock()
 
 
@@ -134,6 +129,16 @@ def _load_plugins() -> tuple[ModelPlugin, ...]:
     return tuple(found)
 
 
+def _types_of_hands(position_servo: bool) -> list[tuple[str, str]]:
+    """The types of commands and states of those hands of several joints that dexkit has.
+
+    Only these can be encoded: the conformance kit reads them by a table of its own, independently.
+    """
+    spoken = (d for m in BUILT_IN for d in m.dialects if not d.is_gripper)
+    pairs = ((d.cmd_type, d.state_type) for d in spoken if d.position_servo == position_servo)
+    return list(dict.fromkeys(pairs))
+
+
 def _checked(value: object, name: str) -> HandModel:
     """The profile, if it can be used.
 
@@ -159,10 +164,11 @@ def _checked(value: object, name: str) -> HandModel:
     require(bool(value.dialects), "it has no dialect")
     for each in value.dialects:
         require(each.model == name, f"its dialect {each.name} is of {each.model!r}")
+        pairs = _types_of_hands(each.position_servo)
         require(
-            each.is_gripper or (each.cmd_type, each.state_type) == _HAND_TYPES[each.position_servo],
+            each.is_gripper or (each.cmd_type, each.state_type) in pairs,
             f"its dialect {each.name} has to use the types "
-            f"{' and '.join(_HAND_TYPES[each.position_servo])}",
+            f"{', or '.join(' and '.join(pair) for pair in pairs)}",
         )
     if not value.dialects[0].is_gripper:
         require(value.roles is not None, "it has no joint roles")
