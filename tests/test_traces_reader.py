@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType
 
 from dexkit.errors import TraceError, TraceUnreadable, TraceUnsupported, UsageError
-from dexkit.traces import SAMPLES, open_trace, sample_labels, sample_path
+from dexkit.traces import SAMPLES, Trace, open_trace, sample_labels, sample_path
 from dexkit.traces import reader as reader_module
 from dexkit.traces.names import dds_topic, dds_type, select_topics
 from tests.each import each
@@ -54,8 +54,12 @@ def as_rows(path: Path) -> list[Row]:
 
 # -- the shipped recordings ----------------------------------------------------------------------
 
-SYNTHETIC = ("dex5_synthetic",)  # never on DDS
-RECORDED_BY_DEXKIT = (*SYNTHETIC, "brainco_grip", "inspire_dfx_grip", "inspire_ftp_grip")
+RECORDED_BY_DEXKIT = ("brainco_grip", "inspire_dfx_grip", "inspire_ftp_grip")
+
+
+def synthetic(trace: Trace) -> bool:
+    """Whether its messages were never on DDS."""
+    return trace.metadata["provenance"]["controller_commit"].startswith("none")
 
 
 def readme_tables() -> dict[str, dict[str, list[float]]]:
@@ -81,10 +85,11 @@ def test_a_sample_holds_what_its_readme_says(name: str) -> None:
     assert trace.topics == sorted(table)
     assert trace.first_ns == sample_labels(name).first_message_ns
     loaded = trace.load()
+    ours = name in RECORDED_BY_DEXKIT or synthetic(trace)
     for channel in trace.channels:
         count, hz, p50, p99, worst, first = table[channel.topic]
         assert channel.supported
-        assert channel.schema_encoding == ("ros2msg" if name in RECORDED_BY_DEXKIT else "omgidl")
+        assert channel.schema_encoding == ("ros2msg" if ours else "omgidl")
         assert channel.message_count == count
         times = loaded[channel.topic].log_time_ns
         gaps = np.diff(times) / 1e6
@@ -114,7 +119,7 @@ def test_a_sample_names_its_provenance_and_its_endpoints(name: str) -> None:
     trace = open_trace(sample_path(name))
     assert trace.metadata["provenance"]["controller_commit"]
     endpoints = trace.endpoints
-    assert {e.topic for e in endpoints} == (set() if name in SYNTHETIC else set(trace.topics))
+    assert {e.topic for e in endpoints} == (set() if synthetic(trace) else set(trace.topics))
     for endpoint in endpoints:
         expected = "reliable" if endpoint.kind == "writer" else "best_effort"
         assert endpoint.reliability == expected
