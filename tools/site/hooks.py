@@ -41,7 +41,7 @@ def on_config(config: Any) -> Any:
 
 
 def hand_pages() -> list[str]:
-    """The page of each model that has one of its own, ``dex5.md`` of a Dex5-1."""
+    """The page of each model that has one by its short name: ``dex3.md``."""
     names = (f"{hand.short_name}.md" for hand in BUILT_IN)
     return [name for name in names if (ROOT / "docs" / name).exists()]
 
