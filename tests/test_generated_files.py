@@ -32,6 +32,7 @@ def test_every_generator_contributes() -> None:
         "docs/layouts/foxglove-dex3-1.json",
         "docs/layouts/plotjuggler-dex3-1.xml",
         "docs/models.md",
+        "docs/mutants.md",
     }
 
 

@@ -3,7 +3,8 @@
 =============================  ==================================================================
 :mod:`~.message_modules`       dexkit/messages/unitree_*.py, from dexkit/messages/idl/*.idl
 :mod:`~.models_page`           docs/models.md and docs/images/model-*.svg, from the model profiles
-:mod:`~.requirement_pages`     the catalogues in docs/conformance*.md, from the requirement files
+:mod:`~.requirement_pages`     the catalogues in docs/conformance*.md and the areas in
+                               docs/mutants.md, from the requirement files
 :mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
 :mod:`~.doctor_page`           the table of docs/doctor.md, from the doctor's diagnoses
 :mod:`~.conformity_page`       docs/conformity.md, from conformity.toml

@@ -1,4 +1,5 @@
-"""The requirement catalogues in docs/conformance*.md, one page per layer.
+"""The requirement catalogues in docs/conformance*.md, one page per layer, and the table of areas in
+docs/mutants.md.
 
 Of a requirement that is like another one, only the differences are written.
 """
@@ -11,13 +12,16 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dexkit.conformance.mutants import mutants
-from dexkit.conformance.requirements import Kind, Requirement, catalogue, renamed
+from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue, renamed
+from dexkit.models import BUILT_IN
 from tools.generate import DOCS
 
-__all__ = ["PAGES", "catalogue_entry", "catalogue_page", "files"]
+__all__ = ["PAGES", "area_table", "catalogue_entry", "catalogue_page", "files"]
 
 _BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
 _END = "<!-- end of catalogue -->"
+_AREAS = "<!-- areas: made from conformance/requirements, do not edit -->"
+_END_AREAS = "<!-- end of areas -->"
 
 
 _CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z])([\d-]*))")
@@ -129,11 +133,34 @@ def _judged_from(requirement: Requirement) -> str:
     return f"{where}, in {' and '.join(requirement.dialects)}"
 
 
+def area_table() -> str:
+    """Markdown of the areas that each model has not, of those in which a hand can fail or warn."""
+    has = {
+        hand.name: dict.fromkeys(
+            r.id.split("-")[1] for r in catalogue(hand.name) if r.level is not Level.INFO
+        )
+        for hand in BUILT_IN
+    }
+    every = dict.fromkeys(area for areas in has.values() for area in areas)
+    lines = ["", "| model | prefix | has not |", "| --- | --- | --- |"]
+    for name, areas in has.items():
+        prefix = catalogue(name)[0].id.partition("-")[0]
+        absent = ", ".join(area for area in every if area not in areas)
+        lines.append(f"| {name} | {prefix} | {absent} |")
+    return "\n".join([*lines, ""])
+
+
 def files() -> dict[Path, str]:
-    """The pages with their catalogues generated."""
-    made = {}
-    for layer, name in PAGES.items():
-        text = (DOCS / name).read_text(encoding="utf-8")
-        head, tail = text[: text.index(_BEGIN) + len(_BEGIN)], text[text.index(_END) :]
-        made[DOCS / name] = f"{head}\n{catalogue_page(layer)}\n{tail}"
-    return made
+    """The pages with their catalogues and tables generated."""
+    made = {
+        DOCS / name: _filled(name, _BEGIN, catalogue_page(layer), _END)
+        for layer, name in PAGES.items()
+    }
+    return {**made, DOCS / "mutants.md": _filled("mutants.md", _AREAS, area_table(), _END_AREAS)}
+
+
+def _filled(name: str, begin: str, content: str, end: str) -> str:
+    """The text of a page with this content between two lines of it."""
+    text = (DOCS / name).read_text(encoding="utf-8")
+    head, tail = text[: text.index(begin) + len(begin)], text[text.index(end) :]
+    return f"{head}\n{content}\n{tail}"
