@@ -63,15 +63,21 @@ def synthetic(trace: Trace) -> bool:
 
 
 def readme_tables() -> dict[str, dict[str, list[float]]]:
-    """The tables of samples/README.md, whose figures were taken by the capture itself."""
-    text = (sample_path(SAMPLES[0]).parent / "README.md").read_text()
+    """The tables of samples/README.md and of the hands' pages, whose figures were taken by the
+    capture itself.
+    """
+    pages = sorted((Path(__file__).parent.parent / "docs").glob("*.md"))
+    readme = sample_path(SAMPLES[0]).parent / "README.md"
+    text = "".join(page.read_text(encoding="utf-8") for page in (readme, *pages))
     tables: dict[str, dict[str, list[float]]] = {}
     name = ""
     for line in text.splitlines():
-        if match := re.match(r"### (\w+)", line):
+        if match := re.match(rf"###? ({'|'.join(SAMPLES)}) \(", line):
             name = match.group(1)
             tables[name] = {}
-        elif match := re.match(r"\| `(rt/\S+)` \|(.*)\|$", line):
+        elif line.startswith("#"):
+            name = ""
+        elif name and (match := re.match(r"\| `(rt/\S+)` \|(.*)\|$", line)):
             tables[name][match.group(1)] = [float(v) for v in match.group(2).split("|")]
     return tables
 
