@@ -34,6 +34,7 @@ from dexkit.conformance.requirements import Kind
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.session import SuiteOptions, judge_recording
+from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.errors import UsageError
@@ -302,8 +303,9 @@ def write_hand_on_usb(recorder: Recorder) -> str:
     """Record a good Dex3-1 whose USB device sends old checksums."""
     plan = replace(plan_for("dex3", sides=(Side.LEFT,)), phases=frozenset[str]())
     write_trace(run_virtual(plan, DEX3_1.reference.load()), recorder)
-    (usb,) = run_virtual_usb(StaleCrc(Side.LEFT)).sides.values()
-    write_usb(usb, recorder)
+    usb = UsbRecording.decode(run_virtual_usb(StaleCrc(Side.LEFT)))
+    assert usb is not None
+    write_usb(usb.sides[Side.LEFT], recorder)
     return "DEX3USB-CRC-01"
 
 

@@ -51,8 +51,8 @@ CAPABILITIES: Mapping[str, str] = {
     "acceleration": "ddq is measured",
     "temperature": "temperatures are measured",
     "voltage": "the supply voltage is measured",
-    "pressure": "fingers and palm feel pressure",
-    "imu": "the hand knows its attitude",
+    "pressure": "fingers and palm measure pressure",
+    "imu": "the hand measures its attitude",
     "low_rate": "a second, slow topic with the state",
     "timeout": "motors that ask for it brake when commands end (bit 7 of the mode byte)",
 }
