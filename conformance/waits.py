@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.rows import Rows
+from dexkit.conformance.row_selection import Rows
 from dexkit.conformance.sums import total
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported

@@ -25,7 +25,7 @@ from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.brainco import BrainCoService
 from dexkit.conformance.virtual.fingers import FingerHand
-from dexkit.doctor.ways import Course, moves_against, swapped
+from dexkit.doctor.motion_direction import Course, moves_against, swapped
 from dexkit.emulators.sim_brainco import SimBrainCo, sim_brainco
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Floats, Hand, HandCommand, HandState, Side

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks.afterwards import fastest
+from dexkit.conformance.checks.after_disturbances import fastest
 from dexkit.conformance.checks.motion import Step
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge

@@ -7,7 +7,7 @@ import pytest
 
 from dexkit.conformance.checks.tracking import _best_delay
 from dexkit.conformance.excess import Course, Excess
-from dexkit.conformance.rows import SomeTimes, Times
+from dexkit.conformance.row_selection import SomeTimes, Times
 from dexkit.hand import Floats
 
 LAG, PART, LONGEST = 0.04, 0.15, 0.02

@@ -38,7 +38,7 @@ from dexkit.service.dialects import StateView, dialect_map
 from dexkit.topics import roles
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.streams import _streams
-from dexkit.view.texts import hand_table
+from dexkit.view.html_tables import hand_table
 from dexkit.watch import Collector, Picture, SubjectView
 from dexkit.watch.fields import parts_of
 from dexkit.watch.recorded import feed

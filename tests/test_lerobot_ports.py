@@ -20,9 +20,9 @@ from dexkit.cli import cli
 from dexkit.clock import ManualClock
 from dexkit.dds import DdsNode, Reader
 from dexkit.emulators.lerobot import LerobotPorts, Ports
-from dexkit.emulators.lerobot.body import MOST, command_from, state_json
 from dexkit.emulators.lerobot.camera import CAMERA, SIZE, camera_json, moving_cards
 from dexkit.emulators.lerobot.freshness import CommandStream
+from dexkit.emulators.lerobot.low_level_json import MOST, command_from, state_json
 from dexkit.errors import EmulatorError, WireError
 from dexkit.messages import message_type
 from dexkit.messages.unitree_hg import IMUState_, LowState_, MotorState_

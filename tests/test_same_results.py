@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.checks import timing
 from dexkit.conformance.median import median, medians, percentile
-from dexkit.conformance.rows import finite_rows
+from dexkit.conformance.row_selection import finite_rows
 
 _COLUMNS = st.lists(st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 1e-300, math.nan]))
 

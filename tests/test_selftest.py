@@ -23,7 +23,7 @@ from dexkit.conformance.report.selftest import findings, render_selftest
 from dexkit.conformance.selftest import measure
 from dexkit.conformance.selftest.bench import LEAD, Setup
 from dexkit.conformance.selftest.external import ExternalHandCodec
-from dexkit.conformance.selftest.figures import KINDS, Figure
+from dexkit.conformance.selftest.figure_limits import KINDS, Figure
 from dexkit.conformance.selftest.live import run
 from dexkit.conformance.selftest.machine import End, SelfTest
 from dexkit.conformance.selftest.measure import Rest

@@ -31,7 +31,7 @@ from dexkit.errors import (
 )
 from dexkit.setup_dds import advice, execute, inspect_machine, pinned_wheel, plan, probe
 from dexkit.setup_dds.facts import Distribution, Installed, Interpreter, Library, Machine
-from dexkit.setup_dds.running import Done, Interrupted, ProcessRunner
+from dexkit.setup_dds.process_runner import Done, Interrupted, ProcessRunner
 from dexkit.stop_signals import StopRequest
 from tests import optional
 from tests.each import each

@@ -26,13 +26,13 @@ from dexkit.hand import MotorError, Side
 from dexkit.messages import encode, unitree_go
 from dexkit.models import INSPIRE_DFX
 from dexkit.traces import open_trace, sample_path
+from dexkit.view.html_tables import hand_table, time_strip, topics_table
 from dexkit.view.process import viewer
 from dexkit.view.sources import Recorded
-from dexkit.view.texts import hand_table, time_strip, topics_table
 from dexkit.view.thin import common_times, thin
 from dexkit.view.transport import Transport
 from dexkit.watch import Collector, Mark
-from dexkit.watch.texts import seconds
+from dexkit.watch.number_format import seconds
 from tests.cli_helpers import running
 from tests.patience import PATIENCE
 from tests.watch_helpers import closing_hands, ns

@@ -5,10 +5,10 @@ without evidence, and takes every limit from its requirement's tolerances, so th
 share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
 :mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.velocity`,
 :mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.firmness`, :mod:`~.grip`, :mod:`~.safety`,
-:mod:`~.afterwards`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`, :mod:`~.fingers`,
-:mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints, :mod:`~.touch` for a topic of
-tactile areas, :mod:`~.servos` and :mod:`~.servo_force` for position servos, and
-:mod:`~.client` for the client that drives them.
+:mod:`~.after_disturbances`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`,
+:mod:`~.fingers`, :mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints,
+:mod:`~.touch` for a topic of tactile areas, :mod:`~.servos` and :mod:`~.servo_force` for position
+servos, and :mod:`~.client` for the client that drives them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
-from dexkit.conformance.rows import Selected, finite_rows
+from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
 

@@ -18,7 +18,7 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.excess import Course
 from dexkit.conformance.median import median
-from dexkit.conformance.rows import Rows, SomeTimes, Times, finite_rows
+from dexkit.conformance.row_selection import Rows, SomeTimes, Times, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model

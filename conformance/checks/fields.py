@@ -12,7 +12,7 @@ from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import joints_of
-from dexkit.conformance.rows import Times
+from dexkit.conformance.row_selection import Times
 from dexkit.hand import Floats
 
 Windows: TypeAlias = tuple[NDArray[np.intp], NDArray[np.intp], Floats]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.rows import Rows
+from dexkit.conformance.row_selection import Rows
 from dexkit.hand import Floats, JointMode
 
 __all__ = ["Press", "torque_scales", "worst_of"]

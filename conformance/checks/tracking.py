@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.checks.motion import own_speed, speed_of, steps_of
-from dexkit.conformance.rows import Selected, finite_rows
+from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
 

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import FOUGHT_OVER, filled
-from dexkit.conformance.rows import Rows, Selected, Times
+from dexkit.conformance.row_selection import Rows, Selected, Times
 from dexkit.hand import Floats
 
 __all__: list[str] = []

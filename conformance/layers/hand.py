@@ -113,7 +113,7 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
             *("discovery", "timing", "fields", "members", "motion", "force", "consistency"),
             *("velocity", "drive", "safety", "lifecycle", "tracking", "fingers", "each_joint"),
             *("pressure", "operator", "uncommanded", "servos", "servo_force", "touch"),
-            *("firmness", "grip", "afterwards"),
+            *("firmness", "grip", "after_disturbances"),
         )
     ),
     plots=(Plot(PlotKind.POSITION),),

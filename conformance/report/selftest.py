@@ -13,7 +13,7 @@ from dexkit.conformance.report.curves import STYLE
 from dexkit.conformance.report.html import document, utc
 from dexkit.conformance.report.tables import table, unbroken
 from dexkit.conformance.selftest.bench import Series
-from dexkit.conformance.selftest.figures import BY_NAME, KINDS, Figure, Unit, Wear
+from dexkit.conformance.selftest.figure_limits import BY_NAME, KINDS, Figure, Unit, Wear
 from dexkit.conformance.selftest.result import (
     Condition,
     ElementResponse,

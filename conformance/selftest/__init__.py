@@ -6,6 +6,6 @@ states; :mod:`~dexkit.conformance.selftest.procedure` is the order of the tests;
 :mod:`~dexkit.conformance.selftest.machine` adds the supervision. None of them has a clock, a device
 or DDS: time is the states' stamps. :mod:`~dexkit.conformance.selftest.live` runs them on a
 :class:`~dexkit.hand.Hand`, :mod:`~dexkit.conformance.selftest.external` is a hand on DDS.
-:mod:`~dexkit.conformance.selftest.figures` judges, :mod:`~dexkit.conformance.selftest.result` is
-the file.
+:mod:`~dexkit.conformance.selftest.figure_limits` judges,
+:mod:`~dexkit.conformance.selftest.result` is the file.
 """

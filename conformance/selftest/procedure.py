@@ -16,7 +16,7 @@ import numpy as np
 from dexkit.command_age import PAUSE
 from dexkit.conformance.selftest import measure
 from dexkit.conformance.selftest.bench import SETTLE, Bench, Series, Setup, T, Turns
-from dexkit.conformance.selftest.figures import BY_NAME
+from dexkit.conformance.selftest.figure_limits import BY_NAME
 from dexkit.conformance.selftest.measure import Rest
 from dexkit.hand import Floats, HandCommand, HandState, JointSpec
 from dexkit.models import model
@@ -52,7 +52,7 @@ _TOUCH_PATIENCE = 60.0  # seconds without a new element
 class JointFound:
     """Findings about a joint; NaN where it was not measured.
 
-    :ivar figures: by name (:data:`dexkit.conformance.selftest.figures.KINDS`).
+    :ivar figures: by name (:data:`dexkit.conformance.selftest.figure_limits.KINDS`).
     :ivar moves: names of the joints that move when it is commanded.
     :ivar notes: what a reader has to know about its figures.
     :ivar curves: by name.

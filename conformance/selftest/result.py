@@ -16,7 +16,7 @@ import numpy as np
 from dexkit import __version__, documents
 from dexkit.conformance.result_file import validate
 from dexkit.conformance.selftest.bench import Series
-from dexkit.conformance.selftest.figures import KINDS, Figure, Wear, judged
+from dexkit.conformance.selftest.figure_limits import KINDS, Figure, Wear, judged
 from dexkit.conformance.selftest.machine import End, SelfTest
 from dexkit.conformance.selftest.procedure import ElementFound, JointFound, Procedure
 from dexkit.errors import UsageError

@@ -20,7 +20,7 @@ from dexkit.escaping import REMARK, one_line
 if TYPE_CHECKING:
     from dexkit.setup_dds.facts import Installed, Machine
     from dexkit.setup_dds.plan import Plan
-    from dexkit.setup_dds.running import Runner
+    from dexkit.setup_dds.process_runner import Runner
 
 __all__ = ["command"]
 
@@ -74,7 +74,7 @@ def command(
     """
     from dexkit.setup_dds.execute import carry_out
     from dexkit.setup_dds.plan import Options, make_plan
-    from dexkit.setup_dds.running import Interrupted, ProcessRunner
+    from dexkit.setup_dds.process_runner import Interrupted, ProcessRunner
     from dexkit.stop_signals import stop_on_signals
 
     if no_install and wheel_folder is None:

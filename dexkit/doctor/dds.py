@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
-from dexkit.doctor.awaited import AWAITED
+from dexkit.doctor.awaited_topics import AWAITED
 from dexkit.doctor.link import percentile
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream

@@ -10,7 +10,7 @@ from rich.table import Column, Table
 
 from dexkit.console import Console
 from dexkit.console import markup as escape
-from dexkit.doctor.awaited import AWAITED
+from dexkit.doctor.awaited_topics import AWAITED
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Link, Observations
 from dexkit.doctor.rules import Readiness, Verdict

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
-from dexkit.doctor.awaited import AWAITED, Awaited, awaited
+from dexkit.doctor.awaited_topics import AWAITED, Awaited, awaited
 from dexkit.doctor.catalogue import DIAGNOSES, Finding, Severity
+from dexkit.doctor.motion_direction import Course, moves_against, swapped
 from dexkit.doctor.observations import (
     DomainView,
     Endpoint,
@@ -23,7 +24,6 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.topics import nearly, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
-from dexkit.doctor.ways import Course, moves_against, swapped
 from dexkit.hand import Side
 from dexkit.messages.earlier import EARLIER, earlier_by_hash
 from dexkit.models import DIALECTS, MODELS, Dialect

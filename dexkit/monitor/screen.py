@@ -13,7 +13,7 @@ from dexkit.escaping import one_line
 from dexkit.monitor.bars import ASCII, UNICODE, Signs, bar
 from dexkit.watch import Picture, SubjectView, TopicView
 from dexkit.watch.events import Event
-from dexkit.watch.texts import number, seconds, subject_name
+from dexkit.watch.number_format import number, seconds, subject_name
 
 __all__ = ["Shown", "hand_lines", "screen", "summary", "topic_lines"]
 

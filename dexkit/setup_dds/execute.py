@@ -18,7 +18,7 @@ from dexkit.setup_dds.advice import Cause, cause_of
 from dexkit.setup_dds.facts import BINDING, Installed, Library, Machine
 from dexkit.setup_dds.inspect_machine import library_at
 from dexkit.setup_dds.plan import Build, BuildSource, FromIndex, Keep, Plan
-from dexkit.setup_dds.running import Done, Runner
+from dexkit.setup_dds.process_runner import Done, Runner
 from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = ["build_environment", "carry_out", "check", "try_compiler"]

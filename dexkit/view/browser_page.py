@@ -18,11 +18,11 @@ from dexkit.hand import Subject
 from dexkit.kinematics import Skeleton
 from dexkit.robots import RobotModel
 from dexkit.view.drawing import places
+from dexkit.view.html_tables import hand_table, time_strip, topics_table
 from dexkit.view.sources import HISTORY, Source
-from dexkit.view.texts import hand_table, time_strip, topics_table
 from dexkit.view.transport import SPEEDS, Transport
 from dexkit.watch import Mark, Picture, SubjectView
-from dexkit.watch.texts import subject_name
+from dexkit.watch.number_format import subject_name
 
 try:
     import viser

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from dexkit.watch.collector import Collector, Picture, SubjectView, TopicView
-from dexkit.watch.texts import seconds, subject_name
+from dexkit.watch.number_format import seconds, subject_name
 
 __all__ = ["Event", "Events"]
 

@@ -2,8 +2,9 @@
 
 On a real G1 LeRobot's ``run_g1_server.py`` serves them: commands and states of the body as JSON
 over ZeroMQ, pictures of a camera. :class:`LerobotPorts` serves the same ones for an emulated G1:
-:mod:`~dexkit.emulators.lerobot.body` is the JSON, :mod:`~dexkit.emulators.lerobot.freshness`
-decides which commands count, :mod:`~dexkit.emulators.lerobot.camera` makes the pictures,
+:mod:`~dexkit.emulators.lerobot.low_level_json` is the JSON,
+:mod:`~dexkit.emulators.lerobot.freshness` decides which commands count,
+:mod:`~dexkit.emulators.lerobot.camera` makes the pictures,
 :mod:`~dexkit.emulators.lerobot.ports` has sockets and threads. See docs/lerobot.md.
 """
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from dexkit.clock import Clock, Rate, RealClock
 from dexkit.dds import DdsNode
-from dexkit.emulators.lerobot.body import MOST, command_from, state_json
 from dexkit.emulators.lerobot.camera import CAMERA, FPS, camera_json, moving_cards
 from dexkit.emulators.lerobot.freshness import CommandStream
+from dexkit.emulators.lerobot.low_level_json import MOST, command_from, state_json
 from dexkit.errors import EmulatorError, ExtraMissing, WireError
 from dexkit.robots import G1
 from dexkit.threads import Worker

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.emulators.joint_mechanics import FixedSteps
-from dexkit.emulators.robot.image import Image
+from dexkit.emulators.robot.c_struct_image import Image
 from dexkit.emulators.robot.joints import Joints, Law
 from dexkit.emulators.robot.settings import STEP, Remote, Settings
 from dexkit.emulators.robot.supply import PERIOD, Supply

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from dexkit.escaping import html as escape
 from dexkit.watch import SubjectView, TopicView
-from dexkit.watch.texts import number, seconds
+from dexkit.watch.number_format import number, seconds
 
 __all__ = ["hand_table", "time_strip", "topics_table"]
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from dexkit.conformance.rows import SomeTimes, Times, extremes
+from dexkit.conformance.row_selection import SomeTimes, Times, extremes
 from dexkit.conformance.sums import total
 
 SHIFTS = [(s, side) for s in (-0.3, -0.01, 0.0, 0.004, 0.04, 5.0) for side in ("left", "right")]
