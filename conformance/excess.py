@@ -44,21 +44,21 @@ class Course:
 
     :param times: of its measurements, rising.
     :param q: rad.
-    :param said: the integral of dq, rad.
+    :param dq_integral: the integral of dq, rad.
     :param path: the integral of its size, rad.
     :param lag: seconds by which dq may be early or late.
     :param part: of ``path`` that q may move beyond.
     :param longest: seconds; windows with a longer step between two measurements do not count.
     :param barred: begin and end, seconds, of what no window may overlap.
-    :param exactly: works out ``said`` and ``path`` as a window's excess is to be worked out from
-        them, where these differ from those that are given, by no more than sums round.
+    :param exactly: computes the ``dq_integral`` and ``path`` of which a window's excess is
+        computed, where these differ, by no more than rounding, from those that are given.
     """
 
     def __init__(
         self,
         times: SomeTimes,
         q: Floats,
-        said: Floats,
+        dq_integral: Floats,
         path: Floats,
         *,
         lag: float,
@@ -68,7 +68,7 @@ class Course:
         exactly: Callable[[], tuple[Floats, Floats]] | None = None,
     ) -> None:
         self.times, self.t = times, times.t
-        self.q, self.rough, self._exactly = q, (said, path), exactly
+        self.q, self.rough, self._exactly = q, (dq_integral, path), exactly
         self._lag, self._part, self._barred = lag, part, barred
         self._known: dict[float, Floats] = {}
         gap = np.diff(self.t) > longest
@@ -79,7 +79,7 @@ class Course:
         return self.rough if self._exactly is None else self._exactly()
 
     @property
-    def said(self) -> Floats:
+    def dq_integral(self) -> Floats:
         """The integral of dq, exactly."""
         return self._integrals[0]
 
@@ -146,20 +146,20 @@ class Course:
     def _allowed(
         self, starts: Rows, ends: Rows
     ) -> tuple[Floats, Floats, Rows | slice, Rows | slice]:
-        """Least and greatest of ``said`` around rows, and where those of starts and ends are."""
+        """Extremes of ``dq_integral`` around rows, and where those of starts and ends are."""
         n = len(starts)
         if n * _MANY > len(self.t):
             return *self._around, starts, ends
         at = self.t[np.concatenate((starts, ends))]
         first = np.searchsorted(self.t, at - self._lag)
         last = np.searchsorted(self.t, at + self._lag, "right")
-        return *extremes(self.said, first, last), slice(0, n), slice(n, 2 * n)
+        return *extremes(self.dq_integral, first, last), slice(0, n), slice(n, 2 * n)
 
     @cached_property
     def _around(self) -> tuple[Floats, Floats]:
-        """The least and greatest of ``said`` within the lag of each row."""
+        """The least and greatest of ``dq_integral`` within the lag of each row."""
         first = self.times.shifted(-self._lag)
-        return extremes(self.said, first, self.times.shifted(self._lag, "right"))
+        return extremes(self.dq_integral, first, self.times.shifted(self._lag, "right"))
 
     @cached_property
     def _blocks(self) -> _Blocks | None:
@@ -185,27 +185,29 @@ class _Blocks:
             table = padded.reshape(count, size).T.copy()  # long rows are compared much faster
             return table.min(axis=0), table.max(axis=0)
 
-        said, path = course.rough
+        dq_integral, path = course.rough
         q_low, q_high = bounds(course.q)
-        said_low, said_high = bounds(said)
+        dq_integral_low, dq_integral_high = bounds(dq_integral)
         # around every row of a block lie the blocks beside it, if they are near enough; if not
         # even the block itself does, the row does
         begins, ends = course.t[first], course.t[last]
         self._begins, self._numbers = begins, np.arange(float(count))
         near = lag * (1 - 1e-9) - 1e-9
-        least, most = said_low.copy(), said_high.copy()
+        least, most = dq_integral_low.copy(), dq_integral_high.copy()
         beside = ends[1:] - begins[:-1] <= near
-        least[1:] = np.where(beside, np.minimum(least[1:], said_low[:-1]), least[1:])
-        least[:-1] = np.where(beside, np.minimum(least[:-1], said_low[1:]), least[:-1])
-        most[1:] = np.where(beside, np.maximum(most[1:], said_high[:-1]), most[1:])
-        most[:-1] = np.where(beside, np.maximum(most[:-1], said_high[1:]), most[:-1])
+        least[1:] = np.where(beside, np.minimum(least[1:], dq_integral_low[:-1]), least[1:])
+        least[:-1] = np.where(beside, np.minimum(least[:-1], dq_integral_low[1:]), least[:-1])
+        most[1:] = np.where(beside, np.maximum(most[1:], dq_integral_high[:-1]), most[1:])
+        most[:-1] = np.where(beside, np.maximum(most[:-1], dq_integral_high[1:]), most[:-1])
         alone = ends - begins > near
-        least[alone], most[alone] = said_high[alone], said_low[alone]
+        least[alone], most[alone] = dq_integral_high[alone], dq_integral_low[alone]
         before, after = part * path[first], part * path[last]
         # of what ends in a block, and of what begins in one; see :meth:`bounds`
         self._end_up, self._end_down = q_high - most - before, q_low - least + before
         self._start_up, self._start_down = q_low - least - after, q_high - most + after
-        largest = max(float(np.abs(v).max()) for v in (q_low, q_high, said_low, said_high))
+        largest = max(
+            float(np.abs(v).max()) for v in (q_low, q_high, dq_integral_low, dq_integral_high)
+        )
         rounding = _ROUNDING + 4 * n * float(np.finfo(np.float64).eps)
         self._slack = rounding * (1 + largest + abs(float(path[-1])))
 

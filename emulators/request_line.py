@@ -33,7 +33,7 @@ class RequestDevice(Protocol):
     def advance_to(self, now: float) -> None:
         """Advance the device to ``now``."""
 
-    def strike(self, kind: str) -> None:
+    def apply_fault(self, kind: str) -> None:
         """Apply a fault kind specific to this device."""
 
 
@@ -106,7 +106,7 @@ class RequestLine(SerialLine, Generic[FrameT]):
                 self._apply_plug()
                 self._parser.reset()
             elif begins and not fault.lasting:
-                self.device.strike(fault.kind)
+                self.device.apply_fault(fault.kind)
 
     @property
     def busy(self) -> bool:

@@ -77,7 +77,7 @@ class Revo2(ServoDevice):
         self._limit = np.array([joint.tau_max for joint in joints])
         self.speeds = [FULL] * JOINTS
 
-    def strike(self, kind: str) -> None:
+    def apply_fault(self, kind: str) -> None:
         """Do nothing: the device has no fault kind of its own."""
         raise ValueError(kind)
 

@@ -82,7 +82,7 @@ class Rh56(ServoDevice):
         self._felt: tuple[Floats, bytes] | None = None
         self._drive()
 
-    def strike(self, kind: str) -> None:
+    def apply_fault(self, kind: str) -> None:
         """Apply the fault ``locked``."""
         if kind == "locked":
             self.lock()

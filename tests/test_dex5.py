@@ -250,7 +250,7 @@ def test_client_sends_same_commands_as_genuine_client() -> None:
     for motors in commands.values():
         assert {m.mode for m in motors} == {1}
         assert [(m.q, m.kp, m.kd) for m in motors] == [(0.2, kp, kd) for kp, kd in DEX5_1.gains]
-    assert {m.mode for m in client.parting(rest[LEFT])} == {0}
+    assert {m.mode for m in client.final_command(rest[LEFT])} == {0}
     with pytest.raises(UsageError, match="the client of a Dex5-1 hand is the same"):
         client_for("dex5", simulated=True)
 

@@ -29,23 +29,23 @@ def a_course(kind: str, seed: int, n: int = 3000) -> Course:
     rows = np.flatnonzero(rng.random(n) > 0.05)
     times = SomeTimes(Times(t), rows)
     q, speed, steps = q[rows], speed[rows], np.diff(t[rows])
-    said, path = (
+    integral, path = (
         np.concatenate(([0.0], np.cumsum((v[1:] + v[:-1]) / 2 * steps)))
         for v in (speed, np.abs(speed))
     )
     barred = [(2.0, 2.5)] if kind == "barred" else []
-    return Course(times, q, said, path, lag=LAG, part=PART, longest=LONGEST, barred=barred)
+    return Course(times, q, integral, path, lag=LAG, part=PART, longest=LONGEST, barred=barred)
 
 
 def every_window(course: Course, seconds: float, barred: list[tuple[float, float]]) -> Excess:
-    t, q, said = course.t, course.q, course.said
+    t, q, integral = course.t, course.q, course.dq_integral
     found = []
     for start, end in enumerate(np.searchsorted(t, t + seconds).tolist()):
         if end == len(t) or np.diff(t[start : end + 1]).max() > LONGEST:
             continue
         if t[end] - t[start] >= 2 * seconds:
             continue
-        near = [said[(t >= t[row] - LAG) & (t <= t[row] + LAG)] for row in (start, end)]
+        near = [integral[(t >= t[row] - LAG) & (t <= t[row] + LAG)] for row in (start, end)]
         moved = q[end] - q[start]
         beyond = max(
             moved - (near[1].max() - near[0].min()), (near[1].min() - near[0].max()) - moved
@@ -66,13 +66,13 @@ def test_the_largest_excess_is_that_of_all_windows(kind: str) -> None:
         assert course.worst(seconds, wanted.rad) == wanted
         lower = course.worst(seconds, wanted.rad + 1e-9)
         assert lower is None or lower.rad <= wanted.rad
-        # the same from integrals that differ as sums round, and no more is said to be possible
+        # the same from integrals that differ as sums round, and no more is integral to be possible
         rough = Course(
             course.times,
             course.q,
-            course.said * (1 + 1e-13),
+            course.dq_integral * (1 + 1e-13),
             course.path * (1 - 1e-13),
-            exactly=lambda: (course.said, course.path),
+            exactly=lambda: (course.dq_integral, course.path),
             lag=LAG,
             part=PART,
             longest=LONGEST,

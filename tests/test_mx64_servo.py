@@ -550,10 +550,10 @@ def test_bus_watchdog_stops_and_locks_the_goals() -> None:
     write(target, mx64.BUS_WATCHDOG, 5)  # 100 ms
     write(target, mx64.GOAL_POSITION, read(target, mx64.PRESENT_POSITION) + 1000)
     for _ in range(4):
-        target.heard()
+        target.note_packet()
         run(target, 0.09)
     assert read(target, mx64.BUS_WATCHDOG) == 5
-    target.heard()
+    target.note_packet()
     run(target, 0.12)
     assert read(target, mx64.BUS_WATCHDOG) == mx64.WATCHDOG_TRIPPED
     run(target, 0.2)

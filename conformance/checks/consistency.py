@@ -80,7 +80,7 @@ class _Joint:
         return starts[whole], ends[whole]
 
     @property
-    def said(self) -> Floats:
+    def dq_integral(self) -> Floats:
         """The integral of dq up to each measurement, rad."""
         return self._integrals[0]
 
@@ -348,9 +348,9 @@ def _window_error(
         barred += [ctx.span(p) for name in FOUGHT_OVER for p in ctx.phases(name)]
     for begin, end in barred:
         whole &= (grid + step < begin) | (grid > end)
-    c = x.said
+    c = x.dq_integral
     moved = np.where(whole, x.q[last] - x.q[first], 0.0)
-    said = np.where(whole, c[last] - c[first], 0.0)
+    dq_integral = np.where(whole, c[last] - c[first], 0.0)
 
     def summed(values: Floats) -> Floats:
         sums = np.concatenate(([0.0], np.cumsum(values)))
@@ -359,10 +359,12 @@ def _window_error(
     moves = summed(np.abs(moved)) > ctx.tolerance("min_motion_part") * stroke
     if not moves.any():
         return None
-    error = np.sqrt(np.maximum(summed((moved - said) ** 2), 0.0)[moves] / summed(moved**2)[moves])
+    error = np.sqrt(
+        np.maximum(summed((moved - dq_integral) ** 2), 0.0)[moves] / summed(moved**2)[moves]
+    )
     i = int(np.argmax(error))
     at = int(np.flatnonzero(moves)[i])
-    mine, theirs = moved[at : at + count], said[at : at + count]
+    mine, theirs = moved[at : at + count], dq_integral[at : at + count]
     ratio = total(mine * theirs) / max(total(theirs * theirs), 1e-12)
     return float(error[i]), float(ratio), float(grid[at])
 
@@ -416,11 +418,11 @@ def keeps_up(ctx: Context) -> Outcome:
 def _course(ctx: Context, x: _Joint) -> tuple[Course, float]:
     """A joint's course with the constant factor of its dq removed, and that factor."""
     lag = ctx.tolerance("max_lag_s")
-    factor = _factor(x, x.said, lag)
+    factor = _factor(x, x.dq_integral, lag)
     course = Course(
         x.times,
         x.q,
-        factor * x.said,
+        factor * x.dq_integral,
         abs(factor) * x.path,
         exactly=None if factor == 1.0 else lambda: x.integrals(factor * x.dq),
         lag=lag,
@@ -445,13 +447,13 @@ def _factor(x: _Joint, c: Floats, lag: float) -> float:
     :param c: the integral of dq.
     """
     starts, ends = x.windows(4 * lag, 0.5 * lag)
-    said = c.take(ends) - c[starts]
+    dq_integral = c.take(ends) - c[starts]
     reach = float(np.ptp(x.q))
-    moving = np.flatnonzero(np.abs(said) > 0.05 * reach)
+    moving = np.flatnonzero(np.abs(dq_integral) > 0.05 * reach)
     if len(moving) < _FEW or not reach:
         return 1.0
     moved = x.q.take(ends[moving]) - x.q[starts].take(moving)
-    ratios = np.sort(moved / said.take(moving))
+    ratios = np.sort(moved / dq_integral.take(moving))
     low, middle, high = (float(ratios[int(p * (len(ratios) - 1))]) for p in (0.25, 0.5, 0.75))
     return middle if middle and high - low <= 0.2 * abs(middle) else 1.0
 

@@ -19,7 +19,7 @@ _PART = 0.75
 
 
 @dataclass(frozen=True)
-class _Felt:
+class _OperatorFigures:
     """Measured figures of one side.
 
     :param client_hz: commands a second of the client in the phase.
@@ -32,7 +32,7 @@ class _Felt:
     joints: dict[int, TrackingFigures]
 
 
-def _felt(recording: Recording, side: Side) -> _Felt | str:
+def _operator_figures(recording: Recording, side: Side) -> _OperatorFigures | str:
     phases = recording.phases(OPERATOR, side)
     if not phases:
         return "no operator in this recording"
@@ -61,7 +61,7 @@ def _felt(recording: Recording, side: Side) -> _Felt | str:
         )
         if figures.steps or figures.figures():
             joints[i] = figures
-    return _Felt(begin, end, (len(sent) - 1) / float(sent[-1] - sent[0]), joints)
+    return _OperatorFigures(begin, end, (len(sent) - 1) / float(sent[-1] - sent[0]), joints)
 
 
 def _judge(
@@ -76,7 +76,7 @@ def _judge(
     """The joint with the worst figure against a tolerance."""
     side = ctx.side
     assert isinstance(side, Side), "these requirements are about hands"
-    found = ctx.once("felt", lambda: _felt(ctx.recording, side))
+    found = ctx.once("operator figures", lambda: _operator_figures(ctx.recording, side))
     if isinstance(found, str):
         return ctx.skipped(found)
     figures = {i: value(f) for i, f in found.joints.items()}

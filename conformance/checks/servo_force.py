@@ -155,7 +155,7 @@ def reported(ctx: Context) -> Outcome:
 
 
 @check("BRAINCO-FORCE-01")
-def felt(ctx: Context) -> Outcome:
+def force_in_grip(ctx: Context) -> Outcome:
     """The smallest tau_est towards closing of a joint that stands against the object."""
     if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
         return skipped

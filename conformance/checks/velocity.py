@@ -250,10 +250,10 @@ def not_the_command(ctx: Context) -> Outcome:
             if last - begin < 2:
                 continue
             steps = np.diff(t[begin:last])
-            said = np.concatenate(
+            dq_integral = np.concatenate(
                 ([0.0], np.cumsum(0.5 * steps * (dq[begin : last - 1] + dq[begin + 1 : last])))
             )
-            beyond = said - (q[begin:last] - q[begin])
+            beyond = dq_integral - (q[begin:last] - q[begin])
             for at in np.arange(
                 float(t[begin]), float(t[last - 1]), ctx.tolerance("window_s")
             ).tolist():

@@ -377,8 +377,8 @@ class OddPackets(FingerService):
     sensors = 10
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        return np.concatenate((felt, felt[:1]))
+        pressure = super().pressures(hand)
+        return np.concatenate((pressure, pressure[:1]))
 
 
 @wrong_hand("DEX3-SENS-02", sides=BOTH, brief=True)
@@ -386,8 +386,8 @@ class NanPressure(FingerService):
     """Publishes NaN where there is no sensor."""
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        return np.where(felt == 30000.0, math.nan, felt)
+        pressure = super().pressures(hand)
+        return np.where(pressure == 30000.0, math.nan, pressure)
 
 
 @wrong_hand("DEX3-SENS-03", sides=BOTH, brief=True)
@@ -395,8 +395,8 @@ class ZeroForNoValue(FingerService):
     """Publishes 0 where there is no sensor."""
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        return np.where(felt == 30000.0, 0.0, felt)
+        pressure = super().pressures(hand)
+        return np.where(pressure == 30000.0, 0.0, pressure)
 
 
 @wrong_hand("DEX3-SENS-03", brief=True)
@@ -411,8 +411,8 @@ class Numb(FingerService):
     """Publishes a pressure of 0 at every contact."""
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        return np.where(felt == 30000.0, felt, 0.0)
+        pressure = super().pressures(hand)
+        return np.where(pressure == 30000.0, pressure, 0.0)
 
 
 @wrong_hand("DEX3-SENS-04", sides=BOTH)
@@ -428,8 +428,8 @@ class SaturatesToNothing(FingerService):
     """Publishes a pressure at the end of the converter's range as a slot without a sensor."""
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        return np.where(felt > 5000.0, 30000.0, felt)
+        pressure = super().pressures(hand)
+        return np.where(pressure > 5000.0, 30000.0, pressure)
 
 
 @wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
@@ -438,15 +438,15 @@ class SlowFoam(FingerService):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.felt: dict[Side, tuple[float, Floats]] = {}
+        self.pressure: dict[Side, tuple[float, Floats]] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        at, before = self.felt.get(hand.side, (self.now, felt))
+        pressure = super().pressures(hand)
+        at, before = self.pressure.get(hand.side, (self.now, pressure))
         left = before * math.exp((at - self.now) / 2.0)
-        felt = np.where(felt == 30000.0, felt, np.maximum(felt, left))
-        self.felt[hand.side] = self.now, felt
-        return felt
+        pressure = np.where(pressure == 30000.0, pressure, np.maximum(pressure, left))
+        self.pressure[hand.side] = self.now, pressure
+        return pressure
 
     def live(self, dt: float) -> None:
         super().live(dt)
@@ -460,12 +460,12 @@ class FeelsMotionOnly(Dex3Service):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.felt: dict[Side, Floats] = {}
+        self.pressure: dict[Side, Floats] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        if hand.side not in self.felt or max(map(abs, hand.dq)) > 0.5:
-            self.felt[hand.side] = np.array(super().pressures(hand))
-        return self.felt[hand.side]
+        if hand.side not in self.pressure or max(map(abs, hand.dq)) > 0.5:
+            self.pressure[hand.side] = np.array(super().pressures(hand))
+        return self.pressure[hand.side]
 
 
 @wrong_hand("DEX3-SENS-10", sides=BOTH)
@@ -474,13 +474,13 @@ class KeepsTheMost(Dex3Service):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.felt: dict[Side, Floats] = {}
+        self.pressure: dict[Side, Floats] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = np.array(super().pressures(hand))
-        kept = np.maximum(self.felt.get(hand.side, felt), felt)
-        self.felt[hand.side] = np.where(felt > 0.0, kept, felt)
-        return self.felt[hand.side]
+        pressure = np.array(super().pressures(hand))
+        kept = np.maximum(self.pressure.get(hand.side, pressure), pressure)
+        self.pressure[hand.side] = np.where(pressure > 0.0, kept, pressure)
+        return self.pressure[hand.side]
 
 
 @wrong_hand("DEX3-SENS-11", sides=BOTH, whole=True)
@@ -502,13 +502,13 @@ class TaresInAGrip(FingerService):
         self.drift: dict[Side, tuple[float, Floats]] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        empty = felt == 30000.0
-        rest = np.where(empty, 0.0, felt)
+        pressure = super().pressures(hand)
+        empty = pressure == 30000.0
+        rest = np.where(empty, 0.0, pressure)
         at, drift = self.drift.get(hand.side, (self.now, np.zeros_like(rest)))
         drift = rest + (drift - rest) * math.exp((at - self.now) / 0.7)
         self.drift[hand.side] = self.now, drift
-        return np.asarray(np.where(empty, felt, np.maximum(rest - drift, 0.0)))
+        return np.asarray(np.where(empty, pressure, np.maximum(rest - drift, 0.0)))
 
     def live(self, dt: float) -> None:
         super().live(dt)

@@ -42,7 +42,7 @@ class OtherState(_OtherFamily):
         super().__init__(dialect, sides, touch)
         self.state_type = self.others[1]
 
-    def sealed(self) -> bytes:
+    def state_with_crc(self) -> bytes:
         kind = message_type(self.state_type)
         return kind.encode(kind.cls())
 
@@ -96,8 +96,8 @@ class WaitsForCommands(ReferenceRobot):
 class CutShort(ReferenceRobot):
     """Its first states lack their last four bytes."""
 
-    def sealed(self) -> bytes:
-        payload = super().sealed()
+    def state_with_crc(self) -> bytes:
+        payload = super().state_with_crc()
         return payload[:-4] if self.now < _EARLY else payload
 
 
@@ -115,8 +115,8 @@ class NotANumber(ReferenceRobot):
 class CdrCrc(ReferenceRobot):
     """Computes the CRC over the CDR bytes."""
 
-    def sealed(self) -> bytes:
-        payload = super().sealed()
+    def state_with_crc(self) -> bytes:
+        payload = super().state_with_crc()
         return payload[:-4] + crc32_words(payload[4:-4]).to_bytes(4, "little")
 
 
@@ -124,8 +124,8 @@ class CdrCrc(ReferenceRobot):
 class NoCrc(ReferenceRobot):
     """Publishes a CRC of 0."""
 
-    def sealed(self) -> bytes:
-        return super().sealed()[:-4] + bytes(4)
+    def state_with_crc(self) -> bytes:
+        return super().state_with_crc()[:-4] + bytes(4)
 
 
 # ----------------------------------------------------------------------------------------- rate

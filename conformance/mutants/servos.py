@@ -600,8 +600,8 @@ class TouchKept(FtpService):
         self.most: dict[Side, Floats] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        self.most[hand.side] = np.maximum(self.most.get(hand.side, felt), felt)
+        pressure = super().pressures(hand)
+        self.most[hand.side] = np.maximum(self.most.get(hand.side, pressure), pressure)
         return self.most[hand.side]
 
 

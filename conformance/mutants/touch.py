@@ -62,9 +62,9 @@ class CountsFromTheThumb(FtpService):
     """Publishes the areas of the fingers in the opposite order, the thumb's first."""
 
     def pressures(self, hand: FingerHand) -> Floats:
-        felt = super().pressures(hand)
-        felt[_TOPS] = felt[_TOPS[::-1]]
-        return felt
+        pressure = super().pressures(hand)
+        pressure[_TOPS] = pressure[_TOPS[::-1]]
+        return pressure
 
 
 @wrong_hand("FTP-TOUCH-06", sides=BOTH)

@@ -236,16 +236,16 @@ class Dex3Hand(FingerHand):
         """Values of the sensor packets, shape (9, 12)."""
         if not self.touches or not any(self.contact):
             return _UNTOUCHED
-        felt = np.array(_UNTOUCHED)
-        felt[_PRESSED] = 1e4 * np.abs(self.contact)[_PRESSING]
-        return felt
+        pressure = np.array(_UNTOUCHED)
+        pressure[_PRESSED] = 1e4 * np.abs(self.contact)[_PRESSING]
+        return pressure
 
 
 def _untouched() -> Floats:
-    felt = np.full((len(DEX3_1.sensors), 12), NO_VALUE)
-    for row, sensor in zip(felt, DEX3_1.sensors, strict=True):
+    pressure = np.full((len(DEX3_1.sensors), 12), NO_VALUE)
+    for row, sensor in zip(pressure, DEX3_1.sensors, strict=True):
         row[list(sensor.slots)] = 0.0
-    return felt
+    return pressure
 
 
 def _pressed() -> tuple[tuple[Ints, Ints], Ints]:
@@ -272,14 +272,14 @@ class _Message:
 
     def __init__(self, data: bytearray, motors: Sequence[Any], packets: Any) -> None:
         self.data, self.motors, self.packets = data, motors, packets
-        self._felt: Floats | None = None
+        self._pressure: Floats | None = None
 
-    def set_pressures(self, felt: Floats) -> None:
+    def set_pressures(self, pressure: Floats) -> None:
         """Fill in the values of the packets, shape (n_sensors, 12)."""
         # those of a hand that touches nothing are one array that cannot change
-        if felt is not self._felt or felt.flags.writeable:
-            self.packets["pressure"] = felt[: len(self.packets)]
-            self._felt = felt
+        if pressure is not self._pressure or pressure.flags.writeable:
+            self.packets["pressure"] = pressure[: len(self.packets)]
+            self._pressure = pressure
 
 
 class FingerService(Service):

@@ -51,17 +51,17 @@ class FtpHand(InspireHand):
 
     def pressures(self) -> Floats:
         """Shape (n_areas, elements of the largest): counts of the tactile areas."""
-        felt = np.zeros((len(_AREAS), _MOST))
+        pressure = np.zeros((len(_AREAS), _MOST))
         if not self.touches:
-            return felt
+            return pressure
         # the object is on the way to closed, which is toward 0
         pressed = np.maximum(self.contact, 0.0) / self.most
-        for row, area in zip(felt, _AREAS, strict=True):
+        for row, area in zip(pressure, _AREAS, strict=True):
             finger, _, part = area.place.partition(" ")
             if part == "top":
                 mine = [p for p, name in zip(pressed, _JOINTS, strict=True) if name == finger]
                 row[: area.elements] = _COUNTS * max(mine)
-        return felt
+        return pressure
 
 
 class FtpService(ServoService):
@@ -114,8 +114,8 @@ class FtpService(ServoService):
         """A hand's tactile readings as a message."""
         hand = self.hands[side]
         if self._touched.get(side, (-1, b""))[0] != hand.version:
-            felt = self.pressures(hand)
-            self._touched[side] = hand.version, self._lists.encode(felt.ravel()[self._there])
+            pressure = self.pressures(hand)
+            self._touched[side] = hand.version, self._lists.encode(pressure.ravel()[self._there])
         return self._touched[side][1]
 
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:

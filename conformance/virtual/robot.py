@@ -154,9 +154,9 @@ class ReferenceRobot(TopicDevice):
 
     def publish(self) -> list[Sample]:
         """A state."""
-        return [Sample(self.dialect.state_topic, self.state_type, self.sealed(), self.now)]
+        return [Sample(self.dialect.state_topic, self.state_type, self.state_with_crc(), self.now)]
 
-    def sealed(self) -> bytes:
+    def state_with_crc(self) -> bytes:
         """A state with its CRC."""
         return encode_with_crc(self.message())
 

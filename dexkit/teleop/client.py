@@ -280,7 +280,7 @@ class TeleopClient(ABC):
     def _may_start(self, latest: Mapping[Side, Pose]) -> bool:
         return not self.dialect.zero_is_no_state or all(any(latest[s]) for s in self._awaited)
 
-    def parting(self, pose: Pose) -> tuple[JointCommand, ...]:
+    def final_command(self, pose: Pose) -> tuple[JointCommand, ...]:
         """A command to hold the pose, with motors locked where the dialect has a mode for it."""
         hand = model(self.dialect.model)
         return tuple(

@@ -243,7 +243,9 @@ class LiveClient:
         if self._sole.lost:  # another program commands them now
             return
         poses = self._client.receiver.seen
-        stay = {s: self._client.parting(q) for s, q in poses.items() if s in self._client.sides}
+        stay = {
+            s: self._client.final_command(q) for s, q in poses.items() if s in self._client.sides
+        }
         self._watch.restart()
         end = time.monotonic() + _LEAVING
         while stay and time.monotonic() < end and not self._watch.measure_pause():

@@ -172,7 +172,7 @@ class Bus(SerialLine):
             return
         self.counters.instructions += 1
         for servo in hearing:
-            servo.heard()
+            servo.note_packet()
         code = packet.instruction
         if packet.id == dxl.BROADCAST_ID and code == Instruction.PING:
             self._broadcast_ping(hearing, at)

@@ -563,7 +563,7 @@ class Servo:
 
     # --- instructions
 
-    def heard(self) -> None:
+    def note_packet(self) -> None:
         """Note that an instruction packet passed on the bus: it feeds the watchdog."""
         self._last_packet = self.now
 

@@ -347,7 +347,7 @@ class ReplayMachine:
         """Command to stay. The position of a silent hand is unknown: it is damped only."""
         known = side in self._seen and self.end is not End.SILENT
         pose = self._seen[side][1].q if known else tuple(c.q for c in self._sent[side][1])
-        found = self._client.parting(pose)
+        found = self._client.final_command(pose)
         return found if known else tuple(c._replace(kp=0.0) for c in found)
 
     def _note(self, now: float, commands: Commands) -> Commands:

@@ -138,7 +138,7 @@ def _episodes(trace: Trace, fps: int | None, task: str | None, result: Result) -
 
 def _info(source: Source, rate: int, result: Result, start_ns: int) -> dict[str, Any]:
     joints = {_name(s.part): list(s.names) for s in source.streams}
-    elements = {_name(felt.part): list(felt.elements) for felt in source.pressures}
+    elements = {_name(tactile.part): list(tactile.elements) for tactile in source.pressures}
     return {
         "version": "1.0.0",
         "date": "",
@@ -216,8 +216,8 @@ def _as_it_was(
         else:
             _fill(s, items, name)
     if _ALIGNED in record:
-        for felt in source.pressures:
-            _feel(felt, items, str(names.get(felt.part, felt.part)))
+        for tactile in source.pressures:
+            _add_tactile(tactile, items, str(names.get(tactile.part, tactile.part)))
         for t, item in items.items():
             item["timestamp_ns"] = t
     pictures: list[tuple[str, bytes]] = []
@@ -277,12 +277,14 @@ def _fill(stream: Stream, items: Mapping[int, dict[str, Any]], name: str) -> Non
                 entry[column] = row
 
 
-def _feel(felt: Pressure, items: Mapping[int, dict[str, Any]], name: str) -> None:
+def _add_tactile(tactile: Pressure, items: Mapping[int, dict[str, Any]], name: str) -> None:
     """Insert the pressures of a hand, except in gaps."""
     for suffix in (f"_{STATE}", f"_{COMMAND}"):
         name = name.removesuffix(suffix)
     times = np.array(sorted(items), dtype=np.int64)
-    for t, known, row in zip(times.tolist(), felt.is_known(times), felt.at(times), strict=True):
+    for t, known, row in zip(
+        times.tolist(), tactile.is_known(times), tactile.at(times), strict=True
+    ):
         if known and isinstance(items[t].get("tactiles") or {}, dict):
             pressed = items[t]["tactiles"] = items[t].get("tactiles") or {}
             pressed[name] = np.nan_to_num(row).tolist()

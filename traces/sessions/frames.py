@@ -82,7 +82,7 @@ class Source:
     def measured(self) -> dict[str, float]:
         """Hz of each topic, from its usual period."""
         found = {s.topic: _rate(s.times_ns) for s in self.streams}
-        found |= {felt.topic: _rate(felt.times_ns) for felt in self.pressures}
+        found |= {tactile.topic: _rate(tactile.times_ns) for tactile in self.pressures}
         found |= {p.camera: _rate(p.times_ns) for p in self.pictures}
         return {name: rate for name, rate in found.items() if rate}
 
@@ -145,17 +145,18 @@ def open_source(trace: Trace) -> Source:
         raise SessionError(f"{trace.path} has no joints of a known hand, robot or session")
     pressures: list[Pressure] = []
     problems = []
-    for felt in pressures_of(trace, streams):
-        if felt.unusable:
+    for tactile in pressures_of(trace, streams):
+        if tactile.unusable:
             text = (
-                f"{felt.topic}: {felt.unusable} messages whose lists are not as long as the areas"
+                f"{tactile.topic}: {tactile.unusable} messages whose lists are not as long as "
+                "the areas"
             )
             problems.append(text)
-        if len(felt) >= _LEAST:
-            pressures.append(felt)
+        if len(tactile) >= _LEAST:
+            pressures.append(tactile)
         else:
-            lost.append(f"{felt.topic}: {'a single' if len(felt) else 'no usable'} sample")
-    known = {s.topic for s in streams} | {felt.topic for felt in pressures}
+            lost.append(f"{tactile.topic}: {'a single' if len(tactile) else 'no usable'} sample")
+    known = {s.topic for s in streams} | {tactile.topic for tactile in pressures}
     for channel in trace.channels:
         if channel.message_count and channel.topic not in known | _session_topics(trace):
             lost.append(f"{channel.topic}: no joints in it")
@@ -221,7 +222,7 @@ def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
     :raises SessionError: there is no time at which all streams have values.
     """
     every = [s.times_ns for s in source.streams] + [p.times_ns for p in source.pictures]
-    every += [felt.times_ns for felt in source.pressures]
+    every += [tactile.times_ns for tactile in source.pressures]
     begin = max(int(t[0]) for t in every)
     end = min(int(t[-1]) for t in every)
     name = source.trace.path.name
@@ -238,9 +239,9 @@ def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
             values[s.part, s.kind, f] = made = method(s.times_ns, table, grid)
             if f == "q":
                 good &= np.isfinite(made).all(axis=1)
-    for felt in source.pressures:
-        pressure[felt.part] = felt.at(grid)
-        good &= felt.is_known(grid)
+    for tactile in source.pressures:
+        pressure[tactile.part] = tactile.at(grid)
+        good &= tactile.is_known(grid)
     shown: dict[str, NDArray[np.intp]] = {}
     for p in source.pictures:
         places = np.arange(len(p.times_ns), dtype=np.float64)[:, None]

@@ -372,9 +372,9 @@ def _scheme(source: Source) -> _Scheme:
         members = tuple(s.part for s in own)
         features.append(_Feature(column, kind, name, members, _names(own)))
     if pressed := source.pressures:
-        names = tuple(name for felt in pressed for name in felt.names)
+        names = tuple(name for tactile in pressed for name in tactile.names)
         features.append(
-            _Feature(PRESSURE, STATE, "pressure", tuple(felt.part for felt in pressed), names)
+            _Feature(PRESSURE, STATE, "pressure", tuple(tactile.part for tactile in pressed), names)
         )
     parts: dict[str, dict[str, Any]] = {}
     for feature in features:

@@ -88,7 +88,7 @@ class Stream:
         return self.joints
 
     @property
-    def felt(self) -> Pressure | None:
+    def tactile(self) -> Pressure | None:
         """Pressures of the sensors in the states; None without sensors."""
         if self.pressure is None:
             return None
@@ -148,7 +148,7 @@ def pressures_of(trace: Trace, streams: Sequence[Stream]) -> list[Pressure]:
 
     :param streams: of the recording: the states of some hands have sensors in them.
     """
-    found = [felt for s in streams if (felt := s.felt) is not None]
+    found = [found for s in streams if (found := s.tactile) is not None]
     topics = {c.topic for c in trace.channels if c.message_count}
     touch = [t for t in sorted(topics) if any(r.kind == "touch" for r in roles(t))]
     loaded = trace.load(touch, decode=True) if touch else {}
