@@ -239,7 +239,7 @@ class Rig:
         return found
 
     def dead(self) -> Tool | None:
-        """A process that has ended unasked, or None."""
+        """A process that has ended although the run did not stop it, or None."""
         return next((t for t in self.tools if not t.running and t not in self._ended), None)
 
 

@@ -2,8 +2,9 @@
 
 A service that has no sensor can publish a q that follows the commands like a good hand's. Each
 observation is of something that the commands do not tell: where an object is, how stiff the drive
-is, how heavy the mechanics are. A service that models all of that cannot be told from a hand by its
-topics alone; for that there is the manual test of docs/capabilities.md, which the vendor claims.
+is, how heavy the mechanics are. A service that models all of that cannot be distinguished from a
+hand by its topics alone; for that there is the manual test of docs/capabilities.md, which the
+vendor claims.
 
 The observations are not requirements: they pass or fail no hand.
 """

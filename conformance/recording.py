@@ -303,11 +303,11 @@ class Recording:
             return None
         return self.stimulus.time_error(self.log_time(begin), self.log_time(end))
 
-    def lost(self, begin: float, end: float) -> Lateness | None:
+    def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
         if self.stimulus is None:
             return None
-        return self.stimulus.beats.lost(self.log_time(begin), self.log_time(end))
+        return self.stimulus.beats.excess_lateness(self.log_time(begin), self.log_time(end))
 
     def starvation(self, subject: Subject, begin: float, end: float) -> Starvation | None:
         """How long the hand's processes waited for a processor in [begin, end]; None if unknown."""

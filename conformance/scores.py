@@ -157,7 +157,8 @@ NO_SCORE = Score("the result holds none")
 class Entry:
     """One entry of the file: hands of one model, tried in runs of one kind and setting.
 
-    :param hands: how many were generated; those that cannot be told from a good one count nowhere.
+    :param hands: how many were generated; those that cannot be distinguished from a good one are
+        not counted.
     :param phases: the phases of the stimulus that such a run asks for, and ``rounds`` how often.
     :param requirements: ids of those that such a run judges.
     :param fewer: by dialect, on how many sides of a good hand a requirement is judged in such a

@@ -135,7 +135,7 @@ class Beats:
         median, high = np.percentile(there, [50, 99])
         return float(median), float(high)
 
-    def lost(self, begin_ns: int, end_ns: int) -> Lateness | None:
+    def excess_lateness(self, begin_ns: int, end_ns: int) -> Lateness | None:
         """Lateness in [begin, end] beyond that of an idle machine; None if it is not known."""
         return Lateness.beyond_idle(self._in(begin_ns, end_ns))
 

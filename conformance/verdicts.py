@@ -13,15 +13,15 @@ late while it was judged:
 3. The hand's process may have been hit harder: up to :data:`HARDEST` times that, and up to twice as
    much again in proportion to the time in which programs waited for a processor (Linux' pressure
    stall information). Pressure alone excuses nothing: it only scales what was lost.
-4. Machines are busy by fits: a hand that is too slow at its best, too, is slow by itself. Of what
-   happens again and again, the best quarter must be explained by the kit's own best quarter.
-5. On a machine that is overloaded, where the kit's own timer is late by :data:`OVERLOADED` on
-   average over the whole run, nothing can be told of single events or of motion: a process that
-   computes is hit there without any measure. What 4 refuses, and what is wrong without moving,
-   fails all the same.
+4. Load varies. Of what recurs (a rate, a delay), the best quarter of the hand's values must be
+   explained by the best quarter of the timer's as well: a hand that is slow even where the timer is
+   on time is slow by itself.
+5. On an overloaded machine, where the kit's own timer is late by :data:`OVERLOADED` on average over
+   the whole run, single events and motion cannot be judged: how much a computing process was held
+   up is not known there. What 4 does not explain, and what is wrong without moving, still fails.
 6. A failure that is no larger than that at any of its places is *blocked*: the run is done again.
    A larger one is the hand's, and its result says what the machine does not explain. A run that
-   fails by nothing but such results is done again as well, and then believed.
+   fails by nothing but such results is done once more, and the second run counts.
 
 7. Where the hand's processes run on this machine, what they waited for a processor is measured as
    well (:mod:`~dexkit.conformance.run_queue`), and explains a failure by itself: up to
@@ -29,7 +29,8 @@ late while it was judged:
    longest wait. To wait is not to compute: a process that is slow by itself is not excused. This
    holds for motion that is not of real time, too: there a failure without a size is as large as its
    place is long. Where they waited for :data:`OVERLOADED` in each sample on average over the whole
-   run, no requirement of real time can be told, but for what 4 refuses; which way a hand moves can.
+   run, no requirement of real time can be judged, but for what 4 does not explain; the direction
+   of motion can.
 8. Apart from load, a MUST that fails by less than the kit's measurement error
    (:mod:`~dexkit.conformance.measure`) is *blocked* as well: its figure is nearer to the limit than
    the kit can tell. A pass by less than that remains a pass, and says so.
@@ -99,7 +100,7 @@ class Machine(Protocol):
         """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
         ...
 
-    def lost(self, begin: float, end: float) -> Lateness | None:
+    def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         """Lateness of the kit's own timer in it, s; None if unknown."""
         ...
 
@@ -197,7 +198,7 @@ class _Failure:
 
 def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse | None:
     """The excuse of a machine that was overloaded during the whole run; None if it was not."""
-    lost = machine.lost(*whole) if whole is not None else None
+    lost = machine.excess_lateness(*whole) if whole is not None else None
     if lost is None or lost.mean < OVERLOADED:
         return None
     return Excuse(
@@ -235,7 +236,7 @@ _HOW = {"total": "in all", "chain": "in all", "mean": "each time", "p99": "one t
 def _late(machine: Machine, failure: _Failure) -> Excuse:
     """Whether what the kit's own timer was late by explains a failure."""
     size, best = failure.size, failure.best
-    lost = machine.lost(failure.begin, failure.end)
+    lost = machine.excess_lateness(failure.begin, failure.end)
     share = min(machine.starved(failure.begin, failure.end), 1.0)
     if lost is None:
         return Excuse()

@@ -97,8 +97,6 @@ class Tool:
         self.ready = threading.Event()
         self.place = ""
         """The first word after ``ready:``."""
-        self.ready_line = ""
-        """Its ready line."""
         self._on_line = on_line
         self._tail: deque[str] = deque(maxlen=40)
         # closed when this process ends, even by SIGKILL
@@ -144,7 +142,6 @@ class Tool:
             self._tail.append(line.rstrip())
             if line.startswith("ready:") and not self.place:
                 self.place = line.split()[1] if len(line.split()) > 1 else ""
-                self.ready_line = line.rstrip()
                 self.ready.set()
             if self._on_line is not None:
                 self._on_line(line.rstrip())
@@ -184,7 +181,7 @@ class Tool:
             raise self.error(f"{self!r} {what}", hint=self.last_lines or silent)
 
     def stop(self) -> bool:
-        """End it, politely at first. May be called twice.
+        """Stop the process: SIGTERM first, then SIGKILL. May be called twice.
 
         :returns: whether it ended when it was asked to.
         """

@@ -89,7 +89,7 @@ class PauseWatch:
         self._last: float | None = None  # nothing is a pause before the first look
 
     def restart(self) -> None:
-        """The loop was away on purpose."""
+        """Do not count the time since the last measurement as a pause."""
         self._last = self._clock.since_boot()
 
     def away(self) -> float:

@@ -50,7 +50,8 @@ def open_sockets() -> dict[int, int]:
 class DomainSockets:
     """The sockets of one domain, restricted to packets of its interface and of this machine.
 
-    The domain is to be deaf at first: it must not receive what came before the filter was set.
+    Create it while the domain receives nothing: packets that came before the filter was set must
+    be dropped.
 
     :param before: :func:`open_sockets` before CycloneDDS made the domain.
     :raises OSError: they are not found, or the system has no such filter.

@@ -32,7 +32,7 @@ def entry_points(group: str) -> list[metadata.EntryPoint]:
 def _may_register(group: str) -> bool:
     """Whether an installed package may register something in a group.
 
-    The answer is yes as well where that cannot be told from ``entry_points.txt`` of the packages
+    The answer is yes as well where that does not follow from ``entry_points.txt`` of the packages
     in the folders of :data:`sys.path`: in archives and with other finders.
     """
     for finder in sys.meta_path:

@@ -55,7 +55,7 @@ class Machine:
     def starved(self, begin: float, end: float) -> float:
         return self._starved
 
-    def lost(self, begin: float, end: float) -> Lateness | None:
+    def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         return self._lost
 
     def starvation(self, subject: Subject, begin: float, end: float) -> None:
@@ -151,7 +151,7 @@ def test_larger_failure_needs_more_lateness_to_be_excused(
 
 def test_failure_is_excused_only_at_all_its_places() -> None:
     class Once(Machine):
-        def lost(self, begin: float, end: float) -> Lateness | None:
+        def excess_lateness(self, begin: float, end: float) -> Lateness | None:
             return LATE if end < 3 else IDLE
 
     assert excuse(Once(None), GAP, failure(2.0).if_late(0.1), Side.LEFT).excused

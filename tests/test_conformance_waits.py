@@ -65,7 +65,7 @@ class Machine:
     def starved(self, begin: float, end: float) -> float:
         return 0.0
 
-    def lost(self, begin: float, end: float) -> Lateness | None:
+    def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         return Lateness(0.0, 0.0, 0.0)
 
     def starvation(self, subject: Subject, begin: float, end: float) -> Starvation | None:

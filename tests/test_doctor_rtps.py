@@ -319,7 +319,7 @@ def test_observer_sends_only_valid_packets_for_any_input(
             sent += observer.receive(rtps.message(source, event), now)
     for packet, _ in sent:
         grammar.check(packet)
-    grammar.check(observer.farewell())
+    grammar.check(observer.withdrawal_packet())
     assert grammar.kinds >= {0x15, 0x0E, 0x06}
 
 

@@ -39,7 +39,7 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.report import as_data, print_report
 from dexkit.doctor.rtps import Data, parse_message, parse_participant
-from dexkit.doctor.topics import is_driven, nearly
+from dexkit.doctor.topics import closest_topic, is_driven
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.messages.earlier import EARLIER
 from dexkit.models import DIALECTS
@@ -472,7 +472,7 @@ def test_state_of_another_robot_silent_or_on_another_domain() -> None:
 def test_other_hands_and_simulators_are_named(topic: str, kind: str, expected: str) -> None:
     found = [f for f in diagnose(_seen(_waiting(topic, kind))) if f.id == "DDS-UNPUBLISHED"]
     assert expected in found[0].seen
-    assert nearly(topic) is None
+    assert closest_topic(topic) is None
 
 
 def test_a_requested_hand_leaves_other_states_aside() -> None:
@@ -560,7 +560,7 @@ def test_device_check_reports_no_waiting_client() -> None:
     ],
 )
 def test_misspelt_topic_is_recognised(topic: str, meant: str) -> None:
-    found = nearly(topic)
+    found = closest_topic(topic)
     assert found is not None
     assert found[0] == meant
 
@@ -569,7 +569,7 @@ def test_misspelt_topic_is_recognised(topic: str, meant: str) -> None:
     "topic", ["rt/dex1/left/cmd", "rt/dex5/left/state", "rt/lowstate", "rt/inspire/cmd", "rosout"]
 )
 def test_unrelated_topic_name_is_no_misspelling(topic: str) -> None:
-    assert nearly(topic) is None
+    assert closest_topic(topic) is None
 
 
 def test_topics_are_not_cut_in_a_narrow_terminal() -> None:

@@ -275,6 +275,9 @@ WRONG_TYPES = """
         replace(DEX5_1.dialects[0], name="bad", model="bad-1", state_type="a::B_"),
     ),
 """
+OWN_DIALECT = """
+    dialects=(replace(DEX5_1.dialects[0], name="bad", model="bad-1"),),
+"""
 BAD_PROFILE = """
 from dataclasses import replace
 from dexkit.models import DEX5_1, DEX3_1
@@ -301,6 +304,11 @@ def test_profiles_of_dexkit_meet_what_is_asked_of_others() -> None:
         ("bad-1", BAD_PROFILE.format(change="joints={}"), "it has no joints"),
         ("bad-1", BAD_PROFILE.format(change="rest_q=DEX3_1.rest_q"), "rest_q of the left hand"),
         ("bad-1", BAD_PROFILE.format(change=WRONG_TYPES), "has to use the types unitree_hg"),
+        (
+            "bad-1",
+            BAD_PROFILE.format(change=OWN_DIALECT),
+            "simulated_by is for the models of dexkit",
+        ),
     ],
 )
 def test_a_broken_model_says_why_and_affects_no_other(

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from dexkit.cli import cli
 from dexkit.conformance.plots import Plot, PlotKind
-from dexkit.conformance.report.labels import nature
+from dexkit.conformance.report.labels import device_kind
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import VERSION, Load, Overall, RunResult, Verdict
 
@@ -32,7 +32,7 @@ def test_verdicts_and_texts_are_those_of_the_file() -> None:
         assert document["version"] == 2
         result = read(name)
         assert str(result.overall) == document["overall"], name
-        assert nature(result) == "simulated", name
+        assert device_kind(result) == "simulated", name
         for entry, told in zip(result.results, document["results"], strict=True):
             for key in ("figure", "observed", "reason", "cause", "blocked_by"):
                 assert getattr(entry, key) == told[key], (name, key)

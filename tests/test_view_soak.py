@@ -51,7 +51,7 @@ def hands(domain: int) -> Iterator[None]:
     """Two Dex3-1 at 1000 Hz."""
     with Tool("serve", "sim-dex3", "--side", "both", "--domain", str(domain), "--quiet") as served:
         served.ready.wait(60)
-        assert "ready" in served.ready_line, served.last_lines
+        assert served.place, served.last_lines
         yield
 
 

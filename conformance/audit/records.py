@@ -61,7 +61,7 @@ class State(str, Enum):
 
     @property
     def final(self) -> bool:
-        """Whether the same file would come to the same again."""
+        """Whether an unchanged file need not be judged again."""
         return self in (State.JUDGED, State.NOT_JUDGED, State.UNREADABLE)
 
 
@@ -134,7 +134,7 @@ class FileRecord:
         return self.overall == Overall.FAIL
 
     @property
-    def badness(self) -> tuple[int, int, int]:
+    def sort_key(self) -> tuple[int, int, int]:
         """For sorting, worst first: failures, then files without verdicts, then warnings."""
         found = list(self.verdicts().values())
         return (

@@ -17,7 +17,7 @@ from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.report.charts import Line, chart
 from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import ANSWERS, VERDICTS
-from dexkit.conformance.report.tables import table, unbroken
+from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.conformance.run_record import catalogue_digest
@@ -123,7 +123,7 @@ class Summary:
         return [*found, ("folder", folder)] if folder else found
 
     def _rank(self, record: FileRecord, failed: Sequence[str]) -> None:
-        badness = record.badness
+        badness = record.sort_key
         if badness == (0, 0, 0):
             return
         shown = []
@@ -259,7 +259,7 @@ def _short(name: str, locations: Sequence[str]) -> str:
     """A file or folder as a cell: without the location, if the page is about one alone."""
     if len(locations) == 1:
         name = name.removeprefix(locations[0].rstrip("/") + "/")
-    return unbroken(escape(name)) if len(name) <= _SHORT else escape(name)
+    return no_wrap(escape(name)) if len(name) <= _SHORT else escape(name)
 
 
 def _worst(summary: Summary, locations: Sequence[str]) -> str:

@@ -136,7 +136,7 @@ def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
 
 
 @check("DEX1-FORCE-18")
-def presses_as_it_holds(ctx: Context) -> Outcome:
+def contact_force_fits_stiffness(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, relative to the hand's measured stiffness times the
     error.
     """

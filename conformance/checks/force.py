@@ -273,7 +273,7 @@ def no_more_than_asked(ctx: Context) -> Outcome:
 
 
 @check("DEX1-FORCE-15")
-def lets_go(ctx: Context) -> Outcome:
+def releases_with_zero_gains(ctx: Context) -> Outcome:
     """tau_est after zero gains at the q of a grip, relative to that of the grip."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")

@@ -19,10 +19,10 @@ from dexkit.conformance.motor_messages import sequence_of
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
+from dexkit.messages import message_type
 
 __all__: list[str] = []
 
-_HG = "HandState_"
 _STEPS = 3.0
 """Smallest second difference of q, encoder steps, that shows an acceleration: rounding of three
 positions makes up to two steps, with a standard deviation of 0.7."""
@@ -242,7 +242,8 @@ def lost(ctx: Context) -> Outcome:
 def reserved(ctx: Context) -> Outcome:
     """Number of different values of each reserved word."""
     paths = _motors(ctx, "reserve")
-    if ctx.recording.dialect.state_type.endswith(_HG):
+    members = {f.name for f in message_type(ctx.recording.dialect.state_type).layout.fields}
+    if "press_sensor_state" in members:
         paths += _motors(ctx, "sensor")
         paths += [*_packets(ctx, "reserve"), "reserve"]
     most = (0, "")

@@ -133,7 +133,10 @@ def touch(ctx: Context) -> Outcome:
         return outcome
     if not judged:
         return ctx.skipped("the object held no finger back")
-    return ctx.passed(f"{judged} fingers", f"{judged} fingers feel the object, each by its own")
+    return ctx.passed(
+        f"{judged} fingers",
+        f"{judged} fingers report pressure at the object, each by its own sensors",
+    )
 
 
 @check("DEX3-SENS-07")

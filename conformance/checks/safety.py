@@ -696,7 +696,7 @@ def two_writers(ctx: Context) -> Outcome:
 
 
 @check("DEX1-SAFE-09", "DEX3-SAFE-10")
-def company(ctx: Context) -> Outcome:
+def obeys_beside_second_client(ctx: Context) -> Outcome:
     """The steps of this hand while a second client sends the same commands, or commands the other
     hand.
     """

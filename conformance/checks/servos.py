@@ -242,7 +242,7 @@ def _turns(q: Floats, least: float) -> int:
 
 
 @check("BRAINCO-WDOG-01")
-def goes_nowhere_else(ctx: Context) -> Outcome:
+def takes_no_detour(ctx: Context) -> Outcome:
     """Deviation of a joint from the way to its last goal while there are no commands."""
     worst: tuple[float, int, float] | None = None
     for begin, end, goal in _silences(ctx):

@@ -30,7 +30,10 @@ def _commanded(recording: Recording) -> Iterable[tuple[Subject, SideView]]:
 
 
 def _no_script(name: str) -> type[Any]:
-    raise UsageError("the kit plays no stimulus to a client", hint="record a session with it")
+    raise UsageError(
+        "the kit plays no stimulus to a client",
+        hint="record its session with 'dexkit record', then judge it with 'dexkit check'",
+    )
 
 
 LAYER: Layer[Recording, SideView, Context] = Layer(

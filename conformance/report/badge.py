@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dexkit.conformance.report.labels import model_title, nature, tally
+from dexkit.conformance.report.labels import count_verdicts, device_kind, model_title
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Overall, RunResult
 from dexkit.escaping import html as escape
@@ -24,7 +24,7 @@ def badge_text(result: RunResult, kind: Kind = Kind.DROP_IN) -> tuple[str, str]:
     name = model_title(result).removesuffix(" gripper")
     if result.client_only:
         return f"{name} client", str(result.overall)
-    grade, found = result.grade(kind), tally(result, kind)
+    grade, found = result.grade(kind), count_verdicts(result, kind)
     if not grade.judged and kind is Kind.SAFETY:
         text = "not judged"
     elif grade.overall is Overall.INCONCLUSIVE:
@@ -40,7 +40,7 @@ def badge_text(result: RunResult, kind: Kind = Kind.DROP_IN) -> tuple[str, str]:
             (found.not_judged + found.open, "not judged"),
         ]
         text += "".join(f", {n} {what}" for n, what in rest if n)
-    real = nature(result)
+    real = device_kind(result)
     return f"{name} {kind}", (f"{text} ({real})" if real else text)
 
 

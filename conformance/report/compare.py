@@ -10,10 +10,10 @@ from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
+    count_verdicts,
+    device_kind,
     hand_name,
     model_title,
-    nature,
-    tally,
 )
 from dexkit.conformance.report.markdown import code, plain, table
 from dexkit.conformance.requirements import Requirement
@@ -186,7 +186,7 @@ def render_comparison(comparison: Comparison, curves: str = "") -> str:
 def _about(comparison: Comparison) -> str:
     rows = []
     for run, name in zip(comparison.runs, comparison.names, strict=True):
-        answer, found, real = ANSWERS[run.overall], tally(run), nature(run)
+        answer, found, real = ANSWERS[run.overall], count_verdicts(run), device_kind(run)
         stages = ", ".join(f"{side} {stage}" for side, stage in run.stage.items())
         badge = f' <span class="chip real">{real}</span>' if real else ""
         rows.append(
@@ -258,8 +258,8 @@ def render_comparison_markdown(comparison: Comparison) -> str:
     lines = [f"## Comparison: {len(runs)} runs as {model_title(runs[0])}", ""]
     rows = []
     for run, name in zip(runs, names, strict=True):
-        answer, found = ANSWERS[run.overall], tally(run)
-        real = nature(run)
+        answer, found = ANSWERS[run.overall], count_verdicts(run)
+        real = device_kind(run)
         rows.append(
             [
                 plain(name) + (f" ({real})" if real else ""),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.report.charts import Level, Line, chart
 from dexkit.conformance.report.html import document
-from dexkit.conformance.report.tables import table, unbroken
+from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.escaping import html as escape
 from dexkit.hand import Floats, JointSpec, Side
 from dexkit.models import MODELS
@@ -149,7 +149,7 @@ def topics(recordings: Sequence[Recorded]) -> str:
     sections = ["<h2>Rates and gaps</h2>"]
     names = sorted({t for r in recordings for t in r.times})
     rows = [
-        (unbroken(escape(topic)), *(_counts(r.times.get(topic)) for r in recordings))
+        (no_wrap(escape(topic)), *(_counts(r.times.get(topic)) for r in recordings))
         for topic in names
     ]
     sections.append(table(("topic", *(escape(r.name) for r in recordings)), rows))

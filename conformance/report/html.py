@@ -26,9 +26,9 @@ from dexkit.conformance.report.labels import (
     VERDICTS,
     about_harness,
     answer_of,
+    device_kind,
     hand_name,
     model_title,
-    nature,
     part,
     quantity,
     subject,
@@ -144,7 +144,7 @@ def _verdict(result: RunResult) -> str:
     answer = ANSWERS[result.overall] if result.client_only else answer_of(grade)
     counts = result.counts()
     sentence = _sentence(grade, subject(result))
-    real = nature(result)
+    real = device_kind(result)
     badge = f' <span class="chip real">{real}</span>' if real else ""
     chips = "".join(
         f'<span class="chip {VERDICTS[v].css}">{n} {VERDICTS[v].text}</span>'
@@ -445,8 +445,8 @@ def _measured_q(result: RunResult) -> str:
     return (
         "<h2>Is q measured?</h2><p class='dim'>A service can compute q from the commands instead "
         "of measuring it. These observations are of what the commands do not tell. They count in "
-        "no verdict; a service that models the hand and its object cannot be told from a hand by "
-        f"its topics.</p><ul>{items}</ul>{claim}"
+        "no verdict; a service that models the hand and its object cannot be distinguished from a "
+        f"hand by its topics.</p><ul>{items}</ul>{claim}"
         f'<table class="measured"><thead><tr><th scope="col">observation</th>{head}</tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table>"
     )
@@ -586,7 +586,7 @@ def _what(result: RunResult) -> str:
         )
     else:
         text.append("Here the recording of a session was judged.</p>")
-    if real := _REALITY.get(nature(result)):
+    if real := _REALITY.get(device_kind(result)):
         text.append(f'<p class="reality">{real}</p>')
     return "".join(text)
 

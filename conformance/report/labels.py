@@ -19,13 +19,13 @@ __all__ = [
     "Word",
     "about_harness",
     "answer_of",
+    "count_verdicts",
+    "device_kind",
     "hand_name",
     "model_title",
-    "nature",
     "part",
     "quantity",
     "subject",
-    "tally",
     "utc_date",
     "whose",
 ]
@@ -97,7 +97,7 @@ def answer_of(grade: Grade) -> Word:
     return ANSWERS[grade.overall] if grade.judged else _NOT_JUDGED
 
 
-def tally(result: RunResult, kind: Kind | None = None) -> Tally:
+def count_verdicts(result: RunResult, kind: Kind | None = None) -> Tally:
     """Count the requirements of a run.
 
     :param kind: only those of that kind.
@@ -154,7 +154,7 @@ def part(result: RunResult) -> str:
     return f"Only {n} of {result.catalogue} requirements were selected"
 
 
-def nature(result: RunResult) -> str:
+def device_kind(result: RunResult) -> str:
     """``emulated``, ``simulated``, ``recorded``, or empty for a real hand."""
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":

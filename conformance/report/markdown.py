@@ -14,9 +14,9 @@ from dexkit.conformance.report.labels import (
     VERDICTS,
     about_harness,
     answer_of,
+    device_kind,
     hand_name,
     model_title,
-    nature,
     part,
     whose,
 )
@@ -58,7 +58,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 def render_markdown(result: RunResult) -> str:
     """The summary: verdict, the two grades, areas, failures, and all requirements folded."""
     answer = ANSWERS[result.overall]
-    real = nature(result)
+    real = device_kind(result)
     counts = ", ".join(f"{n} {VERDICTS[v].text}" for v, n in result.counts().items() if n)
     lines = [
         f"## {answer.mark} {answer.text}: {plain(hand_name(result))} as {model_title(result)}",

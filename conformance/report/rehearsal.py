@@ -10,7 +10,7 @@ import numpy as np
 from dexkit import __version__
 from dexkit.conformance.report.charts import Band, Level, Line, chart
 from dexkit.conformance.report.html import document
-from dexkit.conformance.report.tables import table, unbroken
+from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehearsed
 from dexkit.escaping import html as escape
 from dexkit.hand import Side
@@ -90,11 +90,11 @@ def _findings(prepared: Prepared) -> str:
         return "<h2>Findings</h2><p>Nothing was found.</p>"
     rows = [
         (
-            unbroken(f"<code>{escape(f.name)}</code>"),
-            unbroken(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
-            unbroken(escape(f.where)),
+            no_wrap(f"<code>{escape(f.name)}</code>"),
+            no_wrap(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
+            no_wrap(escape(f.where)),
             escape(f.text),
-            unbroken(f"<code>{escape(f.option)}</code>") if f.option else escape(f.advice),
+            no_wrap(f"<code>{escape(f.option)}</code>") if f.option else escape(f.advice),
         )
         for f in prepared.findings
     ]
@@ -182,7 +182,7 @@ def _overview(
 def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
     rows = [
         (
-            unbroken(escape(f.name)),
+            no_wrap(escape(f.name)),
             f"{f.commanded:.2f}",
             f"{f.moved:.2f}",
             f"{f.rms:.3f}",

@@ -11,7 +11,7 @@ import numpy as np
 from dexkit.conformance.report.charts import Level, Line, chart
 from dexkit.conformance.report.curves import STYLE
 from dexkit.conformance.report.html import document, utc
-from dexkit.conformance.report.tables import table, unbroken
+from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.selftest.bench import Series
 from dexkit.conformance.selftest.figure_limits import BY_NAME, KINDS, Figure, Unit, Wear
 from dexkit.conformance.selftest.result import (
@@ -220,13 +220,13 @@ def _facts(result: SelfTestResult) -> str:
 def _findings(result: SelfTestResult) -> str:
     rows = [
         (
-            unbroken(escape(f.where)),
+            no_wrap(escape(f.where)),
             f'<b class="bad">{"worse than before" if f.worn else "outside the model"}</b>',
             escape(f.what),
         )
         for f in findings(result)
     ]
-    notes = [(unbroken(escape(j.name)), "note", escape(n)) for j in result.joints for n in j.notes]
+    notes = [(no_wrap(escape(j.name)), "note", escape(n)) for j in result.joints for n in j.notes]
     if not rows and not notes:
         return ""
     return "<h2>Findings</h2>" + table(("where", "verdict", "what"), [*rows, *notes])
@@ -244,9 +244,9 @@ def _joints(result: SelfTestResult, profile: HandModel) -> str:
         if joint.name in rest:
             continue
         css = "bad" if "condition" in joint.faulty else "ok"
-        moves = f'<b class="{css}">{unbroken(escape(str(joint.condition)))}</b>'
+        moves = f'<b class="{css}">{no_wrap(escape(str(joint.condition)))}</b>'
         cells = ["".join(_cell(joint, n, profile) for n in names) for names in columns.values()]
-        rows.append((unbroken(escape(joint.name)), moves, *cells))
+        rows.append((no_wrap(escape(joint.name)), moves, *cells))
     both = any(len(names) > 1 for names in columns.values())
     about = "<p>Of two figures, the first is with q rising.</p>" if both else ""
     if profile.unit == _TRAVEL:
@@ -267,11 +267,11 @@ def _cell(joint: JointResult, name: str, profile: HandModel) -> str:
         return "<div>-</div>"
     bad = not figure.good or figure.wear is Wear.WORN
     css = "bad" if bad else "ok" if figure.wear is Wear.BETTER else ""
-    text = unbroken(escape(_value(figure, profile)))
+    text = no_wrap(escape(_value(figure, profile)))
     if bad:
         text = f'<b class="{css}">{text}</b>'
     if math.isfinite(figure.before):
-        text += f"<span>was {unbroken(escape(_value(figure, profile, before=True)))}</span>"
+        text += f"<span>was {no_wrap(escape(_value(figure, profile, before=True)))}</span>"
     return f"<div>{text}</div>"
 
 
@@ -284,7 +284,7 @@ def _elements(result: SelfTestResult) -> str:
         css = "bad" if e.faulty or e.worn else "na" if e.touch is ElementResponse.UNTESTED else "ok"
         rows.append(
             (
-                unbroken(escape(_element(e))),
+                no_wrap(escape(_element(e))),
                 f'<span class="{css}">{e.touch}</span>',
                 *(_pascal(v) for v in (e.rest, e.noise, e.peak)),
             )
@@ -299,7 +299,7 @@ def _elements(result: SelfTestResult) -> str:
 
 
 def _pascal(value: float) -> str:
-    return unbroken(f"{value:.0f} Pa") if math.isfinite(value) else "-"
+    return no_wrap(f"{value:.0f} Pa") if math.isfinite(value) else "-"
 
 
 # --------------------------------------------------------------------------- curves of a joint

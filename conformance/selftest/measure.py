@@ -1,7 +1,7 @@
 """Figures of one joint from time series; no clock, no device.
 
 Every function takes arrays of one joint, shape (n,): seconds, commanded q, measured q, torque. What
-cannot be told from them is NaN.
+cannot be distinguished from them is NaN.
 """
 
 from __future__ import annotations

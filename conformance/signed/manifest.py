@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dexkit import documents
-from dexkit.conformance.report.labels import nature
+from dexkit.conformance.report.labels import device_kind
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Grade, RunResult
 from dexkit.errors import ArchiveError
@@ -91,7 +91,7 @@ class Judged:
         count = sum(result.counts().values())
         known = {
             **result.subject,
-            "nature": nature(result),
+            "nature": device_kind(result),
             "requirements": f"{count} of {result.catalogue}" if result.partial else str(count),
             "recorded_at": result.recorded_at,
             "dexkit": result.environment.get("dexkit", ""),

@@ -309,6 +309,6 @@ class UsbRecording:
         late = self.lateness(begin, end)
         return None if late is None else late[1]
 
-    def lost(self, begin: float, end: float) -> Lateness | None:
+    def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         """Delay of the kit in [begin, end] beyond that of an idle machine, s; None if unknown."""
-        return self.beats.lost(self.log_time(begin), self.log_time(end))
+        return self.beats.excess_lateness(self.log_time(begin), self.log_time(end))

@@ -45,7 +45,7 @@ _LENGTHS = {area.member: area.elements for area in _AREAS}
 
 
 class FtpHand(InspireHand):
-    """The same joints, whose forces are measured, too, and fingers that feel."""
+    """The same joints, with measured forces and tactile areas."""
 
     model = INSPIRE_FTP
 
@@ -98,7 +98,7 @@ class FtpService(ServoService):
         return self.dialect.touch_topic_of(side)
 
     def publish(self) -> list[Sample]:
-        """One state of every hand, and now and then what its areas feel."""
+        """One state of every hand, and at its own rate the touch message."""
         samples = super().publish()
         if self.now + 1e-9 < self.touch_due:
             return samples

@@ -71,7 +71,9 @@ class BringupSession:
         elif isinstance(action, PressRequest):
             self._touch = _TouchWatch(action)
             self.question = Question(
-                action.key, f"Press the {action.place} when told. Ready?", ("yes", SKIP)
+                action.key,
+                f"When dexkit asks for it, press the {action.place}. Ready?",
+                ("yes", SKIP),
             )
         else:
             self.question = action

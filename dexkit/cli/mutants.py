@@ -97,7 +97,9 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     help="Try N hands generated from faults, places and conditions.",
 )
 @click.option(
-    "--good", is_flag=True, help="With --generated: good hands, which must not be blamed."
+    "--good",
+    is_flag=True,
+    help="With --generated: good hands, which must not fail or get a warning.",
 )
 @seed_option("--generated", 1)
 @click.option("--quick", is_flag=True, help="With --generated: judge them in quick runs.")
@@ -148,10 +150,9 @@ def command(
     quick or thorough runs like those of the conformance suite. With --from, the hands are your own
     (docs/mutants.md).
 
-    Exit code: 0 every requirement detects its wrong hand, 1 a wrong hand is missed or wrongly
-    blamed, or a requirement has none, 2 no hand is selected. With --generated and --from: 0 every
-    wrong hand is
-    caught and no good one is blamed, 1 otherwise.
+    Exit code: 0 every requirement detects its wrong hand, 1 a wrong hand is missed or fails
+    another requirement, or a requirement has none, 2 no hand is selected. With --generated and
+    --from: 0 every wrong hand is caught and no good one fails or gets a warning, 1 otherwise.
     """
     if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:
         raise UsageError("--generated, --hand, --from and --require cannot be combined")

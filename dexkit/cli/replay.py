@@ -215,7 +215,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
     if given["hand"] not in (None, "none"):
         model(given["hand"])  # refused before anything is read
     options = Options(rate=given["rate"], hand=given["hand"], correct=not given["keep_sides"])
-    wishes = ReplayOptions(
+    replay_options = ReplayOptions(
         sides=given["sides"],
         dialect=given["dialect"],
         pace=given["pace"],
@@ -237,7 +237,7 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
         loop=given["loop"],
     )
     session = read_session(source, given["form"], given["chosen"], options)
-    prepared = prepare(session, wishes)
+    prepared = prepare(session, replay_options)
     _print_session(session, prepared)
     code = 1 if session.damage else 0
     if given["rehearse"]:

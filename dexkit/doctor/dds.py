@@ -287,7 +287,7 @@ def observe_domains(
             _run(windows, selector, began, DISCOVERY_SECONDS + seconds, stop)
         until = time.monotonic()
         for window in windows:
-            window.send(window.everywhere(window.observer.farewell()))
+            window.send(window.everywhere(window.observer.withdrawal_packet()))
         return tuple(
             _view(domain, [w for w in windows if w.domain == domain], began, until)
             for domain in domains

@@ -117,7 +117,7 @@ class Observer:
         """The packet that makes others answer; to be sent to all addresses where they may be."""
         return rtps.message(self.prefix, rtps.build_data(rtps.SPDP_WRITER, 1, self._announcement))
 
-    def farewell(self) -> bytes:
+    def withdrawal_packet(self) -> bytes:
         """The packet that withdraws the announcement, so that others forget this participant."""
         return rtps.message(
             self.prefix, rtps.build_data(rtps.SPDP_WRITER, 2, self._announcement, gone=True)

@@ -22,7 +22,7 @@ from dexkit.doctor.observations import (
     Stream,
     UsbDevice,
 )
-from dexkit.doctor.topics import nearly, short
+from dexkit.doctor.topics import closest_topic, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.messages.earlier import EARLIER, earlier_by_hash
@@ -305,7 +305,7 @@ def _names_and_types(view: DomainView, scope: Scope) -> Iterator[Finding]:
     for endpoint in view.endpoints:
         key = (endpoint.topic, endpoint.kind)
         verb = "publishes" if endpoint.kind == "writer" else "reads"
-        near = nearly(endpoint.topic)
+        near = closest_topic(endpoint.topic)
         if near is not None and key not in reported:
             reported.add(key)
             yield _finding(

@@ -11,7 +11,7 @@ from dexkit.messages import message_types
 from dexkit.models import Dialect, ModeByte
 from dexkit.topics import HAND_TOPICS, roles
 
-__all__ = ["is_driven", "is_hand_topic", "is_limp", "nearly", "short"]
+__all__ = ["closest_topic", "is_driven", "is_hand_topic", "is_limp", "short"]
 
 _KNOWN_TYPES = frozenset(kind.name for kind in message_types())
 _ALIKE = 0.86  # ratio of difflib above which a name is a slip of the pen
@@ -49,7 +49,7 @@ def _plain(topic: str) -> str:
     return text.removeprefix("rt/")
 
 
-def nearly(topic: str, among: Iterable[str] = ()) -> tuple[str, str] | None:
+def closest_topic(topic: str, among: Iterable[str] = ()) -> tuple[str, str] | None:
     """The hand topic that an unknown name is nearest to, and the difference.
 
     :param among: names to choose from; default all hand topics.

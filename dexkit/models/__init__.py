@@ -121,6 +121,11 @@ def _load_plugins() -> tuple[ModelPlugin, ...]:
                     f"{owner} registers {', '.join(sorted(taken))}, which is there already",
                     hint="give the model and each of its dialects a name of its own",
                 )
+            if loaded.simulated_by is not None:
+                raise ModelBroken(
+                    f"{owner}: simulated_by is for the models of dexkit itself",
+                    hint="register the simulated backend under the entry points dexkit.backends",
+                )
             known.add(name)
             dialects |= {d.name for d in loaded.dialects}
         except ModelBroken as broken:

@@ -73,7 +73,7 @@ class Dialect:
     :param zero_is_no_state: clients take a state of which every q is exactly 0 for no state
         (docs/sources/unitree-dex.md#b1).
     :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
-    :param touch_topic: topic of what the hand's tactile areas feel, or empty; with ``{side}`` or
+    :param touch_topic: topic of what the hand's tactile areas measure, or empty; with ``{side}`` or
         ``{s}``.
     :param touch_type: its DDS type name.
     :param torque_units: N·m in one unit of a motor's tau and tau_est; empty where all are in N·m.
@@ -310,7 +310,7 @@ class HandModel:
         clients wait for a position that is not.
     :param sensors: pressure sensor packets of a state, in order.
     :param areas: tactile areas, in the order of the touch message.
-    :param touch_rate: Hz at which dexkit publishes what they feel, where the dialect has a topic.
+    :param touch_rate: Hz of the touch message that dexkit publishes, where the dialect has one.
     :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
     :param shared_motors: joints that one motor moves, by index; the others have one each.
     :param simulator: name of the backend that simulates it, with the setting ``object``; or empty.

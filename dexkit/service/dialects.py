@@ -118,7 +118,7 @@ class StateView:
 
 @dataclass(frozen=True)
 class Remark:
-    """Something odd about a command that is obeyed nevertheless.
+    """A remark on an unusual command that is obeyed that is obeyed nevertheless.
 
     :param counter: which of :class:`~dexkit.service.counters.HandCounters` counts it.
     :param text: what is odd, and what to send instead.

@@ -114,8 +114,8 @@ class HandCore:
     # -- what happened ----------------------------------------------------------------------
 
     def submit(self, command: HandCommand, sent: float | None = None) -> bool:
-        """A command came. False when it does not count: the one before stays in force, and the
-        watchdog is not fed. It may have been rejected, or be stale: sent more than
+        """Take a command. False when it is rejected or stale: the one before stays in force, and
+        the watchdog is not fed. A command is stale that was sent more than
         :data:`~dexkit.command_age.PAUSE` seconds ago, or before the link was opened, a fault ended
         or a pause did.
 

@@ -136,7 +136,7 @@ class StateReceiver:
         self._at = 0
 
     def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
-        """A message came, of one side or of both.
+        """Take a state message, of one side or of both.
 
         :param now: seconds on any monotonic clock; not before the last call.
         """
@@ -250,7 +250,7 @@ class TeleopClient(ABC):
         self.receiver.forget()
 
     def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
-        """A state message came: q of the joints of the side, or sides, that are in it.
+        """Take a state message: q of the joints of the side, or sides, that are in it.
 
         :param now: seconds on any monotonic clock; not before the last call.
         """

@@ -251,23 +251,23 @@ class Prepared:
         return list(dict.fromkeys(f.option for f in self.refused if f.option))
 
 
-def prepare(session: RecordedCommands, wishes: ReplayOptions = ReplayOptions()) -> Prepared:
+def prepare(session: RecordedCommands, options: ReplayOptions = ReplayOptions()) -> Prepared:
     """Check a session, correct it as the options say, and make the plan.
 
     :raises SessionError: it has no hand that dexkit knows.
     :raises UsageError: the options contradict the session: a dialect of another model, or a missing
         side.
     """
-    return _Preparation(session, wishes).run()
+    return _Preparation(session, options).run()
 
 
 class _Preparation:
-    def __init__(self, session: RecordedCommands, wishes: ReplayOptions) -> None:
-        self.session, self.wishes = session, wishes
+    def __init__(self, session: RecordedCommands, options: ReplayOptions) -> None:
+        self.session, self.options = session, options
         self.model: HandModel = session.model
         assert session.dialect is not None
         self.recorded = session.dialect
-        self.spoken = dialect(wishes.dialect) if wishes.dialect else self.recorded
+        self.spoken = dialect(options.dialect) if options.dialect else self.recorded
         self.found = Prepared()
 
     # -- findings
@@ -289,7 +289,7 @@ class _Preparation:
         level = Level.REFUSED
         if cured:
             level = Level.CURED
-        elif name in self.wishes.accept and name in ACCEPTABLE:
+        elif name in self.options.accept and name in ACCEPTABLE:
             level = Level.ACCEPTED
         if level is not Level.REFUSED:
             option = advice = ""
@@ -322,8 +322,8 @@ class _Preparation:
         tracks = {s: self._gains(s, t) for s, t in tracks.items()}
         tracks = {s: t if s in exchanged else self._limits(s, t) for s, t in tracks.items()}
         tracks = self._timed(tracks)
-        if self.wishes.resample:
-            tracks = {s: _resampled(t, self.wishes.resample) for s, t in tracks.items()}
+        if self.options.resample:
+            tracks = {s: _resampled(t, self.options.resample) for s, t in tracks.items()}
         self.found.plan = Plan(self.session.name, self.spoken, tracks)
         return self.found
 
@@ -349,23 +349,23 @@ class _Preparation:
 
     def _chosen(self) -> dict[Side, HandCommands]:
         """The commands of the chosen hands, on the sides where they are to be played."""
-        session, wishes = self.session, self.wishes
+        session, options = self.session, self.options
         commands = dict(session.commands)
-        if wishes.states or not commands:
+        if options.states or not commands:
             self.judge(
                 "only-states" if not commands else "states",
                 "the session has positions of hands and no commands"
                 if not commands
                 else "its positions are played instead of its commands",
                 "--play states",
-                cured=wishes.states,
+                cured=options.states,
             )
             commands = {s: _from_states(t, q, self.model) for s, (t, q) in session.states.items()}
-        if wishes.swap_sides:
+        if options.swap_sides:
             other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT}
             commands = {other[s]: commands[s] for s in reversed(list(commands))}
             self.note("swapped", "each hand's commands are played on the other hand")
-        sides = wishes.sides or tuple(commands)
+        sides = options.sides or tuple(commands)
         if missing := [str(s) for s in sides if s not in commands]:
             raise UsageError(
                 f"{session.name} has nothing to play on the {' and '.join(missing)} hand",
@@ -382,7 +382,7 @@ class _Preparation:
         tables = np.concatenate([given.q, given.dq, given.tau, given.kp, given.kd], axis=1)
         broken = ~odd & ~np.isfinite(tables).all(axis=1)
         stale = ~odd & ~broken & (given.late > PAUSE)
-        drop = self.wishes.invalid == "drop"
+        drop = self.options.invalid == "drop"
         out = odd | broken | given.backwards
         option = "--invalid drop"
         if odd.all() and len(given):
@@ -428,9 +428,9 @@ class _Preparation:
         if self.spoken.name != self.recorded.name and self.spoken.is_gripper:
             scale = self.spoken.q_open / self.recorded.q_open
         return Track(
-            t=given.t / self.wishes.pace,
+            t=given.t / self.options.pace,
             q=given.q * scale,
-            dq=given.dq * scale * self.wishes.pace,
+            dq=given.dq * scale * self.options.pace,
             tau=given.tau,
             kp=given.kp,
             kd=given.kd,
@@ -447,10 +447,10 @@ class _Preparation:
             "side",
             f"{mine:.0%} of the commands are outside the limits of the {side} hand, and "
             f"within those of the {other} one",
-            "" if self.wishes.swap_sides else "--swap-sides",
+            "" if self.options.swap_sides else "--swap-sides",
             cured=False,
             where=str(side),
-            advice="leave out --swap-sides" if self.wishes.swap_sides else "",
+            advice="leave out --swap-sides" if self.options.swap_sides else "",
         )
         return True
 
@@ -466,7 +466,7 @@ class _Preparation:
             return track
         limits = joint_limits(self.spoken, side)
         kp, kd = np.array(self.model.gains).T
-        cured = self.wishes.gains == "model"
+        cured = self.options.gains == "model"
         moves = np.ptp(track.q, axis=0) > _MOVES * limits.stroke
         option = "--gains model"
         locked = ~track.driven
@@ -525,7 +525,7 @@ class _Preparation:
         """Check position, feed-forward velocity and torque."""
         limits = joint_limits(self.spoken, side)
         margin = _BEYOND * limits.stroke
-        clamp = self.wishes.limit == "clamp"
+        clamp = self.options.limit == "clamp"
         clamped = replace(
             track,
             q=np.clip(track.q, limits.low, limits.high),
@@ -569,21 +569,21 @@ class _Preparation:
 
     def _timed(self, tracks: dict[Side, Track]) -> dict[Side, Track]:
         """Check pace, gaps, jumps and rate; shorten gaps and stretch jumps."""
-        wishes = self.wishes
-        if wishes.pace > 1:
+        options = self.options
+        if options.pace > 1:
             self.judge(
                 "pace",
-                f"{wishes.pace:g} times as fast as it was recorded",
+                f"{options.pace:g} times as fast as it was recorded",
                 "--accept pace",
                 cured=False,
             )
         begin = min(float(t.t[0]) for t in tracks.values())
         tracks = {s: replace(t, t=_apart(t.t - begin)) for s, t in tracks.items()}
-        if wishes.max_gap is not None:
-            longest = wishes.max_gap / wishes.pace
+        if options.max_gap is not None:
+            longest = options.max_gap / options.pace
             tracks = _warped(tracks, lambda middle, dt: np.minimum(dt, longest))
         tracks = {s: self._gaps(s, t) for s, t in tracks.items()}
-        stretch = wishes.jumps == "stretch"
+        stretch = options.jumps == "stretch"
         jumping = [s for s, t in tracks.items() if self._jumps(s, t)]
         if jumping and stretch:
             tracks = self._stretched(tracks)
@@ -626,7 +626,7 @@ class _Preparation:
             f"{window * 1e3:.0f} ms at "
             f"{track.t[i]:.2f} s, at most {limits.dq[j]:.3g} {limits.unit}/s",
             "--jumps stretch",
-            cured=self.wishes.jumps == "stretch",
+            cured=self.options.jumps == "stretch",
             where=str(side),
         )
         return True
@@ -670,7 +670,7 @@ class _Preparation:
             return
         torque = steps * track.kp[1:]
         i, j = np.unravel_index(int(np.argmax(torque)), torque.shape)
-        wished = self.wishes.resample or 0.0
+        wished = self.options.resample or 0.0
         self.judge(
             "thin-rate",
             f"loud motors: {rate:.3g} commands a second, where the model's client sends "

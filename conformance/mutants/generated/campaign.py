@@ -337,7 +337,9 @@ class Campaign:
         if kinds:
             console.print(table)
             count = len(self.trials_of(Severity.EQUIVALENT.value))
-            console.print(f"{count} hands cannot be told from the reference, and are not counted")
+            console.print(
+                f"{count} hands cannot be distinguished from the reference, and are not counted"
+            )
         if good := self.trials_of(GOOD):
             console.print(
                 f"{len(good)} good hands: {sum(bool(t.failed) for t in good)} fail a MUST, "

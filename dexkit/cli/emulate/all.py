@@ -156,7 +156,7 @@ def _for_lerobot(robot: str) -> list[str]:
         "next, with LeRobot (docs/lerobot.md):",
         f"  lerobot-teleoperate --robot.type={name} --robot.is_simulation=false "
         f"--robot.robot_ip={LOOPBACK} ...",
-        f"  (LeRobot's {name} commands the body only: the hands are on DDS alone)",
+        f"  (LeRobot's {name} commands the robot only; its hands are on DDS)",
     ]
 
 

@@ -50,8 +50,9 @@ def emulate_lerobot_g1(
 ) -> None:
     """Serve the ports of LeRobot's robot server for an emulated G1.
 
-    Stands in for run_g1_server.py of a real G1: the body's commands and states as JSON over ZeroMQ,
-    and pictures (a test card). 'dexkit emulate all --for lerobot' starts it with robot and hands.
+    Stands in for run_g1_server.py of a real G1: the robot's low-level commands and states as JSON
+    over ZeroMQ, and pictures (a test card). 'dexkit emulate all --for lerobot' starts it with robot
+    and hands.
     Commands are obeyed after one second without a gap of more than 0.25 s, and from one client
     only.
 

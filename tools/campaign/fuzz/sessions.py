@@ -122,7 +122,7 @@ def _audited(rng: random.Random, scratch: Path) -> Target:
 def _replayed(rng: random.Random, scratch: Path) -> Target:
     path = scratch / "x.mcap"
 
-    def wishes() -> ReplayOptions:
+    def options() -> ReplayOptions:
         return ReplayOptions(
             pace=rng.choice((0.5, 1.0, 3.0)),
             gains=rng.choice(GAINS),
@@ -138,7 +138,7 @@ def _replayed(rng: random.Random, scratch: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        plan = prepare(read_session(path), wishes()).plan
+        plan = prepare(read_session(path), options()).plan
         if plan is not None and plan.duration <= _REHEARSED:  # what is refused is rehearsed, too
             rehearse(plan, Guards(ramp_speed=3.0))
 
