@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dynamixel_sdk import PacketHandler, PortHandler
 
 from benchmarks import Result
-from dexkit.drivers.ezgripper import EZGripper, GripperSettings, block
+from dexkit.drivers.ezgripper import EZGripper, GripperSettings, register_block
 from dexkit.drivers.ezgripper.servo import exchange_bytes, line_time
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.mx64 import emulated_ezgripper
@@ -78,13 +78,17 @@ def _one_call_a_register(path: str) -> tuple[float, float]:
 def _sdk_port(path: str) -> tuple[float, float]:
     """The driver's own two packets through the SDK's own port."""
     port, packets = _open(path)
-    goal = block.encode(block.Goal(2760, 240, 100))
+    goal = register_block.encode(register_block.Goal(2760, 240, 100))
 
     def exchange() -> None:
         packets.syncWriteTxOnly(
-            port, block.WRITE_ADDRESS, block.WRITE_SIZE, [1, *goal], 1 + block.WRITE_SIZE
+            port,
+            register_block.WRITE_ADDRESS,
+            register_block.WRITE_SIZE,
+            [1, *goal],
+            1 + register_block.WRITE_SIZE,
         )
-        packets.readTxRx(port, 1, block.READ_ADDRESS, block.READ_SIZE)
+        packets.readTxRx(port, 1, register_block.READ_ADDRESS, register_block.READ_SIZE)
 
     try:
         return _rate(exchange)

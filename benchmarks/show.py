@@ -12,8 +12,8 @@ import numpy as np
 from rich.text import Text
 
 from benchmarks import Result
-from dexkit.conformance.report.charts import Level, Line, chart
 from dexkit.conformance.report.html import document
+from dexkit.conformance.report.svg_charts import Level, Line, chart
 from dexkit.conformance.report.tables import table
 from dexkit.escaping import html as escape
 

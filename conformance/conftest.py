@@ -10,7 +10,7 @@ from _pytest.outcomes import Exit
 
 from dexkit.conformance.plugin import OPTIONS_KEY, RESULT_KEY, WHY_KEY
 from dexkit.conformance.results import RunResult
-from dexkit.conformance.session import run_suite
+from dexkit.conformance.suite_run import run_suite
 from dexkit.errors import DexkitError
 from dexkit.stop_signals import stop_on_signals
 

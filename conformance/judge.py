@@ -16,8 +16,8 @@ import numpy as np
 from dexkit.conformance.checks import Outcome, check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
-from dexkit.conformance.measure import Measure, weigh
 from dexkit.conformance.measured_q import measured_q
+from dexkit.conformance.measurement_error import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage

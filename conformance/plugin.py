@@ -15,7 +15,7 @@ import pytest
 
 if TYPE_CHECKING:
     from dexkit.conformance.results import Result, RunResult
-    from dexkit.conformance.session import SuiteOptions
+    from dexkit.conformance.suite_run import SuiteOptions
     from dexkit.errors import DexkitError
 
 __all__ = ["OPTIONS_KEY", "REPORTED_KEY", "RESULT_KEY", "WHY_KEY"]
@@ -167,7 +167,7 @@ def pytest_configure(config: pytest.Config) -> None:
             text = f"{', '.join(given)} without --backend: which hand is to be judged?"
             raise pytest.UsageError(text)
         return
-    from dexkit.conformance.session import SuiteOptions
+    from dexkit.conformance.suite_run import SuiteOptions
     from dexkit.errors import DexkitError
 
     try:
@@ -186,7 +186,7 @@ def pytest_cmdline_main(config: pytest.Config) -> int | None:
     if not config.getoption("dexkit_list"):
         return None
     from dexkit.conformance.selection import print_selection
-    from dexkit.conformance.session import selection
+    from dexkit.conformance.suite_run import selection
     from dexkit.errors import DexkitError
 
     try:

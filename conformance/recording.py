@@ -20,10 +20,10 @@ from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.layers import layer
 from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.processor_waits import Starvation
 from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.touch import Touch
-from dexkit.conformance.waits import Starvation
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.messages.columns import Columns

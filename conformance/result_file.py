@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import documents
-from dexkit.conformance.measure import Measure
 from dexkit.conformance.measured_q import MeasuredQ
+from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
 from dexkit.conformance.result_file_v2 import converted

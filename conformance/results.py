@@ -11,7 +11,7 @@ warn           a SHOULD that is not met; does not fail the hand
 not claimed    about a unit that the vendor does not claim (:mod:`~.claims`)
 not applicable cannot be judged here, with the reason; never counts as a pass
 blocked        another requirement failed first, the kit's own machine was too busy, or a MUST
-               fails by less than the kit's measurement error (:mod:`~.measure`)
+               fails by less than the kit's measurement error (:mod:`~.measurement_error`)
 error          the kit's own fault
 ============== ============================================================================
 """
@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import __version__, documents
-from dexkit.conformance.measure import Measure
 from dexkit.conformance.measured_q import MeasuredQ
+from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
 from dexkit.conformance.scores import NO_SCORE, Score

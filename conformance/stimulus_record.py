@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.waits import Waits
+from dexkit.conformance.processor_waits import Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import ROBOT, Floats, Side, Subject

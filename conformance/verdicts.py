@@ -32,8 +32,8 @@ late while it was judged:
    run, no requirement of real time can be judged, but for what 4 does not explain; the direction
    of motion can.
 8. Apart from load, a MUST that fails by less than the kit's measurement error
-   (:mod:`~dexkit.conformance.measure`) is *blocked* as well: its figure is nearer to the limit than
-   the kit can tell. A pass by less than that remains a pass, and says so.
+   (:mod:`~dexkit.conformance.measurement_error`) is *blocked* as well: its figure is nearer to the
+   limit than the kit can tell. A pass by less than that remains a pass, and says so.
 
 So a gross failure fails on a busy machine, too; one at the border is blocked there; every failure
 fails on an idle machine.
@@ -49,10 +49,10 @@ from typing import Protocol
 from dexkit.conformance.checks import Late, Outcome
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.lateness import IDLE, Lateness
-from dexkit.conformance.measure import Measure
+from dexkit.conformance.measurement_error import Measure
+from dexkit.conformance.processor_waits import Starvation
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
-from dexkit.conformance.waits import Starvation
 from dexkit.hand import Subject
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.emulators.servo_mechanics import SETTINGS
-from dexkit.emulators.simulated import COMMON_SETTINGS
+from dexkit.emulators.simulated_hand import COMMON_SETTINGS
 from dexkit.emulators.simulated_servos import SimulatedServos, make_servos
 from dexkit.models import BRAINCO_REVO2
 

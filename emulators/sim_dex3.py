@@ -9,7 +9,7 @@ from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP
-from dexkit.emulators.simulated import COMMON_SETTINGS, SimulatedHand, configured, number
+from dexkit.emulators.simulated_hand import COMMON_SETTINGS, SimulatedHand, configured, number
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 

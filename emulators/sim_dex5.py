@@ -14,7 +14,7 @@ from __future__ import annotations
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP, FingerMechanics, MotorModel
-from dexkit.emulators.simulated import COMMON_SETTINGS, SimulatedHand, configured, number
+from dexkit.emulators.simulated_hand import COMMON_SETTINGS, SimulatedHand, configured, number
 from dexkit.hand import JointSpec, Side
 from dexkit.models import DEX5_1
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.emulators.servo_mechanics import SETTINGS, ServoMechanics
-from dexkit.emulators.simulated import COMMON_SETTINGS
+from dexkit.emulators.simulated_hand import COMMON_SETTINGS
 from dexkit.emulators.simulated_servos import SimulatedServos, make_servos
 from dexkit.hand import Floats, HandCommand, HandState, Side
 from dexkit.models import INSPIRE_DFX, INSPIRE_FTP

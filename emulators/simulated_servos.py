@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.servo_mechanics import STEP, ServoMechanics
-from dexkit.emulators.simulated import SimulatedHand, configured, number
+from dexkit.emulators.simulated_hand import SimulatedHand, configured, number
 from dexkit.hand import Side
 from dexkit.models import HandModel
 

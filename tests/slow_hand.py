@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.emulators.sim_dex3 import SimDex3
-from dexkit.emulators.sim_hand import SimHand
 from dexkit.hand import HandSpec, Side
 from dexkit.models import DEX1_1, DEX3_1
 

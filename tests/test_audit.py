@@ -15,11 +15,11 @@ from dexkit.cli import main
 from dexkit.conformance.audit import objects, sessions
 from dexkit.conformance.audit.audit import Audit, AuditProgress, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
+from dexkit.conformance.audit.file_records import FINDING, FileRecord, State
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.records import FINDING, FileRecord, State
+from dexkit.conformance.audit.result_tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
-from dexkit.conformance.audit.tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of

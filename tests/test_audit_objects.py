@@ -20,8 +20,8 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from dexkit.conformance.audit import objects
 from dexkit.conformance.audit.examine import Task, examine
+from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.audit.objects import Object, RangeFile
-from dexkit.conformance.audit.records import FileRecord, State
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.traces import sample_path
 

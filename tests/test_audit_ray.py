@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 
 from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, in_this_process
+from dexkit.conformance.audit.file_records import FileRecord
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.records import FileRecord
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.traces import sample_path
 

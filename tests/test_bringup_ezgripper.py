@@ -13,7 +13,7 @@ from dexkit.clock import ManualClock, RealClock
 from dexkit.drivers.ezgripper import GripperSettings
 from dexkit.drivers.ezgripper.bringup import EZGripperBench, plan_of
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus
-from dexkit.drivers.ezgripper.config import Store, record_key
+from dexkit.drivers.ezgripper.calibration_file import Store, record_key
 from dexkit.emulators.mx64 import (
     Bus,
     EmulatedThread,

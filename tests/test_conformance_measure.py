@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from dexkit.conformance.checks import Outcome, rate_measure
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
-from dexkit.conformance.measure import Measure, Quantity, weigh
+from dexkit.conformance.measurement_error import Measure, Quantity, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.card import Card, near_limits
 from dexkit.conformance.report.html import render

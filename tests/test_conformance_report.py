@@ -17,10 +17,10 @@ from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import gripper, mutants, plan_for
 from dexkit.conformance.mutants import usb as wrong_usb
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.report.charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.labels import VERDICTS
 from dexkit.conformance.report.result_plots import plots_of
+from dexkit.conformance.report.svg_charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual

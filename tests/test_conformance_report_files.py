@@ -33,7 +33,7 @@ from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import RunResult, Verdict
-from dexkit.conformance.session import SuiteOptions, judge_recording
+from dexkit.conformance.suite_run import SuiteOptions, judge_recording
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb

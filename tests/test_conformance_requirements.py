@@ -13,9 +13,9 @@ from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Level, catalogue, models, parse, select
 from dexkit.conformance.selection import quick
-from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.conformance.stimuli.script import default_objects
+from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.documents import parse_toml
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side

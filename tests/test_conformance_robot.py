@@ -32,9 +32,9 @@ from dexkit.conformance.robot import (
     robot_in,
     robot_recording,
 )
-from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.conformance.stimulus_record import Stimulus
+from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.errors import ConformanceError, UsageError

@@ -23,8 +23,8 @@ from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements
 from dexkit.conformance.results import Overall, RunResult
 from dexkit.conformance.selection import length, quick
-from dexkit.conformance.session import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.on_dds import ServiceOnDds

@@ -22,6 +22,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.lateness import IDLE, Lateness
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.gripper import Inverted, NanVelocity, Percent
+from dexkit.conformance.processor_waits import ProcessWaits, Starvation, Waits
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Evidence, Load, RunResult, Verdict
@@ -30,7 +31,6 @@ from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.verdicts import AFTERMATH, HOPS, excuse
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
-from dexkit.conformance.waits import ProcessWaits, Starvation, Waits
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side, Subject
 from tests.conformance_helpers import copy_of, result_of, short_run

@@ -39,7 +39,7 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.report import as_data, print_report
 from dexkit.doctor.rtps import Data, parse_message, parse_participant
-from dexkit.doctor.topics import closest_topic, is_driven
+from dexkit.doctor.topic_spelling import closest_topic, is_driven
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.messages.earlier import EARLIER
 from dexkit.models import DIALECTS

@@ -20,7 +20,7 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.usb.record import UsbRecord
-from dexkit.drivers.ezgripper.config import Store
+from dexkit.drivers.ezgripper.calibration_file import Store
 from dexkit.errors import DexkitError, OutputError, UsageError
 from dexkit.hand import Side
 from tests import hostile

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from dexkit.clock import Clock, ManualClock
 from dexkit.emulators.sim_brainco import SimBrainCo
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.emulators.sim_dex3 import SimDex3
 from dexkit.emulators.sim_dex5 import SimDex5
-from dexkit.emulators.sim_hand import SimHand
 from dexkit.emulators.sim_inspire import SimInspireDfx, SimInspireFtp
-from dexkit.emulators.simulated import SimulatedHand
+from dexkit.emulators.simulated_hand import SimulatedHand
 from dexkit.errors import EncodeError
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.messages import message_type

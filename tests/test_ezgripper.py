@@ -26,7 +26,13 @@ from dexkit.backends import BackendOptions
 from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
 from dexkit.descriptors import wait_readable
-from dexkit.drivers.ezgripper import Calibrate, EZGripper, GripperSettings, calibration, settings
+from dexkit.drivers.ezgripper import (
+    Calibrate,
+    EZGripper,
+    GripperSettings,
+    calibration,
+    servo_registers,
+)
 from dexkit.drivers.ezgripper import bus as bus_module
 from dexkit.drivers.ezgripper import gripper as gripper_module
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus, ServoError
@@ -176,9 +182,9 @@ def test_open_sets_registers_without_motion(tmp_path: Path) -> None:
         before = travel(gripper)
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
             servo = gripper.servo
-            for item, value in (*settings.EEPROM, *settings.RAM):
+            for item, value in (*servo_registers.EEPROM, *servo_registers.RAM):
                 assert servo.get(item) == value, item.name
-            assert servo.get(mx64.BUS_WATCHDOG) == settings.WATCHDOG_UNITS
+            assert servo.get(mx64.BUS_WATCHDOG) == servo_registers.WATCHDOG_UNITS
             assert not servo.torque
             assert travel(gripper) == before
             assert hand.ping is not None
@@ -189,7 +195,7 @@ def test_open_sets_registers_without_motion(tmp_path: Path) -> None:
         # a second time there is nothing to be written to the EEPROM
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
             assert hand._servo is not None
-            assert settings.differences(hand._servo.bus, 1) == []
+            assert servo_registers.differences(hand._servo.bus, 1) == []
 
 
 def test_open_without_calibration_is_refused(tmp_path: Path) -> None:

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.drivers.ezgripper import block, calibration, config, scaling
-from dexkit.drivers.ezgripper.block import Goal, Sample
+from dexkit.drivers.ezgripper import calibration, calibration_file, register_block, scaling
 from dexkit.drivers.ezgripper.contact import MIN_FREE_SPEED, ContactDetector
 from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
 from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE, ForceTable
 from dexkit.drivers.ezgripper.recovery import RebootPolicy, describe, motor_error
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
 from dexkit.errors import TruncatedError, UsageError
 from dexkit.hand import HandCommand, MotorError, Side
 from dexkit.wire import mx64
@@ -151,20 +151,20 @@ def test_a_sample_is_read_as_the_table_encodes_it(sample: Sample) -> None:
         mx64.PRESENT_INPUT_VOLTAGE: sample.voltage,
         mx64.PRESENT_TEMPERATURE: sample.temperature,
     }
-    data = b"".join(item.encode(values[item]) for item in block.MAPPED[1:])
-    assert block.decode(data, sample.time, sample.received) == sample
+    data = b"".join(item.encode(values[item]) for item in register_block.MAPPED[1:])
+    assert register_block.decode(data, sample.time, sample.received) == sample
     with pytest.raises(TruncatedError):
-        block.decode(data[:-1], 1.5, 1.6)
+        register_block.decode(data[:-1], 1.5, 1.6)
 
 
 def test_mapping_lists_every_byte_once_in_order() -> None:
-    addresses = block.mapping()
+    addresses = register_block.mapping()
     listed = [int.from_bytes(addresses[i : i + 2], "little") for i in range(0, len(addresses), 2)]
     assert listed[:4] == [112, 113, 114, 115]
     assert listed[4:10] == [102, 103, 116, 117, 118, 119]
     assert len(listed) == len(set(listed)) == 28
     assert all(a >= 64 for a in listed), "EEPROM cannot be mapped"
-    goal = block.encode(Goal(position=-12000, current=320, profile_velocity=500))
+    goal = register_block.encode(Goal(position=-12000, current=320, profile_velocity=500))
     assert goal == b"\xf4\x01\x00\x00" + b"\x40\x01" + b"\x20\xd1\xff\xff"
 
 
@@ -597,16 +597,16 @@ def test_a_hot_servo_is_not_rebooted() -> None:
 
 def test_calibration_store_keeps_unknown_keys(tmp_path: Path) -> None:
     path = tmp_path / "new" / "file.json"
-    store = config.Store(path)
-    assert store.read("A") == config.GripperRecord()
+    store = calibration_file.Store(path)
+    assert store.read("A") == calibration_file.GripperRecord()
     assert store.keys() == []
-    store.write("A", config.GripperRecord(zero=3010))
-    store.write("A", config.GripperRecord(opening=130.123, closing=120.0))
-    store.write("B#2", config.GripperRecord(zero=-10, force_table=DEFAULT_FORCE_TABLE))
+    store.write("A", calibration_file.GripperRecord(zero=3010))
+    store.write("A", calibration_file.GripperRecord(opening=130.123, closing=120.0))
+    store.write("B#2", calibration_file.GripperRecord(zero=-10, force_table=DEFAULT_FORCE_TABLE))
     content = json.loads(path.read_text())
     content["left"] = "/dev/ttyUSB0"
     path.write_text(json.dumps(content))
-    store.write("A", config.GripperRecord(zero=3011))
+    store.write("A", calibration_file.GripperRecord(zero=3011))
     record = store.read("A")
     assert (record.zero, record.opening, record.closing) == (3011, 130.12, 120.0)
     assert store.read("B#2").zero == 4086
@@ -623,7 +623,7 @@ def test_calibration_file_of_sakes_driver_is_read(tmp_path: Path) -> None:
         '{"left": "/dev/ttyUSB0", "left_serial": "DA1Z9T40", "calibration": {"DA1Z9T40": 3010},'
         '"movement_speed": {"DA1Z9T40": 50.0}, "force_lookup": {"DA1Z9T40": {"0": 0, "9": 1}}}'
     )
-    record = config.Store(path).read("DA1Z9T40")
+    record = calibration_file.Store(path).read("DA1Z9T40")
     assert record.zero == 3010
     assert record.opening == record.closing == 50.0
     assert record.force_table is not None
@@ -633,7 +633,7 @@ def test_calibration_file_of_sakes_driver_is_read(tmp_path: Path) -> None:
 
 def test_the_file_names_the_adapter_of_a_side(tmp_path: Path) -> None:
     path = tmp_path / "file.json"
-    store = config.Store(path)
+    store = calibration_file.Store(path)
     assert store.device(Side.LEFT) is None
     path.write_text('{"left": "/dev/ttyUSB0", "left_serial": "DA1Z9T40", "right": "/dev/ttyUSB1"}')
     assert store.device(Side.LEFT) == "DA1Z9T40"
@@ -653,9 +653,11 @@ def test_a_file_that_is_written_back_keeps_the_types_of_its_readers(tmp_path: Pa
         "force_lookup": {"A": {"0": 0, "9": 1.5}},
     }
     path.write_text(json.dumps(before))
-    store = config.Store(path)
+    store = calibration_file.Store(path)
     table = ForceTable(((0.0, 0.0), (480.0, 3.5)))
-    store.write("A", config.GripperRecord(1, opening=130.0, closing=120.0, force_table=table))
+    store.write(
+        "A", calibration_file.GripperRecord(1, opening=130.0, closing=120.0, force_table=table)
+    )
     after = json.loads(path.read_text())
     assert after["movement_speed"] == {"A": 120.0, "B": 60}
     assert after["calibration"] == {"A": 1, "B": -7}
@@ -704,18 +706,18 @@ def test_a_damaged_file_is_a_clear_error(tmp_path: Path, text: str) -> None:
     path = tmp_path / "file.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(UsageError):
-        config.Store(path).read("A")
+        calibration_file.Store(path).read("A")
 
 
 def test_environment_variable_sets_calibration_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv(config.ENVIRONMENT, str(tmp_path / "x.json"))
-    assert config.Store().path == tmp_path / "x.json"
-    monkeypatch.delenv(config.ENVIRONMENT)
-    assert config.default_path().name == "ezgripper.json"
-    assert config.record_key("DA1Z9T40", 1) == "DA1Z9T40"
-    assert config.record_key("DA1Z9T40", 3) == "DA1Z9T40#3"
+    monkeypatch.setenv(calibration_file.ENVIRONMENT, str(tmp_path / "x.json"))
+    assert calibration_file.Store().path == tmp_path / "x.json"
+    monkeypatch.delenv(calibration_file.ENVIRONMENT)
+    assert calibration_file.default_path().name == "ezgripper.json"
+    assert calibration_file.record_key("DA1Z9T40", 1) == "DA1Z9T40"
+    assert calibration_file.record_key("DA1Z9T40", 3) == "DA1Z9T40#3"
 
 
 # --- calibration

@@ -18,7 +18,7 @@ from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
 from dexkit.clock import RealClock
 from dexkit.drivers.ezgripper import Calibrate, EZGripper, GripperSettings
-from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
+from dexkit.drivers.ezgripper.calibration_file import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.control import ControlSettings
 from dexkit.drivers.ezgripper.scaling import current_of_effort
 from dexkit.drivers.ezgripper.servo import exchange_bytes

@@ -15,7 +15,7 @@ import pytest
 
 from dexkit import documents
 from dexkit.documents import update_file
-from dexkit.drivers.ezgripper.config import GripperRecord, Store
+from dexkit.drivers.ezgripper.calibration_file import GripperRecord, Store
 from dexkit.errors import UsageError
 
 

@@ -19,10 +19,10 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpService
-from dexkit.conformance.virtual.topics import run_virtual
+from dexkit.conformance.virtual.topic_run import run_virtual
 from dexkit.doctor.observations import DomainView, Endpoint, Observations, Participant, Stream
 from dexkit.doctor.rules import diagnose
-from dexkit.doctor.topics import is_hand_topic
+from dexkit.doctor.topic_spelling import is_hand_topic
 from dexkit.emulators.sim_inspire import SimInspireFtp
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, Side

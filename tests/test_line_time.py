@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, Rate
-from dexkit.drivers.ezgripper import EZGripper, GripperSettings, block, gripper
+from dexkit.drivers.ezgripper import EZGripper, GripperSettings, gripper, register_block
 from dexkit.drivers.ezgripper.servo import exchange_bytes, line_time
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.mx64 import Bus, Firmware
@@ -33,9 +33,11 @@ def _number(value: int, size: int = 2) -> bytes:
 
 def _exchange() -> bytes:
     """The two packets of the driver's exchange, as bytes."""
-    goal = block.encode(block.Goal(position=2000, current=100, profile_velocity=100))
-    write_one = _number(block.WRITE_ADDRESS) + _number(len(goal)) + b"\x01" + goal
-    read_one = _number(block.READ_ADDRESS) + _number(block.READ_SIZE)
+    goal = register_block.encode(
+        register_block.Goal(position=2000, current=100, profile_velocity=100)
+    )
+    write_one = _number(register_block.WRITE_ADDRESS) + _number(len(goal)) + b"\x01" + goal
+    read_one = _number(register_block.READ_ADDRESS) + _number(register_block.READ_SIZE)
     return dxl.encode(dxl.BROADCAST_ID, Instruction.SYNC_WRITE, write_one) + dxl.encode(
         1, Instruction.READ, read_one
     )

@@ -26,7 +26,7 @@ from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.m4010 import Dex1Motors
 from dexkit.emulators.mx64 import EmulatedThread, emulated_ezgripper
 from dexkit.emulators.robot import EmulatedRobot, RobotMechanics
-from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.errors import HandTimeout
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from dexkit.messages import encode, message_type, unitree_go

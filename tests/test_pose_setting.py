@@ -11,9 +11,9 @@ import pytest
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import ManualClock
 from dexkit.emulators.sim_brainco import sim_brainco
+from dexkit.emulators.sim_dex1 import sim_dex1
 from dexkit.emulators.sim_dex3 import sim_dex3
 from dexkit.emulators.sim_dex5 import SimDex5, sim_dex5
-from dexkit.emulators.sim_hand import sim_dex1
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, HandCommand, JointMode, Side
 

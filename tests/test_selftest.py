@@ -20,13 +20,12 @@ from dexkit.backends import BackendOptions, backend
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
 from dexkit.conformance.report.selftest import findings, render_selftest
-from dexkit.conformance.selftest import measure
-from dexkit.conformance.selftest.bench import LEAD, Setup
+from dexkit.conformance.selftest import joint_figures
 from dexkit.conformance.selftest.external import ExternalHandCodec
 from dexkit.conformance.selftest.figure_limits import KINDS, Figure
+from dexkit.conformance.selftest.joint_figures import Rest
+from dexkit.conformance.selftest.joint_motion import LEAD, Setup
 from dexkit.conformance.selftest.live import run
-from dexkit.conformance.selftest.machine import End, SelfTest
-from dexkit.conformance.selftest.measure import Rest
 from dexkit.conformance.selftest.procedure import Procedure
 from dexkit.conformance.selftest.result import (
     SCHEMA,
@@ -38,12 +37,13 @@ from dexkit.conformance.selftest.result import (
     read_result,
     result_of,
 )
+from dexkit.conformance.selftest.supervision import End, SelfTest
 from dexkit.emulators.sim_brainco import SimBrainCo
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.emulators.sim_dex3 import SimDex3
 from dexkit.emulators.sim_dex5 import SimDex5
-from dexkit.emulators.sim_hand import SimHand
 from dexkit.emulators.sim_inspire import SimInspireDfx
-from dexkit.emulators.simulated import SimulatedHand
+from dexkit.emulators.simulated_hand import SimulatedHand
 from dexkit.emulators.wear import parse_wear
 from dexkit.errors import HandLost, HandTimeout, UsageError
 from dexkit.hand import Floats, Hand, HandCommand, HandSpec, HandState, JointMode, MotorError, Side
@@ -357,25 +357,25 @@ def test_a_failure_of_the_caller_leaves_the_hand_at_rest() -> None:
 
 def test_lost_motion_excludes_friction() -> None:
     below, above = [Rest(1.0, 0.1)], [Rest(1.09, -0.1)]
-    assert measure.lost_motion(below, above, 5.0, 5.0) == pytest.approx(0.05)
-    assert measure.lost_motion(below, above, 5.0, math.nan) == pytest.approx(0.09)
-    assert measure.lost_motion(below, above, 5.0, 2.0) == pytest.approx(0.09)
-    assert math.isnan(measure.lost_motion([], above, 5.0, 5.0))
+    assert joint_figures.lost_motion(below, above, 5.0, 5.0) == pytest.approx(0.05)
+    assert joint_figures.lost_motion(below, above, 5.0, math.nan) == pytest.approx(0.09)
+    assert joint_figures.lost_motion(below, above, 5.0, 2.0) == pytest.approx(0.09)
+    assert math.isnan(joint_figures.lost_motion([], above, 5.0, 5.0))
 
 
 def test_start_delay_and_speed_are_measured_from_synthetic_series() -> None:
     t: Floats = np.arange(200, dtype=np.float64) / 100
     command: Floats = 0.1 * t
     q = np.maximum(command - 0.04, 0.0)  # moves once kp 5 gives 0.2
-    found = measure.start(command, q, 5.0 * np.roll(command - q, 1), 1, 0.01)
+    found = joint_figures.start(command, q, 5.0 * np.roll(command - q, 1), 1, 0.01)
     assert found.torque == pytest.approx(0.2, abs=0.01)
     assert found.stiffness == pytest.approx(5.0, rel=0.05)
-    assert math.isnan(measure.start(command, 0 * q, q, 1, 0.01).torque)
+    assert math.isnan(joint_figures.start(command, 0 * q, q, 1, 0.01).torque)
     moved = np.where(t > 1.03, 1.0, 0.0)
-    assert measure.delay(t, moved, 1.0, 1, 0.1) == pytest.approx(0.04)
-    assert math.isnan(measure.delay(t, 0 * t, 1.0, 1, 0.1))
-    assert measure.speed(t, 3.0 * t, 1.0, 2.0) == pytest.approx(3.0)
-    assert math.isnan(measure.speed(t, 3.0 * t, 9.0, 9.5))
+    assert joint_figures.delay(t, moved, 1.0, 1, 0.1) == pytest.approx(0.04)
+    assert math.isnan(joint_figures.delay(t, 0 * t, 1.0, 1, 0.1))
+    assert joint_figures.speed(t, 3.0 * t, 1.0, 2.0) == pytest.approx(3.0)
+    assert math.isnan(joint_figures.speed(t, 3.0 * t, 9.0, 9.5))
 
 
 # ------------------------------------------------------------------------------------- the file
@@ -400,7 +400,7 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_the_schema_names_every_value() -> None:
-    folder = Path(measure.__file__).parent.parent / "report"
+    folder = Path(joint_figures.__file__).parent.parent / "report"
     schema = json.loads((folder / SCHEMA).read_text())
     defs = schema["$defs"]
     assert schema["properties"]["verdict"]["enum"] == [str(v) for v in Verdict]

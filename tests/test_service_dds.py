@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from dexkit.dds import DdsNode, Qos, Reader, Sample, Writer
-from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.errors import TopicConflict
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_go, unitree_hg

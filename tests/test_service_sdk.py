@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.hand import Side
 from dexkit.messages import unitree_go, unitree_hg
 from dexkit.models import dialect

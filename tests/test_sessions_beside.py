@@ -11,8 +11,8 @@ import pytest
 
 from dexkit.cli.record import _episodes, _merge_episodes
 from dexkit.traces import open_trace, sample_path
-from dexkit.traces.sessions.beside import find_times
 from dexkit.traces.sessions.edit import Span, cut
+from dexkit.traces.sessions.episode_times import find_times
 from dexkit.traces.sessions.episodes import read_episode
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.resample import hold, interpolate

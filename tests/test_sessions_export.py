@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from dexkit.messages import message_type
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.traces import Recorder, open_trace, sample_path
-from dexkit.traces.sessions import tables
+from dexkit.traces.sessions import topic_tables
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.streams import streams_of
 from dexkit.traces.writer import RecordingWriter, definition
@@ -90,9 +90,9 @@ def test_messages_of_every_type_survive_tables(
         for i, message in enumerate(found):
             writer.put(number, mt.encode(message), T0 + i)
     for form in ("csv", "parquet"):
-        tables.export_tables(open_trace(folder / "a.mcap"), folder / form, form)
+        topic_tables.export_tables(open_trace(folder / "a.mcap"), folder / form, form)
         if found:
-            tables.import_tables(folder / form, folder / f"{form}.mcap")
+            topic_tables.import_tables(folder / form, folder / f"{form}.mcap")
             assert rows(folder / f"{form}.mcap") == rows(folder / "a.mcap")
 
 
@@ -180,6 +180,6 @@ def test_equal_values_are_distinguished(tmp_path: Path) -> None:
         for i, q in enumerate(values):
             writer.put(number, mt.encode(mt.cls([motor(q=q)] * (i % 3))), T0 + i)
     for form in ("csv", "parquet"):
-        tables.export_tables(open_trace(tmp_path / "a.mcap"), tmp_path / form, form)
-        tables.import_tables(tmp_path / form, tmp_path / f"{form}.mcap")
+        topic_tables.export_tables(open_trace(tmp_path / "a.mcap"), tmp_path / form, form)
+        topic_tables.import_tables(tmp_path / form, tmp_path / f"{form}.mcap")
         assert rows(tmp_path / f"{form}.mcap") == rows(tmp_path / "a.mcap")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.clock import ManualClock
-from dexkit.emulators.sim_hand import SimHand, sim_dex1
+from dexkit.emulators.sim_dex1 import SimHand, sim_dex1
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from tests.each import each

@@ -13,7 +13,7 @@ import pytest
 
 from dexkit.dds import DdsNode
 from dexkit.emulators.robot import run_robot
-from dexkit.emulators.sim_hand import SimHand
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.errors import TopicConflict
 from dexkit.hand import Side
 from dexkit.models import DIALECTS

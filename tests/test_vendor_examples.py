@@ -18,7 +18,7 @@ import pytest
 
 from dexkit.backends import BackendOptions
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.session import SuiteOptions
+from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
 from dexkit.hand import Hand, HandCommand, Side
 from tests.conformance_helpers import SUITE
@@ -214,7 +214,7 @@ def test_a_hand_class_needs_no_name_to_be_judged() -> None:
 
 def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "spoilt.py").write_text(
-        "import dexkit.conformance.session as session\n"
+        "import dexkit.conformance.suite_run as session\n"
         "def run_suite(*args): raise IndexError('a bug of the kit')\n"
         "session.run_suite = run_suite\n"
     )
@@ -237,7 +237,7 @@ def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
 
 def test_each_failure_is_printed_once_before_the_verdict(tmp_path: Path) -> None:
     (tmp_path / "canned.py").write_text(
-        "import dexkit.conformance.session as session\n"
+        "import dexkit.conformance.suite_run as session\n"
         "from dexkit.conformance.judge import judge\n"
         "from dexkit.conformance.recording import Recording\n"
         "from dexkit.traces import open_trace, sample_path\n"

@@ -19,18 +19,18 @@ from hypothesis import strategies as st
 
 from dexkit.cli.view import _skeletons
 from dexkit.conformance.judge import judge
-from dexkit.conformance.marks import phase_marks, verdict_marks
 from dexkit.conformance.recording import Recording
+from dexkit.conformance.recording_marks import phase_marks, verdict_marks
 from dexkit.errors import ExtraMissing, UsageError
 from dexkit.hand import MotorError, Side
 from dexkit.messages import encode, unitree_go
 from dexkit.models import INSPIRE_DFX
 from dexkit.traces import open_trace, sample_path
+from dexkit.view.curve_points import common_times, thin
 from dexkit.view.html_tables import hand_table, time_strip, topics_table
-from dexkit.view.process import viewer
 from dexkit.view.sources import Recorded
-from dexkit.view.thin import common_times, thin
 from dexkit.view.transport import Transport
+from dexkit.view.viewer_process import viewer
 from dexkit.watch import Collector, Mark
 from dexkit.watch.number_format import seconds
 from tests.cli_helpers import running

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.stimuli import Send
 from dexkit.conformance.virtual.gripper import ReferenceService
-from dexkit.conformance.virtual.topics import ORIGIN_NS, _Player
+from dexkit.conformance.virtual.topic_run import ORIGIN_NS, _Player
 
 
 @given(

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from dexkit.errors import TraceUnreadable
 from dexkit.messages.packed import rows_at
-from dexkit.traces import records
-from dexkit.traces.records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema, walk
+from dexkit.traces import mcap_records
+from dexkit.traces.mcap_records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema, walk
 from dexkit.traces.summary import Found, Summary, contradictions
 
 __all__ = ["HEADS", "MAX_CHUNK", "MAX_RATIO", "SPARE", "Container", "Heads", "OpenFile", "Segment"]
@@ -213,7 +213,7 @@ class Container:
         if opcode == Opcode.HEADER and end - body <= _MAX_RECORD and end <= self._size:
             try:
                 file.seek(body)
-                self.profile, self.library = records.header(file.read(end - body))
+                self.profile, self.library = mcap_records.header(file.read(end - body))
                 if close:
                     self.report_damage("the first 8 bytes are not quite those of an mcap file")
                 if end == self._size or self._is_record(file, end) or not self._has_end_magic(file):
@@ -235,7 +235,7 @@ class Container:
         return file.read() == MAGIC
 
     def _records(self, file: BinaryIO, at: int) -> Iterator[tuple[int, int, int]]:
-        """The records from ``at`` on; see :func:`~dexkit.traces.records.walk`."""
+        """The records from ``at`` on; see :func:`~dexkit.traces.mcap_records.walk`."""
         return walk(partial(_read_at, file), at, self._size)
 
     def _walk(self, file: BinaryIO, at: int) -> None:
@@ -307,7 +307,7 @@ class Container:
         if opcode == Opcode.CHUNK:
             end = self._add_chunk(file, at, end)
             return end, end
-        if opcode >= records.PRIVATE:
+        if opcode >= mcap_records.PRIVATE:
             self.warn(
                 f"a private record (kind {opcode:#x}, {length} bytes) at byte {at} is skipped"
             )
@@ -343,7 +343,7 @@ class Container:
         elif definition:
             self.define(opcode, body, at)
         elif opcode == Opcode.METADATA:
-            name, entries = records.metadata(body)
+            name, entries = mcap_records.metadata(body)
             self.metadata.setdefault(name, {}).update(entries)
             self._found.metadata.append((at, end - at, name))
         elif opcode == Opcode.MESSAGE_INDEX:
@@ -394,7 +394,7 @@ class Container:
         body = at + HEAD.size
         file.seek(body)
         try:
-            head = records.chunk_head(file.read(records.CHUNK_START))
+            head = mcap_records.chunk_head(file.read(mcap_records.CHUNK_START))
         except BadRecord as error:
             if end <= size:
                 self.report_damage(
@@ -486,7 +486,7 @@ class Container:
     def _read_attachment(self, file: BinaryIO, at: int, end: int) -> None:
         body = at + HEAD.size
         file.seek(body)
-        about, begin = records.attachment(file.read(min(end - body, _BLOCK)))
+        about, begin = mcap_records.attachment(file.read(min(end - body, _BLOCK)))
         stop = body + begin + about.size
         if stop + 4 > end:
             raise BadRecord("its data are longer than the record")
@@ -501,7 +501,7 @@ class Container:
     def _read_footer(self, file: BinaryIO, at: int, end: int) -> bool:
         """Read the last record; return False if the file ends before the 8 bytes after it."""
         file.seek(at + HEAD.size)
-        self._summary.footer = records.footer(file.read(end - at - HEAD.size))
+        self._summary.footer = mcap_records.footer(file.read(end - at - HEAD.size))
         self._summary.end = at
         if self._size < end + len(MAGIC):
             return False
@@ -570,20 +570,20 @@ class Container:
         before = self._bodies.get(key)
         if before is None:
             if opcode == Opcode.SCHEMA:
-                schema = records.schema(body)
+                schema = mcap_records.schema(body)
                 self.schemas[schema.id] = schema
             else:
-                channel = records.channel(body)
+                channel = mcap_records.channel(body)
                 self.channels[channel.id] = channel
             self._bodies[key] = body
         elif before != body:
             if opcode == Opcode.SCHEMA:
-                if self.schemas[key[1]] != records.schema(body):
+                if self.schemas[key[1]] != mcap_records.schema(body):
                     self.report_damage(
                         f"schema {key[1]} is defined twice, again at byte {at}, differently"
                     )
                 return
-            known, channel = self.channels[key[1]], records.channel(body)
+            known, channel = self.channels[key[1]], mcap_records.channel(body)
             if known != channel:
                 both = f", for {known.topic[:200]} and for {channel.topic[:200]}"
                 self.report_damage(
@@ -820,7 +820,7 @@ def _index_matches_header(segment: Segment) -> bool:
 
 def _is_possible(opcode: int, length: int) -> bool:
     """Whether a record of that kind can have that length, outside of chunks."""
-    return opcode >= records.PRIVATE or (opcode in LEAST and length >= LEAST[Opcode(opcode)])
+    return opcode >= mcap_records.PRIVATE or (opcode in LEAST and length >= LEAST[Opcode(opcode)])
 
 
 def _read_at(file: BinaryIO, at: int, count: int) -> bytes:

@@ -25,8 +25,8 @@ from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
 from dexkit.messages.schemas import omgidl
 from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, OpenFile, by_channel
+from dexkit.traces.mcap_records import Schema
 from dexkit.traces.names import SESSION, USB, dds_topic, dds_type, select_topics
-from dexkit.traces.records import Schema
 
 if TYPE_CHECKING:
     from dexkit.traces import schemas

@@ -32,8 +32,8 @@ from pathlib import Path
 from mcap.records import ChunkIndex
 
 from dexkit.errors import TraceError, UsageError
-from dexkit.traces import records
-from dexkit.traces.records import HEAD, MAGIC, Opcode, walk
+from dexkit.traces import mcap_records
+from dexkit.traces.mcap_records import HEAD, MAGIC, Opcode, walk
 
 __all__ = ["ChunkIndexes", "RecordingFile"]
 
@@ -375,7 +375,7 @@ class RecordingFile:
             yield index
 
     def _chunk_index(self, at: int, end: int) -> ChunkIndex:
-        head = records.chunk_head(self._read_at(at + HEAD.size, records.CHUNK_START))
+        head = mcap_records.chunk_head(self._read_at(at + HEAD.size, mcap_records.CHUNK_START))
         return ChunkIndex(
             chunk_length=end - at,
             chunk_start_offset=at,

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from dexkit.traces import records
-from dexkit.traces.records import Attachment, ChunkIndex, Footer, Opcode, Statistics
+from dexkit.traces import mcap_records
+from dexkit.traces.mcap_records import Attachment, ChunkIndex, Footer, Opcode, Statistics
 
 __all__ = ["Found", "Summary", "contradictions"]
 
@@ -74,15 +74,15 @@ class Summary:
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self.definitions.append((opcode, body, at))
         elif opcode == Opcode.STATISTICS:
-            self.statistics.append(records.statistics(body))
+            self.statistics.append(mcap_records.statistics(body))
         elif opcode == Opcode.CHUNK_INDEX:
-            self.chunks.append(records.chunk_index(body))
+            self.chunks.append(mcap_records.chunk_index(body))
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            self.attachments.append(records.attachment_index(body))
+            self.attachments.append(mcap_records.attachment_index(body))
         elif opcode == Opcode.METADATA_INDEX:
-            self.metadata.append(records.metadata_index(body))
+            self.metadata.append(mcap_records.metadata_index(body))
         elif opcode == Opcode.SUMMARY_OFFSET:
-            self.offsets.append(records.summary_offset(body))
+            self.offsets.append(mcap_records.summary_offset(body))
 
 
 def contradictions(summary: Summary, found: Found, *, complete: bool) -> Iterator[str]:

@@ -5,6 +5,6 @@
 * :mod:`~.workers`: do so in several processes, of which any may die.
 * :mod:`~.cluster`: do so on a Ray cluster, whose nodes may die.
 * :mod:`~.journal`: what is done, line by line on the disk, so that an audit can go on later.
-* :mod:`~.tables`, :mod:`~.summary_page`: the rows as Parquet or JSON lines, and the summary page.
+* :mod:`~.result_tables`: the rows as Parquet or JSON lines; :mod:`~.summary_page`: the page.
 * :mod:`~.audit`: all of it together.
 """

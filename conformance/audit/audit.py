@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
+from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.audit.journal import Entry, Journal
-from dexkit.conformance.audit.records import FileRecord, State
+from dexkit.conformance.audit.result_tables import write_tables
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
-from dexkit.conformance.audit.tables import write_tables
 from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.documents import write_file
 

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from dexkit.conformance.audit.examine import Task, examine, settings_key
-from dexkit.conformance.audit.records import FileRecord
+from dexkit.conformance.audit.file_records import FileRecord
 from dexkit.conformance.audit.workers import WorkerLost
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.escaping import one_line

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dexkit import __version__
-from dexkit.conformance.audit.records import FileRecord, State, finding_of
+from dexkit.conformance.audit.file_records import FileRecord, State, finding_of
 from dexkit.conformance.audit.sessions import SessionFile, opened, problem_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dexkit.conformance.audit.records import FORMAT, VERSION, FileRecord, State
+from dexkit.conformance.audit.file_records import FORMAT, VERSION, FileRecord, State
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.audit.objects import Object, file_system, tag_of
-from dexkit.conformance.audit.records import FileRecord, State
 from dexkit.digests import file_pieces
 from dexkit.errors import DexkitError, TraceUnreadable, UsageError
 from dexkit.escaping import one_line

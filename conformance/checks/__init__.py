@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 from dexkit.conformance.layers import layer
-from dexkit.conformance.measure import Measure, Quantity
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Commands, Recording, SideView, States
 from dexkit.conformance.requirements import Requirement

@@ -8,7 +8,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.safety import arrival, away_first
-from dexkit.conformance.measure import Measure
+from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.hand import JointMode
 

@@ -24,7 +24,7 @@ from dexkit.conformance.checks.timing import (
     slow,
     too_slow,
 )
-from dexkit.conformance.measure import Measure, Quantity
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 

@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
-from dexkit.conformance.measure import Measure
+from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.median import median, percentile
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats

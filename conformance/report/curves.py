@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.report.charts import Level, Line, chart
 from dexkit.conformance.report.html import document
+from dexkit.conformance.report.svg_charts import Level, Line, chart
 from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.escaping import html as escape
 from dexkit.hand import Floats, JointSpec, Side

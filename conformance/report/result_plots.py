@@ -9,8 +9,8 @@ import numpy as np
 
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.recording import Recording, SideView
-from dexkit.conformance.report.charts import Band, Level, Line, Range, chart, histogram
 from dexkit.conformance.report.labels import whose
+from dexkit.conformance.report.svg_charts import Band, Level, Line, Range, chart, histogram
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.recording import Recording, SideView
-from dexkit.conformance.report.charts import Band, Level, Line, chart, histogram
 from dexkit.conformance.report.labels import subject, whose
 from dexkit.conformance.report.result_plots import command_and_state, operated, phase_bands
+from dexkit.conformance.report.svg_charts import Band, Level, Line, chart, histogram
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.escaping import html as escape

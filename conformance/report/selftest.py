@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.conformance.report.charts import Level, Line, chart
 from dexkit.conformance.report.curves import STYLE
 from dexkit.conformance.report.html import document, utc
+from dexkit.conformance.report.svg_charts import Level, Line, chart
 from dexkit.conformance.report.tables import no_wrap, table
-from dexkit.conformance.selftest.bench import Series
 from dexkit.conformance.selftest.figure_limits import BY_NAME, KINDS, Figure, Unit, Wear
+from dexkit.conformance.selftest.joint_motion import Series
 from dexkit.conformance.selftest.result import (
     Condition,
     ElementResponse,

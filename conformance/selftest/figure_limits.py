@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from dexkit.conformance.selftest.bench import Setup
+from dexkit.conformance.selftest.joint_motion import Setup
 
 __all__ = ["BY_NAME", "KINDS", "Figure", "Kind", "Unit", "Wear", "judged"]
 

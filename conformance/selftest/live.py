@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dexkit.clock import Clock, Rate, RealClock
-from dexkit.conformance.selftest.machine import End, SelfTest
+from dexkit.conformance.selftest.supervision import End, SelfTest
 from dexkit.errors import HandError, HandTimeout
 from dexkit.hand import CommandGate, Hand
 

@@ -14,10 +14,10 @@ from functools import partial
 import numpy as np
 
 from dexkit.command_age import PAUSE
-from dexkit.conformance.selftest import measure
-from dexkit.conformance.selftest.bench import SETTLE, Bench, Series, Setup, T, Turns
+from dexkit.conformance.selftest import joint_figures
 from dexkit.conformance.selftest.figure_limits import BY_NAME
-from dexkit.conformance.selftest.measure import Rest
+from dexkit.conformance.selftest.joint_figures import Rest
+from dexkit.conformance.selftest.joint_motion import SETTLE, Bench, Series, Setup, T, Turns
 from dexkit.hand import Floats, HandCommand, HandState, JointSpec
 from dexkit.models import model
 
@@ -266,7 +266,7 @@ class Procedure:
     def _rest(self, j: int) -> Rest:
         """Rest position that a joint has just reached."""
         s = self.bench.series(j, -max(3, int(SETTLE / self.setup.period)))
-        return measure.rest(s.q, s.tau)
+        return joint_figures.rest(s.q, s.tau)
 
     def _starts(self, j: int) -> Turns[None]:
         bench, joint = self.bench, self.found.joints[j]
@@ -278,7 +278,7 @@ class Procedure:
             )
             joint.figures[name] = math.nan if one is None else one.torque
             found += [] if one is None else [one]
-        best = max(found, key=lambda s: s.swing, default=measure.Start(math.nan))
+        best = max(found, key=lambda s: s.swing, default=joint_figures.Start(math.nan))
         joint.figures["stiffness"] = best.stiffness
 
     def _measured(
@@ -290,7 +290,7 @@ class Procedure:
             self.found.joints[j].notes.append(f"{what}: spoiled by pauses of this machine")
         return found
 
-    def _start(self, j: int, direction: int) -> Turns[measure.Start | None]:
+    def _start(self, j: int, direction: int) -> Turns[joint_figures.Start | None]:
         bench, stroke = self.bench, float(self.setup.stroke[j])
         yield from bench.settle(j)
         assert bench.state is not None
@@ -301,7 +301,7 @@ class Procedure:
         self.found.joints[j].curves[f"start{'+' if direction > 0 else '-'}"] = s
         if s.gap() > PAUSE:  # hands brake by themselves then
             return None
-        return measure.start(s.command, s.q, s.tau, direction, _STARTED * stroke)
+        return joint_figures.start(s.command, s.q, s.tau, direction, _STARTED * stroke)
 
     def _returns(self, j: int) -> Turns[None]:
         figures = self.found.joints[j].figures
@@ -314,10 +314,10 @@ class Procedure:
                 if one is None:
                     return
                 found.append(one)
-        figures["repeatability"] = max(measure.spread(r) for r in rests.values())
+        figures["repeatability"] = max(joint_figures.spread(r) for r in rests.values())
         kp = 0.0 if self.setup.servo else float(self.setup.kp[j])
         stiffness = figures.get("stiffness", math.nan)
-        figures["play"] = measure.lost_motion(rests[1], rests[-1], kp, stiffness)
+        figures["play"] = joint_figures.lost_motion(rests[1], rests[-1], kp, stiffness)
 
     def _return(self, j: int, direction: int) -> Turns[Rest | None]:
         """Rest position of a joint at mid-range, approached in ``direction``."""
@@ -355,7 +355,7 @@ class Procedure:
         yield from bench.wait(_WATCHED)
         s = bench.series(j, begin)
         self.found.joints[j].curves["step"] = s
-        lag = measure.delay(s.t, s.q, sent, direction, _LAGGED * step)
+        lag = joint_figures.delay(s.t, s.q, sent, direction, _LAGGED * step)
         period = self.setup.period
         late = s.gap(sent - 2 * period, sent + (lag if math.isfinite(lag) else math.inf))
         return lag if late <= _GAP * period else None
@@ -404,7 +404,7 @@ class Procedure:
         if s.gap(end=left) > _GAP * self.setup.period:
             return None
         beyond = float((direction * (s.q - self._at(j, goal))).max()) / spec.stroke
-        return measure.speed(s.t, s.q, low, high), beyond
+        return joint_figures.speed(s.t, s.q, low, high), beyond
 
     # -- touch -----------------------------------------------------------------------------------
 

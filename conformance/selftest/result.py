@@ -15,10 +15,10 @@ import numpy as np
 
 from dexkit import __version__, documents
 from dexkit.conformance.result_file import validate
-from dexkit.conformance.selftest.bench import Series
 from dexkit.conformance.selftest.figure_limits import KINDS, Figure, Wear, judged
-from dexkit.conformance.selftest.machine import End, SelfTest
+from dexkit.conformance.selftest.joint_motion import Series
 from dexkit.conformance.selftest.procedure import ElementFound, JointFound, Procedure
+from dexkit.conformance.selftest.supervision import End, SelfTest
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 

@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from dexkit.conformance.processor_waits import Waits
 from dexkit.conformance.stimulus_record import Beats, Stall, parse_stalls, parse_time
 from dexkit.conformance.usb import RECORD
-from dexkit.conformance.waits import Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side

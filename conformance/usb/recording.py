@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.lateness import Lateness
+from dexkit.conformance.processor_waits import Starvation, Waits
 from dexkit.conformance.stimulus_record import Beats, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
@@ -23,7 +24,6 @@ from dexkit.conformance.usb.record import (
     UsbRecord,
     topic,
 )
-from dexkit.conformance.waits import Starvation, Waits
 from dexkit.hand import JointSpec, Side, Subject
 from dexkit.models import DEX3_1
 from dexkit.traces import ChannelInfo, SampleArray

@@ -9,6 +9,6 @@ requirement, and each wrong hand in :mod:`dexkit.conformance.mutants` changes on
 
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.conformance.virtual.service import Sample, Service, TopicDevice
-from dexkit.conformance.virtual.topics import run_virtual
+from dexkit.conformance.virtual.topic_run import run_virtual
 
 __all__ = ["MemoryTrace", "Sample", "Service", "TopicDevice", "run_virtual"]

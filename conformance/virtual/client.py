@@ -10,7 +10,7 @@ from dexkit.conformance.layers import layer
 from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.conformance.virtual.service import Service
-from dexkit.conformance.virtual.topics import log_time_ns
+from dexkit.conformance.virtual.topic_run import log_time_ns
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, Pose, Profile, TeleopClient, client_for

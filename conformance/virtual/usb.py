@@ -48,7 +48,7 @@ from dexkit.conformance.usb.record import (
     topic,
 )
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
-from dexkit.conformance.virtual.topics import log_time_ns
+from dexkit.conformance.virtual.topic_run import log_time_ns
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID

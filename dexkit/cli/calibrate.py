@@ -13,9 +13,15 @@ from rich.table import Table
 
 from dexkit.cli.options import Number, device_option, dry_run_option, one_side_option
 from dexkit.console import Console
-from dexkit.drivers.ezgripper import EZGripper, GripperSettings, calibration, discovery, settings
+from dexkit.drivers.ezgripper import (
+    EZGripper,
+    GripperSettings,
+    calibration,
+    discovery,
+    servo_registers,
+)
 from dexkit.drivers.ezgripper.bus import ServoBus
-from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
+from dexkit.drivers.ezgripper.calibration_file import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.control import ControlSettings
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.gripper import stored_device
@@ -366,7 +372,7 @@ def _print_servo(hand: EZGripper, console: Console, store: Store) -> None:
                 f"servo {ping.id} at {bus.baudrate} baud: MX-64(2.0), firmware {ping.firmware}"
             )
             mirrored = bool(store.read(record_key(device.key, ping.id)).mirrored)
-            differing = settings.differences(bus, ping.id, mirrored=mirrored)
+            differing = servo_registers.differences(bus, ping.id, mirrored=mirrored)
             for item, found, wanted in differing:
                 console.print(f"  {item.name}({item.address}) is {found}, would be set to {wanted}")
             if not differing:

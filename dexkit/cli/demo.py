@@ -43,7 +43,7 @@ def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
     1 they did not, 2 they could not be judged.
     """
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.session import SuiteOptions, run_suite
+    from dexkit.conformance.suite_run import SuiteOptions, run_suite
 
     console = Console()
     out.mkdir(parents=True, exist_ok=True)

@@ -55,7 +55,7 @@ def command(
     exported), 2 wrong usage, or nothing could be exported.
     """
     from dexkit.traces import open_trace
-    from dexkit.traces.sessions import rosbag, tables
+    from dexkit.traces.sessions import rosbag, topic_tables
 
     if form in ("lerobot", "episodes"):
         # bytes of the command line that are no UTF-8 are escaped, as those of recordings are
@@ -75,7 +75,7 @@ def command(
             if form == "rosbag2":
                 lost = rosbag.export_bag(trace, target, storage=storage)
             else:
-                lost = tables.export_tables(trace, target, form)
+                lost = topic_tables.export_tables(trace, target, form)
         except DexkitError as error:
             if not several:
                 raise

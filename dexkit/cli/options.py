@@ -513,7 +513,7 @@ def real_time_option(*, default: bool = True) -> Callable[[F], F]:
 
 
 def view_option() -> Callable[[F], F]:
-    """``--view`` of the commands that run hands; see :func:`dexkit.view.process.viewer`."""
+    """``--view`` of the commands that run hands; see :func:`dexkit.view.viewer_process.viewer`."""
     return click.option(
         "--view",
         is_flag=True,

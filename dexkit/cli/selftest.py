@@ -35,8 +35,8 @@ from dexkit.models import dialect as dialect_by_name
 from dexkit.models import model as model_by_name
 
 if TYPE_CHECKING:
-    from dexkit.conformance.selftest.machine import SelfTest
     from dexkit.conformance.selftest.result import SelfTestResult
+    from dexkit.conformance.selftest.supervision import SelfTest
     from dexkit.stop_signals import StopRequest
 
 __all__ = ["command"]
@@ -112,11 +112,11 @@ def command(backend_name: str | None, **given: Any) -> int:
         raise UsageError("--dialect is for --external: a backend is driven without DDS")
     if given["external"] and given["dialect"] is None:
         raise UsageError("--external needs --dialect", hint="e.g. --dialect unitree_go")
-    from dexkit.conformance.selftest.bench import Setup
+    from dexkit.conformance.selftest.joint_motion import Setup
     from dexkit.conformance.selftest.live import run
-    from dexkit.conformance.selftest.machine import End, SelfTest
     from dexkit.conformance.selftest.procedure import Procedure
     from dexkit.conformance.selftest.result import check_baseline, read_result, result_of
+    from dexkit.conformance.selftest.supervision import End, SelfTest
     from dexkit.documents import check_output_paths
     from dexkit.stop_signals import stop_on_signals
 
@@ -236,7 +236,7 @@ def _outputs(given: dict[str, Any], model: str) -> tuple[Path, Path]:
 def _turn(stop: StopRequest, quiet: bool) -> Iterator[Callable[[SelfTest], None]]:
     """Shows progress and questions, and takes keys, in each turn of a test."""
     from dexkit.cli.stop_keys import is_stop, keys
-    from dexkit.conformance.selftest.machine import End
+    from dexkit.conformance.selftest.supervision import End
 
     status = StatusLine(quiet)
     said = ""

@@ -147,7 +147,7 @@ def command(
     groups = _groups(hands, language)
 
     from dexkit.dds import DdsNode
-    from dexkit.view.process import viewer
+    from dexkit.view.viewer_process import viewer
 
     with (
         stop_on_signals() as stop,

@@ -207,7 +207,7 @@ def _marks(trace: Trace, judge: bool) -> list[Mark]:
     """Phases and verdicts; a recording that cannot be judged is shown all the same."""
     from dexkit.conformance.judge import judge as verdict_on
     from dexkit.conformance.layers import recording_of
-    from dexkit.conformance.marks import phase_marks, verdict_marks
+    from dexkit.conformance.recording_marks import phase_marks, verdict_marks
 
     try:
         marks = phase_marks(trace)

@@ -22,7 +22,7 @@ from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
 from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
-from dexkit.doctor.topics import is_driven, is_hand_topic, is_limp
+from dexkit.doctor.topic_spelling import is_driven, is_hand_topic, is_limp
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
 from dexkit.messages.earlier import layout_of

@@ -14,7 +14,7 @@ from dexkit.doctor.awaited_topics import AWAITED
 from dexkit.doctor.catalogue import Finding, Severity
 from dexkit.doctor.observations import DomainView, Endpoint, Link, Observations
 from dexkit.doctor.rules import Readiness, Verdict
-from dexkit.doctor.topics import short
+from dexkit.doctor.topic_spelling import short
 from dexkit.escaping import LONGEST
 from dexkit.robots import ROBOTS
 from dexkit.topics import roles

@@ -22,7 +22,7 @@ from dexkit.doctor.observations import (
     Stream,
     UsbDevice,
 )
-from dexkit.doctor.topics import closest_topic, short
+from dexkit.doctor.topic_spelling import closest_topic, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.messages.earlier import EARLIER, earlier_by_hash

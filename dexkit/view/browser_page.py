@@ -27,8 +27,8 @@ from dexkit.watch.number_format import subject_name
 try:
     import viser
 
-    from dexkit.view.charts import Chart, Curve
     from dexkit.view.scene import Figure
+    from dexkit.view.strip_charts import Chart, Curve
 except ImportError as error:
     raise ExtraMissing(
         "the page needs the package viser", hint="pip install 'dexkit[view]'"

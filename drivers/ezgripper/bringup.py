@@ -14,12 +14,11 @@ from dexkit.bringup.findings import Findings
 from dexkit.bringup.script import travel_key
 from dexkit.bringup.settings_file import SettingsFile
 from dexkit.clock import Clock
-from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import ServoBus
-from dexkit.drivers.ezgripper.config import GripperRecord, Store, record_key
+from dexkit.drivers.ezgripper.calibration_file import GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.discovery import find_device, find_servos, latency_warning
-from dexkit.drivers.ezgripper.options import GripperSettings, settings_of, stored_device
 from dexkit.drivers.ezgripper.recovery import motor_error
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
 from dexkit.drivers.ezgripper.scaling import (
     CURRENT_LIMIT,
     JOINT_PER_TICK,
@@ -27,7 +26,8 @@ from dexkit.drivers.ezgripper.scaling import (
     STROKES,
 )
 from dexkit.drivers.ezgripper.servo import Servo, ServoGroup
-from dexkit.drivers.ezgripper.settings import ServoLimits
+from dexkit.drivers.ezgripper.servo_registers import ServoLimits
+from dexkit.drivers.ezgripper.settings import GripperSettings, settings_of, stored_device
 from dexkit.drivers.serial_port import is_pseudo_terminal
 from dexkit.errors import HandError, HandLost
 from dexkit.hand import Side

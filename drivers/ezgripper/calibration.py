@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol
 
-from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import ContactDetector
 from dexkit.drivers.ezgripper.control import without_profile
 from dexkit.drivers.ezgripper.recovery import describe
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
 from dexkit.drivers.ezgripper.scaling import (
     STROKE,
     TICKS_PER_PERCENT,

@@ -27,8 +27,8 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.contact import MIN_FREE_SPEED, Contact, ContactDetector
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
 from dexkit.drivers.ezgripper.scaling import (
     STROKE,
     current_of_effort,

@@ -12,9 +12,9 @@ from dexkit.backends import SHARED_MACHINE, Backend, BackendOptions, Emulator
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE, WriteDeadline
 from dexkit.drivers.ezgripper import calibration
-from dexkit.drivers.ezgripper.block import Goal, Sample
 from dexkit.drivers.ezgripper.bus import BusStatistics, Ping, ServoBus, ServoSilent
-from dexkit.drivers.ezgripper.config import CURRENT_UNIT, GripperRecord, Store, record_key
+from dexkit.drivers.ezgripper.calibrated_servo import Unit
+from dexkit.drivers.ezgripper.calibration_file import CURRENT_UNIT, GripperRecord, Store, record_key
 from dexkit.drivers.ezgripper.control import Control, Phase
 from dexkit.drivers.ezgripper.discovery import (
     Device,
@@ -24,7 +24,11 @@ from dexkit.drivers.ezgripper.discovery import (
     latency_warning,
 )
 from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE
-from dexkit.drivers.ezgripper.options import (
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
+from dexkit.drivers.ezgripper.restart import GripperStatistics, Restart
+from dexkit.drivers.ezgripper.scaling import STROKE, joint_of_ticks, joint_speed
+from dexkit.drivers.ezgripper.servo import Servo, ServoGroup, ServoStatistics, line_time
+from dexkit.drivers.ezgripper.settings import (
     PARSERS,
     Calibrate,
     GripperSettings,
@@ -32,10 +36,6 @@ from dexkit.drivers.ezgripper.options import (
     settings_of,
     stored_device,
 )
-from dexkit.drivers.ezgripper.restart import GripperStatistics, Restart
-from dexkit.drivers.ezgripper.scaling import STROKE, joint_of_ticks, joint_speed
-from dexkit.drivers.ezgripper.servo import Servo, ServoGroup, ServoStatistics, line_time
-from dexkit.drivers.ezgripper.unit import Unit
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.errors import HandError, HandLost, HandRefused, UsageError
 from dexkit.hand import HandCommand, HandSpec, HandState, JointMode, MotorError, Side

@@ -13,11 +13,11 @@ from enum import Enum
 from typing import NoReturn
 
 from dexkit.clock import Clock
-from dexkit.drivers.ezgripper.block import Sample
 from dexkit.drivers.ezgripper.bus import ServoSilent
+from dexkit.drivers.ezgripper.calibrated_servo import Unit
 from dexkit.drivers.ezgripper.recovery import RebootPolicy, describe, motor_error
+from dexkit.drivers.ezgripper.register_block import Sample
 from dexkit.drivers.ezgripper.servo import BOOT_TIME, ServoGroup
-from dexkit.drivers.ezgripper.unit import Unit
 from dexkit.errors import HandFault, HandTimeout
 from dexkit.hand import HandCommand, MotorError
 from dexkit.wire import mx64

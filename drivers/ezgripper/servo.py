@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
-from dexkit.drivers.ezgripper import block
-from dexkit.drivers.ezgripper.block import Goal, Sample
+from dexkit.drivers.ezgripper import register_block
 from dexkit.drivers.ezgripper.bus import BITS_PER_BYTE, ServoBus
-from dexkit.drivers.ezgripper.settings import (
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
+from dexkit.drivers.ezgripper.servo_registers import (
     WATCHDOG_UNITS,
     ServoLimits,
     apply_settings,
@@ -40,8 +40,8 @@ _RETURN_DELAY = 4e-6  # as settings.py sets it
 
 def exchange_bytes(servos: int = 1) -> tuple[int, int]:
     """Return the bytes on the line of one exchange: (to the servos, from the servos)."""
-    sent = _SYNC_WRITE_OVERHEAD + servos * (1 + block.WRITE_SIZE) + _read_bytes(servos)
-    return sent, servos * (_STATUS_OVERHEAD + block.READ_SIZE)
+    sent = _SYNC_WRITE_OVERHEAD + servos * (1 + register_block.WRITE_SIZE) + _read_bytes(servos)
+    return sent, servos * (_STATUS_OVERHEAD + register_block.READ_SIZE)
 
 
 def _read_bytes(servos: int) -> int:
@@ -104,9 +104,9 @@ class Servo:
         :raises HandLost: the port has gone away.
         """
         started = self._clock.now()
-        data = block.encode(goal)
+        data = register_block.encode(goal)
         self.bus.write_unacknowledged(
-            self.id, block.WRITE_ADDRESS, data, with_next=True, before=before
+            self.id, register_block.WRITE_ADDRESS, data, with_next=True, before=before
         )
         return self.check_goal(goal, self._read(started + self._to_measurement))
 
@@ -122,7 +122,7 @@ class Servo:
         return self._read(self._clock.now() + self._read_to_measurement)
 
     def _read(self, measured_at: float) -> Sample:
-        data, _ = self.bus.read(self.id, block.READ_ADDRESS, block.READ_SIZE)
+        data, _ = self.bus.read(self.id, register_block.READ_ADDRESS, register_block.READ_SIZE)
         return self.decode(data, measured_at)
 
     def decode(self, data: bytes, measured_at: float) -> Sample:
@@ -132,7 +132,7 @@ class Servo:
         """
         received = self._clock.now()
         # the time must not be in the future
-        sample = block.decode(data, min(measured_at, received), received)
+        sample = register_block.decode(data, min(measured_at, received), received)
         if sample.tick == self._tick:
             self.statistics.stale += 1
         self._tick = sample.tick
@@ -144,8 +144,8 @@ class Servo:
 
     def engage(self, goal: Goal, before: WriteDeadline | None = None) -> None:
         """Write ``goal``, then switch torque on."""
-        data = block.encode(goal)
-        self.bus.write_unacknowledged(self.id, block.WRITE_ADDRESS, data, before=before)
+        data = register_block.encode(goal)
+        self.bus.write_unacknowledged(self.id, register_block.WRITE_ADDRESS, data, before=before)
         self.set_torque(True)
 
     def rearm_watchdog(self) -> None:
@@ -193,9 +193,11 @@ class ServoGroup:
             return [self.servos[0].exchange(goals[0], before)]
         started = self._clock.now()
         pairs = list(zip(self.servos, goals, strict=True))
-        data = {servo.id: block.encode(goal) for servo, goal in pairs}
-        self._bus.sync_write(block.WRITE_ADDRESS, data, with_next=True, before=before)
-        answers = self._bus.sync_read(list(data), block.READ_ADDRESS, block.READ_SIZE)
+        data = {servo.id: register_block.encode(goal) for servo, goal in pairs}
+        self._bus.sync_write(register_block.WRITE_ADDRESS, data, with_next=True, before=before)
+        answers = self._bus.sync_read(
+            list(data), register_block.READ_ADDRESS, register_block.READ_SIZE
+        )
         at = started + self._to_measurement
         return [
             servo.check_goal(goal, servo.decode(answers[servo.id], at)) for servo, goal in pairs

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.records import FileRecord, Finding, State
 from tools.generate_archive import ANSWERS, Answer
 
 __all__ = ["Score", "score"]
@@ -103,7 +103,7 @@ def _finds(answer: Answer, record: FileRecord) -> bool:
 def _failed(
     findings: Iterable[Finding], verdicts: tuple[str, ...] = ("fail",)
 ) -> Iterable[Mapping[str, str]]:
-    from dexkit.conformance.audit.records import FINDING
+    from dexkit.conformance.audit.file_records import FINDING
 
     for finding in findings:
         row = dict(zip(FINDING, finding, strict=True))

@@ -19,12 +19,12 @@ from dexkit.clock import ManualClock
 from dexkit.conformance.report.curves import page as curves_page
 from dexkit.conformance.report.curves import recorded as curves_of
 from dexkit.conformance.report.selftest import render_selftest
-from dexkit.conformance.selftest.bench import Setup
+from dexkit.conformance.selftest.joint_motion import Setup
 from dexkit.conformance.selftest.live import run
-from dexkit.conformance.selftest.machine import SelfTest
 from dexkit.conformance.selftest.procedure import Procedure
 from dexkit.conformance.selftest.result import SelfTestResult, result_of
-from dexkit.emulators.sim_hand import SimHand
+from dexkit.conformance.selftest.supervision import SelfTest
+from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.emulators.wear import parse_wear
 from dexkit.hand import Side
 from dexkit.threads import Worker

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from dexkit.errors import SessionError, UsageError
 from dexkit.traces.reader import Trace
-from dexkit.traces.sessions import episodes, jsonl, lerobot_in, rosbag, tables
-from dexkit.traces.sessions.beside import write_beside
+from dexkit.traces.sessions import episodes, jsonl, lerobot_in, rosbag, topic_tables
+from dexkit.traces.sessions.episode_times import write_beside
 from dexkit.traces.sessions.episodes import DEFAULT, Options
 from dexkit.traces.sessions.imported import NOMINAL
 from dexkit.traces.sessions.model import Session, write
@@ -128,7 +128,7 @@ def choose(
 
 
 def _format(source: Path) -> str:
-    if tables.is_tables(source):
+    if topic_tables.is_tables(source):
         return "tables"
     if lerobot_in.is_dataset(source):
         return "lerobot"
@@ -154,5 +154,5 @@ def _bag(source: Path, out: Path, overwrite: bool) -> Report:
 
 
 def _tables(source: Path, out: Path, overwrite: bool) -> Report:
-    written, problems = tables.import_tables(source, out, overwrite=overwrite)
+    written, problems = topic_tables.import_tables(source, out, overwrite=overwrite)
     return Report("tables", written, [], problems.sentences())

@@ -31,7 +31,7 @@ from dexkit.conformance.mutants.trials import plan_for
 from dexkit.conformance.recording import States
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.virtual import MemoryTrace
-from dexkit.conformance.virtual.topics import log_time_ns
+from dexkit.conformance.virtual.topic_run import log_time_ns
 from dexkit.hand import Floats, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, model

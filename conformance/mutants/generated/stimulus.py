@@ -13,7 +13,7 @@ from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual import Service, run_virtual
-from dexkit.conformance.virtual.topics import ORIGIN_NS
+from dexkit.conformance.virtual.topic_run import ORIGIN_NS
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 

@@ -30,7 +30,7 @@ from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import DEX1_1, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import StopRequest, stop_on_signals
-from dexkit.view.process import viewer
+from dexkit.view.viewer_process import viewer
 
 __all__ = ["emulate_all"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dexkit.backends import Backend, BackendOptions
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP, FingerMechanics, MotorModel
-from dexkit.emulators.simulated import SimulatedHand, number
+from dexkit.emulators.simulated_hand import SimulatedHand, number
 from dexkit.hand import Side
 from twofinger_hand.profile import TWOFINGER_1
 

@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from dexkit.cli.info import summary
 from dexkit.messages import message_type
 from dexkit.traces import open_trace
-from dexkit.traces.records import HEAD, walk
+from dexkit.traces.mcap_records import HEAD, walk
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
 from tools.campaign.mutate import mutator

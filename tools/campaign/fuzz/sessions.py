@@ -15,7 +15,7 @@ import numpy as np
 from mcap.writer import CompressionType
 
 from dexkit.conformance.audit.examine import Task, examine
-from dexkit.conformance.audit.records import FileRecord, State
+from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.audit.sessions import SessionFile
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.traces.replay.commands import read_session

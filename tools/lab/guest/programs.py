@@ -45,7 +45,7 @@ MODULES = (
     "dexkit.messages.unitree_hg",
     "dexkit.robots",
     "dexkit.service",
-    "dexkit.view.process",
+    "dexkit.view.viewer_process",
     "tools.lab.guest.probe",
     "usb.backend.libusb1",
     "usb.util",

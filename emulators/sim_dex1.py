@@ -9,7 +9,7 @@ from __future__ import annotations
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.dex1_mechanics import STEP, Dex1Mechanics
-from dexkit.emulators.simulated import COMMON_SETTINGS, SimulatedHand, configured, number
+from dexkit.emulators.simulated_hand import COMMON_SETTINGS, SimulatedHand, configured, number
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.audit.records import FINDING, FileRecord
+from dexkit.conformance.audit.file_records import FINDING, FileRecord
 from dexkit.documents import write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error

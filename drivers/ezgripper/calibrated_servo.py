@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dexkit.drivers.ezgripper import settings
-from dexkit.drivers.ezgripper.block import Sample
+from dexkit.drivers.ezgripper import servo_registers
 from dexkit.drivers.ezgripper.bus import Ping
-from dexkit.drivers.ezgripper.config import GripperRecord
+from dexkit.drivers.ezgripper.calibration_file import GripperRecord
 from dexkit.drivers.ezgripper.control import Control
 from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.recovery import motor_error
+from dexkit.drivers.ezgripper.register_block import Sample
 from dexkit.drivers.ezgripper.servo import Servo
 from dexkit.hand import MotorError
 from dexkit.wire import mx64
@@ -33,8 +33,8 @@ class Unit:
     force: ForceTable
     mirrored: bool
     stroke: int
-    limits: settings.ServoLimits = field(
-        default_factory=lambda: settings.ServoLimits(80, 9.5, 16.0)
+    limits: servo_registers.ServoLimits = field(
+        default_factory=lambda: servo_registers.ServoLimits(80, 9.5, 16.0)
     )
     control: Control | None = None
     last: Sample | None = None

@@ -37,7 +37,7 @@ from dexkit.models import DEX1_1, Dialect, dialect, model
 from dexkit.open_file_limit import require_open_files
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import TemporaryFolder
-from dexkit.view.process import viewer
+from dexkit.view.viewer_process import viewer
 
 if TYPE_CHECKING:
     import pytest

@@ -9,7 +9,7 @@ import viser
 import viser.uplot
 
 from dexkit.hand import Floats
-from dexkit.view.thin import common_times, thin
+from dexkit.view.curve_points import common_times, thin
 from dexkit.watch import Collector
 
 __all__ = ["Chart", "Curve"]
