@@ -105,7 +105,7 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def _patient_servo(monkeypatch: pytest.MonkeyPatch) -> None:
     """The servo's bus watchdog outlasts a pause of the emulator's thread on a busy machine."""
-    for module in ("settings", "servo"):
+    for module in ("servo_registers", "servo"):
         monkeypatch.setattr(f"dexkit.drivers.ezgripper.{module}.WATCHDOG_UNITS", 127)
 
 

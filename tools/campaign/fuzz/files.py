@@ -38,7 +38,6 @@ from dexkit.doctor.environment import uri_problem
 from dexkit.drivers.dex1_serial import settings as dex1_settings
 from dexkit.drivers.dex3_usb import discovery as dex3_discovery
 from dexkit.drivers.dex3_usb import settings as dex3_settings
-from dexkit.drivers.ezgripper import servo_registers as ezgripper_settings
 from dexkit.drivers.ezgripper.calibration_file import Store
 from dexkit.emulators.faults import (
     DEX3_FAULTS,
@@ -306,9 +305,9 @@ def _store(rng: random.Random, scratch: Path) -> Target:
         "speeds": {"a:1": {"opening": 90.0, "closing": 80.0}},
         "force_tables": {"a:1": {"0": 0.0, "100": 0.5}},
     }
-    from dexkit.drivers.ezgripper import calibration_file as ezgripper_config
+    from dexkit.drivers.ezgripper import calibration_file
 
-    names = [ezgripper_config._ZERO, ezgripper_config._SPEED, ezgripper_config._FORCE]
+    names = [calibration_file._ZERO, calibration_file._SPEED, calibration_file._FORCE]
     plain = dict(zip(names, content.values(), strict=True))
 
     def run(text: str) -> None:
@@ -406,7 +405,6 @@ def _settings(rng: random.Random, scratch: Path) -> Target:
         except DexkitError:
             pass
 
-    _ = ezgripper_settings
     return Target(text, run, ())
 
 
