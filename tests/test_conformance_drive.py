@@ -11,7 +11,7 @@ from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.selection import length
 from dexkit.conformance.stimuli import CommandSession, phases_for
-from dexkit.conformance.virtual import Service
+from dexkit.conformance.virtual import Sample, Service
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from dexkit.models import MODELS
@@ -87,6 +87,20 @@ def test_torque_that_only_opens_passes_the_check_of_torque_commands() -> None:
 
     (result,) = judged(Clamped, "DEX1-GAIN-03")
     assert result.verdict is Verdict.PASS
+
+
+def test_a_gap_at_the_end_of_a_step_is_no_failure_of_the_step() -> None:
+    class Pauses(ReferenceService):
+        """Publishes nothing for 72 ms in every 0.45 s, and so at the end of a step."""
+
+        def publish(self) -> list[Sample]:
+            samples = super().publish()
+            return [] if self.now > 1.0 and (self.now + 0.15) % 0.45 < 0.072 else samples
+
+    wanted = select(catalogue("dex1-1"), prefixes=["DEX1-SIDE-03"])
+    results = run_mutant(Pauses, replace(plan_for(), phases=phases_for(wanted))).results
+    found = [r.verdict for r in results if r.requirement.id == "DEX1-SIDE-03"]
+    assert found == [Verdict.PASS] * 2
 
 
 def test_noise_of_q_does_not_hide_that_a_torque_moves_a_gripper() -> None:

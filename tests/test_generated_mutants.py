@@ -455,6 +455,7 @@ def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
         "dex1-1/unitree_go:lighter+predicts-100+servo-own",  # starts from rest between two samples
         "dex1-1/unitree_go:faster+sags-down",  # falls while it is limp
         "dex1-1/unitree_go:backlash-more+top-speed-4.5+latency-20",
+        "dex1-1/unitree_go:slower+predicts-150+pauses",  # no state at the end of a step
         "dex3-1/dex3:predicts-150",
     ],
 )

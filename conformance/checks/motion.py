@@ -690,9 +690,10 @@ def by_its_own(ctx: Context) -> Outcome:
             before = ctx.states.between(step.begin - 0.1, step.begin)
             if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
                 continue  # it was still under way, from where it was limp
-            if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
-                # the step is short: its last states, not the median of some
-                final = median(step.q[step.t >= step.end - 0.03])
+            last = step.q[step.t >= step.end - 0.03]
+            if len(last) and abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
+                # the step is short: its last states, not the median of some; RATE-03 judges gaps
+                final = median(last)
                 step = replace(step, final=final)
                 part = (final - step.start) / step.size
                 if worst is None or part < worst[0]:
