@@ -701,7 +701,10 @@ def by_its_own(ctx: Context) -> Outcome:
                 if step.error > ctx.tolerance("max_error_stroke", step.joint):
                     return disobeyed(ctx, "while the other hand was commanded otherwise", step)
     if worst is None:
-        return ctx.skipped("only one side was commanded, or the hand had stopped obeying before")
+        return ctx.skipped(
+            "no step to judge: only one side was commanded, the hand had stopped obeying before, "
+            "or no state shows the end of a step"
+        )
     part, step = worst
     text = f"while the other hand had zero gains: {step}"
     limit = ctx.tolerance("min_progress")
