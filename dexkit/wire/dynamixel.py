@@ -313,7 +313,7 @@ class PacketParser(FrameBuffer):
         buffer += data
         packets: list[Packet] = []
         start = 0  # of what is not yet consumed
-        while True:
+        while start < len(buffer):
             found = buffer.find(HEADER, start)
             if found < 0:
                 # keep a tail that may be the first bytes of a header

@@ -188,7 +188,7 @@ class Control:
         now = sample.time
         position = self.position(sample)
         base = sample.position - position
-        braking = command.mode[0] == JointMode.BRAKE
+        braking = int(command.mode[0]) == JointMode.BRAKE  # numpy compares enums slowly
         # the service brakes during the fault; that brake does not make the old command new
         if self._refused is not None and not braking and not command.same_as(self._refused):
             self._refused = None

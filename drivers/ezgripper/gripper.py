@@ -477,7 +477,8 @@ class EZGripper:
             q += joint_of_ticks(position, unit.stroke) / len(samples)
             dq += joint_speed(sample.velocity, unit.stroke) / len(samples)
             tau += self._tau(unit, sample)
-            fault |= unit.motor_error(sample)
+            if sample.error:
+                fault |= unit.motor_error(sample)
         braking = self.phase is Phase.BRAKE
         mode = JointMode.BRAKE if braking else JointMode.FOC
         return HandState(
