@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.bringup import DeadMan, Effort, Findings
+from dexkit.bringup import DeadMan, Drive, Effort, Findings, Reading, Snapshot
 from dexkit.bringup.dead_man import ARM, PAUSE, RELEASE
+from dexkit.bringup.motion import End, Go, Mover
 from dexkit.drivers.dex3_usb.settings import Dex3Settings, with_stored
 from dexkit.drivers.dex3_usb.stored import Store
 from dexkit.emulators.dex3_mcu import Firmware, Wiring
@@ -197,6 +198,30 @@ def test_fault_ends_the_bringup_for_good(moving: Bring) -> None:
         with pytest.raises(HandFault, match="overcurrent"):
             moving.cycle()
     assert len(moving.driven) == sent
+
+
+def _step(mover: Mover, now: float, q: float) -> Drive | End | None:
+    return mover.step(now, Snapshot({"1": Reading(q, 0, 30.0)}), True)
+
+
+def test_a_motion_begins_once_the_motor_has_come_to_rest() -> None:
+    """A motor that runs on after a motion is no motor that moves against the next one."""
+    mover = Mover(Go("1", 0.0, "back"), FAST, 1.0)
+    running_on = [0.5, 0.54, 0.57, 0.59, 0.6]
+    for n, q in enumerate(running_on):
+        assert _step(mover, 0.02 * n, q) is None
+    assert isinstance(_step(mover, 0.1, 0.6), Drive)
+
+
+def test_a_motor_that_never_comes_to_rest_is_judged_all_the_same() -> None:
+    mover = Mover(Go("1", 0.0, "back"), FAST, 1.0)
+    n = 0
+    while _step(mover, 0.02 * n, 0.5 + 0.03 * n) is None:
+        n += 1
+    assert 0.02 * n == pytest.approx(1.0, abs=0.05)
+    _step(mover, 0.02 * n + 0.02, 0.53 + 0.03 * n)
+    with pytest.raises(HandFault, match="moves against its command"):
+        _step(mover, 0.02 * n + 0.06, 0.59 + 0.03 * n)
 
 
 def test_motion_of_another_motor_ends_the_bringup(moving: Bring) -> None:

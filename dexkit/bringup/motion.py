@@ -70,6 +70,9 @@ _HOT = 60.0
 _SILENT = 3
 """Answers in a row without a motor."""
 _LONGEST_STEP = 0.05  # s
+_REST_SPEED = 0.25  # rad/s, a count of position in two exchanges
+_SETTLING = 1.0
+"""Seconds that a motor gets to come to rest before a motion begins."""
 
 
 class End(str, Enum):
@@ -122,7 +125,22 @@ class Mover:
         self._resting: Mapping[str, Reading] = {}
         self._silent = 0
         self._running = False
+        self._before: tuple[float, float] | None = None
+        self._waiting_since = 0.0
         self._time = 0.0
+
+    def _at_rest(self, now: float, q: float) -> bool:
+        """Whether the motor has come to rest after the motion before this one.
+
+        Driven back at once, it would run on for a while: no motor that moves against its command.
+        """
+        before, self._before = self._before, (now, q)
+        if before is None:
+            self._waiting_since = now
+            return False
+        since, last = before
+        slow = abs(q - last) <= _REST_SPEED * (now - since)
+        return slow or now - self._waiting_since > _SETTLING
 
     def _start(self, now: float, snapshot: Snapshot, q: float) -> None:
         self._running = True
@@ -130,6 +148,7 @@ class Mover:
         self._marked = self._time = now
         self._level = 0
         self._resting = snapshot.motors
+        self._before = None
 
     def step(self, now: float, snapshot: Snapshot, held: bool) -> Drive | End | None:
         """Return the command to send now, the reason for the end of the motion, or None to lock
@@ -155,8 +174,11 @@ class Mover:
         self.q = q = reading.q
         if not held:
             self._running = False
+            self._before = None
             return None
         if not self._running:
+            if not self._at_rest(now, q):
+                return None
             self._start(now, snapshot, q)
         self._check_motion(q, snapshot)
         way = self.go.target - q
