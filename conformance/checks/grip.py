@@ -25,8 +25,10 @@ _FREE = ("joint", "step", "fingerprint", "stiff")
 """Phases in which the joints move without contact, by the client's gains."""
 _ALIKE = 3
 """Fewest joints whose scales of tau_est can be compared."""
+_FEW_SHOWN = 5
+"""Fewest states for a joint's factor: a fast joint is driven for some 10 ms of each step."""
 _FEW = 20
-"""Fewest states for a factor."""
+"""Fewest states for a gripper's stiffness."""
 _REACHED = 0.9
 """Quantile of tau_est, relative to its command, that is compared between joints."""
 _OTHER_UNITS = (1e-3, 1e3)
@@ -38,7 +40,7 @@ _STANDS = 0.01
 _MOST = 0.95
 """Quantile of a gripper's torque by distance that counts as its greatest stiffness."""
 _LAGS_S = tuple(0.002 * i for i in range(21))
-"""Ages of commands with which a gripper's states are compared: 0 to 40 ms."""
+"""Ages of commands with which states are compared, 0 to 40 ms: a hand may obey and publish late."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +105,14 @@ def worst_of(pieces: Iterable[Press]) -> Press | None:
 # ------------------------------------------------------------------------- hands of several joints
 
 
-def _law(ctx: Context, rows: Rows) -> tuple[Floats, NDArray[np.bool_]]:
+def _law(ctx: Context, rows: Rows, age: float = 0.0) -> tuple[Floats, NDArray[np.bool_]]:
     """The torque of each joint by the newest command at these states, N m, and whether a joint is
     driven by it, both shape (n, joints).
+
+    :param age: seconds that the command must be old.
     """
     commands, states = ctx.commands, ctx.states
-    newest = np.maximum(np.searchsorted(commands.t, states.t[rows], "right") - 1, 0)
+    newest = np.maximum(np.searchsorted(commands.t, states.t[rows] - age, "right") - 1, 0)
     tau = (
         commands.kp[newest] * (commands.q[newest] - states.q[rows])
         + commands.kd[newest] * (commands.dq[newest] - states.dq[rows])
@@ -117,6 +121,25 @@ def _law(ctx: Context, rows: Rows) -> tuple[Floats, NDArray[np.bool_]]:
     mode = np.nan_to_num(commands.mode[newest]).astype(np.intp)
     driven = MotorCodec(ctx.recording.dialect).status(mode) == JointMode.FOC
     return tau, driven & np.isfinite(tau)
+
+
+def _law_shown(ctx: Context, rows: Rows) -> tuple[Floats, NDArray[np.bool_]]:
+    """The law by commands of the age whose torque tau_est follows best, whatever its scales are.
+
+    By the newest commands, the first states of each motion would not show the torque that these
+    ask for, and a fast joint is driven for little longer.
+    """
+    tau, most = ctx.states.tau[rows], np.array([j.tau_max for j in ctx.joints])
+    best, closest = _law(ctx, rows), 0.0
+    for lag in _LAGS_S:
+        law, driven = _law(ctx, rows, lag)
+        used = driven & np.isfinite(tau)
+        x, y = np.where(used, np.clip(law, -most, most), 0.0), np.where(used, tau, 0.0)
+        sizes = np.sqrt((x**2).sum(axis=0) * (y**2).sum(axis=0))
+        alike = float((np.abs((x * y).sum(axis=0)) / np.maximum(sizes, 1e-9)).mean())
+        if alike > closest + 1e-9:  # more than rounding
+            best, closest = (law, driven), alike
+    return best
 
 
 @dataclass(frozen=True)
@@ -150,7 +173,7 @@ def _factors(ctx: Context, least: float) -> _Factors:
     rows = rows[ctx.states.t[rows] >= ctx.commands.t[0]]
     if not len(rows):
         return found
-    law, driven = _law(ctx, rows)
+    law, driven = _law_shown(ctx, rows)
     most = 0.9 * np.array([j.tau_max for j in ctx.joints])
     with np.errstate(invalid="ignore", divide="ignore"):
         clear = driven & (np.abs(law) >= least) & (np.abs(law) <= most)
@@ -158,7 +181,7 @@ def _factors(ctx: Context, least: float) -> _Factors:
     for joint in range(count):
         mine = ratios[clear[:, joint], joint]
         mine = np.sort(mine[np.isfinite(mine)])
-        if len(mine) < _FEW:
+        if len(mine) < _FEW_SHOWN:
             continue
         low, middle, high = (float(mine[int(p * (len(mine) - 1))]) for p in (0.25, 0.5, 0.75))
         found.factors[joint] = abs(middle)
