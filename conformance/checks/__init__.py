@@ -18,6 +18,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
+
 from dexkit.conformance.layers import layer
 from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.plots import Plot, PlotKind
@@ -31,6 +33,7 @@ from dexkit.hand import JointSpec, Side, Subject
 __all__ = [
     "REGISTRY",
     "ROUNDING",
+    "UNSEEN_S",
     "BaseContext",
     "Check",
     "Context",
@@ -48,6 +51,9 @@ reports it as float32 and in its own counts, which round (docs/sources/unitree-d
 clamps; other limits have their own tolerance."""
 STROKE_S = 1.0
 """Seconds for a full stroke under Unitree's client."""
+UNSEEN_S = 0.03
+"""Seconds without a state after which it is not known what the hand did meanwhile. A hand may pause
+for longer (RATE-03 judges that): what it does in a pause is left out."""
 
 
 Span = tuple[float, float]
@@ -319,6 +325,14 @@ class Context(BaseContext[Recording, SideView]):
     def span(self, phase: Phase) -> tuple[float, float]:
         """Begin and end of a phase, seconds."""
         return self.recording.seconds(phase.begin_ns), self.recording.seconds(phase.end_ns)
+
+    def seen(self, begin: float, end: float, longest: float = UNSEEN_S) -> bool:
+        """Whether states show what the hand did in [begin, end], without a gap in them.
+
+        :param longest: seconds that may be without a state, also at the ends.
+        """
+        inside = self.states.t[self.states.between(begin, end)]
+        return float(np.diff(inside, prepend=begin, append=end).max()) <= longest
 
     @property
     def object_at(self) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import UNSEEN_S, Context, Outcome, check
 from dexkit.conformance.checks.firmness import STIFFNESS, nudges
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.median import median
@@ -18,8 +18,6 @@ _AT_A_STOP = 0.05
 """Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
 _AT_REST_PART = 0.01
 """Part of the range by which q may vary in the 0.1 s before a step that begins at rest."""
-_UNSEEN_S = 0.03
-"""Seconds without a state in a step, after which its speed is not known: RATE-03 judges the gap."""
 _FAST_S = 0.05
 """Seconds over which the fastest part of a step is measured: several states of the slowest rate."""
 
@@ -99,7 +97,8 @@ def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
             continue
         for step in steps_of(ctx, phase):
             before = ctx.states.q[ctx.states.between(step.begin - 0.1, step.begin), step.joint]
-            if not (len(before) and np.ptp(before) < _AT_REST_PART * step.stroke):
+            at_rest = len(before) and np.ptp(before) < _AT_REST_PART * step.stroke
+            if not (at_rest and ctx.seen(step.begin - 0.1, step.begin)):
                 continue  # it was under way, so that this is not the same step
             now = fastest(step)
             known = [
@@ -133,7 +132,7 @@ def fastest(step: Step) -> float | None:
     if not (part >= 0.9).any():
         return None
     until = int(np.argmax(part >= 0.9))
-    if np.diff(step.t[: until + 1], prepend=step.begin).max() > _UNSEEN_S:
+    if np.diff(step.t[: until + 1], prepend=step.begin).max() > UNSEEN_S:
         return None
     later = np.searchsorted(step.t, step.t + _FAST_S)
     whole = np.flatnonzero(later < len(step.t))

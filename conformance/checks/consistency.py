@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import UNSEEN_S, Context, Outcome, check
 from dexkit.conformance.excess import Course
 from dexkit.conformance.median import median
 from dexkit.conformance.row_selection import Rows, SomeTimes, Times, finite_rows
@@ -348,6 +348,10 @@ def _window_error(
         barred += [ctx.span(p) for name in FOUGHT_OVER for p in ctx.phases(name)]
     for begin, end in barred:
         whole &= (grid + step < begin) | (grid > end)
+    clock = ctx.states.clock
+    gaps = np.flatnonzero(np.diff(clock) > UNSEEN_S)  # in them dq is not known
+    for begin, end in zip(clock[gaps].tolist(), clock[gaps + 1].tolist(), strict=True):
+        whole &= (grid + step <= begin) | (grid >= end)
     c = x.dq_integral
     moved = np.where(whole, x.q[last] - x.q[first], 0.0)
     dq_integral = np.where(whole, c[last] - c[first], 0.0)

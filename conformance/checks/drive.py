@@ -37,7 +37,6 @@ _STEPS = (
 _LEAST_STEP = 0.1  # of the stroke
 _REST_S, _REST_PART = 0.1, 0.01  # before a step: seconds, and part of the stroke that q may vary
 _BEGUN, _WAY = 0.01, 0.5  # parts of a step between which the motor must drive the joint
-_UNSEEN_S = 0.03  # s without a state, after which the motor may already brake the joint
 _STRONG = 0.5  # of the largest tau_est: values that count
 _CLEAR = 0.75  # part of them that must have the same sign
 
@@ -72,6 +71,8 @@ def _drive_of(ctx: Context, step: Step) -> _Drive | None:
     before = states.q[states.between(step.begin - _REST_S, step.begin), joint]
     if abs(step.size) < _LEAST_STEP * step.stroke or not len(before):
         return None
+    if not ctx.seen(step.begin - _REST_S, step.begin):
+        return None  # no state shows whether it was at rest
     if not float(np.ptp(before)) <= _REST_PART * step.stroke:
         return None  # it was still moving: its torque may brake it
     way = 1 if step.size > 0 else -1
@@ -82,7 +83,7 @@ def _drive_of(ctx: Context, step: Step) -> _Drive | None:
     # before it moves, tau_est may still be that of the previous command
     first = int(np.argmax(part >= _BEGUN))
     begin = float(step.t[first])
-    if np.diff(step.t[max(first - 1, 0) : half[0] + 1]).max(initial=0.0) > _UNSEEN_S:
+    if not ctx.seen(float(step.t[max(first - 1, 0)]), float(step.t[half[0]])):
         return None  # no state shows the torque at the beginning
     return _driven(ctx, joint, way, begin, float(step.t[half[0]]))
 
@@ -268,23 +269,30 @@ def _pushed(ctx: Context, phase: Phase, *, after: float = 0.0) -> Iterator[tuple
     """Joints that a phase pushes, and their motion towards the target, rad.
 
     Both ends are medians: one state is off by the noise of q, which is allowed to be of the size
-    of the motion.
+    of the motion. A push of which no state shows an end is left out.
 
     :param after: part of the phase that is skipped.
     """
     for step in steps_of(ctx, phase):
-        start = step.start
+        start: float | None = None
         if after:
-            start = _place(ctx, step.joint, step.begin + after * (step.end - step.begin), start)
-        end = _place(ctx, step.joint, step.end, float(step.q[-1]))
-        yield step.joint, (end - start) * (1 if step.size > 0 else -1)
+            start = _place(ctx, step.joint, step.begin + after * (step.end - step.begin))
+        elif ctx.seen(step.begin - _REST_S, step.begin):
+            start = step.start
+        end = _place(ctx, step.joint, step.end)
+        if start is not None and end is not None:
+            yield step.joint, (end - start) * (1 if step.size > 0 else -1)
 
 
-def _place(ctx: Context, joint: int, at: float, otherwise: float) -> float:
-    """The median of q around a time, rad: in a steady motion, that of the time itself."""
-    q = ctx.states.q[ctx.states.between(at - _AROUND_S, at + _AROUND_S), joint]
+def _place(ctx: Context, joint: int, at: float) -> float | None:
+    """The median of q around a time, rad: in a steady motion, that of the time itself.
+
+    None without states on both sides of it.
+    """
+    begin, end = at - _AROUND_S, at + _AROUND_S
+    q = ctx.states.q[ctx.states.between(begin, end), joint]
     q = q[np.isfinite(q)]
-    return median(q) if len(q) else otherwise
+    return median(q) if len(q) and ctx.seen(begin, end, _AROUND_S) else None
 
 
 def _noise(ctx: Context, joint: int) -> float:
@@ -316,7 +324,7 @@ def torque_drives(ctx: Context) -> Outcome:
             if least is None or part < least[0]:
                 least = part, moved, joint, phase
     if least is None:
-        return ctx.skipped("no state while a torque was commanded")
+        return ctx.skipped("no state shows the begin and the end of a torque command")
     for phase in ctx.phases("pull"):
         for joint, moved in _pushed(ctx, phase, after=_LATE):
             most = 0.5 * ctx.tolerance("min_motion_stroke", joint) + _noise(ctx, joint)
@@ -379,7 +387,7 @@ def torque_way(ctx: Context) -> Outcome:
         for joint, moved in _pushed(ctx, phase, after=_LATE)
     ]
     if not found:
-        return ctx.skipped("no state while a torque was commanded")
+        return ctx.skipped("no state shows the begin and the end of a torque command")
     if len(ctx.joints) == 1:
         held = nudges(ctx, [*ctx.phases(STIFFNESS), *ctx.phases("nudge")])
         found += [(-n.way, 0, n.begin, n.end) for n in held if n.at_rest]
@@ -401,7 +409,7 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
     stiffness.
 
     A step at the joint's own top speed, or within its soft start, does not depend on gains, and is
-    left out.
+    left out, as is one that no state shows on its way to half.
     """
     stiff = {s.joint: s for p in ctx.phases("stiff") for s in steps_of(ctx, p)}
     worst: tuple[float, int, float, float] | None = None
@@ -412,9 +420,11 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
         if quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
         took, quick = least_half_way(step), max(quick, 1e-3)
+        if reference is None or not (_seen_to_half(ctx, step) and _seen_to_half(ctx, reference)):
+            continue
         soon = took < ctx.tolerance("min_ratio") * quick
         own = limited_by_speed, limited_by_start
-        if soon and reference is not None and any(by(ctx, reference) for by in own):
+        if soon and any(by(ctx, reference) for by in own):
             limited += 1
             continue
         if worst is None or took / quick < worst[0]:
@@ -424,7 +434,7 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
             "its own speed or start limits every joint's steps, whatever their gains are"
         )
     if worst is None:
-        return ctx.skipped("no state during the steps")
+        return ctx.skipped("no state shows how the steps got half-way")
     ratio, joint, took, quick = worst
     least = ctx.tolerance("min_ratio") * quick
     text = ctx.named(
@@ -434,6 +444,12 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
         return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
     outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
     return outcome.timed(took, least, at_least=True)
+
+
+def _seen_to_half(ctx: Context, step: Step) -> bool:
+    """Whether states show a step up to twice the time to half of it, and so its fastest part."""
+    half = half_way(step)
+    return half is None or ctx.seen(step.begin, min(step.begin + 2 * half, step.end))
 
 
 # ---------------------------------------------------------------------------------------- low

@@ -32,6 +32,7 @@ _MOVED = 0.02  # of the stroke
 _REST = 0.1  # seconds at the end of a step in which a hand at rest is looked at
 _SETTLE = 0.6  # seconds that a step must be held before it is looked at
 _AT_REST = 0.01  # of the stroke: movement of a hand that rests
+_UNSEEN = 0.03  # seconds without a state, after which it is not known what the hand did meanwhile
 _STEADY = 10.0  # strokes a second: an operator who is faster has jumped
 _SEARCH = 0.6  # seconds of lag looked for
 _FOLLOWS = 0.3  # part of the operator's way that a hand goes that follows, however late
@@ -46,8 +47,9 @@ class Step:
     :param begin: where the joint was, rad.
     :param goal: where it was wanted, rad.
     :param stroke_s: seconds from 5 to 95 % of the whole stroke at the speed of this step;
-        infinite if it hardly moved, NaN for a short step.
-    :param reaction_s: seconds; NaN if it did not move.
+        infinite if it hardly moved, NaN for a short step, or if no state shows when it arrived.
+    :param reaction_s: seconds; NaN if it did not move, or if no state shows where it was at the
+        step or when it began to move.
     :param overshoot: rad; NaN if it did not arrive.
     :param stuck: rad from the goal at rest; NaN if it did not come to rest.
     :param reached: whether it got to 95 % of the step.
@@ -114,8 +116,9 @@ def tracking_figures(
     if len(grid) < 2:
         return TrackingFigures()
     goal: Floats = np.array([math.nan if (x := wanted(float(g))) is None else x for g in grid])
-    position: Floats = q[np.searchsorted(t, grid, "right") - 1]
-    steps = steps_of(grid, position, goal, stroke)
+    newest = np.searchsorted(t, grid, "right") - 1
+    position: Floats = q[newest]
+    steps = steps_of(grid, position, goal, stroke, grid - t[newest])
     strokes = [s.stroke_s for s in steps if not math.isnan(s.stroke_s)]
     lag, rms = _lag(grid, position, goal, stroke)
     return TrackingFigures(
@@ -134,8 +137,13 @@ def _maximum(values: Sequence[float]) -> float:
     return max((v for v in values if not math.isnan(v)), default=math.nan)
 
 
-def steps_of(grid: Floats, position: Floats, goal: Floats, stroke: float) -> list[Step]:
-    """The operator's jumps, and the joint's response to each until the operator moves again."""
+def steps_of(
+    grid: Floats, position: Floats, goal: Floats, stroke: float, ages: Floats
+) -> list[Step]:
+    """The operator's jumps, and the joint's response to each until the operator moves again.
+
+    :param ages: of the state that shows each position, seconds.
+    """
     jumps = np.flatnonzero(np.abs(np.diff(goal)) > _JUMP * stroke) + 1
     # a first target where there was none is a step as well
     appears = np.flatnonzero(np.isnan(goal[:-1]) & ~np.isnan(goal[1:])) + 1
@@ -145,11 +153,12 @@ def steps_of(grid: Floats, position: Floats, goal: Floats, stroke: float) -> lis
         later = moves[moves > at]
         end = int(later[0]) if len(later) else len(goal)
         if (end - at) * GRID >= 0.1 and not np.isnan(goal[at]):
-            found.append(_step(grid[at:end], position[at:end], float(goal[at]), stroke))
+            span = slice(at, end)
+            found.append(_step(grid[span], position[span], float(goal[at]), stroke, ages[span]))
     return found
 
 
-def _step(t: Floats, q: Floats, goal: float, stroke: float) -> Step:
+def _step(t: Floats, q: Floats, goal: float, stroke: float, ages: Floats) -> Step:
     begin = float(q[0])
     travel = goal - begin
     nothing = math.nan
@@ -163,7 +172,8 @@ def _step(t: Floats, q: Floats, goal: float, stroke: float) -> Step:
     arrived = _first(progress >= TO)
     whole = TO - FROM
     stroke_s = nothing
-    if abs(travel) >= _LONG * stroke:
+    unseen = arrived is not None and ages[max(arrived - 1, 0)] > _UNSEEN
+    if abs(travel) >= _LONG * stroke and not unseen:
         if arrived is not None and started is not None:
             part, seconds = progress[arrived] - progress[started], t[arrived] - t[started]
         elif started is not None:  # not there when the operator moved on: as fast as it went
@@ -173,6 +183,9 @@ def _step(t: Floats, q: Floats, goal: float, stroke: float) -> Step:
         speed = part * abs(travel) / max(seconds, GRID)
         stroke_s = whole * stroke / speed if speed > 1e-6 * stroke else math.inf
     reached = arrived is not None
+    reaction = nothing
+    if moved is not None and max(ages[0], ages[max(moved - 1, 0)]) <= _UNSEEN:
+        reaction = float(t[moved] - t[0])
     overshoot = nothing
     if reached:
         overshoot = max(0.0, float((progress[arrived:].max() - 1.0) * abs(travel)))
@@ -186,7 +199,7 @@ def _step(t: Floats, q: Floats, goal: float, stroke: float) -> Step:
         begin=begin,
         goal=goal,
         stroke_s=float(stroke_s),
-        reaction_s=nothing if moved is None else float(t[moved] - t[0]),
+        reaction_s=reaction,
         overshoot=overshoot,
         stuck=stuck,
         reached=reached,
