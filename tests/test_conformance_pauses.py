@@ -9,7 +9,7 @@ import numpy as np
 from dexkit.conformance.checks import Context
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
-from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.generated import parse
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
@@ -85,3 +85,10 @@ def test_a_stretch_is_seen_unless_a_gap_in_the_states_reaches_into_it() -> None:
     assert not context.seen(begin - 0.1, end + 0.1)
     assert not context.seen(begin + 0.01, end - 0.01)
     assert not context.seen(begin - 0.1, begin + 0.02, 0.01)
+
+
+def test_tau_est_that_follows_commands_late_has_one_scale() -> None:
+    """A light joint is driven for hardly longer than the hand takes to obey."""
+    hand = parse("dex3-1/dex3:backlash-more+lighter+counts-4096+latency-20")
+    results = run_mutant(hand.service(), plan_for(hand.dialect.name, sides=hand.sides)).results
+    assert {r.verdict for r in results if r.requirement.id == "DEX3-FORCE-09"} == {Verdict.PASS}
