@@ -31,9 +31,14 @@ class InspireService(ServoService):
 
     hand = InspireHand
     tick = period = 0.003
+    measured_members = frozenset(("q",))
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
-        """Fill in q, the only member that is measured."""
+        """Fill in q, the only member that is measured.
+
+        The others are 0: what a fault has written into the state before does not stay there.
+        """
+        motors["mode"], motors["values"] = 0, 0.0
         motors["q"] = hand.q[: len(motors)]
 
 
@@ -68,6 +73,7 @@ class FtpService(ServoService):
     """Each hand on its own topics, in lists of integers."""
 
     hand = FtpHand
+    measured_members = frozenset(("q", "tau_est"))
     touch_period = 0.04
     """Seconds from one touch message to the next."""
     touch_lengths: Mapping[str, int] = _LENGTHS

@@ -150,6 +150,8 @@ class Service(TopicDevice):
 
     fault_sides: tuple[Side, ...] = tuple(Side)
     sides: tuple[Side, ...]
+    measured_members = frozenset(("q", "dq", "ddq", "tau_est"))
+    """The members of a motor's state that it measures; of others a state holds 0 or nothing."""
 
     def __init__(
         self, dialect: Dialect, sides: Iterable[Side], touch: Mapping[Subject, float]
