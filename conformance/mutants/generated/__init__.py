@@ -31,7 +31,7 @@ _SIDES = {"left": (Side.LEFT,), "right": (Side.RIGHT,), "both": tuple(Side)}
 _SECOND = 0.2
 """Part of a sample that has two faults, or one with two conditions."""
 _LAST = "latency"
-"""The group that acts on commands when the others have changed them."""
+"""The group whose deviation is drawn last."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +156,9 @@ def _fault(text: str, of: HandModel) -> Fault:
     if not at:
         if what not in DEVIATIONS:
             raise UsageError(f"{what!r} is no deviation of a good hand", hint=", ".join(DEVIATIONS))
+        suitable = [w for w in DEVIATIONS if _suits(w, of)]
+        if what not in suitable:
+            raise UsageError(f"{of.name} cannot have {what!r}", hint=", ".join(suitable))
         return Fault(what)
     side, _, rest = where.partition(",")
     joint, _, whens = rest.partition(",")
@@ -250,6 +253,14 @@ def _drawn(draw: random.Random, spoken: Dialect, kind: str) -> Fault:
     )
 
 
+def _suits(deviation: str, of: HandModel) -> bool:
+    """Whether a good hand of a model can have a deviation."""
+    what = DEVIATIONS[deviation]
+    if what.one_joint and len(of.joints[Side.LEFT]) > 1:
+        return False
+    return not what.needs or what.needs in of.reference.load().measured_members
+
+
 def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:
     """``count`` different good hands, with one to four deviations of different groups."""
     draw = random.Random(seed)
@@ -258,12 +269,10 @@ def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Genera
     while len(found) < count and turn < 20 * count + 100:
         d = spoken[turn % len(spoken)]
         turn += 1
-        one_joint = len(_joints(d)) == 1
         groups = draw.sample(list(GROUPS), draw.choice((1, 2, 3, 4)))
         chosen = [draw.choice(GROUPS[g]) for g in sorted(groups, key=lambda g: (g == _LAST, g))]
-        faults = [
-            Fault(w) for w in chosen if one_joint or not getattr(DEVIATIONS[w], "one_joint", False)
-        ]
+        chosen.sort(key=lambda w: DEVIATIONS[w].turn)
+        faults = [Fault(w) for w in chosen if _suits(w, model(d.model))]
         if faults:
             hand = Generated(d, tuple(faults))
             found.setdefault(hand.name, hand)

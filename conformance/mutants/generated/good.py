@@ -2,7 +2,8 @@
 
 Each stays within what the sources allow (docs/sources/unitree-dex.md#b2, #b4 of the same page): a
 vendor may measure more coarsely, have more friction, answer some milliseconds later, brake in
-another way. One of each group can be in a hand; a hand with two slow gears is no good one.
+another way. One of each group can be in a hand; a hand with two slow gears is no good one. What a
+reference does not measure has no noise either: the deviation ``needs`` it.
 """
 
 from __future__ import annotations
@@ -62,8 +63,22 @@ class _WideNoise(What):
 
 
 _add("noise", _WideNoise, "noise-q-wide", "has noise of up to 0.7 % of the range on q", **_ONE)
-_add("noise", _Noise, "noise-dq", "has noise of 1 % of the range in a second on dq", dq=0.01)
-_add("noise", _Noise, "noise-tau", "has noise of 3 % of a soft grip on tau_est", tau=0.03)
+_add(
+    "noise",
+    _Noise,
+    "noise-dq",
+    "has noise of 1 % of the range in a second on dq",
+    dq=0.01,
+    needs="dq",
+)
+_add(
+    "noise",
+    _Noise,
+    "noise-tau",
+    "has noise of 3 % of a soft grip on tau_est",
+    tau=0.03,
+    needs="tau_est",
+)
 
 
 class _Counts(What):
@@ -79,21 +94,25 @@ _add("resolution", _Counts, "counts-16384", "measures q in 16384 steps of a turn
 
 
 class _Predicted(What):
-    """Measures 100 times a second and extrapolates by its velocity in between."""
+    """Measures 100 times a second and extrapolates by its velocity in between.
+
+    The velocity is the joint's own, in q's unit: dq of a state may be in another, or not be there.
+    """
 
     period = 0.01
 
     def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
         super().__init__(rig, side, joints)
-        self.measured: dict[int, tuple[float, float, float]] = {}
+        self.measured: dict[int, tuple[float, float, float, float]] = {}
 
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
-        at, q, dq = self.measured.get(joint, (-math.inf, 0.0, 0.0))
+        at, q, dq, speed = self.measured.get(joint, (-math.inf, 0.0, 0.0, 0.0))
         if now - at >= self.period - 0.5 * self.rig.tick:
             at, q, dq = now, values.q, values.dq
-            self.measured[joint] = at, q, dq
-        values.q, values.dq = q + dq * (now - at), dq
+            speed = self.rig.velocities(self.side)[joint]
+            self.measured[joint] = at, q, dq, speed
+        values.q, values.dq = q + speed * (now - at), dq
 
 
 _add("prediction", _Predicted, "predicts-100", "measures 100 times a second, and predicts")
@@ -238,6 +257,7 @@ _add("servo", _Servo, "servo-own", "is a position servo of its own stiffness", t
 
 class _Latency(What):
     seconds = 0.02
+    turn = 1  # what the others have made of a command is late
 
     def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
         super().__init__(rig, side, joints)
@@ -269,16 +289,31 @@ for _ms in (5, 10, 20):
     )
 
 
-class _StateLatency(What):
+class _Published(What):
+    """Changes when states are published: once, also where one message holds both sides."""
+
+    def publish(self, samples: list[Sample]) -> list[Sample]:
+        if self.rig.codec.shared and self.side is not self.rig.sides[0]:
+            return samples
+        return self.timed(samples)
+
+    def timed(self, samples: list[Sample]) -> list[Sample]:
+        """The samples that are published instead of these."""
+        raise AssertionError  # overridden
+
+
+class _StateLatency(_Published):
     seconds = 0.01
+    turn = -1  # the others act when a state leaves
 
     def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
         super().__init__(rig, side, joints)
         self.queue: deque[Sample] = deque()
 
-    def publish(self, samples: list[Sample]) -> list[Sample]:
+    def timed(self, samples: list[Sample]) -> list[Sample]:
         if self.rig.ended:
-            return samples
+            # an older one would leave together with the state before the last
+            return [x for x in samples if x.sent == self.rig.now]
         self.queue.extend(samples)
         out = []
         while self.queue and self.queue[0].sent <= self.rig.now - self.seconds + 1e-9:
@@ -291,7 +326,7 @@ _add("latency", _StateLatency, "state-late-6", "publishes 6 ms after it measured
 _add("latency", _StateLatency, "state-late-10", "publishes 10 ms after it measured", seconds=0.01)
 
 
-class _Jitters(What):
+class _Jitters(_Published):
     """Holds some states back until the next one."""
 
     part = 0.05
@@ -300,17 +335,17 @@ class _Jitters(What):
         super().__init__(rig, side, joints)
         self.held: list[Sample] = []
 
-    def publish(self, samples: list[Sample]) -> list[Sample]:
+    def timed(self, samples: list[Sample]) -> list[Sample]:
         out, self.held = self.held + samples, []
         if len(out) == 1 and not self.rig.ended and self.random.random() < self.part:
             out, self.held = [], out
         return out
 
 
-class _Pauses(What):
+class _Pauses(_Published):
     """Publishes nothing for 72 ms in every 2.5 s."""
 
-    def publish(self, samples: list[Sample]) -> list[Sample]:
+    def timed(self, samples: list[Sample]) -> list[Sample]:
         quiet = self.rig.now > 1.0 and self.rig.now % 2.5 < 0.072 and not self.rig.ended
         return [] if quiet else samples
 

@@ -101,6 +101,10 @@ class What:
     :cvar several: whether it needs a hand of several joints.
     :cvar both: whether it needs both sides in the run.
     :cvar idle: why it has no effect under ``always``; empty where it has one.
+    :cvar one_joint: whether it needs a hand of one joint.
+    :cvar needs: the member of a motor's state that the reference must measure; empty for none.
+    :cvar turn: its place among the deviations of a good hand: below 0 before the others, above 0
+        after them.
     """
 
     title = ""
@@ -111,6 +115,9 @@ class What:
     several = False
     both = False
     idle = ""
+    one_joint = False
+    needs = ""
+    turn = 0
 
     def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
         self.rig, self.side, self.joints = rig, side, joints
