@@ -121,6 +121,6 @@ def test_unitree_sdk_moves_the_emulated_g1(
         assert state["tau_est"][elbow] == pytest.approx(3.0)
 
         counters = robot.robot.counters
-        assert counters.commands > 100
+        wait_until(lambda: counters.commands > 100)
         assert counters.bad_crc == counters.bad_machine == counters.wrong_mode == 0
     assert "CRC Error" not in "".join(capfd.readouterr())
