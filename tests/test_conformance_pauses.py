@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from dexkit.conformance.checks import Context
 from dexkit.conformance.judge import judge
@@ -16,7 +17,6 @@ from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
-from tests.each import each
 
 PAUSE, EVERY = 0.072, 1.0  # seconds
 MADE_ONCE = {"DEX1-LIFE-05", "DEX3-GAIN-05", "DEX5-GAIN-05"}
@@ -39,19 +39,24 @@ def without(trace: MemoryTrace, commands: str, at: float) -> MemoryTrace:
     return replace(trace, rows=rows)
 
 
-@each(
-    "name, places",
+@pytest.mark.parametrize(
+    ("name", "places"),
     [
         # DEX1-GAIN-03: the begin or the end of a push
         ("dex1-1/unitree_actuator:backlash-more+soft-start+sags-down", (0.0, 0.2)),
-        # DEX1-OPER-05: when it begins to move
-        ("dex1-1/unitree_go:backlash-more+latency-20", (0.04, 0.76)),
-        # DEX1-FIELD-16: most of the motion in a window
-        ("dex1-1/unitree_hg:backlash-more+soft-start", (0.52,)),
-        # DEX3-FIELD-16; DEX3-FORCE-04 and -07: that it moves before a step; DEX3-GAIN-04
-        ("dex3-1/dex3:backlash-more+latency-20", (0.12, 0.64, 0.8)),
-        # DEX5-GAIN-05: how a step gets half-way
-        ("dex5-1/dex5:backlash-more+state-late-10", (0.66, 0.78)),
+        *(
+            pytest.param(name, places, marks=pytest.mark.soak)
+            for name, places in (
+                # DEX1-OPER-05: when it begins to move
+                ("dex1-1/unitree_go:backlash-more+latency-20", (0.04, 0.76)),
+                # DEX1-FIELD-16: most of the motion in a window
+                ("dex1-1/unitree_hg:backlash-more+soft-start", (0.52,)),
+                # DEX3-FIELD-16; DEX3-FORCE-04 and -07: that it moves before a step; DEX3-GAIN-04
+                ("dex3-1/dex3:backlash-more+latency-20", (0.12, 0.64, 0.8)),
+                # DEX5-GAIN-05: how a step gets half-way
+                ("dex5-1/dex5:backlash-more+state-late-10", (0.66, 0.78)),
+            )
+        ),
     ],
 )
 def test_a_pause_is_no_failure_of_what_it_hides(name: str, places: tuple[float, ...]) -> None:
