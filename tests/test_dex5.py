@@ -37,6 +37,7 @@ from dexkit.traces import Recorder, open_trace, sample_path, samples
 
 ROOT = Path(__file__).parent.parent
 GENERATED = (
+    "conformance/scores.json",
     *("docs/images/*", "docs/layouts/*", "traces/samples/*", "tests/pinned/*.json"),
     "dexkit/messages/idl/*",
 )
