@@ -29,11 +29,11 @@ from dexkit.conformance.results import Evidence
 from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
+from dexkit.teleop.tracking import UNSEEN_S
 
 __all__ = [
     "REGISTRY",
     "ROUNDING",
-    "UNSEEN_S",
     "BaseContext",
     "Check",
     "Context",
@@ -51,9 +51,6 @@ reports it as float32 and in its own counts, which round (docs/sources/unitree-d
 clamps; other limits have their own tolerance."""
 STROKE_S = 1.0
 """Seconds for a full stroke under Unitree's client."""
-UNSEEN_S = 0.03
-"""Seconds without a state after which it is not known what the hand did meanwhile. A hand may pause
-for longer (RATE-03 judges that): what it does in a pause is left out."""
 
 
 Span = tuple[float, float]

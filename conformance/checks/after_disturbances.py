@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexkit.conformance.checks import UNSEEN_S, Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.firmness import STIFFNESS, nudges
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
+from dexkit.teleop.tracking import UNSEEN_S
 
 __all__ = ["fastest"]
 

@@ -15,13 +15,14 @@ from functools import cached_property
 
 import numpy as np
 
-from dexkit.conformance.checks import UNSEEN_S, Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.excess import Course
 from dexkit.conformance.median import median
 from dexkit.conformance.row_selection import Rows, SomeTimes, Times, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
+from dexkit.teleop.tracking import UNSEEN_S
 
 __all__ = ["FOUGHT_OVER", "contacts", "filled"]
 

@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats
 
-__all__ = ["FROM", "TO", "Step", "TrackingFigures", "steps_of", "tracking_figures"]
+__all__ = ["FROM", "TO", "UNSEEN_S", "Step", "TrackingFigures", "steps_of", "tracking_figures"]
 
 FROM, TO = 0.05, 0.95
 """Parts of a stroke between which its time is taken."""
+UNSEEN_S = 0.03
+"""Seconds without a state after which it is not known what the hand did meanwhile. A hand may pause
+for longer (RATE-03 judges that): what it does in a pause is left out."""
 GRID = 0.002
 """Seconds between the points at which hand and operator are compared."""
 _JUMP = 0.15  # of the stroke, from one point to the next: a step
@@ -32,7 +35,6 @@ _MOVED = 0.02  # of the stroke
 _REST = 0.1  # seconds at the end of a step in which a hand at rest is looked at
 _SETTLE = 0.6  # seconds that a step must be held before it is looked at
 _AT_REST = 0.01  # of the stroke: movement of a hand that rests
-_UNSEEN = 0.03  # seconds without a state, after which it is not known what the hand did meanwhile
 _STEADY = 10.0  # strokes a second: an operator who is faster has jumped
 _SEARCH = 0.6  # seconds of lag looked for
 _FOLLOWS = 0.3  # part of the operator's way that a hand goes that follows, however late
@@ -172,7 +174,7 @@ def _step(t: Floats, q: Floats, goal: float, stroke: float, ages: Floats) -> Ste
     arrived = _first(progress >= TO)
     whole = TO - FROM
     stroke_s = nothing
-    unseen = arrived is not None and ages[max(arrived - 1, 0)] > _UNSEEN
+    unseen = arrived is not None and ages[max(arrived - 1, 0)] > UNSEEN_S
     if abs(travel) >= _LONG * stroke and not unseen:
         if arrived is not None and started is not None:
             part, seconds = progress[arrived] - progress[started], t[arrived] - t[started]
@@ -184,7 +186,7 @@ def _step(t: Floats, q: Floats, goal: float, stroke: float, ages: Floats) -> Ste
         stroke_s = whole * stroke / speed if speed > 1e-6 * stroke else math.inf
     reached = arrived is not None
     reaction = nothing
-    if moved is not None and max(ages[0], ages[max(moved - 1, 0)]) <= _UNSEEN:
+    if moved is not None and max(ages[0], ages[max(moved - 1, 0)]) <= UNSEEN_S:
         reaction = float(t[moved] - t[0])
     overshoot = nothing
     if reached:
