@@ -21,8 +21,10 @@ from dexkit.hand import ROBOT, Floats, Side, Subject
 
 __all__ = ["ProcessWaits", "Starvation", "Waits", "Worst"]
 
+_MOST_PROCESSORS = 2**16
 _LATEST = 2**62  # ns since 1970: the year 2116
 _AROUND = 500_000_000  # ns before and after a place: the kernel counts work in steps of 10 ms
+_FULL = 0.98  # part of the time for which processors that are never idle are counted to work
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class Waits:
     :param busy_us: time that the machine's processors worked since the sample before, all together;
         empty where it is not known.
     :param own_us: that which they worked for these processes.
+    :param processors: how many they could use; 0 where it is not known.
     """
 
     begin_ns: int = 0
@@ -91,6 +94,7 @@ class Waits:
     processes: list[ProcessWaits] = field(default_factory=list)
     busy_us: list[int] = field(default_factory=list)
     own_us: list[int] = field(default_factory=list)
+    processors: int = 0
 
     @classmethod
     def parse(cls, text: str) -> Waits:
@@ -115,7 +119,11 @@ class Waits:
         busy, own = _numbers(found["busy_us"]), _numbers(found["own_us"])
         if not len(busy) == len(own) in (0, len(times)):
             raise ValueError("the work of processors was not looked at each time")
-        return cls(_number(found["begin_ns"]), times, processes, busy, own)
+        # records of earlier versions do not have it
+        processors = _number(found.get("processors", 0))
+        if not 0 <= processors <= _MOST_PROCESSORS:
+            raise ValueError(f"{processors} is no number of processors")
+        return cls(_number(found["begin_ns"]), times, processes, busy, own, processors)
 
     def as_text(self) -> str:
         """The record's content."""
@@ -135,6 +143,7 @@ class Waits:
             "processes": processes,
             "busy_us": self.busy_us,
             "own_us": self.own_us,
+            "processors": self.processors,
         }
         return json.dumps(record, separators=(",", ":"))
 
@@ -151,17 +160,29 @@ class Waits:
         return Starvation(lost, longest, max(waited, key=lambda w: w.part))
 
     def others(self, begin_ns: int, end_ns: int) -> float:
-        """Part of the processors' work in [begin, end] that was not for these processes, 0 to 1.
+        """Part of these processes' waits in [begin, end] of which other programs are the cause.
 
-        A hand that keeps all processors busy waits for itself. 1 where it is not known.
+        A hand that keeps all processors busy waits for itself. Where processors work for a part p
+        of the time, what needs one waits in proportion to p / (1 - p), as in any queue with
+        arrivals at random. So the waits are compared with those that these processes would have
+        alone: beside work of their own for 68 % of the time, other programs that take the other
+        32 % cause nearly all of them.
+
+        :returns: 0 to 1; 1 where it is not known. Where the number of processors is not known, the
+            part of the work that was for other programs, which is less.
         """
-        rows, _ = self._there(np.zeros(len(self.t_us)), begin_ns - _AROUND, end_ns + _AROUND)
+        rows, spans = self._there(np.zeros(len(self.t_us)), begin_ns - _AROUND, end_ns + _AROUND)
         if not self.busy_us or not len(rows):
             return 1.0
         busy, own = (
-            float(np.array(x, dtype=np.float64)[rows].sum()) for x in (self.busy_us, self.own_us)
+            total(np.array(x, dtype=np.float64)[rows]) for x in (self.busy_us, self.own_us)
         )
-        return min(max((busy - own) / busy, 0.0), 1.0) if busy > 0 else 0.0
+        if busy <= 0:
+            return 0.0
+        whole = self.processors * total(spans[rows])
+        if whole <= 0:
+            return min(max((busy - own) / busy, 0.0), 1.0)
+        return 1.0 - _queue(min(own, busy) / whole) / _queue(busy / whole)
 
     def delays(self, subject: Subject, begin_ns: int, end_ns: int) -> Floats:
         """By how much a hand's processes were delayed in each sample in [begin, end], seconds.
@@ -194,6 +215,12 @@ class Waits:
         spans = np.maximum(np.diff(t, prepend=0.0), longest)
         begin, end = (begin_ns - self.begin_ns) / 1e3, (end_ns - self.begin_ns) / 1e3
         return np.flatnonzero((t >= begin) & (t - spans <= end)), spans
+
+
+def _queue(part: float) -> float:
+    """How long one waits for a processor, relatively, where they work for this part of the time."""
+    part = min(part, _FULL)
+    return part / (1.0 - part)
 
 
 def _number(value: object) -> int:

@@ -76,7 +76,8 @@ class RunQueue:
         if not found:
             return None
         busy = self._busy_us if any(self._busy_us) else []
-        return Waits(self._begin_ns, self._t_us, found, busy, self._own_us if busy else [])
+        own = self._own_us if busy else []
+        return Waits(self._begin_ns, self._t_us, found, busy, own, len(os.sched_getaffinity(0)))
 
     def _run(self) -> None:
         clock = RealClock()

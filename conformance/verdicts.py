@@ -26,7 +26,8 @@ late while it was judged:
 7. Where the hand's processes run on this machine, what they waited for a processor is measured as
    well (:mod:`~dexkit.conformance.run_queue`), and explains a failure by itself: up to
    :data:`AGAIN` times what they waited at its place; a single event up to :data:`HOPS` times their
-   longest wait. To wait is not to compute: a process that is slow by itself is not excused. This
+   longest wait; of all waits the part of which other programs are the cause. To wait is not to
+   compute: a process that is slow by itself is not excused. This
    holds for motion that is not of real time, too: there a failure without a size is as large as its
    place is long. Where they waited for :data:`OVERLOADED` in each sample on average over the whole
    run, no requirement of real time can be judged, but for what 4 does not explain; the direction

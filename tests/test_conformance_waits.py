@@ -151,9 +151,47 @@ def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
     others = replace(MANY_SHORT, busy_us=busy, own_us=[SAMPLE_US // 5] * 200)
     assert excuse(Machine(others), RATE, slow, Side.LEFT).excused
     assert not excuse(Machine(own), RATE, slow, Side.LEFT).excused
-    assert own.others(0, 10**9) == pytest.approx(0.1)
+    assert own.others(0, 10**9) == pytest.approx(0.1)  # on processors whose number is not known
     assert replace(own, busy_us=[0] * 200).others(0, 10**9) == 0.0
     assert MANY_SHORT.others(0, 10**9) == 1.0  # not known
+
+
+@each(
+    ("own", "busy", "part"),
+    [
+        (0.68, 0.68, 0.0),  # alone
+        (0.98, 1.0, 0.0),  # it keeps all busy itself
+        (0.68, 1.0, 0.957),  # others took what it left
+        (0.1, 1.0, 0.998),
+        (0.9, 1.0, 0.816),
+        (0.6, 0.7, 0.357),  # they left some of it
+        (0.5, 0.4, 0.0),  # counted in another way
+        (0.0, 0.0, 0.0),
+    ],
+)
+def test_part_of_the_waits_that_other_programs_cause(own: float, busy: float, part: float) -> None:
+    found = replace(
+        MANY_SHORT,
+        busy_us=[round(2 * busy * SAMPLE_US)] * 200,
+        own_us=[round(2 * own * SAMPLE_US)] * 200,
+        processors=2,
+    )
+    assert found.others(0, 10**9) == pytest.approx(part, abs=2e-3)
+
+
+@given(own=st.floats(0, 1), others=st.floats(0, 1), more=st.floats(0, 1))
+def test_more_work_of_others_causes_more_of_the_waits(
+    own: float, others: float, more: float
+) -> None:
+    def part(work: float) -> float:
+        return replace(
+            MANY_SHORT,
+            busy_us=[round((own + work) * SAMPLE_US)] * 200,
+            own_us=[round(own * SAMPLE_US)] * 200,
+            processors=2,
+        ).others(0, 10**9)
+
+    assert 0.0 <= part(others) <= part(others + more) + 1e-9 <= 1.0 + 1e-9
 
 
 def test_excuse_says_what_happened_and_what_to_do() -> None:
