@@ -37,7 +37,8 @@ old-stamps     commands whose source timestamps are an hour old
 late-joiner    a new subscriber appears
 touch          one finger alone presses on the object, if there is one
 firmer         all fingers hold it softly, and one after the other presses firmly
-squeeze        all fingers close on it, for seconds; position servos also after each restart
+squeeze        all fingers close on it, for seconds; position servos also on, after a silence, and
+               after each restart
 guarded-step   some joints of each hand have time-out protection from here on (bit 7 of the mode
                byte); a step, and back
 guarded        meanwhile a hand without an object holds its pose
@@ -130,6 +131,9 @@ _SPEEDS_SECONDS = 0.5
 """Seconds of each turn with them."""
 _GRIP_SECONDS = 1.1
 """Seconds of a grip after a restart."""
+_GRIP_ON_SECONDS = 1.5
+"""Seconds for which position servos grip on after a silence, which they need not let go in: five
+seconds of contact, in which a force that fades within six is down to a sixth."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -912,6 +916,9 @@ class FingerScript(HandScript):
             yield from self._drive("drive", free, squeeze)
             self._report("... silence: nothing may be left driven by a velocity, a grip is kept")
             yield from self._silence("silence", self._model.command_timeout + 0.7)
+            if pressing and self.plan.dialect.position_servo:
+                self._report("squeezing the object on: its force must not fade")
+                yield from self._squeeze(pressing, _GRIP_ON_SECONDS)
         yield from self._everyone("resume", {s: self._home(s) for s in sides}, most=1.5)
 
     def _each_silent(self) -> Steps:
