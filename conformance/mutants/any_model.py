@@ -843,7 +843,6 @@ class StopsInABurst(Service):
         "DEX1-SAFE-09",
         "DEX3-SAFE-10",
         "DEX1-RATE-03",
-        "DEX1-RATE-04",
         "DEX3-RATE-03",
     ),
 )
@@ -1197,7 +1196,8 @@ class ParksWhenItEnds(Service):
     """Commands each motor to its farther end when its service ends, and nothing stops it."""
 
     def brake(self) -> None:
-        kp, kd = model(self.dialect.model).client_gains
+        profile = model(self.dialect.model)
+        kp, kd = profile.client_gains
         for side, hand in self.hands.items():  # type: ignore[attr-defined]
             hand.timeout = math.inf
             here = [hand.q] if self.codec.joints == 1 else hand.q
@@ -1206,7 +1206,10 @@ class ParksWhenItEnds(Service):
                 j.q_min if q > 0.5 * (j.q_min + j.q_max) else j.q_max
                 for q, j in zip(here, joints, strict=True)
             ]
-            goals = [Motor(q=q, kp=kp, kd=kd, mode=self.codec.mode(i)) for i, q in enumerate(ends)]
+            goals = [
+                Motor(q=q, dq=profile.client_dq, kp=kp, kd=kd, mode=self.codec.mode(i))
+                for i, q in enumerate(ends)
+            ]
             self.motors(side, tuple(goals))
 
 

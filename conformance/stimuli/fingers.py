@@ -115,6 +115,9 @@ _STATUSES = range(2, 8)
 """Values of the three status bits without a meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
 (docs/sources/unitree-dex.md#g)."""
+_ENDS = 30.0
+"""Percent of closing from which a hand moves when its service ends: far enough from both ends and
+from the object that it is seen if the hand opens or closes then."""
 _STAYS = 4.1
 """Seconds after the time-out in which a hand must do what its protection says: a client that has
 died is started again within them, and its operator relies on what the hand holds."""
@@ -340,7 +343,12 @@ class FingerScript(HandScript):
             # long enough for the fastest joint to leave its range from anywhere
             travel = min(j.stroke / j.dq_max for joints in self._joints.values() for j in joints)
             each = max(0.3, 0.7 * travel)
-            yield from self._bad_commands(name, self.plan.sides, far, each)
+            # each way from inside of the range: at an end, a hand that goes there in any case
+            # cannot be told from one that ignores them
+            for way in range(2):
+                if way:
+                    yield from self._everyone("recover", self._other_place(), most=1.5, after=name)
+                yield from self._bad_commands(name, self.plan.sides, far[way::2], each)
         else:
             for alone in self._each_alone():
                 wrong = self._malformed(name, alone)
@@ -436,7 +444,7 @@ class FingerScript(HandScript):
 
     def _before_shutdown(self) -> Steps:
         """Move: what was commanded last must not be in force after the restart."""
-        yield from self._to("center", OPEN)
+        yield from self._to("center", _ENDS)
         yield from self._drive("drive", self.plan.sides, {})
 
     def _silent_again(self) -> Steps:

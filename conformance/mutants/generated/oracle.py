@@ -64,7 +64,8 @@ DEAD_S, GAP_S = 0.15, 0.05
 stroke halfway, and for 10."""
 SLOW, SLOWISH = 0.5, 0.9
 """States for each cycle of the client, over a second: below half it acts on the same state twice
-and more; below nine tenths now and then."""
+and more; below nine tenths now and then. Grave is no rate that the vendor's own service has, less a
+fifth (``min_state_rate`` of the profile)."""
 SPEED, SPEED_S = 0.2, 0.1
 """Of the range in a second: an error of dq that a client's filter or damping would act on."""
 GRIP, GRIP_S = 0.5, 0.3
@@ -212,6 +213,7 @@ class _Compare:
         )
         self.grip = 0.05 * self.spans * np.array([kp for kp, _ in profile.gains])
         self.rate = profile.command_rate
+        self.least_rate = min(SLOW * profile.command_rate, profile.min_state_rate)
         self.side = side
         self.effects: list[Effect] = []
 
@@ -279,8 +281,11 @@ class _Compare:
             return np.asarray(np.searchsorted(times, starts + 1.0) - np.searchsorted(times, starts))
 
         rates, good = counts(t), counts(there)
-        for severity, least in ((Severity.BREAKING, SLOW), (Severity.LESSER, SLOWISH)):
-            slow = np.flatnonzero((rates < least * self.rate) & (good >= self.rate))
+        for severity, least in (
+            (Severity.BREAKING, self.least_rate),
+            (Severity.LESSER, SLOWISH * self.rate),
+        ):
+            slow = np.flatnonzero((rates < least) & (good >= self.rate))
             if len(slow):
                 text = f"publishes {rates[slow[0]]:.0f} states in a second"
                 self.effects.append(
