@@ -161,7 +161,6 @@ def _score(recording: Recording, results: Sequence[Result]) -> Score:
         recording.dialect.name,
         [str(side) for side in recording.judged],
         recording.stimulus,
-        {r.requirement.id for r in results},
         Counter(r.requirement.id for r in results if r.verdict.judged),
     )
 

@@ -4,14 +4,16 @@
 generated wrong hands (docs/mutants.md) in runs of each kind, on the virtual clock. A figure of the
 file is about one model, one :class:`~dexkit.conformance.selection.RunKind` and one
 :class:`Setting`. :func:`score_of` gives it to a run only if that was applied the same stimuli, was
-judged by the same requirements, and left out none that the trial could judge. Every other run has
-no score, and says why.
+judged on the same sides. A requirement that the run did not judge, as it was left out, blocked or
+excused, catches nothing: the score is computed without it, and its sentence says so. Every other
+run has no score, and says why.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass
@@ -39,6 +41,7 @@ __all__ = [
     "catalogue_digest",
     "entries",
     "score_of",
+    "wilson",
 ]
 
 FILE = Path(__file__).with_name("scores.json")
@@ -80,6 +83,20 @@ class Setting(str, Enum):
         return "" if whole else "; the service not restarted, nothing in the hands"
 
 
+def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """The confidence interval of a proportion by Wilson's score, 95 % by default.
+
+    :returns: lower and upper bound, 0 to 1; the whole range where there is nothing to count.
+    """
+    if not count:
+        return 0.0, 1.0
+    p = hits / count
+    scale = 1.0 + z * z / count
+    middle = (p + z * z / (2 * count)) / scale
+    half = z * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count)) / scale
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
 @dataclass(frozen=True)
 class Caught:
     """Number of caught hands of one grade.
@@ -90,6 +107,17 @@ class Caught:
     count: int
     caught: int
     interval: tuple[float, float]
+
+    @classmethod
+    def of(cls, found: Sequence[AbstractSet[str]], judged: AbstractSet[str]) -> Caught:
+        """Count the hands of which a run catches some.
+
+        :param found: for each hand, the requirements that catch it.
+        :param judged: the requirements that the run judges.
+        """
+        caught = sum(bool(ids & judged) for ids in found)
+        low, high = wilson(caught, len(found))
+        return cls(len(found), caught, (round(low, 4), round(high, 4)))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Caught:
@@ -114,6 +142,8 @@ class Score:
         reason; ``lesser`` those with lesser faults, noticed by a failure or a warning.
     :param seed: of the trial.
     :param catalogue: :func:`catalogue_digest` of the requirements that it was computed with.
+    :param unjudged: requirements of such a run that this one did not judge on as many sides as the
+        trial with a good hand; the hands that only they catch count as missed.
     """
 
     why: str = ""
@@ -123,6 +153,7 @@ class Score:
     lesser: Caught | None = None
     seed: int = 0
     catalogue: str = ""
+    unjudged: tuple[str, ...] = ()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Score:
@@ -131,7 +162,8 @@ class Score:
         for name in ("must_breaking", "lesser"):
             if found[name] is not None:
                 found[name] = Caught.from_dict(found[name])
-        return cls(**found)
+        # files of earlier versions do not have it
+        return cls(**{**found, "unjudged": tuple(found.get("unjudged", ()))})
 
     def sentence(self) -> str:
         """The score in one sentence, for people."""
@@ -139,6 +171,8 @@ class Score:
         if self.why or found is None or not found.count:
             return f"No score is known for this run: {self.why or 'no wrong hand was tried'}."
         remark = next((s.remark for s in Setting if str(s) == self.setting), "")
+        if self.unjudged:
+            remark += f"; {_few(self.unjudged)} not judged"
         return (
             f"In a trial of {found.count} generated wrong hands that break a MUST, a run like this "
             f"({self.run}{remark}) caught {found.text()}."
@@ -159,6 +193,8 @@ class Entry:
 
     :param hands: how many were generated; those that cannot be distinguished from a good one are
         not counted.
+    :param must_breaking: for each hand that breaks a MUST, the ids of the requirements that catch
+        it, for a right reason; ``lesser`` for each of the others.
     :param phases: the phases of the stimulus that such a run asks for, and ``rounds`` how often.
     :param requirements: ids of those that such a run judges.
     :param fewer: by dialect, on how many sides of a good hand a requirement is judged in such a
@@ -171,8 +207,8 @@ class Entry:
     seed: int
     hands: int
     equivalent: int
-    must_breaking: Caught
-    lesser: Caught
+    must_breaking: tuple[frozenset[str], ...]
+    lesser: tuple[frozenset[str], ...]
     catalogue: str
     rounds: int
     phases: frozenset[str]
@@ -185,8 +221,8 @@ class Entry:
         return cls(
             **{
                 **values,
-                "must_breaking": Caught.from_dict(values["must_breaking"]),
-                "lesser": Caught.from_dict(values["lesser"]),
+                "must_breaking": tuple(frozenset(ids) for ids in values["must_breaking"]),
+                "lesser": tuple(frozenset(ids) for ids in values["lesser"]),
                 "phases": frozenset(values["phases"]),
                 "requirements": tuple(values["requirements"]),
             }
@@ -194,18 +230,27 @@ class Entry:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry as plain data."""
-        return {**asdict(self), "phases": sorted(self.phases)}
+        return {
+            **asdict(self),
+            "must_breaking": [sorted(ids) for ids in self.must_breaking],
+            "lesser": [sorted(ids) for ids in self.lesser],
+            "phases": sorted(self.phases),
+        }
 
-    @property
-    def score(self) -> Score:
-        """The score of a run that the entry is about."""
+    def score(self, unjudged: Sequence[str] = ()) -> Score:
+        """The score of a run that the entry is about.
+
+        :param unjudged: requirements of such a run that this one did not judge.
+        """
+        judged = frozenset(self.requirements) - frozenset(unjudged)
         return Score(
             run=self.run,
             setting=self.setting,
-            must_breaking=self.must_breaking,
-            lesser=self.lesser,
+            must_breaking=Caught.of(self.must_breaking, judged),
+            lesser=Caught.of(self.lesser, judged),
             seed=self.seed,
             catalogue=self.catalogue,
+            unjudged=tuple(unjudged),
         )
 
     def missing(self, dialect: str, judged: Mapping[str, int]) -> list[str]:
@@ -248,7 +293,6 @@ def score_of(
     dialect: str,
     sides: Sequence[str],
     stimulus: Stimulus | None,
-    selected: AbstractSet[str],
     judged: Mapping[str, int],
     known: Sequence[Entry] | None = None,
 ) -> Score:
@@ -256,8 +300,7 @@ def score_of(
 
     :param sides: of the hands that were judged.
     :param stimulus: the recording's stimulus record; None in a recording of a session.
-    :param selected: ids of the requirements that were to be judged.
-    :param judged: on how many sides each of them came to a finding.
+    :param judged: on how many sides each requirement came to a finding, by its id.
     :param known: what there is to choose from; None for what the file has.
     """
     if stimulus is None:
@@ -282,19 +325,12 @@ def score_of(
         return Score("the requirements have changed since wrong hands were tried on them")
     if len(sides) < len(Side):
         return Score(f"only the {' and '.join(sides)} hand was judged")
-    lacking = [[r for r in e.requirements if r not in selected] for e in of_kind]
-    if all(lacking):
-        return Score(f"requirements were left out: {_few(min(lacking, key=len))}")
-    of_kind = [e for e, ids in zip(of_kind, lacking, strict=True) if not ids]
-    empty = not any(place is not None for place in stimulus.objects.values())
-    for entry in of_kind:
-        held = entry.setting == Setting.WHOLE
-        if held is not empty and not entry.missing(dialect, judged):
-            return entry.score
-    missing = of_kind[0].missing(dialect, judged)
-    if not missing:
+    held = any(place is not None for place in stimulus.objects.values())
+    setting = Setting.WHOLE if held else Setting.EXTERNAL
+    entry = next((e for e in of_kind if e.setting == setting), None)
+    if entry is None:
         return Score("nothing was held, and the trial of such a run was with an object")
-    return Score(f"requirements could not be judged on each side: {_few(missing)}")
+    return entry.score(entry.missing(dialect, judged))
 
 
 def _few(ids: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from dexkit.cli.mutants import command
 from dexkit.conformance.mutants import generated, outsiders
 from dexkit.conformance.mutants.generated import Fault, Generated, dialects, oracle, parse
-from dexkit.conformance.mutants.generated.campaign import Campaign, Trial, try_generated, wilson
+from dexkit.conformance.mutants.generated.campaign import Campaign, Trial, try_generated
 from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
 from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.mutants.generated.rig import Part, What, compose
@@ -232,13 +232,6 @@ def test_only_a_failed_must_of_a_declared_area_catches_a_breaking_hand() -> None
     assert trial(severity="lesser", warned=("DEX1-MOVE-02",)).caught
     assert trial(severity="good").caught
     assert not trial(severity="good", warned=("DEX1-MOVE-02",)).caught
-
-
-def test_wilson_interval() -> None:
-    assert wilson(0, 0) == (0.0, 1.0)
-    low, high = wilson(8, 10)
-    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
-    assert wilson(10, 10)[1] == pytest.approx(1.0)
 
 
 def test_survivors_come_first_and_equivalents_are_not_counted() -> None:

@@ -19,7 +19,7 @@ from dexkit.conformance import scores
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.generated.campaign import Trial, wilson
+from dexkit.conformance.mutants.generated.campaign import Trial
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.html import render
@@ -38,6 +38,7 @@ from dexkit.conformance.scores import (
     catalogue_digest,
     entries,
     score_of,
+    wilson,
 )
 from dexkit.conformance.selection import THOROUGH_ROUNDS, RunKind
 from dexkit.conformance.stimulus_record import Planned, Stimulus
@@ -72,6 +73,8 @@ def test_a_score_is_a_sentence_with_its_uncertainty() -> None:
     assert KNOWN.sentence() == SENTENCE
     external = replace(KNOWN, setting="external").sentence()
     assert "(default; the service not restarted, nothing in the hands)" in external
+    few = replace(KNOWN, unjudged=("DEX1-A-01",)).sentence()
+    assert "a run like this (default; DEX1-A-01 not judged) caught" in few
 
 
 def test_without_a_score_the_sentence_says_why() -> None:
@@ -106,15 +109,32 @@ def test_every_report_has_the_sentence(score: Score, tmp_path: Path) -> None:
         assert score.sentence() in text, name
 
 
+def test_wilson_interval() -> None:
+    assert wilson(0, 0) == (0.0, 1.0)
+    low, high = wilson(8, 10)
+    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
+    assert wilson(10, 10)[1] == pytest.approx(1.0)
+
+
 # ------------------------------------------------------------------------- the result file
 
 
-@pytest.mark.parametrize("score", [KNOWN, Score("it is so")])
+@pytest.mark.parametrize(
+    "score", [KNOWN, replace(KNOWN, unjudged=("DEX1-A-01", "DEX1-B-01")), Score("it is so")]
+)
 def test_the_result_file_keeps_the_score(score: Score, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     replace(result_of_every_kind(), score=score).write_json(path)
     assert json.loads(path.read_text())["score"]["sentence"] == score.sentence()
     assert read_json(path).score == score
+
+
+def test_a_score_of_an_earlier_version_has_judged_everything(tmp_path: Path) -> None:
+    data = replace(result_of_every_kind(), score=KNOWN).as_dict()
+    del data["score"]["unjudged"]
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(data))
+    assert read_json(path).score == KNOWN
 
 
 def test_a_result_file_without_a_score_is_read(tmp_path: Path) -> None:
@@ -132,6 +152,8 @@ def test_a_result_file_without_a_score_is_read(tmp_path: Path) -> None:
         ("must_breaking", {"count": 1}),
         ("must_breaking", {"count": 2, "caught": 1, "interval": [0.0, 1.0, 1.0]}),
         ("seed", "1"),
+        ("unjudged", "DEX1-A-01"),
+        ("unjudged", [1]),
         ("surprise", 1),
     ],
 )
@@ -150,6 +172,8 @@ def test_a_wrong_score_in_a_result_file_is_refused(
 
 IDS = ("DEX1-A-01", "DEX1-B-01", "DEX1-C-01")
 PHASES = frozenset({"step", "silence"})
+A, B, C = (frozenset({name}) for name in IDS)
+GRAVE = (A, A | B, C, frozenset[str]())
 BOTH = {"DEX1-A-01": 2, "DEX1-B-01": 2, "DEX1-C-01": 1}
 
 
@@ -160,10 +184,10 @@ def entry(run: str = "default", setting: str = "whole", **changes: Any) -> Entry
         run=run,
         setting=setting,
         seed=1,
-        hands=100,
+        hands=6,
         equivalent=1,
-        must_breaking=Caught(90, 50, (0.4527, 0.6541)),
-        lesser=Caught(9, 3, (0.1206, 0.6458)),
+        must_breaking=GRAVE,
+        lesser=(B,),
         catalogue=catalogue_digest("dex1-1"),
         rounds=1,
         phases=PHASES,
@@ -190,7 +214,6 @@ def found(known: tuple[Entry, ...] = FILE, **changes: Any) -> Score:
         "dialect": "unitree_go",
         "sides": ["left", "right"],
         "stimulus": stimulus,
-        "selected": set(IDS),
         "judged": BOTH,
         **changes,
     }
@@ -203,8 +226,6 @@ def test_a_complete_run_has_the_score_of_its_kind() -> None:
     thorough = Stimulus(planned=Planned(PHASES, 10), objects=held)
     assert found(stimulus=thorough).run == "thorough"
     quick = Stimulus(planned=Planned(frozenset({"step"})), objects=held)
-    assert found(stimulus=quick, selected={IDS[0]}, judged={IDS[0]: 2}).run == "quick"
-    # the recording of a quick run, judged again by every requirement
     assert found(stimulus=quick, judged={IDS[0]: 2}).run == "quick"
     external = Stimulus(planned=Planned(PHASES), objects={Side.LEFT: None, Side.RIGHT: None})
     assert found(stimulus=external, judged={IDS[0]: 2}).setting == "external"
@@ -220,10 +241,6 @@ def test_a_complete_run_has_the_score_of_its_kind() -> None:
         ({"stimulus": Stimulus(planned=Planned(PHASES, 3))}, "no kind of run that was tried"),
         ({"stimulus": Stimulus(planned=Planned(frozenset("a")))}, "stimuli are those of no kind"),
         ({"sides": ["left"]}, "only the left hand was judged"),
-        ({"selected": set(IDS[1:])}, "requirements were left out: DEX1-A-01"),
-        ({"judged": {**BOTH, "DEX1-B-01": 1}}, "not be judged on each side: DEX1-B-01"),
-        ({"judged": {}}, "not be judged on each side: DEX1-A-01, DEX1-B-01, DEX1-C-01"),
-        ({"dialect": "unitree_actuator"}, "not be judged on each side: DEX1-C-01"),
         ({"known": (entry(catalogue="0"),)}, "requirements have changed"),
         ({"known": ()}, "no wrong hands of the model"),
     ],
@@ -239,10 +256,40 @@ def test_run_without_an_object_does_not_get_the_score_of_one_with_it() -> None:
     assert "nothing was held" in found((entry(),), stimulus=empty).sentence()
 
 
+@pytest.mark.parametrize(
+    ("judged", "unjudged", "caught", "lesser"),
+    [
+        (BOTH, (), 3, 1),
+        ({**BOTH, "DEX1-D-01": 2}, (), 3, 1),
+        ({**BOTH, "DEX1-B-01": 1}, ("DEX1-B-01",), 3, 0),
+        ({"DEX1-A-01": 2, "DEX1-B-01": 2}, ("DEX1-C-01",), 2, 1),
+        ({"DEX1-B-01": 2}, ("DEX1-A-01", "DEX1-C-01"), 1, 1),
+        ({}, IDS, 0, 0),
+    ],
+)
+def test_what_was_not_judged_catches_nothing(
+    judged: dict[str, int], unjudged: tuple[str, ...], caught: int, lesser: int
+) -> None:
+    score = found(judged=judged)
+    assert score.unjudged == unjudged
+    assert score.must_breaking == Caught(4, caught, rounded(caught, 4))
+    assert score.lesser == Caught(1, lesser, rounded(lesser, 1))
+
+
+def rounded(hits: int, count: int) -> tuple[float, float]:
+    """Wilson's interval as scores have it."""
+    low, high = wilson(hits, count)
+    return round(low, 4), round(high, 4)
+
+
+def test_a_requirement_counts_on_as_many_sides_as_in_the_trial() -> None:
+    assert found(dialect="unitree_actuator").unjudged == ("DEX1-C-01",)
+
+
 def test_a_long_list_of_requirements_is_cut() -> None:
     ids = tuple(f"DEX1-A-{i:02}" for i in range(9))
-    text = found((entry(requirements=ids),), selected=set()).sentence()
-    assert text.endswith("left out: DEX1-A-00, DEX1-A-01, DEX1-A-02 and 6 more.")
+    text = found((entry(requirements=ids),), judged={}).sentence()
+    assert "(default; DEX1-A-00, DEX1-A-01, DEX1-A-02 and 6 more not judged) caught 0 %" in text
 
 
 # ---------------------------------------------------------------------------- real recordings
@@ -255,19 +302,27 @@ def test_a_good_gripper_in_a_complete_run_has_the_score_of_the_file(run: RunKind
     wanted = run.requirements(catalogue("dex1-1"))
     result = run_mutant(model("dex1-1").reference.load(), plan_for(run=run), wanted)
     (expected,) = (
-        e.score for e in entries() if (e.model, e.run, e.setting) == ("dex1-1", run, Setting.WHOLE)
+        e.score()
+        for e in entries()
+        if (e.model, e.run, e.setting) == ("dex1-1", run, Setting.WHOLE)
     )
     assert result.score == expected
     assert f"({run})" in result.score.sentence()
 
 
-def test_a_selection_of_a_run_has_no_score() -> None:
+def test_a_selection_of_a_run_has_the_score_of_its_requirements() -> None:
     plan = plan_for(run=RunKind.QUICK)
     trace = run_virtual(plan, model("dex1-1").reference.load())
     recording = recording_of(trace, "unitree_go", plan.sides)
     wanted = RunKind.QUICK.requirements(catalogue("dex1-1"))
     score = judge(recording, requirements=wanted[1:]).score
-    assert f"left out: {wanted[0].id}" in score.sentence()
+    assert score.unjudged == (wanted[0].id,)
+    assert f"(quick; {wanted[0].id} not judged)" in score.sentence()
+    alone = judge(recording, requirements=wanted[:1]).score
+    assert wanted[0].id not in alone.unjudged
+    assert alone.must_breaking is not None
+    assert score.must_breaking is not None
+    assert alone.must_breaking.caught <= score.must_breaking.caught
 
 
 def test_a_recorded_session_has_no_score() -> None:
@@ -357,13 +412,11 @@ def test_score_file_covers_the_trials_of_the_tool() -> None:
         assert e.seed == SEED
 
 
-def test_counts_and_intervals_of_the_file_agree() -> None:
+def test_counts_and_requirements_of_the_file_agree() -> None:
     for e in entries():
-        assert e.equivalent + e.must_breaking.count + e.lesser.count == e.hands
-        for grade in (e.must_breaking, e.lesser):
-            assert 0 <= grade.caught <= grade.count
-            assert grade.interval == pytest.approx(wilson(grade.caught, grade.count), abs=1e-4)
+        assert e.equivalent + len(e.must_breaking) + len(e.lesser) == e.hands
         assert set(e.requirements) >= {r for ids in e.fewer.values() for r in ids}
+        assert set(e.requirements) >= frozenset().union(*e.must_breaking, *e.lesser)
 
 
 def test_score_file_equals_the_output_of_the_tool() -> None:
@@ -426,8 +479,8 @@ def test_an_entry_counts_hands_by_grade() -> None:
     ]
     made = _entry(task, trials, {"unitree_go": {}})
     assert (made.hands, made.equivalent) == (4, 1)
-    assert (made.must_breaking.count, made.must_breaking.caught) == (2, 1)
-    assert (made.lesser.count, made.lesser.caught) == (1, 1)
+    assert made.must_breaking == ({"DEX1-MOVE-02"}, set())
+    assert made.lesser == ({"DEX1-MOVE-02"},)
     assert Entry.from_dict(json.loads(json.dumps(made.as_dict()))) == made
 
 

@@ -127,7 +127,7 @@ DEX3_1 = HandModel(
     session="dex3_pinch",
     simulator="sim-dex3",
     simulated_by=Lazy("dexkit.emulators.sim_dex3:sim_dex3"),
-    scored_hands=ScoredHands(quick=40, default=40, thorough=10),
+    scored_hands=ScoredHands(quick=40, default=40, thorough=10, external=20),
     fingers=3 * ("thumb",) + 2 * ("middle",) + 2 * ("index",),
     client_forks=True,
     layout=HandLayout(

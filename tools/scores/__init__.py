@@ -19,10 +19,10 @@ from typing import Any
 
 from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.generated import dialects, parse, sample
-from dexkit.conformance.mutants.generated.campaign import Campaign, Trial, graded, judged
+from dexkit.conformance.mutants.generated.campaign import Trial, graded, judged
 from dexkit.conformance.mutants.generated.oracle import Severity
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.scores import FORMAT, Caught, Entry, Setting, catalogue_digest
+from dexkit.conformance.scores import FORMAT, Entry, Setting, catalogue_digest
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.errors import UsageError
@@ -110,12 +110,11 @@ def _fewer(task: Task, dialect: str) -> dict[str, int]:
     return {r.id: found[r.id] for r in wanted if found[r.id] != len(Side)}
 
 
-def _caught(campaign: Campaign, severity: Severity) -> Caught:
-    return Caught.from_dict(campaign.score(severity.value))
-
-
 def _entry(task: Task, trials: Sequence[Trial], fewer: Mapping[str, Mapping[str, int]]) -> Entry:
-    campaign = Campaign(SEED, trials=list(trials), kind=task.run)
+    by_grade = {
+        grade: [t for t in trials if t.severity == grade.value]
+        for grade in (Severity.BREAKING, Severity.LESSER, Severity.EQUIVALENT)
+    }
     requirements = task.run.requirements(catalogue(task.model))
     plan = plan_for(next(iter(fewer)), run=task.run)
     return Entry(
@@ -124,9 +123,9 @@ def _entry(task: Task, trials: Sequence[Trial], fewer: Mapping[str, Mapping[str,
         setting=str(task.setting),
         seed=SEED,
         hands=len(trials),
-        equivalent=len(campaign.trials_of(Severity.EQUIVALENT.value)),
-        must_breaking=_caught(campaign, Severity.BREAKING),
-        lesser=_caught(campaign, Severity.LESSER),
+        equivalent=len(by_grade[Severity.EQUIVALENT]),
+        must_breaking=tuple(t.caught_by for t in by_grade[Severity.BREAKING]),
+        lesser=tuple(t.caught_by for t in by_grade[Severity.LESSER]),
         catalogue=catalogue_digest(task.model),
         rounds=plan.rounds,
         phases=plan.phases,

@@ -42,7 +42,7 @@ def main() -> int:
         kept.sort(key=lambda e: names.index(e.model))
         write_file(FILE, as_text(kept))
         for entry in found:
-            print(f"{entry.model} {entry.run} ({entry.setting}): {entry.score.sentence()}")
+            print(f"{entry.model} {entry.run} ({entry.setting}): {entry.score().sentence()}")
     return 0
 
 

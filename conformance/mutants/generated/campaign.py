@@ -9,7 +9,6 @@ hand must not be blamed for anything.
 from __future__ import annotations
 
 import json
-import math
 import multiprocessing
 import signal
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from dexkit.conformance.mutants.generated.rig import Faulty
 from dexkit.conformance.mutants.outsiders import blame
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.scores import wilson
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.console import Console
@@ -34,7 +34,7 @@ from dexkit.documents import parse_json, write_file
 from dexkit.errors import UsageError
 from dexkit.hand import Subject
 
-__all__ = ["Campaign", "Trial", "graded", "judged", "try_generated", "wilson"]
+__all__ = ["Campaign", "Trial", "graded", "judged", "try_generated"]
 
 GOOD = "good"
 
@@ -86,11 +86,16 @@ class Trial:
         return self.failed + self.warned
 
     @property
+    def caught_by(self) -> frozenset[str]:
+        """Ids of the requirements that found a wrong hand for a right reason."""
+        return frozenset(r for r in self._finds if area_of(r) in self.areas)
+
+    @property
     def caught(self) -> bool:
         """Whether the checks were right about it, for a right reason."""
         if self.severity == GOOD:
             return not (self.failed or self.warned or self.errors)
-        return any(area_of(r) in self.areas for r in self._finds)
+        return bool(self.caught_by)
 
     @property
     def wrong_reason(self) -> bool:
@@ -141,20 +146,6 @@ def judged(trial: Trial, service: type[Faulty], plan: Plan[Subject], run: RunKin
     wanted = run.requirements(catalogue(plan.dialect.model))
     failed, warned, errors = blame(run_mutant(service, plan, wanted))
     return replace(trial, failed=failed, warned=warned, errors=errors)
-
-
-def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """The confidence interval of a proportion by Wilson's score, 95 % by default.
-
-    :returns: lower and upper bound, 0 to 1; the whole range where there is nothing to count.
-    """
-    if not count:
-        return 0.0, 1.0
-    p = hits / count
-    scale = 1.0 + z * z / count
-    middle = (p + z * z / (2 * count)) / scale
-    half = z * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count)) / scale
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def _work(name: str, seed: int, run: RunKind) -> dict[str, Any]:
