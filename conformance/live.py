@@ -49,6 +49,7 @@ from dexkit.conformance.stimulus_record import RECORD, Planned, Stimulus
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject
+from dexkit.interpreter import timely_threads
 from dexkit.models import DIALECTS
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
@@ -115,6 +116,8 @@ def record_run(
     rig_options = options.rig
     stop = stop or threading.Event()
     with contextlib.ExitStack() as stack:
+        # a pause of the kit in the reading of states would look like one of the hand
+        stack.enter_context(timely_threads())
         recorder_node = stack.enter_context(_node(rig_options))
         recorder = stack.enter_context(
             Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})

@@ -412,9 +412,9 @@ def _print_rehearsal(rehearsal: Rehearsal) -> None:
 
 
 def _play(prepared: Prepared, guards: Guards, given: dict[str, Any]) -> int:
-    from dexkit.cli.replay_as_recorded import short_switch_interval
     from dexkit.cli.stop_keys import stop_keys
     from dexkit.dds import DdsNode
+    from dexkit.interpreter import timely_threads
     from dexkit.stop_signals import stop_on_signals
     from dexkit.traces.replay.live import LiveReplay
     from dexkit.traces.replay.machine import End, ReplayMachine
@@ -428,7 +428,7 @@ def _play(prepared: Prepared, guards: Guards, given: dict[str, Any]) -> int:
         if not live.wait_ready(stop.event, waiting):
             return 130
         click.echo(f"ready: playing on domain {domain}, {interface}; space, q or Ctrl-C stops")
-        with short_switch_interval(), _status() as show, stop_keys() as pressed:
+        with timely_threads(), _status() as show, stop_keys() as pressed:
 
             def turn(machine: ReplayMachine) -> None:
                 show(machine)

@@ -14,6 +14,7 @@ import click
 
 from dexkit.errors import DdsError, TraceUnsupported
 from dexkit.escaping import REMARK, one_line
+from dexkit.interpreter import timely_threads
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.stop_signals import StopRequest, stop_on_signals
 from dexkit.threads import Worker
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
     from dexkit.traces import Player, Trace, TraceMessage
 
-__all__ = ["play_as_recorded", "short_switch_interval"]
+__all__ = ["play_as_recorded"]
 
 # Seconds from a match seen here to the first message, for the other side to see it too: what comes
 # before is lost to it. Unitree's SDK sleeps as long after making a writer
@@ -84,7 +85,7 @@ def play_as_recorded(
         if stop:
             return 130
         click.echo(f"ready: playing on domain {domain}, {interface}")
-        with short_switch_interval(), _status(player):
+        with timely_threads(), _status(player):
 
             def send(message: TraceMessage) -> object:
                 # stamped first: a command that a stop holds back here is old, and is seen to be
@@ -147,17 +148,6 @@ def _wait_for_readers(
             hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
             "anyway with --no-wait",
         )
-
-
-@contextmanager
-def short_switch_interval() -> Iterator[None]:
-    """Reduce the interpreter's switch interval from 5 to 0.5 ms for the playing thread."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
 
 
 @contextmanager
