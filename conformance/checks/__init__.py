@@ -29,7 +29,7 @@ from dexkit.conformance.results import Evidence
 from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
-from dexkit.teleop.tracking import UNSEEN_S
+from dexkit.unseen import UNSEEN_S
 
 __all__ = [
     "REGISTRY",

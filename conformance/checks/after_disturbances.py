@@ -9,7 +9,7 @@ from dexkit.conformance.checks.firmness import STIFFNESS, nudges
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
-from dexkit.teleop.tracking import UNSEEN_S
+from dexkit.unseen import UNSEEN_S
 
 __all__ = ["fastest"]
 

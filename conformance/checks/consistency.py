@@ -22,7 +22,7 @@ from dexkit.conformance.row_selection import Rows, SomeTimes, Times, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 from dexkit.models import model
-from dexkit.teleop.tracking import UNSEEN_S
+from dexkit.unseen import UNSEEN_S
 
 __all__ = ["FOUGHT_OVER", "contacts", "filled"]
 

@@ -342,12 +342,12 @@ class FingerScript(HandScript):
                 far.append({s: self._at(s, ends[s]) for s in self.plan.sides})
             # long enough for the fastest joint to leave its range from anywhere
             travel = min(j.stroke / j.dq_max for joints in self._joints.values() for j in joints)
-            each = max(0.3, 0.7 * travel)
+            each = max(0.2, 0.7 * travel)
             # each way from inside of the range: at an end, a hand that goes there in any case
             # cannot be told from one that ignores them
             for way in range(2):
                 if way:
-                    yield from self._everyone("recover", self._other_place(), most=1.5, after=name)
+                    yield from self._everyone("center", self._other_place(), most=1.5)
                 yield from self._bad_commands(name, self.plan.sides, far[way::2], each)
         else:
             for alone in self._each_alone():

@@ -327,7 +327,7 @@ class GripperScript(HandScript):
             # cannot be told from one that ignores them
             for way in range(2):
                 if way:
-                    yield from self._everyone("recover", self._other_place(), after=name)
+                    yield from self._everyone("center", self._other_place())
                 yield from self._bad_commands(name, sides, far[way::2], 0.35)
         elif name == "long":
             good = {s: self._motors(s, pose) for s, pose in self._goal.items()}

@@ -19,14 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.hand import Floats
+from dexkit.unseen import UNSEEN_S
 
-__all__ = ["FROM", "TO", "UNSEEN_S", "Step", "TrackingFigures", "steps_of", "tracking_figures"]
+__all__ = ["FROM", "TO", "Step", "TrackingFigures", "steps_of", "tracking_figures"]
 
 FROM, TO = 0.05, 0.95
 """Parts of a stroke between which its time is taken."""
-UNSEEN_S = 0.03
-"""Seconds without a state after which it is not known what the hand did meanwhile. A hand may pause
-for longer (RATE-03 judges that): what it does in a pause is left out."""
 GRID = 0.002
 """Seconds between the points at which hand and operator are compared."""
 _JUMP = 0.15  # of the stroke, from one point to the next: a step
