@@ -205,7 +205,7 @@ class RepeatsOldStates(Service):
 
 
 @wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-04",), whole=True)
-@wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
+@wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02", "BRAINCO-SAFE-10"), whole=True)
 @wrong_hand("DFX-FRESH-01", also=("DFX-SIDE-01",), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
@@ -222,7 +222,7 @@ class StaleState(Service):
 
 
 @wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
-@wrong_hand(("DEX1-FRESH-01", "BRAINCO-FRESH-01"), also=("FTP-SAFE-10",), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "BRAINCO-FRESH-01"), whole=True)
 class StaleLater(StaleState):
     """Measures five times a second from 12 s on."""
 
@@ -274,11 +274,11 @@ class FreezesOnce(Service):
     ("DEX1-FRESH-03", "DEX3-FRESH-03"),
     also=(
         *("DEX1-FIELD-06", "DEX1-FIELD-16", "DEX1-FIELD-17", "DEX1-MOVE-06"),
-        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-16", "DEX3-MOVE-06"),
+        *("DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-15", "DEX3-FIELD-16", "DEX3-MOVE-06"),
     ),
     whole=True,
 )
-@wrong_hand("BRAINCO-FRESH-03", also=("BRAINCO-MOVE-06", "DFX-WDOG-01"), whole=True)
+@wrong_hand("BRAINCO-FRESH-03", also=("BRAINCO-MOVE-06", "DFX-WDOG-01", "FTP-WDOG-01"), whole=True)
 class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 
@@ -359,8 +359,8 @@ class EmptyNowAndThen(Service):
 @wrong_hand(
     "BRAINCO-SIDE-01",
     also=(
-        *("BRAINCO-LIFE-02", "BRAINCO-SAFE-01", "BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
-        "BRAINCO-WDOG-01",
+        *("BRAINCO-SAFE-01", "BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
+        *("BRAINCO-WDOG-01", "BRAINCO-WDOG-03"),
     ),
     sides=BOTH,
 )
@@ -526,7 +526,7 @@ class SnapsAtFirst(_Snaps):
         return not self.restarted
 
 
-@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"), also=("DEX1-LIFE-03",), whole=True)
+@wrong_hand(("DEX1-PATH-01", "DEX3-PATH-01"), also=("DEX1-LIFE-03", "DEX3-LIFE-03"), whole=True)
 class SnapsWhenRestarted(_Snaps):
     """After a restart of its service, first goes to the other end for a quarter of a second."""
 

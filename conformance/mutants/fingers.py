@@ -265,6 +265,7 @@ class _Filled(FingerService):
 @wrong_hand(
     "DEX3-FIELD-20",
     also=(
+        "DEX3-FIELD-04",
         "DEX3-FIELD-05",
         "DEX3-FIELD-19",
         "DEX3-GAIN-03",
@@ -731,7 +732,7 @@ class _GainsOfFirst(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-GAIN-03", "DEX3-SAFE-06"))
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-SAFE-06",))
 class GainsOfFirstMotor(FingerService):
     """Uses the gains of its first motor for all."""
 
@@ -1150,7 +1151,7 @@ class _BoostsIndex(Boosts):
     joints = (5, 6)
 
 
-@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-05",), sides=BOTH)
+@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-02", "DEX3-FORCE-05"), sides=BOTH)
 class OneFingerBoosts(Dex3Service):
     """Its index finger presses with two and a half times the torque where it is blocked."""
 

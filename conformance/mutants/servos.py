@@ -47,12 +47,12 @@ class Thousandths(ServoService):
 @wrong_hand(
     "BRAINCO-SIDE-01",
     also=(
-        "BRAINCO-LIFE-02",
         "BRAINCO-MOVE-09",
         "BRAINCO-SAFE-01",
         "BRAINCO-SPEED-02",
         "BRAINCO-SPEED-03",
         "BRAINCO-WDOG-01",
+        "BRAINCO-WDOG-03",
     ),
     sides=BOTH,
 )
@@ -238,7 +238,7 @@ class _LetsGo(ServoHand):
 
 @wrong_hand(
     "BRAINCO-GRIP-01",
-    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09", "FTP-FORCE-06"),
+    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09", "FTP-FORCE-06", "FTP-TOUCH-05"),
     sides=BOTH,
     whole=True,
 )
@@ -706,8 +706,6 @@ class SwapsAfterRestart(_SwapsSome):
 
 
 @wrong_hand("BRAINCO-WDOG-03", whole=True)
-@wrong_hand("DFX-WDOG-03", also=("DFX-STILL-01",), whole=True)
-@wrong_hand("FTP-WDOG-03", whole=True)
 class SwapsAfterSilence(_SwapsSome):
     """Mixes two joints up in commands for three seconds after a silence."""
 
