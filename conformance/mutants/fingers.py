@@ -1151,7 +1151,7 @@ class _BoostsIndex(Boosts):
     joints = (5, 6)
 
 
-@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-02", "DEX3-FORCE-05"), sides=BOTH)
+@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-02", "DEX3-FORCE-05"), sides=BOTH, whole=True)
 class OneFingerBoosts(Dex3Service):
     """Its index finger presses with two and a half times the torque where it is blocked."""
 
