@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -62,6 +63,7 @@ class RunQueue:
         self._watched: dict[Watched, _Threads] = {}
         self._busy_us: list[int] = []
         self._own_us: list[int] = []
+        self._usable = os.sched_getaffinity(0) if sys.platform == "linux" else set[int]()
         self._stop = threading.Event()
         self._thread = Worker("run queue", self._run)
 
@@ -77,12 +79,12 @@ class RunQueue:
             return None
         busy = self._busy_us if any(self._busy_us) else []
         own = self._own_us if busy else []
-        return Waits(self._begin_ns, self._t_us, found, busy, own, len(os.sched_getaffinity(0)))
+        return Waits(self._begin_ns, self._t_us, found, busy, own, len(self._usable))
 
     def _run(self) -> None:
         clock = RealClock()
         due = search = clock.now()
-        processors = _Processors()
+        processors = _Processors(self._usable)
         while not self._stop.is_set():
             if clock.now() >= search:
                 search = clock.now() + _SEARCH
@@ -190,9 +192,15 @@ class _Threads:
 
 
 class _Processors:
-    """The work of the machine's processors, as the kernel counts it."""
+    """The work of the processors that this process may use, as the kernel counts it.
 
-    def __init__(self) -> None:
+    The hand's processes are started by this one, and may use the same.
+
+    :param mine: their numbers.
+    """
+
+    def __init__(self, mine: Iterable[int]) -> None:
+        self._names = {f"cpu{number}" for number in mine}
         self._count = 0
         self._last: int | None = None
 
@@ -204,11 +212,12 @@ class _Processors:
         if self._count % 10 != 1:
             return 0
         try:
-            with (_PROC / "stat").open() as file:
-                user, nice, system, _, _, *interrupts = map(int, file.readline().split()[1:9])
+            rows = [line.split() for line in (_PROC / "stat").read_text().splitlines()]
+            works = [list(map(int, row[1:9])) for row in rows if row and row[0] in self._names]
         except (OSError, ValueError):
             return 0
-        total = user + nice + system + sum(interrupts)
+        # the fourth and fifth are idle, and waiting for a disk
+        total = sum(sum(work) - sum(work[3:5]) for work in works)
         before, self._last = self._last, total
         return 0 if before is None else round((total - before) * 1e6 / _TICKS)
 

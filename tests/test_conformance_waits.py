@@ -355,17 +355,23 @@ def test_waits_of_all_threads_are_added(tmp_path: Path, monkeypatch: pytest.Monk
     assert threads.longest_us == [0, 0, 0, 3000, 50, 6]
 
 
-def test_work_of_processors_is_read_now_and_then(
+def test_work_of_the_usable_processors_is_read_now_and_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_queue, "_PROC", tmp_path)
     monkeypatch.setattr(run_queue, "_TICKS", 100)
-    processors = run_queue._Processors()
+    processors = run_queue._Processors({0, 2})
     assert processors.worked() == 0  # no such file
     stat = tmp_path / "stat"
-    stat.write_text("cpu  10 20 30 4000 500 1 2 3 7 7\ncpu0 1 2 3\n")
+
+    def work(*rows: str) -> None:
+        names = ("cpu ", "cpu0", "cpu1", "cpu2", "intr")
+        stat.write_text("".join(f"{n} {r}\n" for n, r in zip(names, rows, strict=True)))
+
+    work("0 0 0 0 0 0 0 0", "9 20 30 4000 500 1 2 3 7 7", "0 0 0 0", "1 0 0 0 0 0 0 0 0 0", "5 1")
     assert [processors.worked() for _ in range(10)] == [0] * 10
-    stat.write_text("cpu  12 20 33 9000 900 1 2 4 9 9\ncpu0 1 2 3\n")
+    # the one that is not usable has worked most
+    work("9 9 9 9 9 9 9 9", "10 20 33 9000 900 1 2 4 9 9", "800 0", "2 0 0 50 0 0 0 0 0 0", "9 9")
     assert [processors.worked() for _ in range(10)] == [0] * 9 + [60_000]
 
 
