@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import gc
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+
+from dexkit.interpreter import shorten_pauses
 
 __all__ = ["go_first", "precise_timers", "prepare_process", "real_time"]
 
@@ -70,6 +71,4 @@ def prepare_process(hands: int = 1) -> None:
     Threads hand the interpreter over after 0.05 ms instead of 5 (1 ms with more hands than one),
     and the objects of start-up are left out of garbage collection.
     """
-    sys.setswitchinterval(_SWITCH_INTERVAL if hands == 1 else _SWITCH_INTERVAL_SHARED)
-    gc.collect()
-    gc.freeze()
+    shorten_pauses(_SWITCH_INTERVAL if hands == 1 else _SWITCH_INTERVAL_SHARED)
