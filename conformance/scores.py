@@ -253,7 +253,7 @@ class Entry:
             unjudged=tuple(unjudged),
         )
 
-    def missing(self, dialect: str, judged: Mapping[str, int]) -> list[str]:
+    def unjudged(self, dialect: str, judged: Mapping[str, int]) -> list[str]:
         """Ids that are judged on fewer sides than in the trial."""
         fewer = self.fewer.get(dialect, {})
         return [r for r in self.requirements if judged.get(r, 0) < fewer.get(r, len(Side))]
@@ -330,7 +330,7 @@ def score_of(
     entry = next((e for e in of_kind if e.setting == setting), None)
     if entry is None:
         return Score("nothing was held, and the trial of such a run was with an object")
-    return entry.score(entry.missing(dialect, judged))
+    return entry.score(entry.unjudged(dialect, judged))
 
 
 def _few(ids: Sequence[str]) -> str:

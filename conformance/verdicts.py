@@ -27,11 +27,10 @@ late while it was judged:
    well (:mod:`~dexkit.conformance.run_queue`), and explains a failure by itself: up to
    :data:`AGAIN` times what they waited at its place; a single event up to :data:`HOPS` times their
    longest wait; of all waits the part of which other programs are the cause. To wait is not to
-   compute: a process that is slow by itself is not excused. This
-   holds for motion that is not of real time, too: there a failure without a size is as large as its
-   place is long. Where they waited for :data:`OVERLOADED` in each sample on average over the whole
-   run, no requirement of real time can be judged, but for what 4 does not explain; the direction
-   of motion can.
+   compute: a process that is slow by itself is not excused. This holds for motion that is not of
+   real time, too: there a failure without a size is as large as its place is long. Where they
+   waited for :data:`OVERLOADED` in each sample on average over the whole run, no requirement of
+   real time can be judged, but for what 4 does not explain; the direction of motion can.
 8. Apart from load, a MUST that fails by less than the kit's measurement error
    (:mod:`~dexkit.conformance.measurement_error`) is *blocked* as well: its figure is nearer to the
    limit than the kit can tell. A pass by less than that remains a pass, and says so.

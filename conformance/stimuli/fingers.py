@@ -115,7 +115,7 @@ _STATUSES = range(2, 8)
 """Values of the three status bits without a meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
 (docs/sources/unitree-dex.md#g)."""
-_ENDS = 30.0
+_AT_SHUTDOWN = 30.0
 """Percent of closing from which a hand moves when its service ends: far enough from both ends and
 from the object that it is seen if the hand opens or closes then."""
 _STAYS = 4.1
@@ -343,12 +343,7 @@ class FingerScript(HandScript):
             # long enough for the fastest joint to leave its range from anywhere
             travel = min(j.stroke / j.dq_max for joints in self._joints.values() for j in joints)
             each = max(0.2, 0.7 * travel)
-            # each way from inside of the range: at an end, a hand that goes there in any case
-            # cannot be told from one that ignores them
-            for way in range(2):
-                if way:
-                    yield from self._everyone("center", self._other_place(), most=1.5)
-                yield from self._bad_commands(name, self.plan.sides, far[way::2], each)
+            yield from self._beyond_each_end(name, far, each, most=1.5)
         else:
             for alone in self._each_alone():
                 wrong = self._malformed(name, alone)
@@ -444,7 +439,7 @@ class FingerScript(HandScript):
 
     def _before_shutdown(self) -> Steps:
         """Move: what was commanded last must not be in force after the restart."""
-        yield from self._to("center", _ENDS)
+        yield from self._to("center", _AT_SHUTDOWN)
         yield from self._drive("drive", self.plan.sides, {})
 
     def _silent_again(self) -> Steps:

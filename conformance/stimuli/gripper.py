@@ -323,12 +323,7 @@ class GripperScript(HandScript):
         elif name == "out-of-range":
             places = (1000.0, -1000.0, 1.3 * self._stroke, -0.3 * self._stroke)
             far = [dict.fromkeys(sides, (Motor(q=q),)) for q in places]
-            # each way from inside of the range: at an end, a gripper that goes there in any case
-            # cannot be told from one that ignores them
-            for way in range(2):
-                if way:
-                    yield from self._everyone("center", self._other_place())
-                yield from self._bad_commands(name, sides, far[way::2], 0.35)
+            yield from self._beyond_each_end(name, far, 0.35)
         elif name == "long":
             good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
             for alone in self._each_alone():

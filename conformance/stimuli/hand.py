@@ -349,6 +349,22 @@ class HandScript(Script[Side]):
         for other in beside:
             self._end(other)
 
+    def _beyond_each_end(
+        self, name: str, far: Sequence[Mapping[Side, Motors]], each: float, most: float = 2.5
+    ) -> Steps:
+        """Goals beyond the ends to all sides, each way from inside of the range.
+
+        At an end, a hand that goes there in any case cannot be told from one that ignores them.
+
+        :param far: in turn beyond the one end and the other.
+        :param each: seconds of each.
+        :param most: seconds to come back inside in between.
+        """
+        for way in range(2):
+            if way:
+                yield from self._everyone("center", self._other_place(), most=most)
+            yield from self._bad_commands(name, self.plan.sides, far[way::2], each)
+
     def _beside_others(self, sides: Sequence[Side], seconds: float) -> list[Phase]:
         """Begin a step of the sides that are not among these, where that takes no longer."""
         others = [s for s in self.plan.sides if s not in sides]
