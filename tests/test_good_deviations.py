@@ -18,6 +18,7 @@ from dexkit.conformance.virtual import Sample
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, dialect, model
+from tests.each import each
 
 TIMING = [("", *GROUPS["state"]), ("", *GROUPS["latency"])]
 """The groups that change when commands are obeyed and states leave."""
@@ -140,6 +141,26 @@ def test_a_late_state_is_late_once(spoken: Dialect, what: str, late: float) -> N
     delays = received - np.array(seen[: len(received)])
     assert (delays > late - 1e-6).all()
     assert (delays < late + service.period).all()
+
+
+@each("what", ["state-late-10+pauses", "jitter-5", "state-late-6"])
+def test_low_rate_copies_are_of_published_states(what: str) -> None:
+    hand = parse(f"dex3-1/dex3:{what}")
+    service = started(hand)
+    topic, low_rate = (
+        t.format(side=Side.RIGHT) for t in (hand.dialect.state_topic, hand.dialect.low_rate_topic)
+    )
+    last, copies = b"", 0
+    for _ in range(10_000):
+        for sample in service.advance(service.tick):
+            if sample.topic == topic:
+                last = sample.payload
+            elif sample.topic == low_rate:
+                assert (sample.payload, sample.sent) == (last, service.now)
+                copies += 1
+        if service.now > 2.7:
+            break
+    assert copies > 40
 
 
 @pytest.mark.parametrize("spoken", dialects(), ids=lambda d: f"{d.model}-{d.name}")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -226,6 +226,13 @@ class Faulty(Service):
             hook: {s: [w for w, _ in ws if _overrides(w, hook)] for s, ws in self.whats.items()}
             for hook in ("command", "torque", "report", "publish", "tick")
         }
+        low_rate = dialect.low_rate_topic
+        self._low_rate = (
+            {low_rate.format(side=s): self.codec.state_topics[s] for s in self.sides}
+            if low_rate
+            else {}
+        )
+        self._published: dict[str, Sample] = {}
         self._adopt()
 
     # -- what a fault can ask ------------------------------------------------------------------
@@ -354,7 +361,19 @@ class Faulty(Service):
                     mine = [x for x in samples if x.topic == topic]
                     rest = [x for x in samples if x.topic != topic]
                     samples = what.publish(mine) + rest
-        return samples
+        return self._with_copies(samples) if self._low_rate else samples
+
+    def _with_copies(self, samples: list[Sample]) -> list[Sample]:
+        """The samples, those of a low-rate topic with the state that was last published."""
+        found: list[Sample] = []
+        for sample in samples:
+            of = self._low_rate.get(sample.topic)
+            if of is None:
+                self._published[sample.topic] = sample
+                found.append(sample)
+            elif of in self._published:
+                found.append(replace(self._published[of], topic=sample.topic, sent=sample.sent))
+        return found
 
     def _moves(self, side: Side) -> bool:
         """Whether a joint of a side moves."""
