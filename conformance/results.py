@@ -409,16 +409,17 @@ class RunResult:
         return bool(self.client) and not self.results
 
     @property
-    def disturbed(self) -> bool:
-        """Whether the run should be done again, because the kit's own machine was busy: a MUST is
-        open only for that, or all that failed was seen while it was so.
+    def disturbed_by(self) -> list[Result]:
+        """The results because of which the run should be done again, as the kit's own machine was
+        busy: all that failed, if each was seen while it was so, or what is open only for that.
         """
         failed = [r for r in self.results if r.verdict is Verdict.FAIL]
         if failed:
-            return all(r.retry for r in failed)
-        return self.overall is Overall.INCONCLUSIVE and any(
-            r.verdict is Verdict.BLOCKED and r.retry for r in self.results
-        )
+            return failed if all(r.retry for r in failed) else []
+        if self.overall is not Overall.INCONCLUSIVE:
+            return []
+        opened = [r for r in self.results if r.verdict is Verdict.BLOCKED and r.retry]
+        return [r for r in opened if r.requirement.level is Level.MUST] or opened
 
     @property
     def overall(self) -> Overall:

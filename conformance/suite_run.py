@@ -23,7 +23,7 @@ from dexkit.conformance.known_backends import (
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
-from dexkit.conformance.results import RunResult
+from dexkit.conformance.results import RunResult, grouped
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.run_queue import MOST_FILES
 from dexkit.conformance.selection import RunKind
@@ -49,6 +49,7 @@ __all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "sele
 T = TypeVar("T")
 # descriptors of a run: DDS, recording, the pipes of its processes; and what watches these
 _FILES = 48 + MOST_FILES
+_NAMED = 3  # requirements named, of those that were open in a run that is done again
 
 
 @dataclass(frozen=True)
@@ -393,9 +394,9 @@ def run_suite(
 
     require_open_files(_FILES, "a conformance run")
     result: RunResult | None = None
-    while result is None or (result.disturbed and attempts > 0):
+    while result is None or (result.disturbed_by and attempts > 0):
         if result is not None:
-            report("the machine was too busy to be fair to the hand; once more")
+            report(_why_again(result))
         attempts -= 1
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(TemporaryFolder())
@@ -416,6 +417,15 @@ def run_suite(
                 )
             result = judge_recording(options, view)
     return result
+
+
+def _why_again(result: RunResult) -> str:
+    """What was open in a run that is done again."""
+    groups = [group for _, group in grouped(result.disturbed_by)]
+    rows = [f"{group[0].requirement.id} ({group[0].reason})" for group in groups[:_NAMED]]
+    more = len(groups) - len(rows)
+    what = "; ".join(rows) + (f"; and {more} more" if more else "")
+    return f"this machine was too busy to be fair to the hand: {what}; the run is done once more"
 
 
 def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:

@@ -272,7 +272,7 @@ def test_busy_machine_explains_failures_up_to_its_lateness(
     assert found.verdict is verdict
     if verdict is Verdict.BLOCKED:
         assert result.overall is Overall.INCONCLUSIVE
-        assert result.disturbed
+        assert result.disturbed_by
     elif verdict is Verdict.FAIL:
         assert result.overall is Overall.FAIL
         assert found.disturbance.load is (Load.BUSY if pressed else Load.NONE)

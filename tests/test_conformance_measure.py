@@ -79,7 +79,7 @@ def test_failure_within_the_kits_error_is_inconclusive(
         assert "fails by less than the kit's measurement error of 0.002 s" in found.reason
         assert "a quieter machine or another run may decide it" in found.reason
         assert RunResult({}, [found]).exit_code() == 2
-        assert RunResult({}, [found]).disturbed
+        assert RunResult({}, [found]).disturbed_by
 
 
 def weighed_failure(*values: float) -> Result:

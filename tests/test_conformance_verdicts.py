@@ -193,14 +193,14 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
     assert "late by 149 ms in all" in found.reason
     assert (found.disturbance.load, found.retry) == (Load.TOO_BUSY, True)
     assert found.disturbance.late_s == pytest.approx(0.149, abs=0.001)
-    assert result.disturbed
+    assert result.disturbed_by
     assert result.harness["jitter_p50_ms"] == pytest.approx(0.1)
     result = judge(with_beats(trace, [begin], stall_s=0.02))
     found = result_of(result, GAP.id)
     assert found.verdict is Verdict.FAIL
     assert (found.disturbance.load, found.retry) == (Load.BUSY, True)
-    assert result.disturbed  # one more run, to be sure
-    assert not judge(with_beats(trace)).disturbed
+    assert result.disturbed_by  # one more run, to be sure
+    assert not judge(with_beats(trace)).disturbed_by
 
 
 def test_slow_client_of_the_kit_does_not_fail_the_hand() -> None:

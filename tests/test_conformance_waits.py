@@ -263,7 +263,7 @@ def test_gap_is_open_where_the_process_waited() -> None:
     found = result_of(result, GAP.id)
     assert found.verdict is Verdict.BLOCKED
     assert "the service (pid 42) waited" in found.reason
-    assert result.disturbed
+    assert result.disturbed_by
     assert str(result.overall) == "inconclusive"
     assert result.harness["longest_wait_ms"] == 190.0
 

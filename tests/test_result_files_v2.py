@@ -48,7 +48,7 @@ def test_the_load_of_the_machine_is_read_from_the_reason() -> None:
         gap = next(r for r in result.results if r.requirement.id == "DEX1-RATE-03")
         assert (gap.disturbance.load, gap.retry) == (load, True), name
         assert gap.plots == (Plot(PlotKind.GAP), Plot(PlotKind.POSITION)), name
-        assert (result.overall, result.disturbed) == (overall, True), name
+        assert (result.overall, result.disturbed_by) == (overall, [gap]), name
         others = [r for r in result.results if r is not gap]
         assert {(r.disturbance.load, r.retry) for r in others} == {(Load.NONE, False)}, name
 
