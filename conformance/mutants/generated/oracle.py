@@ -8,6 +8,7 @@ constant says which.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -51,7 +52,8 @@ OFF, OFF_S = 0.03, 0.10
 LIES, LIES_S = 0.06, 0.05
 """Reported q against the true one. xr_teleoperate commands at most a thirtieth of the stroke ahead
 of the state (docs/sources/unitree-dex.md#b3): twice that turns its commands round. 0.05 s is ten of
-its cycles."""
+its cycles. No client of a position servo commands from q: it stores q with each episode
+(docs/sources/unitree-dex.md#j1), where q may be as late and as far off as a motion."""
 JUMPS, JUMPS_S = 0.15, 0.01
 """A jump for two cycles that is five times that lead."""
 UNTRUE, UNTRUE_S = 0.025, 0.05
@@ -317,8 +319,14 @@ class _Compare:
             0.0,
         )
         off = np.abs(states.q - got.q[tick]) / self.spans
-        self.note(Severity.BREAKING, "reports a q that is not true", off > LIES, t, LIES_S)
-        self.note(Severity.BREAKING, "reports a q that jumps", off > JUMPS, t, JUMPS_S)
+        if self.dialect.position_servo:
+            low, high = got.reach
+            away = np.maximum(low[tick] - states.q, states.q - high[tick]) / self.spans
+            grave, far, far_s = away, FAR, FAR_S
+        else:
+            grave, far, far_s = off, LIES, LIES_S
+        self.note(Severity.BREAKING, "reports a q that is not true", grave > far, t, far_s)
+        self.note(Severity.BREAKING, "reports a q that jumps", grave > JUMPS, t, JUMPS_S)
         self.note(Severity.LESSER, "reports a q that is not quite true", off > UNTRUE, t, UNTRUE_S)
         self._repeats(states, t, got.q[tick] / self.spans)
         wrong = np.abs(states.dq - got.dq[tick]) / self.spans > SPEED
@@ -329,10 +337,10 @@ class _Compare:
         if self.dialect.interface_specification:
             true = np.abs(true)
         # clients of a gripper close until they feel the object; of fingers they only show it
-        grave = Severity.BREAKING if self.dialect.is_gripper else Severity.LESSER
+        severity = Severity.BREAKING if self.dialect.is_gripper else Severity.LESSER
         error = np.abs(tau - true)
         limit = np.maximum(GRIP * np.abs(true), GRIP * self.grip)
-        self.note(grave, "reports a torque that is not true", error > limit, t, GRIP_S)
+        self.note(severity, "reports a torque that is not true", error > limit, t, GRIP_S)
         self.note(
             Severity.LESSER,
             "reports a torque that is not quite true",
@@ -348,7 +356,8 @@ class _Compare:
             new = np.flatnonzero(np.diff(states.q[:, joint]) != 0) + 1
             edges = np.concatenate(([0], new, [len(t)]))
             moved = np.abs(true[np.minimum(edges[1:], len(t)) - 1, joint] - true[edges[:-1], joint])
-            for severity, least in ((Severity.BREAKING, FROZEN), (Severity.LESSER, HELD)):
+            grave = math.inf if self.dialect.position_servo else FROZEN  # it is away, see LIES
+            for severity, least in ((Severity.BREAKING, grave), (Severity.LESSER, HELD)):
                 late = np.flatnonzero(moved > least)
                 if len(late):
                     text = f"{self.side}: repeats its q while it moves"
