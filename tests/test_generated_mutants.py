@@ -17,13 +17,14 @@ from dexkit.conformance.mutants.generated.campaign import Campaign, Trial, try_g
 from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
 from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.mutants.generated.rig import Part, What, compose
+from dexkit.conformance.mutants.generated.stimulus import play_order, random_segments
 from dexkit.conformance.mutants.generated.times import WHENS
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.hand import Side
-from dexkit.models import dialect, model
+from dexkit.models import Dialect, dialect, model
 from tests.each import each
 
 ROOT = Path(__file__).parent.parent
@@ -102,10 +103,20 @@ def test_a_reference_without_known_mechanics_is_refused() -> None:
         compose("x", "", Service, ())
 
 
+@pytest.mark.parametrize("spoken", dialects(), ids=lambda d: f"{d.model}-{d.name}")
+def test_a_reference_reports_what_the_oracle_takes_for_true(spoken: Dialect) -> None:
+    sides = (Side.LEFT,)
+    plan = oracle._plan(spoken.name, sides)
+    events, _ = play_order(random_segments(plan, 1)[:4])
+    seen = oracle._observe(oracle._reference(spoken.name, sides), plan, events)
+    assert oracle._compare(spoken, seen, seen) == []
+
+
 @pytest.mark.soak
-def test_without_faults_the_reference_behaves_as_before() -> None:
-    service = compose("x", "", model("dex1-1").reference.load(), ())
-    assert oracle.examine(service, GO, (Side.LEFT,)).effects == ()
+@pytest.mark.parametrize("spoken", dialects(), ids=lambda d: f"{d.model}-{d.name}")
+def test_without_faults_the_reference_behaves_as_before(spoken: Dialect) -> None:
+    service = compose("x", "", model(spoken.model).reference.load(), ())
+    assert oracle.examine(service, spoken, (Side.LEFT,)).effects == ()
 
 
 # ------------------------------------------------------------------------------ properties

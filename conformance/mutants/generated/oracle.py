@@ -214,6 +214,7 @@ class _Compare:
             [dialect.q_open] if dialect.is_gripper else [j.stroke for j in joints]
         )
         self.grip = 0.05 * self.spans * np.array([kp for kp, _ in profile.gains])
+        self.measured = profile.reference.load().measured_members
         self.rate = profile.command_rate
         self.least_rate = min(SLOW * profile.command_rate, profile.min_state_rate)
         self.side = side
@@ -329,16 +330,23 @@ class _Compare:
         self.note(Severity.BREAKING, "reports a q that jumps", grave > JUMPS, t, JUMPS_S)
         self.note(Severity.LESSER, "reports a q that is not quite true", off > UNTRUE, t, UNTRUE_S)
         self._repeats(states, t, got.q[tick] / self.spans)
-        wrong = np.abs(states.dq - got.dq[tick]) / self.spans > SPEED
-        self.note(Severity.LESSER, "reports a dq that is not true", wrong, t, SPEED_S)
-        units = np.array(self.dialect.torque_units[: len(self.spans)] or 1.0)
-        tau = states.tau * units
-        true = got.tau[tick]
+        if "dq" in self.measured:
+            wrong = np.abs(states.dq - got.dq[tick]) / self.spans > SPEED
+            self.note(Severity.LESSER, "reports a dq that is not true", wrong, t, SPEED_S)
+        else:
+            self._constant("dq", states.dq, t)
+        if "tau_est" in self.measured:
+            self._torque(states, t, got.tau[tick])
+        else:
+            self._constant("tau_est", states.tau, t)
+        self._mode(states, t, tick)
+
+    def _torque(self, states: States, t: Floats, true: Floats) -> None:
         if self.dialect.interface_specification:
             true = np.abs(true)
         # clients of a gripper close until they feel the object; of fingers they only show it
         severity = Severity.BREAKING if self.dialect.is_gripper else Severity.LESSER
-        error = np.abs(tau - true)
+        error = np.abs(states.tau - true)
         limit = np.maximum(GRIP * np.abs(true), GRIP * self.grip)
         self.note(severity, "reports a torque that is not true", error > limit, t, GRIP_S)
         self.note(
@@ -348,7 +356,15 @@ class _Compare:
             t,
             GRIP_S,
         )
-        self._mode(states, t, tick)
+
+    def _constant(self, member: str, values: Floats, t: Floats) -> None:
+        """A member that the hand does not measure: nothing is true but what the reference has."""
+        reference = self.ref.states
+        if reference is None or not len(reference):
+            return
+        own = reference.dq if member == "dq" else reference.tau
+        text = f"reports a {member} without a measurement"
+        self.note(Severity.LESSER, text, np.asarray(values != own[0]), t, SPEED_S)
 
     def _repeats(self, states: States, t: Floats, true: Floats) -> None:
         """Measurements that are published again and again while the hand moves on."""
