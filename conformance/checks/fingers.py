@@ -21,6 +21,7 @@ from dexkit.conformance.checks.motion import (
     steps_of,
 )
 from dexkit.conformance.checks.safety import arrival, stays, stopped
+from dexkit.conformance.median import medians
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
@@ -516,13 +517,17 @@ def _silences(ctx: Context, *names: str) -> list[_Silence]:
 
 
 def _stops(ctx: Context, joints: Sequence[int], *, guarded: bool) -> Outcome:
-    """Fail if joints that move when commands end still move after the time-out.
+    """Fail if joints that move when commands end still move after the time-out, or if others leave
+    their place.
 
     :param guarded: whether joints with time-out protection are judged, or those without.
     """
     driven = [s for s in _silences(ctx, "silence", "guard") if s.driven is not None]
     if not driven:
         return ctx.skipped("this hand held an object when the commands stopped")
+    for silence in driven:
+        if (stray := _strays(ctx, silence, guarded=guarded)) is not None:
+            return stray
     outcomes = [
         _stops_in(ctx, mine, s)
         for s in driven
@@ -533,6 +538,51 @@ def _stops(ctx: Context, joints: Sequence[int], *, guarded: bool) -> Outcome:
     failed = [o for o in outcomes if o.met is False]
     passed = [o for o in outcomes if o.met]
     return (failed or passed or outcomes)[0]
+
+
+_MEDIAN_S = 0.05  # s, of a place
+
+
+def _strays(ctx: Context, silence: _Silence, *, guarded: bool) -> Outcome | None:
+    """Failure of a joint that neither moved nor was on its way, and leaves its place; else None.
+
+    The way to its last goal is no leaving: a slow joint may still arrive.
+    """
+    roles, last, end = _roles(ctx), silence.last, silence.end
+    mine = [
+        j
+        for j in range(len(ctx.joints))
+        if j not in roles.driven and j not in roles.slow and silence.guarded[j] == guarded
+    ]
+    before = ctx.states.q[ctx.states.between(last - _MEDIAN_S, last)][:, mine]
+    rows = ctx.states.between(last, end)
+    t, q = ctx.states.t[rows], ctx.states.q[rows][:, mine]
+    sent = np.flatnonzero(np.isfinite(ctx.commands.q).all(axis=1) & (ctx.commands.t <= last))
+    if not mine or not len(before) or len(q) < 5 or not len(sent):
+        return None
+    spec = [ctx.joints[j] for j in mine]
+    limits = [j.q_min for j in spec], [j.q_max for j in spec]
+    here, goal = np.median(before, axis=0), np.clip(ctx.commands.q[sent[-1], mine], *limits)
+    low, high = np.minimum(here, goal), np.maximum(here, goal)
+    limit = ctx.requirement.tolerance("max_motion_stroke")
+    beyond = np.maximum(low - q, q - high) / [j.stroke for j in spec]
+    ends = np.searchsorted(t, t + _MEDIAN_S)
+    windows = np.column_stack((np.arange(len(t)), ends))[ends < len(t)]
+    for i in np.flatnonzero((beyond > limit).any(axis=0)).tolist():
+        away = np.nan_to_num(medians(beyond[:, i], windows))  # noise is no motion
+        at = int(np.argmax(away)) if len(away) else 0
+        if not len(away) or away[at] <= limit:
+            continue
+        rad = float(away[at]) * spec[i].stroke
+        text = f"left its place by {rad:.2f} {ctx.unit} after the last command"
+        outcome = ctx.failed(
+            f"{rad:.2f} {ctx.unit}",
+            ctx.named(text, mine[i]),
+            ctx.at(ctx.states.topic, float(t[at]), end),
+            motion_rad=rad,
+        )
+        return outcome.about(mine[i]).placed(rad, limit * spec[i].stroke)
+    return None
 
 
 def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome:

@@ -39,6 +39,13 @@ class DecodesRis(FingerService):
     hand_fault = _Ris
 
 
+@wrong_hand("DEX5-WDOG-01", also=("DEX5-LIFE-06",))
+class IndexGoesHome(FingerService):
+    """Sends its first joint to one end after the time-out, whatever was commanded."""
+
+    hand_fault = fingers.GoesHome
+
+
 class _AnyModeDrives(FingerHand):
     def understood(self, mode: Ints) -> tuple[Ints, Flags]:
         _, guarded = super().understood(mode)

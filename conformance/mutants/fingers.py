@@ -1340,6 +1340,33 @@ class KeepsPushing(Dex3Service):
     hand_fault = _KeepsTorque
 
 
+class GoesHome(FingerHand):
+    """Sends its first joint to one end after the time-out."""
+
+    lost = False
+
+    def expire(self) -> None:
+        super().expire()
+        self.lost = True
+        self.changed()
+
+    def take(self, rows: Floats, mode: Ints) -> None:
+        self.lost = False
+        super().take(rows, mode)
+
+    def changed(self) -> None:
+        super().changed()
+        if self.lost:
+            self.law_on[0], self.law_q[0], self.law_kp[0] = True, self.floor[0], 1.5
+
+
+@wrong_hand("DEX3-WDOG-01", also=("DEX3-GUARD-01", "DEX3-LIFE-06", "DEX3-PATH-01"))
+class FirstJointGoesHome(Dex3Service):
+    """Sends its first joint to one end after the time-out, whatever was commanded."""
+
+    hand_fault = GoesHome
+
+
 class _TiresOfHolding(FingerHand):
     expired_at = math.inf
 

@@ -156,7 +156,7 @@ def _fault(text: str, of: HandModel) -> Fault:
     if not at:
         if what not in DEVIATIONS:
             raise UsageError(f"{what!r} is no deviation of a good hand", hint=", ".join(DEVIATIONS))
-        suitable = [w for w in DEVIATIONS if _suits(w, of)]
+        suitable = [w for w, made in DEVIATIONS.items() if _suits(made, of)]
         if what not in suitable:
             raise UsageError(f"{of.name} cannot have {what!r}", hint=", ".join(suitable))
         return Fault(what)
@@ -173,6 +173,9 @@ def _fault(text: str, of: HandModel) -> Fault:
     for given, allowed in known:
         if given not in allowed:
             raise UsageError(f"{given!r} in {text!r} is not known", hint=", ".join(allowed))
+    suitable = [w for w, made in FAULTS.items() if _suits(made, of)]
+    if what not in suitable:
+        raise UsageError(f"{of.name} cannot have {what!r}", hint=", ".join(suitable))
     return fault
 
 
@@ -200,11 +203,11 @@ def _joints(spoken: Dialect) -> tuple[str, ...]:
 
 
 def _whats(spoken: Dialect, kind: str | None = None) -> list[str]:
-    several = len(_joints(spoken)) > 1
+    of = model(spoken.model)
     return [
         name
         for name, what in FAULTS.items()
-        if (several or not what.several) and (kind is None or what.kind == kind)
+        if _suits(what, of) and (kind is None or what.kind == kind)
     ]
 
 
@@ -253,10 +256,10 @@ def _drawn(draw: random.Random, spoken: Dialect, kind: str) -> Fault:
     )
 
 
-def _suits(deviation: str, of: HandModel) -> bool:
-    """Whether a good hand of a model can have a deviation."""
-    what = DEVIATIONS[deviation]
-    if what.one_joint and len(of.joints[Side.LEFT]) > 1:
+def _suits(what: type[What], of: HandModel) -> bool:
+    """Whether a hand of a model can have a fault, or a deviation."""
+    several = len(of.joints[Side.LEFT]) > 1
+    if (what.one_joint and several) or (what.several and not several):
         return False
     return not what.needs or what.needs in of.reference.load().measured_members
 
@@ -272,7 +275,7 @@ def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Genera
         groups = draw.sample(list(GROUPS), draw.choice((1, 2, 3, 4)))
         chosen = [draw.choice(GROUPS[g]) for g in sorted(groups, key=lambda g: (g == _LAST, g))]
         chosen.sort(key=lambda w: DEVIATIONS[w].turn)
-        faults = [Fault(w) for w in chosen if _suits(w, model(d.model))]
+        faults = [Fault(w) for w in chosen if _suits(DEVIATIONS[w], model(d.model))]
         if faults:
             hand = Generated(d, tuple(faults))
             found.setdefault(hand.name, hand)

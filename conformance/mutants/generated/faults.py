@@ -68,12 +68,16 @@ def _fault(
     several: bool = False,
     both: bool = False,
     idle: str = "",
+    needs: str = "",
+    areas: tuple[str, ...] = (),
 ) -> Callable[[W], W]:
-    """Register a class as a fault; its areas are those of its kind."""
+    """Register a class as a fault; its areas are those of its kind, and ``areas``."""
 
     def register(made: W) -> W:
-        made.kind, made.title, made.summary, made.areas = kind, title, summary, KINDS[kind]
+        made.kind, made.title, made.summary = kind, title, summary
+        made.areas = KINDS[kind].union(areas)
         made.several, made.both, made.idle = several, both or kind == "sides", idle
+        made.needs = needs or made.needs
         _found[title] = made
         return made
 
@@ -277,57 +281,62 @@ class _Factor(_Reported):
 
 
 _SPEEDS = "velocity and torque"
-_variant(_Factor, _SPEEDS, "dq-sign", "reports dq with the wrong sign", member="dq", factor=-1.0)
-_variant(
-    _Factor,
-    _SPEEDS,
-    "dq-degrees",
-    "reports dq in degrees a second",
-    member="dq",
-    factor=math.degrees(1),
-)
-_variant(_Factor, _SPEEDS, "dq-zero", "reports 0 as dq", member="dq", factor=0.0)
-_variant(_Factor, _SPEEDS, "dq-half", "reports half of dq", member="dq", factor=0.5)
-_variant(
-    _Factor, _SPEEDS, "tau-sign", "reports tau_est with the wrong sign", member="tau", factor=-1.0
-)
-_variant(_Factor, _SPEEDS, "tau-milli", "reports tau_est in mN m", member="tau", factor=1000.0)
-_variant(_Factor, _SPEEDS, "tau-zero", "reports 0 as tau_est", member="tau", factor=0.0)
-_variant(_Factor, _SPEEDS, "tau-weak", "reports a fifth of tau_est", member="tau", factor=0.2)
-_variant(_Factor, _SPEEDS, "ddq-sign", "reports ddq with the wrong sign", member="ddq", factor=-1.0)
 
 
-@_fault(_SPEEDS, "dq-late", "reports the dq of 0.2 s before")
+class _Dq(_Factor):
+    member = needs = "dq"
+
+
+class _Tau(_Factor):
+    member, needs = "tau", "tau_est"
+
+
+class _Ddq(_Factor):
+    member = needs = "ddq"
+
+
+_variant(_Dq, _SPEEDS, "dq-sign", "reports dq with the wrong sign", factor=-1.0)
+_variant(_Dq, _SPEEDS, "dq-degrees", "reports dq in degrees a second", factor=math.degrees(1))
+_variant(_Dq, _SPEEDS, "dq-zero", "reports 0 as dq", factor=0.0)
+_variant(_Dq, _SPEEDS, "dq-half", "reports half of dq", factor=0.5)
+_variant(_Tau, _SPEEDS, "tau-sign", "reports tau_est with the wrong sign", factor=-1.0)
+_variant(_Tau, _SPEEDS, "tau-milli", "reports tau_est in mN m", factor=1000.0)
+_variant(_Tau, _SPEEDS, "tau-zero", "reports 0 as tau_est", factor=0.0)
+_variant(_Tau, _SPEEDS, "tau-weak", "reports a fifth of tau_est", factor=0.2)
+_variant(_Ddq, _SPEEDS, "ddq-sign", "reports ddq with the wrong sign", factor=-1.0)
+
+
+@_fault(_SPEEDS, "dq-late", "reports the dq of 0.2 s before", needs="dq")
 class _DqLate(_History):
     def report(self, joint: int, values: Report) -> None:
         values.dq = self.before(joint, values, 0.2).dq
 
 
-@_fault(_SPEEDS, "tau-late", "reports the tau_est of 0.4 s before")
+@_fault(_SPEEDS, "tau-late", "reports the tau_est of 0.4 s before", needs="tau_est")
 class _TauLate(_History):
     def report(self, joint: int, values: Report) -> None:
         values.tau = self.before(joint, values, 0.4).tau
 
 
-@_fault(_SPEEDS, "dq-swap", "reports the dq of the next joint", several=True)
+@_fault(_SPEEDS, "dq-swap", "reports the dq of the next joint", several=True, needs="dq")
 class _DqSwap(_Reported):
     def report(self, joint: int, values: Report) -> None:
         values.dq = self.rig.velocities(self.side)[self.neighbour(joint)]
 
 
-@_fault(_SPEEDS, "tau-swap", "reports the tau_est of the next joint", several=True)
+@_fault(_SPEEDS, "tau-swap", "reports the tau_est of the next joint", several=True, needs="tau_est")
 class _TauSwap(_Reported):
     def report(self, joint: int, values: Report) -> None:
         values.tau = self.rig.hand_of(self.side).tau[self.neighbour(joint)]
 
 
-@_fault(_SPEEDS, "tau-offset", "reports tau_est with an offset")
+@_fault(_SPEEDS, "tau-offset", "reports tau_est with an offset", needs="tau_est")
 class _TauOffset(_Reported):
     def report(self, joint: int, values: Report) -> None:
         values.tau += 0.5 * self.rig.strength(self.side, joint)
 
 
-@_fault(_SPEEDS, "tau-stuck", "reports the tau_est of when it began")
+@_fault(_SPEEDS, "tau-stuck", "reports the tau_est of when it began", needs="tau_est")
 class _TauStuck(_Stuck):
     def report(self, joint: int, values: Report) -> None:
         shadow = replace(values, q=values.tau)
@@ -1152,13 +1161,18 @@ class _StateOther(_Other):
             values.q = self.rig.positions(other)[joint]
 
 
-@_fault("sides", "side-tau-other", "reports the other hand's dq and tau_est")
+@_fault(
+    *("sides", "side-tau-other", "reports the other hand's dq and tau_est"),
+    needs="tau_est",
+    areas=("FORCE",),
+)
 class _TauOther(_Other):
     def report(self, joint: int, values: Report) -> None:
         other = self.other_side()
         if other is None:
             return
-        values.dq = self.rig.velocities(other)[joint]
+        if "dq" in self.rig.measured_members:
+            values.dq = self.rig.velocities(other)[joint]
         tau = self.rig.hand_of(other).tau
         values.tau = tau if isinstance(tau, float) else tau[joint]
 
