@@ -36,6 +36,7 @@ class Heartbeat:
         self.stalls: list[Stall] = []
         self._begin_ns = time.time_ns()
         self._beats: list[tuple[int, int]] = []
+        self._late: list[tuple[int, int, int]] = []
         self._stop = threading.Event()
         self._thread = Worker("heartbeat", self._beat)
 
@@ -59,10 +60,27 @@ class Heartbeat:
             else:
                 self.stalls.append(Stall(begin, end))
 
+    def note_late(self, begin_ns: int, end_ns: int, seconds: float) -> None:
+        """Note that another thread of the kit was late: that which receives the states.
+
+        It can be late where the timer is not, as the interpreter runs one thread at a time.
+        """
+        since = self._begin_ns
+        self._late.append(
+            ((begin_ns - since) // 1000, (end_ns - since) // 1000, round(seconds * 1e6))
+        )
+
     @property
     def beats(self) -> Beats:
-        """Lateness of each wake-up of this thread so far: the kit's jitter."""
+        """Lateness of each wake-up of this thread so far, and what other threads were later: the
+        kit's jitter.
+        """
         beats = self._beats.copy()
+        for begin, end, late in self._late.copy():
+            more = late - sum(own for t, own in self._beats if begin <= t <= end)
+            if more > 0:
+                beats.append((end, more))
+        beats.sort()
         return Beats(self._begin_ns, [t for t, _ in beats], [late for _, late in beats])
 
     def __enter__(self) -> Heartbeat:

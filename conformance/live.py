@@ -144,14 +144,17 @@ def record_run(
             if t
         }
         # the recorder starts before the backend, so that it records the hand's first samples
-        recording = stack.enter_context(DdsRecording(recorder_node, recorder, sorted(topics)))
+        heart = Heartbeat()
+        recording = stack.enter_context(
+            DdsRecording(recorder_node, recorder, sorted(topics), on_late=heart.note_late)
+        )
         if rig_options.backend != EXTERNAL:
             report(f"starting {rig_options.backend} on domain {rig_options.domain}")
         rig = stack.enter_context(Rig(rig_options, stop))
         if options.usb and not _judge_usb(rig, recorder, report, stop):
             return False
         # before the services: a busy machine shows in their first states already
-        heart = stack.enter_context(Heartbeat())
+        stack.enter_context(heart)
         queue = stack.enter_context(RunQueue(lambda: _processes(rig, recorder_node)))
         rig.serve()
         if stop.is_set():

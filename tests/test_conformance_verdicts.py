@@ -311,3 +311,14 @@ def test_pause_of_the_kit_between_two_beats_counts(monkeypatch: pytest.MonkeyPat
         wait_until(lambda: len(heart.beats.t_us) > 5)
     assert max(heart.beats.late_us) >= 45_000
     assert heart.stalls
+
+
+def test_another_late_thread_counts_where_the_timer_was_not_late() -> None:
+    heart = Heartbeat()
+    begin = heart.beats.begin_ns
+    heart._beats += [(10_000, 100), (20_000, 30_000), (30_000, 100), (200_000, 100)]
+    heart.note_late(begin + 5_000_000, begin + 25_000_000, 0.02)  # the timer was later
+    heart.note_late(begin + 30_000_000, begin + 150_000_000, 0.11)
+    beats = heart.beats
+    assert beats.t_us == [10_000, 20_000, 30_000, 150_000, 200_000]
+    assert beats.late_us == [100, 30_000, 100, 109_900, 100]

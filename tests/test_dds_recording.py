@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
+
+import pytest
 
 from dexkit.models import DIALECTS
 from dexkit.traces import Recorder
 from dexkit.traces.dds_recording import DdsRecording
-from tests.dds_helpers import DdsNode, free_domain
+from tests.dds_helpers import DdsNode, free_domain, wait_until
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE
 
 
@@ -52,3 +56,33 @@ def test_given_type_overrides_discovery(tmp_path: Path) -> None:
     ):
         assert other.discovery.wait(lambda _: types_read(other), timeout=60)
         assert types_read(other) == {(CMD, CMD_TYPE)}
+
+
+def test_time_without_a_look_for_samples_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes meanwhile has the time of its end, which says nothing of the hand."""
+    domain = free_domain()
+    told: list[tuple[int, int, float]] = []
+    held, goes_on = threading.Event(), threading.Event()
+
+    def read_samples(self: DdsRecording) -> None:
+        held.set()
+        goes_on.wait(60)
+
+    monkeypatch.setattr(DdsRecording, "_read_samples", read_samples)
+    begin = time.time_ns()
+    with (
+        DdsNode(domain) as node,
+        Recorder(tmp_path / "a.mcap") as out,
+        DdsRecording(node, out, [CMD], types={CMD: CMD_TYPE}, on_late=lambda *x: told.append(x)),
+    ):
+        assert held.wait(60)
+        until = time.monotonic() + 0.1
+        wait_until(lambda: time.monotonic() > until)
+        goes_on.set()
+        wait_until(lambda: bool(told))
+    first, last, late = told[0]
+    assert begin <= first < last <= time.time_ns()
+    assert late == pytest.approx((last - first) / 1e9 - 0.01, abs=0.005)
+    assert late > 0.08

@@ -51,6 +51,8 @@ _ENDPOINTS_INTERVAL = 0.25
 _DISCOVERY_WAIT = 0.5
 # Seconds between checks of the thread when no sample wakes it.
 _IDLE = 0.1
+# The same where it is measured how late this thread is, and what is late enough to be told.
+_IDLE_WATCHED, _LATE = 0.01, 0.01
 
 
 class DdsRecording:
@@ -63,6 +65,9 @@ class DdsRecording:
     :param types: DDS type names by topic, for topics that must be subscribed before discovery
         tells their type.
     :param max_topics: how many discovered topics are subscribed.
+    :param on_late: called from the recording's thread with begin and end, ns since the epoch, of
+        each time in which it did not look for samples, and the seconds that this was too long. What
+        was received meanwhile has the time of the end.
 
     Endpoints and their QoS, and what was lost, are stored whenever they change, so that a killed
     recording contains them.
@@ -78,8 +83,11 @@ class DdsRecording:
         *,
         types: dict[str, str] | None = None,
         max_topics: int = MAX_TOPICS,
+        on_late: Callable[[int, int, float], None] | None = None,
     ) -> None:
         self.node = node
+        self._on_late = on_late
+        self._idle = _IDLE if on_late is None else _IDLE_WATCHED
         self.recorder = recorder
         self.losses = Losses()
         self._sockets = ReceiveBuffers(node.domain)
@@ -171,10 +179,15 @@ class DdsRecording:
     def _run(self) -> None:
         told = looked = noted = float("-inf")
         changed = news = False
+        turn, turn_ns = time.monotonic(), time.time_ns()
         while True:
-            self._wake.wait(_IDLE)
+            self._wake.wait(self._idle)
             self._wake.clear()
             stopping = self._stopping
+            before, before_ns = turn, turn_ns
+            turn, turn_ns = time.monotonic(), time.time_ns()
+            if self._on_late is not None and turn - before > self._idle + _LATE:
+                self._on_late(before_ns, turn_ns, turn - before - self._idle)
             pause = self.losses.note_loop(time.clock_gettime(time.CLOCK_BOOTTIME), time.time_ns())
             if pause is not None:
                 _log.warning("%s", pause)
