@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from bisect import bisect_left, bisect_right
+from itertools import accumulate
 from pathlib import Path
 
 from dexkit.clock import RealClock
@@ -61,9 +63,13 @@ class Heartbeat:
                 self.stalls.append(Stall(begin, end))
 
     def note_late(self, begin_ns: int, end_ns: int, seconds: float) -> None:
-        """Note that another thread of the kit was late: that which receives the states.
+        """Note that the kit's thread that receives the states was late.
 
         It can be late where the timer is not, as the interpreter runs one thread at a time.
+
+        :param begin_ns: since when it had not looked for samples.
+        :param end_ns: when it looked again.
+        :param seconds: by how much this was too long.
         """
         since = self._begin_ns
         self._late.append(
@@ -72,14 +78,16 @@ class Heartbeat:
 
     @property
     def beats(self) -> Beats:
-        """Lateness of each wake-up of this thread so far, and what other threads were later: the
-        kit's jitter.
+        """Lateness of each wake-up of this thread so far, and by how much more the receiving thread
+        was late: the kit's jitter.
         """
         beats = self._beats.copy()
+        times = [t for t, _ in beats]
+        total = [0, *accumulate(late for _, late in beats)]
         for begin, end, late in self._late.copy():
-            more = late - sum(own for t, own in self._beats if begin <= t <= end)
-            if more > 0:
-                beats.append((end, more))
+            own = total[bisect_right(times, end)] - total[bisect_left(times, begin)]
+            if late > own:
+                beats.append((end, late - own))
         beats.sort()
         return Beats(self._begin_ns, [t for t, _ in beats], [late for _, late in beats])
 
