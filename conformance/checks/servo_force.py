@@ -25,7 +25,7 @@ _STANDS = 0.03  # of the stroke: motion in a stretch
 _AT_GOAL = 0.03  # of the stroke: distance from the goal of a joint that has reached it
 _NEAR, _CLEAR = 0.08, 0.08  # of the stroke: from where the object is, of one that touches or not
 _END = 0.05  # of the stroke: distance from the ends within which a stop may press
-_HEARD_S = 0.25  # s from the last command, after which a hand may do what it does in a silence
+_HEARD_S = 0.25  # s without a command, after which a hand may do what it does in a silence
 _FAST = 0.5  # part of the full speed from which a goal is soon beyond the object
 FEW_STANDS = 2
 """Stretches of a failure: a single one may be disturbed."""
@@ -69,6 +69,8 @@ def _stands(ctx: Context, settle: float, held: float) -> list[Stand]:
     low, high = np.array([j.q_min for j in specs]), np.array([j.q_max for j in specs])
     goals = np.clip(goals, low, high)
     changes = (np.abs(np.diff(goals, axis=0)) > 1e-6) | (np.abs(np.diff(speeds, axis=0)) > 1e-6)
+    # in a silence a hand may stop pressing; the first command after it begins a stretch
+    changes |= (np.diff(t) > _HEARD_S)[:, None]
     rows = np.where(changes, np.arange(1, len(t))[:, None], 0)
     since = np.vstack((np.zeros(len(specs), np.intp), np.maximum.accumulate(rows, axis=0)))
     fast = np.ones(len(specs), np.bool_)

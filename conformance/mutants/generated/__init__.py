@@ -261,6 +261,8 @@ def _suits(what: type[What], of: HandModel) -> bool:
     several = len(of.joints[Side.LEFT]) > 1
     if (what.one_joint and several) or (what.several and not several):
         return False
+    if what.position_servo and not any(d.position_servo for d in of.dialects):
+        return False
     return not what.needs or what.needs in of.reference.load().measured_members
 
 

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
+
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.generated.rig import Faulty, Motors, Report, What
 from dexkit.conformance.virtual import Sample
@@ -424,6 +426,25 @@ class _StrongBrake(_Mechanics):
 
 
 _add("brake", _StrongBrake, "brake-short", "brakes three times as hard")
+
+
+class _Relaxes(What):
+    """Stops pressing when commands end, and holds where it is then."""
+
+    position_servo = True
+    done = False
+
+    def tick(self, dt: float, active: bool) -> None:
+        hand = self.rig.hand_of(self.side)
+        silent = math.isinf(hand.heard)
+        if silent and not self.done and self.rig.driven(self.side):
+            hand.place = list(hand.q)
+            hand.goal = np.array(hand.place)
+            hand.changed()
+        self.done = silent
+
+
+_add("brake", _Relaxes, "brake-relax", "stops pressing when commands end, and holds")
 
 DEVIATIONS: Mapping[str, type[What]] = _found
 """Every deviation, by name."""

@@ -52,8 +52,8 @@ OFF, OFF_S = 0.03, 0.10
 LIES, LIES_S = 0.06, 0.05
 """Reported q against the true one. xr_teleoperate commands at most a thirtieth of the stroke ahead
 of the state (docs/sources/unitree-dex.md#b3): twice that turns its commands round. 0.05 s is ten of
-its cycles. No client of a position servo commands from q: it stores q with each episode
-(docs/sources/unitree-dex.md#j1), where q may be as late and as far off as a motion."""
+its cycles. The client of a position servo does not command from q: its target is the operator's
+(docs/sources/unitree-dex.md#j1). There q may be as late and as far off as a motion."""
 JUMPS, JUMPS_S = 0.15, 0.01
 """A jump for two cycles that is five times that lead."""
 UNTRUE, UNTRUE_S = 0.025, 0.05

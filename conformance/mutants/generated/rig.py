@@ -102,6 +102,7 @@ class What:
     :cvar both: whether it needs both sides in the run.
     :cvar idle: why it has no effect under ``always``; empty where it has one.
     :cvar one_joint: whether it needs a hand of one joint.
+    :cvar position_servo: whether it needs a hand of position servos.
     :cvar needs: the member of a motor's state that the reference must measure; empty for none.
     :cvar turn: its place among the deviations of a good hand: below 0 before the others, above 0
         after them.
@@ -116,6 +117,7 @@ class What:
     both = False
     idle = ""
     one_joint = False
+    position_servo = False
     needs = ""
     turn = 0
 

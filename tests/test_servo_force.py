@@ -1,0 +1,57 @@
+"""Test when position servos are taken to press on an object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dexkit.conformance.judge import judge
+from dexkit.conformance.layers import recording_of
+from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.requirements import catalogue, select
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.virtual import run_virtual
+from dexkit.conformance.virtual.brainco import BrainCoHand, BrainCoService
+from dexkit.conformance.virtual.memory_trace import MemoryTrace
+
+IDS = ("BRAINCO-FORCE-01", "BRAINCO-FORCE-05")
+
+
+class _Relaxes(BrainCoHand):
+    def expire(self) -> None:
+        self.place = list(self.q)
+        self.goal = np.array(self.place)
+
+
+class Relaxes(BrainCoService):
+    """Stops pressing when commands end, and holds the joints where they are."""
+
+    hand = _Relaxes
+
+
+@pytest.fixture(scope="module")
+def relaxed() -> MemoryTrace:
+    """A run that ends a silence with the goal from before it: beyond the object."""
+    plan = plan_for("brainco")
+    return run_virtual(replace(plan, phases=frozenset({"silence", "squeeze"})), Relaxes)
+
+
+@pytest.mark.parametrize("later", [0.0, 0.01, 0.02, 0.03, 0.04])
+def test_grip_begins_anew_with_the_first_command_after_a_silence(
+    relaxed: MemoryTrace, later: float
+) -> None:
+    """Wherever the stretches lie in which the force is taken."""
+    plan = plan_for("brainco")
+    commands = plan.dialect.cmd_type
+    first = min(rows[0][0] for (_, kind), rows in relaxed.rows.items() if kind == commands)
+    rows = {
+        (topic, kind): [r for r in rows if kind != commands or r[0] >= first + later * 1e9]
+        for (topic, kind), rows in relaxed.rows.items()
+    }
+    wanted = select(catalogue(plan.dialect.model), prefixes=IDS)
+    recording = recording_of(replace(relaxed, rows=rows), plan.dialect.name, plan.sides)
+    found = [r for r in judge(recording, requirements=wanted).results if r.requirement.id in IDS]
+    assert [r.observed for r in found if r.verdict is Verdict.FAIL] == []
+    assert any(r.verdict is Verdict.PASS for r in found)
