@@ -18,7 +18,7 @@ from pathlib import Path
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
 from dexkit.conformance.backend_processes import Rig, RigOptions
-from dexkit.conformance.calibration import Loopback
+from dexkit.conformance.calibration import POLL, Loopback
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.known_backends import EXTERNAL
@@ -51,6 +51,7 @@ from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject
 from dexkit.interpreter import timely_threads
 from dexkit.models import DIALECTS
+from dexkit.service.realtime import real_time
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.recorder import Recorder
@@ -118,6 +119,8 @@ def record_run(
     with contextlib.ExitStack() as stack:
         # a pause of the kit in the reading of states would look like one of the hand
         stack.enter_context(timely_threads())
+        # a service that has real-time priority would starve an ordinary process
+        stack.enter_context(real_time())
         recorder_node = stack.enter_context(_node(rig_options))
         recorder = stack.enter_context(
             Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})
@@ -146,7 +149,9 @@ def record_run(
         # the recorder starts before the backend, so that it records the hand's first samples
         heart = Heartbeat()
         recording = stack.enter_context(
-            DdsRecording(recorder_node, recorder, sorted(topics), on_late=heart.note_late)
+            DdsRecording(
+                recorder_node, recorder, sorted(topics), poll=POLL, on_late=heart.note_late
+            )
         )
         if rig_options.backend != EXTERNAL:
             report(f"starting {rig_options.backend} on domain {rig_options.domain}")
@@ -432,7 +437,8 @@ class _Client:
             for t in commands
         }
         self._readers: dict[str, Reader] = {
-            t: self._node.reader(t, codec.state, qos=Qos.reader_default()) for t in states
+            t: self._node.reader(t, codec.state, qos=Qos.reader_default(), polled=True)
+            for t in states
         }
 
     def send(self, topic: str, payload: bytes, stamp_ns: int | None = None) -> None:
@@ -478,7 +484,7 @@ class _Monitor:
         self._sides = sides
         self._codec = codec
         self._readers = {
-            t: self._node.reader(t, codec.state, qos=qos)
+            t: self._node.reader(t, codec.state, qos=qos, polled=True)
             for t in {codec.state_topics[s] for s in sides}
         }
         self._begin = time.monotonic()

@@ -172,7 +172,7 @@ class Score:
             return f"No score is known for this run: {self.why or 'no wrong hand was tried'}."
         remark = next((s.remark for s in Setting if str(s) == self.setting), "")
         if self.unjudged:
-            remark += f"; {_few(self.unjudged)} not judged"
+            remark += f"; {_few(self.unjudged)} not judged for each hand"
         return (
             f"In a trial of {found.count} generated wrong hands that break a MUST, a run like this "
             f"({self.run}{remark}) caught {found.text()}."

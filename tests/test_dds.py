@@ -12,7 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, _cyclone, interfaces, type_hash
+from dexkit.dds import (
+    DdsNode,
+    DiscoveryEvent,
+    Endpoint,
+    Qos,
+    Reader,
+    _cyclone,
+    interfaces,
+    type_hash,
+)
 from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError, WireError
 from dexkit.interface_filter import interface_address
 from dexkit.messages import message_type
@@ -90,6 +99,31 @@ def test_on_data_wakes_once_per_arrival_and_never_after_close(dds_node: DdsNode)
     with pytest.raises(DdsError, match="closed"):
         reader.take()
     assert not arrived.acquire(timeout=0.05)
+
+
+def test_polled_reader_gets_samples_and_wakes_no_thread(dds_node: DdsNode) -> None:
+    with DdsNode(dds_node.domain, "lo") as other:
+        woken: list[Reader] = []
+        polled = dds_node.reader("rt/polled", CMDS, most=10, polled=True)
+        waited = dds_node.reader("rt/polled", CMDS, most=10)
+        on_status = Reader._on_status
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Reader, "_on_status", lambda r: (on_status(r), woken.append(r)))
+            writer = other.writer("rt/polled", CMDS)
+            assert writer.wait_matched(60, count=2)
+            assert polled.wait_matched(60)
+            assert waited.wait_matched(60)
+            woken.clear()
+            for q in (1.0, 2.0):
+                writer.write(MotorCmds_([MotorCmd_(q=q)]))
+            found = take_until(waited, lambda samples: len(samples) == 2)
+            assert [s.message.cmds[0].q for s in found] == [1.0, 2.0]
+            assert polled not in woken
+        assert [s.data for s in polled.take()] == [s.data for s in found]
+        with pytest.raises(UsageError, match="polled"):
+            polled.wait(0)
+        with pytest.raises(UsageError, match="polled"):
+            dds_node.reader("rt/polled", CMDS, polled=True, on_data=bool)
 
 
 def test_a_callback_may_close_its_reader_and_its_node(dds_domain: int) -> None:

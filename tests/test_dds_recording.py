@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from dexkit.messages import message_type
 from dexkit.models import DIALECTS
-from dexkit.traces import Recorder
+from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from tests.dds_helpers import DdsNode, free_domain, wait_until
-from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE
+from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, state
 
 
 def types_read(node: DdsNode) -> set[tuple[str, str]]:
@@ -46,6 +47,24 @@ def test_known_topic_is_subscribed_before_it_has_a_writer(tmp_path: Path) -> Non
         assert other.discovery.wait(lambda _: types_read(other) == expected, timeout=60)
 
 
+def test_polling_records_every_sample_in_order(tmp_path: Path) -> None:
+    domain = free_domain()
+    path = tmp_path / "a.mcap"
+    kind = message_type(STATE_TYPE)
+    with DdsNode(domain) as hand, DdsNode(domain) as node:
+        writer = hand.writer(STATE, STATE_TYPE)
+        with (
+            Recorder(path) as out,
+            DdsRecording(node, out, [STATE], types={STATE: STATE_TYPE}, poll=0.001),
+        ):
+            assert writer.wait_matched(60)
+            for i in range(100):
+                writer.write_raw(state(float(i)))
+            wait_until(lambda: out.offered.get(STATE, 0) == 100)
+    found = [kind.decode(m.data).states[0].q for m in open_trace(path).messages()]
+    assert found == list(range(100))
+
+
 def test_given_type_overrides_discovery(tmp_path: Path) -> None:
     domain = free_domain()
     with (
@@ -75,7 +94,14 @@ def test_time_without_a_look_for_samples_is_told(
     with (
         DdsNode(domain) as node,
         Recorder(tmp_path / "a.mcap") as out,
-        DdsRecording(node, out, [CMD], types={CMD: CMD_TYPE}, on_late=lambda *x: told.append(x)),
+        DdsRecording(
+            node,
+            out,
+            [CMD],
+            types={CMD: CMD_TYPE},
+            poll=0.01,
+            on_late=lambda *x: told.append(x),
+        ),
     ):
         assert held.wait(60)
         until = time.monotonic() + 0.1

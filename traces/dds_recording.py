@@ -51,8 +51,8 @@ _ENDPOINTS_INTERVAL = 0.25
 _DISCOVERY_WAIT = 0.5
 # Seconds between checks of the thread when no sample wakes it.
 _IDLE = 0.1
-# The same where it is measured how late this thread is, and what is late enough to be told.
-_IDLE_WATCHED, _LATE = 0.01, 0.01
+# Seconds by which this thread is late from which on it is told.
+_LATE = 0.01
 
 
 class DdsRecording:
@@ -65,9 +65,11 @@ class DdsRecording:
     :param types: DDS type names by topic, for topics that must be subscribed before discovery
         tells their type.
     :param max_topics: how many discovered topics are subscribed.
-    :param on_late: called from the recording's thread with begin and end, ns since the epoch, of
-        each time in which it did not look for samples, and the seconds that this was too long. What
-        was received meanwhile has the time of the end.
+    :param poll: look for samples every so many seconds, instead of whenever one arrives: fewer
+        turns where thousands arrive a second. Times of reception are up to so much later then.
+    :param on_late: only with ``poll``: called from the recording's thread with begin and end, ns
+        since the epoch, of each time in which it did not look for samples, and the seconds that
+        this was too long. What was received meanwhile has the time of the end.
 
     Endpoints and their QoS, and what was lost, are stored whenever they change, so that a killed
     recording contains them.
@@ -83,11 +85,14 @@ class DdsRecording:
         *,
         types: dict[str, str] | None = None,
         max_topics: int = MAX_TOPICS,
+        poll: float | None = None,
         on_late: Callable[[int, int, float], None] | None = None,
     ) -> None:
+        if on_late is not None and poll is None:
+            raise UsageError("only a recording that polls can tell when it was late")
         self.node = node
+        self._poll = poll
         self._on_late = on_late
-        self._idle = _IDLE if on_late is None else _IDLE_WATCHED
         self.recorder = recorder
         self.losses = Losses()
         self._sockets = ReceiveBuffers(node.domain)
@@ -181,13 +186,18 @@ class DdsRecording:
         changed = news = False
         turn, turn_ns = time.monotonic(), time.time_ns()
         while True:
-            self._wake.wait(self._idle)
-            self._wake.clear()
+            if self._poll is None:
+                self._wake.wait(_IDLE)
+                self._wake.clear()
+            else:
+                time.sleep(self._poll)
             stopping = self._stopping
             before, before_ns = turn, turn_ns
             turn, turn_ns = time.monotonic(), time.time_ns()
-            if self._on_late is not None and turn - before > self._idle + _LATE:
-                self._on_late(before_ns, turn_ns, turn - before - self._idle)
+            if self._on_late is not None and self._poll is not None:
+                late = turn - before - self._poll
+                if late > _LATE:
+                    self._on_late(before_ns, turn_ns, late)
             pause = self.losses.note_loop(time.clock_gettime(time.CLOCK_BOOTTIME), time.time_ns())
             if pause is not None:
                 _log.warning("%s", pause)
@@ -254,7 +264,12 @@ class DdsRecording:
             return
         try:
             self._readers[topic, type_name] = self.node.reader(
-                topic, kind, qos=Qos.reader_default(), most=MOST, on_data=self._wake.set
+                topic,
+                kind,
+                qos=Qos.reader_default(),
+                most=MOST,
+                on_data=self._wake.set if self._poll is None else None,
+                polled=self._poll is not None,
             )
         except DdsError as error:  # a name that DDS does not allow, although a peer uses it
             self._unknown[topic] = str(error)
