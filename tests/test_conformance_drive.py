@@ -5,13 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import pytest
+
+from dexkit.conformance.checks import Context
+from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.generated import parse
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.selection import length
 from dexkit.conformance.stimuli import CommandSession, phases_for
-from dexkit.conformance.virtual import Sample, Service
+from dexkit.conformance.virtual import Sample, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from dexkit.models import MODELS
@@ -116,3 +122,25 @@ def test_a_default_run_of_hands_is_short_enough() -> None:
         stimuli = length(name, phases_for(catalogue(name)))
         session = CommandSession.default(name).duration if MODELS[name].session else 0.0
         assert stimuli + session <= 87.0, name
+
+
+@pytest.mark.parametrize("name", ["stronger", "stronger+latency-20"])
+def test_force_follows_a_goal_that_changes_in_contact(name: str) -> None:
+    """What is asked for then is the largest of the goals that the hand may follow."""
+    wanted = next(r for r in catalogue("dex1-1") if r.id == "DEX1-FORCE-18")
+    hand = parse(f"dex1-1/unitree_go:{name}")
+    phases = phases_for([wanted]) | {"replay"}
+    plan = replace(plan_for("unitree_go", sides=(Side.RIGHT,)), phases=phases)
+    recording = recording_of(run_virtual(plan, hand.service()), "unitree_go", plan.sides)
+    felt, asked, most = [], [], []
+    for settle in np.arange(0.4, 0.6, 0.02).tolist():  # wherever a piece of contact begins
+        shifted = replace(wanted, tolerances={**wanted.tolerances, "settle_s": settle})
+        ctx = Context(recording, recording.sides[Side.RIGHT], shifted)
+        touch = ctx.object_at
+        assert touch is not None
+        for p in contacts(ctx, touch):
+            felt.append(float(np.abs(ctx.states.tau[ctx.states.between(p.begin, p.end), 0]).max()))
+            asked.append(p.kp * (p.q - p.goal))
+            most.append(p.most)
+    assert np.any(np.array(felt) > 1.6 * np.array(asked))
+    assert np.all(np.array(felt) <= 1.1 * np.array(most))

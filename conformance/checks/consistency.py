@@ -474,6 +474,8 @@ class _Pressing:
     :param tau: median of abs(tau_est), N m.
     :param q: median, rad; likewise ``goal``, clamped to the stroke.
     :param kp: the lowest commanded, N m/rad.
+    :param most: the largest kp times the distance from the goal, N m, in it and in the
+        :data:`_OBEYS_S` before it: of a goal that changes the hand may still follow an earlier one.
     """
 
     begin: float
@@ -482,6 +484,11 @@ class _Pressing:
     q: float
     goal: float
     kp: float
+    most: float
+
+
+_OBEYS_S = 0.1
+"""Seconds from a command to the state of a hand that follows it, or more."""
 
 
 def _newest(ctx: Context) -> tuple[Rows, Floats]:
@@ -528,12 +535,14 @@ def contacts(ctx: Context, touch: float) -> list[_Pressing]:
             & np.isfinite(states.tau[:, 0])
         )
     edges = np.flatnonzero(np.diff(np.concatenate(([0], pressing.view(np.int8), [0]))))
+    asked = stiff * (states.q[:, 0] - goals)
     found = []
     window = ctx.tolerance("window_s")
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         begin, end = float(states.t[first]) + settle, float(states.t[last - 1])
         while begin + window <= end:
-            piece = slice(*np.searchsorted(states.t, (begin, begin + window)))
+            before, *inside = np.searchsorted(states.t, (begin - _OBEYS_S, begin, begin + window))
+            piece = slice(*inside)
             if piece.stop - piece.start >= 5:
                 found.append(
                     _Pressing(
@@ -543,6 +552,7 @@ def contacts(ctx: Context, touch: float) -> list[_Pressing]:
                         median(states.q[piece, 0]),
                         median(goals[piece]),
                         float(stiff[piece].min()),
+                        float(asked[before : piece.stop].max()),
                     )
                 )
             begin += window

@@ -164,8 +164,9 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
         span = piece.begin, piece.end
         pieces.append(Press.within((piece.tau, piece.tau), (low, high), span))
         felt = np.abs(ctx.states.tau[ctx.states.between(*span), 0])
-        above = felt[felt > high]
-        peaks.append(_Peak(*span, len(felt), len(above), high, above))
+        peak = most * stiffest * piece.most
+        above = felt[felt > peak]
+        peaks.append(_Peak(*span, len(felt), len(above), peak, above))
     worst = worst_of(pieces)
     if worst is None:
         return ctx.skipped("it never pressed on the object for long enough")

@@ -163,6 +163,14 @@ _add("mechanics", _Mechanics, "lighter", "has half of the inertia", factors={"in
 _add("mechanics", _Mechanics, "slower", "has 1.15 times the friction", factors={"viscous": 1.15})
 _add("mechanics", _Mechanics, "faster", "has 0.8 times the friction", factors={"viscous": 0.8})
 _add("mechanics", _Mechanics, "sticky", "has 1.5 times the dry friction", factors={"coulomb": 1.5})
+_add(
+    "mechanics",
+    _Mechanics,
+    "stronger",
+    "has five times the largest torque, and the inertia of such a motor",
+    factors={"tau_max": 5.0, "inertia": 3.0},
+    **_ONE,
+)
 _add("mechanics", _Mechanics, "soft-stops", "has stops half as stiff", factors={"stiffness": 0.5})
 
 
