@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +34,7 @@ from dexkit.conformance.virtual.on_dds import ServiceOnDds
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
 from dexkit.models import dialect, model
+from dexkit.service.realtime import real_time
 from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import (
     SUITE,
@@ -338,6 +340,26 @@ def test_stopped_run_leaves_no_process(tmp_path: Path) -> None:
         ["pgrep", "-f", f"--domain {rig.domain} "], capture_output=True, text=True
     )
     assert left.stdout == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no SCHED_RR")
+def test_live_run_has_the_priority_of_the_service_it_judges(tmp_path: Path) -> None:
+    """A service with real-time priority leaves an ordinary process too little."""
+    before = os.sched_getscheduler(0)
+    with real_time() as granted:
+        expected = os.sched_getscheduler(0)
+    assert granted == (expected == os.SCHED_RR)
+    rig = RigOptions("sim-dex1", (Side.LEFT,), dialect("unitree_go"), free_domain())
+    stop = threading.Event()
+    seen: list[int] = []
+
+    def report(text: str) -> None:
+        seen.append(os.sched_getscheduler(0))
+        stop.set()
+
+    record_run(LiveOptions(rig, frozenset()), tmp_path / "run.mcap", report=report, stop=stop)
+    assert set(seen) == {expected}
+    assert os.sched_getscheduler(0) == before
 
 
 @pytest.mark.parametrize(
