@@ -144,3 +144,12 @@ def test_force_follows_a_goal_that_changes_in_contact(name: str) -> None:
             most.append(p.most)
     assert np.any(np.array(felt) > 1.6 * np.array(asked))
     assert np.all(np.array(felt) <= 1.1 * np.array(most))
+
+
+def test_noise_of_q_does_not_hide_that_a_target_is_held() -> None:
+    """A torque displaces a stiff gripper by no more than that noise."""
+    hand = parse("dex1-1/unitree_go:noise-q-wide+predicts-150+servo-stiff")
+    results = run_mutant(hand.service(), plan_for(hand.dialect.name, sides=hand.sides)).results
+    found = [r.verdict for r in results if r.requirement.id == "DEX1-HOLD-01"]
+    assert Verdict.PASS in found
+    assert Verdict.FAIL not in found

@@ -23,6 +23,11 @@ STIFFNESS = "stiffness"
 """The phase of the pushes that are repeated throughout a run."""
 _RESTS_PART = 0.005
 """Part of the stroke by which q may vary at rest."""
+_MOST_NOISE = 0.008
+"""Part of the stroke: noise of q that a gripper may have. What exceeds it counts as motion."""
+_OFF = 0.7
+"""Part of that noise by which the median of q in 0.1 s may be off, 15 of whose states are measured
+anew, and the rest predicted: once in some hundred."""
 _PEAKS_S, _FEW_PEAKS = 1.05, 3
 """Window of contact in which peaks are counted, seconds, and the fewest peaks of a failure."""
 
@@ -32,6 +37,7 @@ class Nudge:
     """A torque pulse on a position-controlled gripper.
 
     :param way: displacement by the torque, rad; ``asked`` is torque / kp.
+    :param noise: half of the range of q before it, rad.
     :param at_rest: whether the gripper stood still before it.
     """
 
@@ -39,6 +45,7 @@ class Nudge:
     end: float
     way: float
     asked: float
+    noise: float
     at_rest: bool
 
 
@@ -55,8 +62,9 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
         kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
         if kp > 0 and tau != 0:  # a damaged recording may hold another command here
             way = (median(after) - median(before)) * (1 if tau > 0 else -1)
-            rests = float(np.ptp(before)) <= _RESTS_PART * ctx.joints[0].stroke
-            found.append(Nudge(begin, end, way, abs(tau) / kp, rests))
+            spread = float(np.ptp(before))
+            rests = spread <= _RESTS_PART * ctx.joints[0].stroke
+            found.append(Nudge(begin, end, way, abs(tau) / kp, 0.5 * spread, rests))
     return found
 
 
@@ -70,6 +78,8 @@ def held(ctx: Context) -> Outcome:
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not shown:
         return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
+    quietest = min(_MOST_NOISE * ctx.joints[0].stroke, *(n.noise for n in found))
+    off = _OFF * quietest
     pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
     for first, last in pairs:
         text = (
@@ -77,7 +87,8 @@ def held(ctx: Context) -> Outcome:
             f"{last.begin - first.end:.1f} "
             f"s of equal commands by {last.way:.3f} {ctx.unit}"
         )
-        if not least * first.way <= last.way <= most * first.way:
+        low, high = least * (first.way - off), most * (first.way + off)
+        if not low - off <= last.way <= high + off:
             place = ctx.at(ctx.states.topic, last.begin, last.end)
             return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
     if not pairs:
