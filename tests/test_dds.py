@@ -26,7 +26,7 @@ from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError, Wire
 from dexkit.interface_filter import interface_address
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
-from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until
+from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until
 
 __all__ = ["dds_domain", "dds_node"]
 
@@ -101,25 +101,27 @@ def test_on_data_wakes_once_per_arrival_and_never_after_close(dds_node: DdsNode)
     assert not arrived.acquire(timeout=0.05)
 
 
-def test_polled_reader_gets_samples_and_wakes_no_thread(dds_node: DdsNode) -> None:
+def test_polled_reader_gets_samples_and_wakes_no_thread(
+    dds_node: DdsNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    woken: list[Reader] = []
+    on_status = Reader._on_status
+    monkeypatch.setattr(Reader, "_on_status", lambda r: (woken.append(r), on_status(r)))
     with DdsNode(dds_node.domain, "lo") as other:
-        woken: list[Reader] = []
-        polled = dds_node.reader("rt/polled", CMDS, most=10, polled=True)
-        waited = dds_node.reader("rt/polled", CMDS, most=10)
-        on_status = Reader._on_status
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Reader, "_on_status", lambda r: (on_status(r), woken.append(r)))
-            writer = other.writer("rt/polled", CMDS)
-            assert writer.wait_matched(60, count=2)
-            assert polled.wait_matched(60)
-            assert waited.wait_matched(60)
-            woken.clear()
-            for q in (1.0, 2.0):
-                writer.write(MotorCmds_([MotorCmd_(q=q)]))
-            found = take_until(waited, lambda samples: len(samples) == 2)
-            assert [s.message.cmds[0].q for s in found] == [1.0, 2.0]
-            assert polled not in woken
-        assert [s.data for s in polled.take()] == [s.data for s in found]
+        polled = dds_node.reader("rt/polled", CMDS, most=40, polled=True)
+        waited = dds_node.reader("rt/polled", CMDS, most=40)
+        writer = other.writer("rt/polled", CMDS)
+        assert writer.wait_matched(60, count=2)
+        found = []
+        for i in range(40):
+            writer.write(MotorCmds_([MotorCmd_(q=float(i))]))
+            found += take_until(waited, bool)
+        assert [s.message.cmds[0].q for s in found] == list(range(40))
+        got: list[bytes] = []
+        wait_until(lambda: got.extend(s.data for s in polled.take()) or len(got) >= len(found))
+        assert got == [s.data for s in found]
+        assert woken.count(waited) >= 40
+        assert woken.count(polled) < 10  # by the writer that was matched
         with pytest.raises(UsageError, match="polled"):
             polled.wait(0)
         with pytest.raises(UsageError, match="polled"):

@@ -697,7 +697,9 @@ def test_driver_recovers_after_pause_trips_watchdog(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.01)
         drive(hand, HALF, at(2.7))
-        assert hand.servo_statistics.watchdog_trips == 1
+        # on a busy machine it may trip again, and once more when the driving has ended
+        cleared, trips = hand.servo_statistics.watchdog_trips, gripper.servo.watchdog_trips
+        assert 1 <= cleared <= trips <= cleared + 1
 
 
 def test_servo_stopped_by_watchdog_is_opened_at_rest(

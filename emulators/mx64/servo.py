@@ -71,6 +71,7 @@ class Servo:
     :param now: time at power-on, seconds; it answers at once.
     :param eeprom: 64 bytes kept from an earlier run; they win over ``servo_id`` and ``baudrate``.
     :param seed: of the noise on Present Current.
+    :ivar watchdog_trips: times that its bus watchdog has tripped.
     :raises UsageError: no such id or baud rate, or ``eeprom`` is not one.
     """
 
@@ -106,6 +107,7 @@ class Servo:
         self._overload_time = 0.0
         self._profile_acceleration = 0
         self._watchdog = self._least_volts = self._most_volts = self._most_heat = 0
+        self.watchdog_trips = 0
         self._after: Callable[[], None] | None = None
         self._factory_eeprom()
         self._put(mx64.ID, servo_id)
@@ -210,6 +212,7 @@ class Servo:
             and self.now - self._last_packet > self._watchdog * mx64.WATCHDOG_UNIT
         ):
             self._put(mx64.BUS_WATCHDOG, mx64.WATCHDOG_TRIPPED)
+            self.watchdog_trips += 1
             drive.reset_control()
             self._update_demand()
         load = abs(drive.current) / self.physics.stall_current
