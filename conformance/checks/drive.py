@@ -20,6 +20,7 @@ from dexkit.conformance.checks.motion import (
     least_half_way,
     limited_by_speed,
     limited_by_start,
+    noise_at_rest,
     steps,
     steps_of,
 )
@@ -260,8 +261,6 @@ def joints_as_commanded(ctx: Context) -> Outcome:
 
 
 _LATE = 0.6  # of a pull: before it, a hand may still obey the previous command
-_FEW = 5  # states that show the noise of q
-_MOST_NOISE = 0.008  # of the stroke
 _AROUND_S = 0.02  # s before and after a time: states whose median is the position at that time
 
 
@@ -296,18 +295,8 @@ def _place(ctx: Context, joint: int, at: float) -> float | None:
 
 
 def _noise(ctx: Context, joint: int) -> float:
-    """The noise of q at rest, rad: half of its range in the quietest of the times before a push.
-
-    No more than what a hand may have: what exceeds it counts as motion.
-    """
-    quiet = _MOST_NOISE * ctx.joints[joint].stroke
-    for phase in (p for name in ("push", "pull") for p in ctx.phases(name)):
-        begin, _ = ctx.span(phase)
-        q = ctx.states.q[ctx.states.between(begin - _REST_S, begin), joint]
-        q = q[np.isfinite(q)]
-        if len(q) >= _FEW:
-            quiet = min(quiet, 0.5 * float(np.ptp(q)))
-    return quiet
+    """The noise of q before a push, rad."""
+    return noise_at_rest(ctx, joint, [p for name in ("push", "pull") for p in ctx.phases(name)])
 
 
 @check("DEX1-GAIN-03", "DEX3-GAIN-04")

@@ -13,6 +13,7 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.checks.grip import Press, worst_of
+from dexkit.conformance.checks.motion import noise_at_rest
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
@@ -23,11 +24,9 @@ STIFFNESS = "stiffness"
 """The phase of the pushes that are repeated throughout a run."""
 _RESTS_PART = 0.005
 """Part of the stroke by which q may vary at rest."""
-_MOST_NOISE = 0.008
-"""Part of the stroke: noise of q that a gripper may have. What exceeds it counts as motion."""
-_OFF = 0.7
-"""Part of that noise by which the median of q in 0.1 s may be off, 15 of whose states are measured
-anew, and the rest predicted: once in some hundred."""
+_MEDIAN_OFF = 0.7
+"""Part of the noise of q by which its median in 0.1 s may be off, if 15 of the states are measured
+and the others predicted from them: once in some hundred."""
 _PEAKS_S, _FEW_PEAKS = 1.05, 3
 """Window of contact in which peaks are counted, seconds, and the fewest peaks of a failure."""
 
@@ -37,7 +36,6 @@ class Nudge:
     """A torque pulse on a position-controlled gripper.
 
     :param way: displacement by the torque, rad; ``asked`` is torque / kp.
-    :param noise: half of the range of q before it, rad.
     :param at_rest: whether the gripper stood still before it.
     """
 
@@ -45,7 +43,6 @@ class Nudge:
     end: float
     way: float
     asked: float
-    noise: float
     at_rest: bool
 
 
@@ -62,9 +59,8 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
         kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
         if kp > 0 and tau != 0:  # a damaged recording may hold another command here
             way = (median(after) - median(before)) * (1 if tau > 0 else -1)
-            spread = float(np.ptp(before))
-            rests = spread <= _RESTS_PART * ctx.joints[0].stroke
-            found.append(Nudge(begin, end, way, abs(tau) / kp, 0.5 * spread, rests))
+            rests = float(np.ptp(before)) <= _RESTS_PART * ctx.joints[0].stroke
+            found.append(Nudge(begin, end, way, abs(tau) / kp, rests))
     return found
 
 
@@ -78,8 +74,7 @@ def held(ctx: Context) -> Outcome:
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not shown:
         return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
-    quietest = min(_MOST_NOISE * ctx.joints[0].stroke, *(n.noise for n in found))
-    off = _OFF * quietest
+    off = _MEDIAN_OFF * noise_at_rest(ctx, 0, ctx.phases())
     pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
     for first, last in pairs:
         text = (

@@ -116,6 +116,8 @@ _LARGER, _FASTER = 1.5, 1.2
 """Factor of size, and of speed: a step larger by this factor is faster by it, unless the joint's
 own top speed limits it."""
 _REST_S, _RESTS = 0.1, 0.01  # s before a step, and part of the range by which q may vary there
+_NOISE_STATES, _MOST_NOISE = 5, 0.008
+"""Fewest states that show the noise of q, and the part of the stroke that it may be."""
 _GROWS = 0.25
 """Part of the growth of the error by which the way may grow where a soft start limits it."""
 _CHANGE, _WATCHED_S = 0.05, 0.25
@@ -868,3 +870,18 @@ def velocity_way(ctx: Context) -> Outcome:
     place = ctx.at(ctx.states.topic, *ctx.span(phase))
     outcome = ctx.failed(f"{against:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
     return outcome.placed(against, limit)
+
+
+def noise_at_rest(ctx: Context, joint: int, phases: Sequence[Phase]) -> float:
+    """The noise of q at rest, rad: half of its range in the quietest of the times before phases.
+
+    No more than what a hand may have: what exceeds it counts as motion.
+    """
+    quiet = _MOST_NOISE * ctx.joints[joint].stroke
+    for phase in phases:
+        begin, _ = ctx.span(phase)
+        q = ctx.states.q[ctx.states.between(begin - _REST_S, begin), joint]
+        q = q[np.isfinite(q)]
+        if len(q) >= _NOISE_STATES:
+            quiet = min(quiet, 0.5 * float(np.ptp(q)))
+    return quiet
