@@ -44,6 +44,8 @@ def without(trace: MemoryTrace, commands: str, at: float) -> MemoryTrace:
     [
         # DEX1-GAIN-03: the begin or the end of a push
         ("dex1-1/unitree_actuator:backlash-more+soft-start+sags-down", (0.0, 0.2)),
+        # DEX3-GAIN-04: the end of a push and the begin of the next one
+        ("dex3-1/dex3:backlash-more+latency-20", (0.12,)),
         *(
             pytest.param(name, places, marks=pytest.mark.soak)
             for name, places in (
@@ -51,8 +53,8 @@ def without(trace: MemoryTrace, commands: str, at: float) -> MemoryTrace:
                 ("dex1-1/unitree_go:backlash-more+latency-20", (0.04, 0.76)),
                 # DEX1-FIELD-16: most of the motion in a window
                 ("dex1-1/unitree_hg:backlash-more+soft-start", (0.52,)),
-                # DEX3-FIELD-16; DEX3-FORCE-04 and -07: that it moves before a step; DEX3-GAIN-04
-                ("dex3-1/dex3:backlash-more+latency-20", (0.12, 0.64, 0.8)),
+                # DEX3-FIELD-16; DEX3-FORCE-04 and -07: that it moves before a step
+                ("dex3-1/dex3:backlash-more+latency-20", (0.64, 0.8)),
                 # DEX5-GAIN-05: how a step gets half-way
                 ("dex5-1/dex5:backlash-more+state-late-10", (0.66, 0.78)),
             )

@@ -283,6 +283,18 @@ def _pushed(ctx: Context, phase: Phase, *, after: float = 0.0) -> Iterator[tuple
             yield step.joint, (end - start) * (1 if step.size > 0 else -1)
 
 
+def _pushed_before_gap(ctx: Context, phase: Phase) -> Iterator[tuple[int, float]]:
+    """As :func:`_pushed`, up to the last state before a gap that hides the end of a push."""
+    for step in steps_of(ctx, phase):
+        t = ctx.states.t[ctx.states.between(step.begin, step.end)]
+        if not ctx.seen(step.begin - _REST_S, step.begin) or len(t) < 2:
+            continue
+        gap = int(np.diff(t, append=step.end).argmax())
+        end = _place(ctx, step.joint, float(t[gap]) - _AROUND_S)
+        if end is not None:
+            yield step.joint, (end - step.start) * (1 if step.size > 0 else -1)
+
+
 def _place(ctx: Context, joint: int, at: float) -> float | None:
     """The median of q around a time, rad: in a steady motion, that of the time itself.
 
@@ -312,6 +324,14 @@ def torque_drives(ctx: Context) -> Outcome:
             part = moved / ctx.joints[joint].stroke
             if least is None or part < least[0]:
                 least = part, moved, joint, phase
+    if least is None:  # a part of a push can show that a joint moves enough, not that it does not
+        enough = [
+            (moved / ctx.joints[joint].stroke, moved, joint, phase)
+            for phase in ctx.phases()
+            for joint, moved in _pushed_before_gap(ctx, phase)
+            if moved >= ctx.tolerance("min_motion_stroke", joint)
+        ]
+        least = min(enough, key=lambda e: e[0], default=None)
     if least is None:
         return ctx.skipped("no state shows the begin and the end of a torque command")
     for phase in ctx.phases("pull"):
