@@ -171,11 +171,12 @@ class Score:
         if self.why or found is None or not found.count:
             return f"No score is known for this run: {self.why or 'no wrong hand was tried'}."
         remark = next((s.remark for s in Setting if str(s) == self.setting), "")
+        without = ""
         if self.unjudged:
-            remark += f"; {_few(self.unjudged)} not judged for each hand"
+            without = f", without {_few(self.unjudged)}, not judged for each hand"
         return (
             f"In a trial of {found.count} generated wrong hands that break a MUST, a run like this "
-            f"({self.run}{remark}) caught {found.text()}."
+            f"({self.run}{remark}) caught {found.text()}{without}."
         )
 
     def as_dict(self) -> dict[str, Any]:
