@@ -415,13 +415,17 @@ def torque_way(ctx: Context) -> Outcome:
 @check("DEX3-GAIN-05")
 def grades_of_stiffness(ctx: Context) -> Outcome:
     """Time to half of a step with a third of the client's stiffness, compared with the client's
-    stiffness.
+    stiffness, and with a tenth of it, compared with a third.
 
     A step at the joint's own top speed, or within its soft start, does not depend on gains, and is
     left out, as is one that no state shows on its way to half.
     """
     stiff = {s.joint: s for p in ctx.phases("stiff") for s in steps_of(ctx, p)}
-    worst: tuple[float, int, float, float] | None = None
+    soft: dict[int, Step] = {}
+    for phase in ctx.phases("soft"):
+        for step in steps_of(ctx, phase):
+            soft.setdefault(step.joint, step)
+    worst: tuple[float, int, float, float, str] | None = None
     limited = 0
     for step in steps(ctx):
         reference = stiff.get(step.joint)
@@ -436,19 +440,23 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
         if soon and any(by(ctx, reference) for by in own):
             limited += 1
             continue
-        if worst is None or took / quick < worst[0]:
-            worst = took / quick, step.joint, took, quick
+        pairs = [(took, quick, "a third of the stiffness")]
+        softer = soft.get(step.joint)
+        if softer is not None and half_way(step) is not None and _seen_to_half(ctx, softer):
+            text = "a tenth of the stiffness, compared with a third,"
+            pairs.append((least_half_way(softer), max(took, 1e-3), text))
+        for slower, faster, text in pairs:
+            if worst is None or slower / faster < worst[0]:
+                worst = slower / faster, step.joint, slower, faster, text
     if worst is None and limited:
         return ctx.absent(
             "its own speed or start limits every joint's steps, whatever their gains are"
         )
     if worst is None:
         return ctx.skipped("no state shows how the steps got half-way")
-    ratio, joint, took, quick = worst
+    ratio, joint, took, quick, which = worst
     least = ctx.tolerance("min_ratio") * quick
-    text = ctx.named(
-        f"a step with a third of the stiffness takes {ratio:.1f} times as long to half-way", joint
-    )
+    text = ctx.named(f"a step with {which} takes {ratio:.1f} times as long to half-way", joint)
     if ratio >= ctx.tolerance("min_ratio"):
         return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
     outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)

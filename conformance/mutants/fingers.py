@@ -881,6 +881,20 @@ class TwoGrades(FingerService):
     hand_fault = _Graded
 
 
+class _Floored(FingerHand):
+    def take(self, rows: Floats, mode: Ints) -> None:
+        own = rows.copy()
+        own[3] = np.where(rows[3] > 0, np.maximum(rows[3], 0.35 * self.client_kp), rows[3])
+        super().take(own, mode)
+
+
+@wrong_hand("DEX3-GAIN-05")
+class LeastStiffness(FingerService):
+    """Raises a kp above 0 to a third of the client's: a soft grip is a firm one."""
+
+    hand_fault = _Floored
+
+
 # --------------------------------------------------------------------------------- mode byte
 
 
