@@ -890,7 +890,7 @@ class _Floored(FingerHand):
 
 @wrong_hand("DEX3-GAIN-05")
 class LeastStiffness(FingerService):
-    """Raises a kp above 0 to a third of the client's: a soft grip is a firm one."""
+    """Raises each kp above 0 to 35 % of the client's at least: soft joints are not soft."""
 
     hand_fault = _Floored
 
