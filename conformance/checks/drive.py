@@ -13,7 +13,7 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.checks.firmness import STIFFNESS, nudges
-from dexkit.conformance.checks.grip import Press, worst_of
+from dexkit.conformance.checks.grip import Press, torque_scales, worst_of
 from dexkit.conformance.checks.motion import (
     Step,
     half_way,
@@ -169,6 +169,23 @@ def sign_of_the_push(ctx: Context) -> Outcome:
     return ctx.passed(f"{len(clear) - len(wrong)} of {len(clear)}", text)
 
 
+@check("DEX1-FORCE-20")
+def constant_sign(ctx: Context) -> Outcome:
+    """Whether tau_est has the same sign in all motions towards one end, and in all contacts."""
+    clear = sorted((d for d in _drives(ctx) if d.sign), key=lambda d: d.begin)
+    if not clear:
+        return ctx.skipped("tau_est has no clear sign in any step from rest")
+    for alike in {(d.way, d.contact): None for d in clear}:
+        mine = [d for d in clear if (d.way, d.contact) == alike]
+        usual = 1 if sum(d.sign for d in mine) >= 0 else -1
+        odd = [d for d in mine if d.sign == -usual]
+        # a single one may be left over from the previous motion
+        if len(odd) >= ctx.tolerance("min_odd"):
+            return _turned(ctx, odd, len(mine))
+    text = f"tau_est keeps its sign in {len(clear)} drives from rest and contacts"
+    return ctx.passed(f"{len(clear)} alike", text)
+
+
 def _turned(ctx: Context, odd: Sequence[_Drive], among: int) -> Outcome:
     first = odd[0]
     text = ctx.named(
@@ -227,6 +244,7 @@ def joints_as_commanded(ctx: Context) -> Outcome:
     least, most = ctx.tolerance("min_part"), math.inf
     if "max_part" in ctx.requirement.tolerances:
         most = ctx.tolerance("max_part")
+    scales = torque_scales(ctx, ctx.tolerance("min_asked_nm"))
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
@@ -241,7 +259,7 @@ def joints_as_commanded(ctx: Context) -> Outcome:
             asked = float(kp[joint] * (goal[joint] - q[joint])) * spec.closing
             if not spec.closing or min(asked, spec.tau_max) < ctx.tolerance("min_asked_nm"):
                 continue
-            felt = abs(float(tau[joint]))  # its sign is judged by DEX3-FORCE-01
+            felt = abs(float(tau[joint] / scales[joint]))  # its sign is judged by DEX3-FORCE-01
             limits = least * min(asked, spec.tau_max), most * asked
             pieces.append(Press.within((felt, felt), limits, (begin, end), joint))
     worst = worst_of(pieces)

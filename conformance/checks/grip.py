@@ -7,7 +7,7 @@ is compared with that law; a hand whose tau_est has another scale while it moves
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.row_selection import Rows
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
 
 __all__ = ["Press", "torque_scales", "worst_of"]
@@ -33,6 +34,10 @@ _REACHED = 0.9
 """Quantile of tau_est, relative to its command, that is compared between joints."""
 _OTHER_UNITS = (1e-3, 1e3)
 """Factors of tau_est where N m and mN m are mistaken for each other, in a dialect that has both."""
+_PRESSED_S = 0.3
+"""Seconds at the end of a squeeze in which the joints stand."""
+_UNEXPLAINED = 3.0
+"""Factor between tau_est and what the command asks for."""
 _HELD = 0.2
 """Quantile of tau_est that counts as held, and from above as reached."""
 _STANDS = 0.01
@@ -239,7 +244,7 @@ def presses_as_it_moves(ctx: Context) -> Outcome:
     """tau_est of each standing joint that presses on the object, relative to the law."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    phases = [p for name in ("squeeze", "touch", "firmer") for p in ctx.phases(name)]
+    phases = [p for name in ("squeeze", "touch", "firmer", "regrip") for p in ctx.phases(name)]
     worst = worst_of(piece for phase in phases for piece in _presses(ctx, *ctx.span(phase)))
     if worst is None or worst.joint is None:
         return ctx.skipped("no joint was held back by the object")
@@ -284,6 +289,75 @@ def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
             limits = float(floor), float(ceiling)
             found.append(Press.within(felt_there, limits, (at, at + window), joint))
     return found
+
+
+@check("DEX3-FORCE-11", "BRAINCO-FORCE-11")
+def stops_at_object(ctx: Context) -> Outcome:
+    """How far q of the joints that close on the object goes past it, in parts of the way from there
+    to their goals: the least of them, as an object need not touch every joint.
+
+    A requirement with ``min_tau_nm`` wants the torque of a joint past the object explained, too.
+    """
+    touch = ctx.object_at
+    if touch is None:
+        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+    most = 0.0
+    judged = False
+    for phase in ctx.phases():
+        begin, end = max(ctx.span(phase)[0], ctx.span(phase)[1] - _PRESSED_S), ctx.span(phase)[1]
+        rows = np.arange(len(ctx.states))[ctx.states.between(begin, end)]
+        past = _past_object(ctx, phase, rows, touch)
+        if not past:
+            continue
+        judged = True
+        place = ctx.at(ctx.states.topic, begin, end)
+        most = max(most, min(past.values()))
+        if most > ctx.tolerance("max_past_part"):
+            text = (
+                f"no joint is held back: all go {most:.0%} of the way or more from the object, at "
+                f"{touch:g} % of closing, to their goals"
+            )
+            return ctx.failed(f"{most:.0%}", text, place, part=most)
+        odd = _unexplained(ctx, rows, past)
+        if odd is not None:
+            joint, felt = odd
+            text = ctx.named(
+                f"q is {past[joint]:.0%} of the way from the object to its goal, where kp "
+                f"(q - q_now) does not explain the {felt:.2f} N m of tau_est",
+                joint,
+            )
+            return ctx.failed(f"{felt:.2f} N m", text, place, tau_nm=felt).about(joint)
+    if not judged:
+        return ctx.skipped("no joint was commanded to go past the object")
+    return ctx.passed(f"{most:.0%}", f"a joint stops {most:.0%} of the way past the object or less")
+
+
+def _past_object(ctx: Context, phase: Phase, rows: Rows, touch: float) -> dict[int, float]:
+    """Where each joint that is commanded past the object is, 0 at the object and 1 at its goal."""
+    if len(rows) < _FEW_SHOWN:
+        return {}
+    q = np.median(ctx.states.q[rows], axis=0)
+    found = {}
+    for joint, goal in phase.targets.get(ctx.side, {}).items():
+        spec = ctx.joints[joint]
+        contact = spec.closed_by(touch / 100)
+        if (goal - contact) * spec.closing >= ctx.tolerance("min_way_stroke", joint):
+            found[joint] = float((q[joint] - contact) / (goal - contact))
+    return found
+
+
+def _unexplained(ctx: Context, rows: Rows, past: Mapping[int, float]) -> tuple[int, float] | None:
+    """A joint past the object that presses more than its command asks for, and its tau_est, N m."""
+    if "min_tau_nm" not in ctx.requirement.tolerances:
+        return None
+    least = ctx.tolerance("min_tau_nm")
+    asked = np.abs(np.median(_law(ctx, rows)[0], axis=0))
+    felt = np.abs(np.median(ctx.states.tau[rows], axis=0)) / torque_scales(ctx, least)
+    for joint, part in past.items():
+        much = felt[joint] >= least and felt[joint] >= _UNEXPLAINED * asked[joint]
+        if part > ctx.tolerance("max_past_part") and much:
+            return joint, float(felt[joint])
+    return None
 
 
 # -------------------------------------------------------------------------------------- grippers

@@ -325,6 +325,16 @@ def brakes(ctx: Context) -> Outcome:
                     ctx.at(states.topic, back[0], end),
                     tau_nm=back[1],
                 ).pressed(back[1], ctx.tolerance("max_back_nm"))
+            begun = _pieces(ctx, *_brake_begins(ctx, last))[:1]
+            if begun and begun[0][1] > _NOT_BEGUN * pressed:
+                at, felt = begun[0]
+                return ctx.failed(
+                    f"{felt:.2f} N m",
+                    f"pressed with {pressed:.2f} N m at the last command, and still with "
+                    f"{felt:.2f} N m {at - last:.2f} s later",
+                    ctx.at(states.topic, last + timeout, end),
+                    tau_nm=felt,
+                ).pressed(felt, _NOT_BEGUN * pressed)
             if still > ctx.tolerance("max_tau_part") * pressed:
                 return ctx.failed(
                     f"{still:.2f} N m",
@@ -370,6 +380,16 @@ def _opposes(ctx: Context, since: float, end: float, before: float) -> tuple[flo
 
 
 _PIECE_S = 0.1
+_NOT_BEGUN = 0.9
+"""Part of the force from which a gripper has not begun to release."""
+
+
+def _brake_begins(ctx: Context, last: float) -> tuple[float, float]:
+    """The piece of a silence in which a brake must have begun, s: after the time-out and grace, and
+    after the states and the sources of command that are a little older.
+    """
+    at = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+    return at, at + _PIECE_S
 
 
 def _pieces(ctx: Context, begin: float, end: float) -> list[tuple[float, float]]:

@@ -276,38 +276,54 @@ def _in_force(goals: _Goals, origin: float, cells: int) -> tuple[Floats, Floats]
     return low, high
 
 
-@check("DEX1-START-03")
+@check("DEX1-START-03", "DEX3-START-03")
 def starts_idle(ctx: Context) -> Outcome:
-    """Motion and force between the first state of a started service and the first command."""
-    worst: tuple[float, float] = (0.0, 0.0)
-    most = 0.0
+    """Motion and force between the first state of a started service and the first command.
+
+    A requirement without ``max_tau_nm`` has no limit of the force.
+    """
+    worst: tuple[float, float, int] = (0.0, 0.0, 0)
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         first = ctx.commands.t[(ctx.commands.t >= begin) & (ctx.commands.t < end)]
         rows = ctx.states.between(begin, float(first[0]) if len(first) else end)
-        t, q, tau = ctx.states.t[rows], ctx.states.q[rows, 0], ctx.states.tau[rows, 0]
-        good = np.isfinite(q) & np.isfinite(tau)
-        t, q, tau = t[good], q[good], tau[good]
-        if len(t) < 5:
-            continue
-        away = np.abs(q - q[0])
-        worst = max(worst, (float(away.max()), float(t[int(np.argmax(away))])))
-        # a motor that releases a grip may still show its force at first
-        for x in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1):
-            at = float(x)
-            piece = np.abs(tau[(t >= at) & (t < at + 0.1)])
-            most = max(most, median(piece) if len(piece) >= 3 else 0.0)
-            if most > ctx.tolerance("max_tau_nm"):
-                text = f"tau_est of {most:.2f} N m before the first command after a start"
-                place = ctx.at(ctx.states.topic, at)
-                outcome = ctx.failed(f"{most:.2f} N m", text, place, tau_nm=most)
-                return outcome.pressed(most, ctx.tolerance("max_tau_nm"))
-    rad, when = worst
-    limit = ctx.tolerance("max_motion_stroke")
-    text = f"moved by {rad:.3f} {ctx.unit} before the first command after a start"
+        for joint, spec in enumerate(ctx.joints):
+            t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
+            t, q = t[np.isfinite(q)], q[np.isfinite(q)]
+            if len(t) < 5:
+                continue
+            away = np.abs(q - q[0])
+            i = int(np.argmax(away))
+            worst = max(worst, (float(away[i]) / spec.stroke, float(t[i]), joint))
+        if "max_tau_nm" in ctx.requirement.tolerances:
+            tau = ctx.states.tau[rows, 0]
+            pressing = _still_presses(ctx, ctx.states.t[rows], tau)
+            if pressing is not None:
+                return pressing
+    part, when, joint = worst
+    rad = part * ctx.joints[joint].stroke
+    limit = ctx.tolerance("max_motion_stroke", joint)
+    text = ctx.named(f"moved by {rad:.3f} {ctx.unit} before the first command after a start", joint)
     if rad > limit:
-        outcome = ctx.failed(
-            f"{rad:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, when), motion_rad=rad
-        )
-        return outcome.placed(rad, limit).if_late(STROKE_S * rad / ctx.joints[0].stroke)
+        place = ctx.at(ctx.states.topic, when)
+        outcome = ctx.failed(f"{rad:.2f} {ctx.unit}", text, place, motion_rad=rad)
+        return outcome.about(joint).placed(rad, limit).if_late(STROKE_S * part)
     return ctx.passed(f"{rad:.3f} {ctx.unit}", text, motion_rad=rad).placed(rad, limit)
+
+
+def _still_presses(ctx: Context, t: Floats, tau: Floats) -> Outcome | None:
+    """The failure of a started gripper with a torque, N m, that its last command had asked for."""
+    t, tau = t[np.isfinite(tau)], tau[np.isfinite(tau)]
+    if len(t) < 5:
+        return None
+    limit = ctx.tolerance("max_tau_nm")
+    # a motor that releases a grip may still show its force at first
+    for x in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1):
+        at = float(x)
+        piece = np.abs(tau[(t >= at) & (t < at + 0.1)])
+        felt = median(piece) if len(piece) >= 3 else 0.0
+        if felt > limit:
+            text = f"tau_est of {felt:.2f} N m before the first command after a start"
+            outcome = ctx.failed(f"{felt:.2f} N m", text, ctx.at(ctx.states.topic, at), tau_nm=felt)
+            return outcome.pressed(felt, limit)
+    return None

@@ -187,6 +187,18 @@ class BurstsForTwoSeconds(BurstsWithGoodStamps):
         return super().publish()
 
 
+@wrong_hand(("DEX1-RATE-04", "DEX3-RATE-04"), also=("DEX1-RATE-02",))
+class PausesOften(Service):
+    """Publishes nothing for 60 ms three times in one second of four: each is allowed."""
+
+    length, times, every = 0.06, (0.1, 0.4, 0.7), 4.0
+
+    def publish(self) -> list[Sample]:
+        at = self.now % self.every
+        pauses = any(begin <= at < begin + self.length for begin in self.times)
+        return [] if pauses else super().publish()
+
+
 @wrong_hand(("DEX1-ORDER-01", "DEX3-ORDER-01"))
 class RepeatsOldStates(Service):
     """Publishes every hundredth state again after the next one."""
@@ -458,22 +470,30 @@ class HomesAtTheStart(_Moves):
         super().live(dt)
 
 
-@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), also=("DEX1-START-03",), whole=True)
+@wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"), also=("DEX1-START-03", "DEX3-START-03"), whole=True)
 class HomesWhenRestarted(_Moves):
     """Moves by a tenth of its range after a restart of its service, before any command."""
 
     due = math.inf
+    delay = 0.2
 
     def begin(self, now: float) -> None:
         super().begin(now)
-        self.due = now + 0.2
+        self.due = now + self.delay
 
     def live(self, dt: float) -> None:
-        if self.now > self.due:
+        if self.now >= self.due:
             self.due = math.inf
             for side in self.sides:
                 self.go(side, 0.1)
         super().live(dt)
+
+
+@wrong_hand(("DEX1-START-03", "DEX3-START-03"), whole=True)
+class HomesAtOnceWhenRestarted(HomesWhenRestarted):
+    """Moves by a tenth of its range with its first state after a restart: it is never at rest."""
+
+    delay = 0.0
 
 
 @wrong_hand(

@@ -94,18 +94,48 @@ class _FadingGrip(FingerHand):
         super().move(dt, [0.3 * p for p in pull] if self.pressed > 0.9 else pull)
 
 
-@wrong_hand("DEX5-FORCE-06", also=("DEX5-FORCE-03",), sides=BOTH, whole=True)
+@wrong_hand(
+    "DEX5-FORCE-06",
+    also=("DEX5-FORCE-03", "DEX5-FORCE-05", "DEX5-FORCE-10"),
+    sides=BOTH,
+    whole=True,
+)
 class GripFades(Dex5Service):
     """Presses with a third of the torque after 0.9 s of contact: a limit of the mean current."""
 
     hand_fault = _FadingGrip
 
 
+class _WeakThumb(FingerHand):
+    part = 0.3
+
+    def move(self, dt: float, pull: list[float]) -> None:
+        super().move(dt, [self.part * p if i >= 16 else p for i, p in enumerate(pull)])
+
+
+class _SoftThumb(_WeakThumb):
+    part = 0.43
+
+
+@wrong_hand("DEX5-FORCE-05", sides=BOTH)
+class SoftThumb(Dex5Service):
+    """Moves and presses with less than half of the torque in all joints of the thumb."""
+
+    hand_fault = _SoftThumb
+
+
+@wrong_hand("DEX5-FORCE-10", also=("DEX5-FORCE-03", "DEX5-FORCE-05"), sides=BOTH)
+class WeakThumb(Dex5Service):
+    """Moves and presses with three tenths of the torque in all joints of the thumb."""
+
+    hand_fault = _WeakThumb
+
+
 class _BoostsLittle(fingers.Boosts):
     joints = (13, 14, 15)
 
 
-@wrong_hand("DEX5-FORCE-08", sides=BOTH)
+@wrong_hand("DEX5-FORCE-08", also=("DEX5-FORCE-05",), sides=BOTH)
 class LittleFingerBoosts(Dex5Service):
     """Its little finger presses with two and a half times the torque where it is blocked."""
 
@@ -117,7 +147,7 @@ class _WeakRing(fingers.OtherInContact):
     factor = 0.35
 
 
-@wrong_hand("DEX5-FORCE-08", sides=BOTH)
+@wrong_hand("DEX5-FORCE-08", also=("DEX5-FORCE-05",), sides=BOTH)
 class RingFingerGivesIn(Dex5Service):
     """Its ring finger presses with a third of the torque where it is blocked."""
 

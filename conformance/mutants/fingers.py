@@ -1184,6 +1184,33 @@ class ThumbGivesIn(Dex3Service):
     hand_fault = _WeakThumb
 
 
+@wrong_hand(
+    ("DEX3-FORCE-11", "BRAINCO-FORCE-11"),
+    also=("BRAINCO-FIELD-04", "DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-17"),
+    sides=BOTH,
+)
+class ReportsGoalsWhenStalled(FingerService):
+    """Reports that a stalled joint glides on to its goal, as a filter without contact predicts."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.shown: dict[Side, list[float]] = {}
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        shown = self.shown.get(hand.side, list(hand.q))
+        for i, push in enumerate(hand.contact):
+            aim = float(hand.goal[i]) if hand.touches and abs(push) > 0.005 else hand.q[i]
+            shown[i] += 0.03 * (aim - shown[i]) if aim != hand.q[i] else 0.3 * (aim - shown[i])
+            motors["q"][i] = shown[i]
+        self.shown[hand.side] = shown
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():  # q changes while the hand rests
+            hand.version += 1
+
+
 @wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-FORCE-10", "DEX3-MOVE-09"), sides=BOTH)
 class TorqueInMillis(Dex3Service):
     """Publishes a thousandth of the torque: a conversion from mN m is made twice."""
@@ -1302,7 +1329,7 @@ class _NoLimits(FingerHand):
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
-@wrong_hand("DEX3-SAFE-02", whole=True)
+@wrong_hand("DEX3-SAFE-02", also=("DFX-FORCE-11",), whole=True)
 class NoLimits(FingerService):
     """Follows goals up to 0.5 rad beyond its limits."""
 

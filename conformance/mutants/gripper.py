@@ -754,6 +754,20 @@ class MirroredForce(_Fields):
         return {**fields, "tau_est": -fields["tau_est"]} if side is Side.LEFT else fields
 
 
+@wrong_hand("DEX1-FORCE-20", also=("DEX1-FORCE-03", "DEX1-FORCE-08", "DEX1-FORCE-16"))
+class SignTurnsAfterBadCommands(_Fields):
+    """Publishes tau_est with the other sign once it got a command that is not finite."""
+
+    turned = False
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.turned = self.turned or not all(math.isfinite(m.q) for m in motors)
+        super().motors(side, motors)
+
+    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
+        return {**fields, "tau_est": -fields["tau_est"]} if self.turned else fields
+
+
 class _Chatters(ReferenceHand):
     load = 0.0
 
@@ -1023,6 +1037,17 @@ class NoWatchdog(ReferenceService):
     """Follows the last command without end."""
 
     hand = _NoWatchdog
+
+
+class _Tardy(ReferenceHand):
+    timeout = 1.38 * ReferenceHand.timeout
+
+
+@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",), sides=BOTH)
+class BrakesLate(ReferenceService):
+    """Brakes 1.38 s after the last command: its watchdog counts a slower clock's ticks."""
+
+    hand = _Tardy
 
 
 class _Hasty(ReferenceHand):

@@ -39,6 +39,7 @@ touch          one finger alone presses on the object, if there is one
 firmer         all fingers hold it softly, and one after the other presses firmly
 squeeze        all fingers close on it, for seconds; position servos also on, after a silence, and
                after each restart
+regrip         all fingers close on it once more, at the end: not of position servos
 guarded-step   some joints of each hand have time-out protection from here on (bit 7 of the mode
                byte); a step, and back
 guarded        meanwhile a hand without an object holds its pose
@@ -132,8 +133,9 @@ _SPEEDS = ((0.0, 0.1, 0.2, 0.3, 0.4, 0.15), (0.2, 0.4, -0.2, 0.15, 0.1, 0.3))
 """Speeds of the joints of position servos in two turns, parts of the full one."""
 _SPEEDS_SECONDS = 0.5
 """Seconds of each turn with them."""
-_GRIP_SECONDS = 1.1
-"""Seconds of a grip after a restart."""
+_GRIP_SECONDS, _REGRIP_SECONDS = 1.1, 0.6
+"""Seconds of a grip after a restart of position servos, and of hands with gains: these touch the
+object after 0.2 s."""
 _GRIP_ON_SECONDS = 1.5
 """Seconds for which position servos grip on after a silence, which they need not let go in: five
 seconds of contact, in which a force that fades within six is down to a sixth."""
@@ -450,8 +452,12 @@ class FingerScript(HandScript):
             yield from self._drive("guard-drive", sides, {}, guarded=splits)
             yield from self._silence("guard", self._model.command_timeout + 0.5)
             yield from self._latch_and_clear(splits)
-            return
-        yield from self._silent_by_motion({})
+        else:
+            yield from self._silent_by_motion({})
+        pressing = [s for s in sides if s in self.plan.objects]
+        if pressing and "squeeze" in self.plan.phases and not self.plan.dialect.position_servo:
+            self._report("squeezing the object again")
+            yield from self._squeeze(pressing, _REGRIP_SECONDS, "regrip")
 
     def _silent_by_motion(self, guarded: Mapping[Side, frozenset[int]]) -> Steps:
         """No commands to moving hands, then a step.
@@ -882,14 +888,14 @@ class FingerScript(HandScript):
         yield from self._squeeze(pressing, _GRIP_SECONDS)
         yield from self._to("center", OPEN)
 
-    def _squeeze(self, sides: Sequence[Side], seconds: float) -> Steps:
+    def _squeeze(self, sides: Sequence[Side], seconds: float, name: str = "squeeze") -> Steps:
         """All fingers close on the object, as a phase."""
         squeeze = self._squeezes(sides, {})
         targets = {
             s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
             for s in sides
         }
-        phase = self._begin("squeeze", sides, targets=targets)
+        phase = self._begin(name, sides, targets=targets)
         yield from self._hold(seconds, squeeze)
         self._end(phase)
 

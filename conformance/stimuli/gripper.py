@@ -411,6 +411,19 @@ class GripperScript(HandScript):
         if regrip is not None:
             self._end(regrip)
 
+    def _grips_again(self) -> Steps:
+        """Where commands have gains, the steps after a restart show the torque by their speed."""
+        pressing = [s for s in self.plan.sides if s in self.plan.objects]
+        if self._gains_used or not pressing or "grip" not in self.plan.phases:
+            return
+        self._report("squeezing the object again")
+        self._grip = dict(self._squeeze(pressing))
+        phase = self._begin("regrip", pressing)
+        yield from self._hold(_SQUEEZE)
+        self._end(phase)
+        self._grip = {}
+        yield from self._turn("center", {s: (self._high(),) for s in pressing}, least=0.5)
+
     def _not_restarted(self) -> Steps:
         self._grip = {}
         if self.plan.phases & {"silence", "rejected"}:
