@@ -754,7 +754,11 @@ class MirroredForce(_Fields):
         return {**fields, "tau_est": -fields["tau_est"]} if side is Side.LEFT else fields
 
 
-@wrong_hand("DEX1-FORCE-20", also=("DEX1-FORCE-03", "DEX1-FORCE-08", "DEX1-FORCE-16"))
+@wrong_hand(
+    "DEX1-FORCE-20",
+    also=("DEX1-FORCE-03", "DEX1-FORCE-08", "DEX1-FORCE-16"),
+    whole=True,
+)
 class SignTurnsAfterBadCommands(_Fields):
     """Publishes tau_est with the other sign once it got a command that is not finite."""
 
