@@ -37,7 +37,11 @@ class NanVelocity(_Fields):
         return fields if fields["dq"] else {**fields, "dq": math.nan}
 
 
-@wrong_hand("DEX1-FIELD-21", also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-GAIN-03"), whole=True)
+@wrong_hand(
+    "DEX1-FIELD-21",
+    also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-FRESH-04", "DEX1-GAIN-03"),
+    whole=True,
+)
 class ShowsTheGoalNearIt(_Fields):
     """Publishes the commanded q within 3.5 % of the stroke from it."""
 
@@ -506,10 +510,7 @@ class _Creeps(ReferenceHand):
 
 @wrong_hand(
     "DEX1-MOVE-07",
-    also=(
-        "DEX1-FORCE-11",
-        "DEX1-FORCE-06",
-    ),
+    also=("DEX1-ABUSE-01", "DEX1-FORCE-11", "DEX1-FORCE-06"),
 )
 class Creeps(ReferenceService):
     """Moves the last 3 mm to its goal slowly."""

@@ -143,7 +143,7 @@ class LateState(ReferenceService):
         return {**found, **past[0][1]}
 
 
-@wrong_hand("DEX1-OPER-03")
+@wrong_hand("DEX1-OPER-03", also=("DEX1-OPER-05",))
 class RunsAhead(_PerJoint, ReferenceService):
     """Extrapolates moving goals by 70 ms, and overshoots when they stop."""
 

@@ -83,6 +83,8 @@ __all__ = ["FingerScript"]
 
 OPEN, CLOSED = 15.0, 50.0
 """Percent of closing between which the hand moves freely."""
+_FARTHER = 15.0
+"""Percent of closing by which a hand is farther closed than the other, where both are alike."""
 _FAR = 80.0
 """Percent of closing that is far from both."""
 BEYOND = 25.0
@@ -242,15 +244,32 @@ class FingerScript(HandScript):
         return self._pose(side, OPEN)
 
     def _other_place(self) -> dict[Side, Pose]:
-        """Nearly open or half closed, whichever is farther from here."""
+        """Nearly open or half closed, whichever is farther from here.
+
+        Of hands that are not mirrored, one goes farther, so that commands to the wrong side show.
+        Position servos get a place for each joint (:meth:`_apart`).
+        """
         places = {}
+        farther = self._farther_side()
         for side in self.plan.sides:
             here = self._obs.q.get(side, self._home(side))
+            more = _FARTHER if side is farther else 0.0
             places[side] = max(
-                (self._pose(side, percent) for percent in (OPEN, CLOSED - 5.0)),
+                (self._pose(side, percent + more) for percent in (OPEN, CLOSED - 5.0)),
                 key=lambda pose: sum(abs(a - b) for a, b in zip(pose, here, strict=True)),
             )
         return places
+
+    def _farther_side(self) -> Side | None:
+        """The side that closes farther than the other, without an object; None where their joints
+        are mirrored, or told apart by their goals.
+        """
+        sides = [s for s in self.plan.sides if s not in self.plan.objects]
+        if self.plan.dialect.position_servo or len(self.plan.sides) < 2 or not sides:
+            return None
+        ways = zip(*(self._joints[s] for s in self.plan.sides), strict=True)
+        mirrored = sum(a.closing != b.closing for a, b in ways)
+        return sides[0] if 2 * mirrored < len(self._joints[sides[0]]) else None
 
     def _apart(self, places: Mapping[Side, Pose]) -> dict[Side, Pose]:
         """The places of position servos, in which no two joints have the same goal twice.

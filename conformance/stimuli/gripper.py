@@ -216,11 +216,14 @@ class GripperScript(HandScript):
         return (self._middle(side),)
 
     def _other_place(self) -> dict[Side, Pose]:
-        """The middle or above it, whichever is farther from here."""
+        """The middle or above it, whichever is farther from here; of the second side a little more
+        open, so that commands to the wrong side show.
+        """
         places: dict[Side, Pose] = {}
-        for side in self.plan.sides:
+        for i, side in enumerate(self.plan.sides):
             here = self._obs.q.get(side, (0.0,))[0]
-            above, middle = 0.7 * self._stroke, self._middle(side)
+            above = (0.7 if i == 0 else 0.85) * self._stroke
+            middle = max(self._middle(side), (0.5 if i == 0 else 0.6) * self._stroke)
             places[side] = (above if abs(above - here) > abs(middle - here) else middle,)
         return places
 
