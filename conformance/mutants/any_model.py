@@ -452,6 +452,28 @@ class _Moves(Service):
         )
 
 
+@wrong_hand(
+    "DEX1-SAFE-01", also=("DEX1-PATH-01", "DEX1-WDOG-01", "DEX1-WDOG-03"), sides=BOTH, whole=True
+)
+@wrong_hand(
+    "DEX5-SAFE-01",
+    also=("DEX5-MOVE-08", "DEX5-PATH-01", "DEX5-WDOG-01", "DEX5-WDOG-03"),
+    sides=BOTH,
+    whole=True,
+)
+class CrossesSidesAfterBadCommands(Service):
+    """Gives each side the other's commands for 2 s after one that is not finite."""
+
+    until = -math.inf
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if not all(math.isfinite(m.q) for m in motors):
+            self.until = self.now + 2.0
+        if self.now < self.until:
+            side = Side.LEFT if side is Side.RIGHT else Side.RIGHT
+        super().motors(side, motors)
+
+
 @wrong_hand(("DEX1-STILL-01", "DEX3-STILL-01"))
 class HomesAtTheStart(_Moves):
     """Moves by a tenth of its range before the first command."""
