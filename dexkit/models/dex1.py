@@ -89,7 +89,7 @@ DEX1_1 = HandModel(
     session="dex1_pick_place",
     simulator="sim-dex1",
     simulated_by=Lazy("dexkit.emulators.sim_dex1:sim_dex1"),
-    scored_hands=ScoredHands(quick=40, default=40, thorough=20, external=40),
+    scored_hands=ScoredHands(quick=100, default=100, thorough=20, external=60),
     client=Lazy("dexkit.teleop.client:Dex1Client"),
     operator_profiles=Lazy("dexkit.teleop.profiles:gripper_profiles"),
     skeleton=Lazy("dexkit.models.dex1:skeleton"),

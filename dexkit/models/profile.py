@@ -386,7 +386,7 @@ class HandModel:
     roles: JointRoles | None = None
     objects: Mapping[Side, float] = field(default_factory=dict)
     session: str | Path = ""
-    scored_hands: ScoredHands = ScoredHands(quick=20, default=20, external=20)
+    scored_hands: ScoredHands = ScoredHands(quick=40, default=40, external=30)
     wrong_hands: Lazy[ModuleType] | None = None
     layout: HandLayout | None = None
     skeleton: Lazy[Callable[[Side], Skeleton]] | None = None
