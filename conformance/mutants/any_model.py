@@ -455,12 +455,6 @@ class _Moves(Service):
 @wrong_hand(
     "DEX1-SAFE-01", also=("DEX1-PATH-01", "DEX1-WDOG-01", "DEX1-WDOG-03"), sides=BOTH, whole=True
 )
-@wrong_hand(
-    "DEX5-SAFE-01",
-    also=("DEX5-MOVE-08", "DEX5-PATH-01", "DEX5-WDOG-01", "DEX5-WDOG-03"),
-    sides=BOTH,
-    whole=True,
-)
 class CrossesSidesAfterBadCommands(Service):
     """Gives each side the other's commands for 2 s after one that is not finite."""
 

@@ -265,3 +265,13 @@ wrong_hand(
         "DEX5-TRACK-02",
     ),
 )(operator.LateFingers)
+# the hands are not mirrored
+wrong_hand(
+    "DEX5-SAFE-01",
+    also=("DEX5-MOVE-08", "DEX5-PATH-01", "DEX5-WDOG-01", "DEX5-WDOG-03"),
+    sides=BOTH,
+    whole=True,
+)(any_model.CrossesSidesAfterBadCommands)
+wrong_hand("DEX5-FORCE-11", also=("DEX5-FIELD-05", "DEX5-FIELD-17"), sides=BOTH)(
+    fingers.ReportsGoalsWhenStalled
+)

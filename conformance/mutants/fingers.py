@@ -1329,7 +1329,10 @@ class _NoLimits(FingerHand):
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
-@wrong_hand("DEX3-SAFE-02", also=("DFX-FORCE-11",), whole=True)
+@wrong_hand("DEX3-SAFE-02", whole=True)
+# its goal is so far that it presses through the object
+@wrong_hand("DFX-SAFE-02", also=("DFX-FORCE-11",), whole=True)
+@wrong_hand("FTP-SAFE-02", whole=True)
 class NoLimits(FingerService):
     """Follows goals up to 0.5 rad beyond its limits."""
 
