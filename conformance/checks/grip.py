@@ -36,8 +36,6 @@ _OTHER_UNITS = (1e-3, 1e3)
 """Factors of tau_est where N m and mN m are mistaken for each other, in a dialect that has both."""
 _PRESSED_S = 0.3
 """Seconds at the end of a squeeze in which the joints stand."""
-_UNEXPLAINED = 3.0
-"""Factor between tau_est and what the command asks for."""
 _HELD = 0.2
 """Quantile of tau_est that counts as held, and from above as reached."""
 _STANDS = 0.01
@@ -293,10 +291,10 @@ def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
 
 @check("DEX3-FORCE-11", "BRAINCO-FORCE-11")
 def stops_at_object(ctx: Context) -> Outcome:
-    """How far q of the joints that close on the object goes past it, in parts of the way from there
-    to their goals: the least of them, as an object need not touch every joint.
+    """The least part of the way from the object to its goal that a joint goes.
 
-    A requirement with ``min_tau_nm`` wants the torque of a joint past the object explained, too.
+    One joint is enough, as an object need not touch all. A requirement with ``min_tau_nm`` also
+    limits the torque of the joints that go farther.
     """
     touch = ctx.object_at
     if touch is None:
@@ -354,7 +352,7 @@ def _unexplained(ctx: Context, rows: Rows, past: Mapping[int, float]) -> tuple[i
     asked = np.abs(np.median(_law(ctx, rows)[0], axis=0))
     felt = np.abs(np.median(ctx.states.tau[rows], axis=0)) / torque_scales(ctx, least)
     for joint, part in past.items():
-        much = felt[joint] >= least and felt[joint] >= _UNEXPLAINED * asked[joint]
+        much = felt[joint] >= least and felt[joint] > ctx.tolerance("max_ratio") * asked[joint]
         if part > ctx.tolerance("max_past_part") and much:
             return joint, float(felt[joint])
     return None

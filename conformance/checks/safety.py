@@ -325,24 +325,21 @@ def brakes(ctx: Context) -> Outcome:
                     ctx.at(states.topic, back[0], end),
                     tau_nm=back[1],
                 ).pressed(back[1], ctx.tolerance("max_back_nm"))
-            begun = _pieces(ctx, *_brake_begins(ctx, last))[:1]
-            if begun and begun[0][1] > _NOT_BEGUN * pressed:
-                at, felt = begun[0]
-                return ctx.failed(
-                    f"{felt:.2f} N m",
-                    f"pressed with {pressed:.2f} N m at the last command, and still with "
-                    f"{felt:.2f} N m {at - last:.2f} s later",
-                    ctx.at(states.topic, last + timeout, end),
-                    tau_nm=felt,
-                ).pressed(felt, _NOT_BEGUN * pressed)
-            if still > ctx.tolerance("max_tau_part") * pressed:
-                return ctx.failed(
-                    f"{still:.2f} N m",
-                    f"pressed with {pressed:.2f} N m at the last command, and still with "
-                    f"{still:.2f} N m after the time-out",
-                    ctx.at(states.topic, last + timeout, end),
-                    tau_nm=still,
-                ).pressed(still, ctx.tolerance("max_tau_part") * pressed)
+            due = last + timeout + ctx.tolerance("grace_s")
+            limits = (
+                (_first_size(ctx, due), "begun_part", f"{due - last:.2f} s later"),
+                (still, "max_tau_part", "after the time-out"),
+            )
+            for felt, part, when in limits:
+                most = ctx.tolerance(part) * pressed
+                if felt > most:
+                    return ctx.failed(
+                        f"{felt:.2f} N m",
+                        f"pressed with {pressed:.2f} N m at the last command, and still with "
+                        f"{felt:.2f} N m {when}",
+                        ctx.at(states.topic, last + timeout, end),
+                        tau_nm=felt,
+                    ).pressed(felt, most)
             measures.append(
                 Measure(still, ctx.tolerance("max_tau_part") * pressed, "N m", Quantity.TORQUE)
             )
@@ -380,16 +377,11 @@ def _opposes(ctx: Context, since: float, end: float, before: float) -> tuple[flo
 
 
 _PIECE_S = 0.1
-_NOT_BEGUN = 0.9
-"""Part of the force from which a gripper has not begun to release."""
 
 
-def _brake_begins(ctx: Context, last: float) -> tuple[float, float]:
-    """The piece of a silence in which a brake must have begun, s: after the time-out and grace, and
-    after the states and the sources of command that are a little older.
-    """
-    at = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
-    return at, at + _PIECE_S
+def _first_size(ctx: Context, begin: float) -> float:
+    """The median abs(tau_est) of the piece that begins then, N m; 0 without states."""
+    return max((size for _, size in _pieces(ctx, begin, begin + _PIECE_S)), default=0.0)
 
 
 def _pieces(ctx: Context, begin: float, end: float) -> list[tuple[float, float]]:

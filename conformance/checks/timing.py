@@ -340,7 +340,7 @@ def regular(ctx: Context) -> Outcome:
 
 @check("DEX1-RATE-05", "DEX3-RATE-05")
 def spread(ctx: Context) -> Outcome:
-    """The most long intervals between states in a window, as published and as received."""
+    """The largest number of long intervals in a window, as published and as received."""
     return _long_intervals(
         ctx, ctx.tolerance("max_interval_s"), ctx.tolerance("window_s"), ctx.tolerance("max_count")
     )

@@ -1190,7 +1190,7 @@ class ThumbGivesIn(Dex3Service):
     sides=BOTH,
 )
 class ReportsGoalsWhenStalled(FingerService):
-    """Reports that a stalled joint glides on to its goal, as a filter without contact predicts."""
+    """Reports that a stalled joint moves on to its goal: q is predicted, and not measured."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)

@@ -758,19 +758,12 @@ class MirroredForce(_Fields):
 @wrong_hand(
     "DEX1-FORCE-20",
     also=("DEX1-FORCE-03", "DEX1-FORCE-08", "DEX1-FORCE-16"),
-    whole=True,
 )
-class SignTurnsAfterBadCommands(_Fields):
-    """Publishes tau_est with the other sign once it got a command that is not finite."""
-
-    turned = False
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.turned = self.turned or not all(math.isfinite(m.q) for m in motors)
-        super().motors(side, motors)
+class SignTurns(_Fields):
+    """Publishes tau_est with the other sign from 5 s on: its motor was enabled again."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": -fields["tau_est"]} if self.turned else fields
+        return {**fields, "tau_est": -fields["tau_est"]} if self.now > 5.0 else fields
 
 
 class _Chatters(ReferenceHand):

@@ -91,10 +91,10 @@ def cost(mutant: Mutant) -> float:
 
 
 def essential(given: Sequence[Mutant]) -> tuple[Mutant, ...]:
-    """The cheapest wrong hand of each MUST."""
+    """The cheapest wrong hand of each MUST, if possible one that a short run shows."""
     musts = {r.id for r in catalogue(None, None) if r.level is Level.MUST}
     found: dict[str, Mutant] = {}
-    for mutant in sorted(given, key=cost):
+    for mutant in sorted(given, key=lambda m: (cost(m), m.whole)):
         if mutant.kills in musts:
             found.setdefault(mutant.kills, mutant)
     return tuple(found.values())

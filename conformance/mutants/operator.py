@@ -57,11 +57,11 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand("DEX1-OPER-06", also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-04"), whole=True)
+@wrong_hand("DEX1-OPER-06", also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-04"))
 class DeadBand(_DeadBand, ReferenceService):
-    """Ignores a goal nearer than 0.14 rad: the client waits there and never moves on."""
+    """Ignores a goal nearer than 0.16 rad: the client waits there and never moves on."""
 
-    band = 0.14 / 5.4
+    band = 0.16 / 5.4
 
 
 @wrong_hand(

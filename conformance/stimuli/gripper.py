@@ -415,7 +415,10 @@ class GripperScript(HandScript):
             self._end(regrip)
 
     def _grips_again(self) -> Steps:
-        """Where commands have gains, the steps after a restart show the torque by their speed."""
+        """A grip after the restart of the service.
+
+        Not in dialects with gains: there the steps after a restart show a loss of torque.
+        """
         pressing = [s for s in self.plan.sides if s in self.plan.objects]
         if self._gains_used or not pressing or "grip" not in self.plan.phases:
             return
