@@ -46,6 +46,9 @@ ASIDE = 0.15
 """Part of a joint's range of a step that one side makes while the other gets bad commands."""
 ASIDE_SECONDS = 1.0
 """Least time, s, in which a side is asked to make such a step."""
+_OTHER_FAR = 10.0
+"""A q far beyond both ends, rad, that leads to the other side than 1000 where a hand takes q modulo a
+turn."""
 BETWEEN = 0.3
 """Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 SINGLES, SINGLE_SECONDS = 10, 0.25
@@ -386,7 +389,7 @@ class HandScript(Script[Side]):
         """Commands that are not finite, and such that are far out of range, soon after a pause."""
         if "nan" in self.plan.phases:
             yield from self._bad_commands("nan", self.plan.sides, [broken], 0.1)
-        yield from self._far_away(1000.0, 0.15)
+        yield from self._far_away(_OTHER_FAR, 0.15)
         if self.plan.phases & {"nan", "out-of-range"}:
             yield from self._everyone(
                 "recover", self._other_place(), after=self._bad_phases_since_recovery
