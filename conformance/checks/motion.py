@@ -640,12 +640,13 @@ def ends(ctx: Context) -> Outcome:
 @check("DEX1-SIDE-01", "DEX3-SIDE-01")
 def independent(ctx: Context) -> Outcome:
     """Motion of this hand while only the other hand's target changes."""
-    name = ctx.requirement.phase or ""
-    others = [p for p in ctx.recording.phases(name) if ctx.side not in p.sides]
+    first = ctx.requirement.phase or ""
+    names = (first, "company", *_AFTER_A_PAUSE)
+    others = [(n, p) for n in names for p in ctx.recording.phases(n) if ctx.side not in p.sides]
     if not others:
         return ctx.skipped("only one side was commanded")
     moved: list[tuple[float, float, int, float, float]] = []
-    for phase in others:
+    for name, phase in others:
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
         t, positions = ctx.states.t[rows], ctx.states.q[rows]
@@ -656,9 +657,21 @@ def independent(ctx: Context) -> Outcome:
         # judged by MOVE-03
         bins = ((t - begin) / 0.25).astype(np.intp)
         counts = np.bincount(bins)
+        given = ctx.commands.q[: int(np.searchsorted(ctx.commands.t, end))]
         for joint, spec in enumerate(ctx.joints):
             means = np.bincount(bins, positions[:, joint])[counts > 0] / counts[counts > 0]
-            most = float(np.abs(means - mean(before[:, joint])).max())
+            start = mean(before[:, joint])
+            goals = given[np.isfinite(given[:, joint]), joint]
+            low = high = start
+            if name != first and len(goals):
+                # the later steps are shorter: the end of its own one may still be ahead
+                goal = float(np.clip(goals[-1], spec.q_min, spec.q_max))
+                ahead = ctx.tolerance("max_rest_stroke", joint)
+                low, high = (
+                    max(min(start, goal), start - ahead),
+                    min(max(start, goal), start + ahead),
+                )
+            most = float(np.maximum(low - means, means - high).max(initial=0.0))
             moved.append((most / spec.stroke, most, joint, begin, end))
     if not moved:
         return ctx.skipped("no state of this hand while the other one moved")

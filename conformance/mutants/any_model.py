@@ -10,7 +10,7 @@ from dexkit.conformance.motor_messages import Motor, sequence_of
 from dexkit.conformance.mutants.registry import BOTH, obeys_gains, takes_floats, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
-from dexkit.hand import Side
+from dexkit.hand import JointSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import HandModel, model
 
@@ -371,15 +371,18 @@ class EmptyNowAndThen(Service):
 @wrong_hand(
     "BRAINCO-SIDE-01",
     also=(
-        *("BRAINCO-SAFE-01", "BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
-        *("BRAINCO-WDOG-01", "BRAINCO-WDOG-03"),
+        *("BRAINCO-PATH-01", "BRAINCO-SAFE-01", "BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
+        *("BRAINCO-STILL-01", "BRAINCO-WDOG-01", "BRAINCO-WDOG-03"),
     ),
     sides=BOTH,
 )
-@wrong_hand("DFX-SIDE-01", also=("DFX-WDOG-03",), sides=BOTH)
+@wrong_hand("DFX-SIDE-01", also=("DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"), sides=BOTH)
 @wrong_hand(
     "FTP-SIDE-01",
-    also=("FTP-SENS-04", "FTP-SIDE-02", "FTP-WDOG-01", "FTP-WDOG-03"),
+    also=(
+        *("FTP-PATH-01", "FTP-SENS-04", "FTP-SIDE-02", "FTP-STILL-01"),
+        *("FTP-WDOG-01", "FTP-WDOG-03"),
+    ),
     sides=BOTH,
 )
 class Swapped(Service):
@@ -387,6 +390,33 @@ class Swapped(Service):
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
         super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
+
+
+@wrong_hand("DEX1-SIDE-01", also=("DEX1-LIFE-03", "DEX1-PATH-01"), sides=BOTH, whole=True)
+@wrong_hand(
+    "DEX3-SIDE-01",
+    also=(
+        *("DEX3-FORCE-08", "DEX3-GUARD-02", "DEX3-GUARD-03", "DEX3-HOLD-01"),
+        *("DEX3-LIFE-03", "DEX3-MODE-05", "DEX3-PATH-01", "DEX3-STILL-01"),
+    ),
+    sides=BOTH,
+    whole=True,
+)
+@wrong_hand(
+    "BRAINCO-SIDE-01",
+    also=("BRAINCO-LIFE-03", "BRAINCO-PATH-01", "BRAINCO-STILL-01"),
+    sides=BOTH,
+    whole=True,
+)
+class SwappedWhenRestarted(Service):
+    """Each side obeys the other side's commands since the service was restarted: it found the two
+    devices in another order.
+    """
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if self.restarted:
+            side = Side.LEFT if side is Side.RIGHT else Side.RIGHT
+        super().motors(side, motors)
 
 
 @wrong_hand(
@@ -937,7 +967,9 @@ class IgnoresTwo(Service):
             super().receive(topic, payload, client)
 
 
-@wrong_hand(("DEX1-MOVE-09", "DEX3-MOVE-08"), whole=True, where=takes_floats)
+@wrong_hand("DEX1-MOVE-09", also=("DEX1-ABUSE-01",), whole=True)
+@wrong_hand("DEX3-MOVE-08", whole=True, where=takes_floats)
+@wrong_hand("DFX-MOVE-08", also=("DFX-ABUSE-01",), whole=True, where=takes_floats)
 class DeafAfterFar(Service):
     """Ignores commands for 0.8 s after one that is far out of range."""
 
@@ -1238,15 +1270,24 @@ class ParksWhenItEnds(Service):
             hand.timeout = math.inf
             here = [hand.q] if self.codec.joints == 1 else hand.q
             joints = joints_of(self.dialect, side)
-            ends = [
-                j.q_min if q > 0.5 * (j.q_min + j.q_max) else j.q_max
-                for q, j in zip(here, joints, strict=True)
-            ]
+            places = [self.place(q, j) for q, j in zip(here, joints, strict=True)]
             goals = [
                 Motor(q=q, dq=profile.client_dq, kp=kp, kd=kd, mode=self.codec.mode(i))
-                for i, q in enumerate(ends)
+                for i, q in enumerate(places)
             ]
             self.motors(side, tuple(goals))
+
+    def place(self, q: float, joint: JointSpec) -> float:
+        """Where a joint that is at q is sent."""
+        return joint.q_min if q > 0.5 * (joint.q_min + joint.q_max) else joint.q_max
+
+
+@wrong_hand("BRAINCO-LIFE-06", sides=BOTH, whole=True)
+class ParksAtAThird(ParksWhenItEnds):
+    """Commands both hands to a pose of a third of the way when its service ends."""
+
+    def place(self, q: float, joint: JointSpec) -> float:
+        return joint.closed_by(0.33)
 
 
 # --------------------------------------------------------------------------------- tracking

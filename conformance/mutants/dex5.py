@@ -272,6 +272,12 @@ wrong_hand(
     sides=BOTH,
     whole=True,
 )(any_model.CrossesSidesAfterBadCommands)
+wrong_hand(
+    "DEX5-SIDE-01",
+    also=("DEX5-FORCE-08", "DEX5-LIFE-03", "DEX5-PATH-01", "DEX5-STILL-01"),
+    sides=BOTH,
+    whole=True,
+)(any_model.SwappedWhenRestarted)
 wrong_hand("DEX5-FORCE-11", also=("DEX5-FIELD-05", "DEX5-FIELD-17"), sides=BOTH)(
     fingers.ReportsGoalsWhenStalled
 )

@@ -47,19 +47,22 @@ class Thousandths(ServoService):
 @wrong_hand(
     "BRAINCO-SIDE-01",
     also=(
-        "BRAINCO-MOVE-09",
-        "BRAINCO-SAFE-01",
-        "BRAINCO-SPEED-02",
-        "BRAINCO-SPEED-03",
-        "BRAINCO-WDOG-01",
-        "BRAINCO-WDOG-03",
+        *("BRAINCO-MOVE-09", "BRAINCO-PATH-01", "BRAINCO-SAFE-01", "BRAINCO-SPEED-02"),
+        *("BRAINCO-SPEED-03", "BRAINCO-STILL-01", "BRAINCO-WDOG-01", "BRAINCO-WDOG-03"),
     ),
     sides=BOTH,
 )
-@wrong_hand("DFX-SIDE-01", also=("DFX-MOVE-09", "DFX-WDOG-03"), sides=BOTH)
+@wrong_hand(
+    "DFX-SIDE-01",
+    also=("DFX-MOVE-09", "DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"),
+    sides=BOTH,
+)
 @wrong_hand(
     "FTP-SIDE-01",
-    also=("FTP-MOVE-09", "FTP-SIDE-02", "FTP-WDOG-01", "FTP-WDOG-03"),
+    also=(
+        *("FTP-MOVE-09", "FTP-PATH-01", "FTP-SIDE-02", "FTP-STILL-01"),
+        *("FTP-WDOG-01", "FTP-WDOG-03"),
+    ),
     sides=BOTH,
 )
 class StatesSwapped(ServoService):

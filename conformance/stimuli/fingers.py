@@ -118,9 +118,10 @@ _STATUSES = range(2, 8)
 """Values of the three status bits without a meaning in a command to a hand. A status
 of 6 calibrates a motor only with a certain torque, which these commands do not have
 (docs/sources/unitree-dex.md#g)."""
-_AT_SHUTDOWN = 30.0
-"""Percent of closing from which a hand moves when its service ends: far enough from both ends and
-from the object that it is seen if the hand opens or closes then."""
+_AT_SHUTDOWN = (30.0, 45.0)
+"""Percent of closing from which hands move when their service ends: far enough from both ends and
+from the object that it is seen if one opens or closes then. The second is of one of two hands: a
+service that sends both to one place moves at least one of them."""
 _STAYS = 4.1
 """Seconds after the time-out in which a hand must do what its protection says: a client that has
 died is started again within them, and its operator relies on what the hand holds."""
@@ -451,7 +452,7 @@ class FingerScript(HandScript):
                 yield from self._hold(BETWEEN)
                 bad = self._malformed(name, sides)[0]
                 yield from self._bad_commands(name, sides, [bad], 0.15)
-        yield from self._far_away(1000.0, 0.2)
+        yield from self._far_away((1000.0, -1000.0), 0.2)
         yield from self._everyone(
             "recover", self._other_place(), most=1.5, after=self._bad_phases_since_recovery
         )
@@ -460,8 +461,12 @@ class FingerScript(HandScript):
 
     def _before_shutdown(self) -> Steps:
         """Move: what was commanded last must not be in force after the restart."""
-        yield from self._to("center", _AT_SHUTDOWN)
-        yield from self._drive("drive", self.plan.sides, {})
+        sides, (near, far) = self.plan.sides, _AT_SHUTDOWN
+        free = [s for s in sides if s not in self.plan.objects]
+        other = free[-1] if free and len(sides) > 1 else None
+        poses = {s: self._pose(s, far if s is other else near) for s in sides}
+        yield from self._everyone("center", poses, most=1.5)
+        yield from self._drive("drive", sides, {})
 
     def _silent_again(self) -> Steps:
         yield from self._to("center", OPEN)

@@ -390,7 +390,7 @@ class GripperScript(HandScript):
             kp, kd = self._model.client_gains
             wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
             yield from self._bad_commands("negative", sides, [wrong], 0.15)
-        yield from self._far_away(1e6, 0.2)
+        yield from self._far_away((1e6, -1e6), 0.2)
         yield from self._everyone(
             "recover", self._other_place(), after=self._bad_phases_since_recovery
         )

@@ -46,9 +46,6 @@ ASIDE = 0.15
 """Part of a joint's range of a step that one side makes while the other gets bad commands."""
 ASIDE_SECONDS = 1.0
 """Least time, s, in which a side is asked to make such a step."""
-_OTHER_FAR = 10.0
-"""A q far beyond both ends, rad, that leads to the other side than 1000 where a hand takes q modulo a
-turn."""
 BETWEEN = 0.3
 """Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 SINGLES, SINGLE_SECONDS = 10, 0.25
@@ -389,22 +386,23 @@ class HandScript(Script[Side]):
         """Commands that are not finite, and such that are far out of range, soon after a pause."""
         if "nan" in self.plan.phases:
             yield from self._bad_commands("nan", self.plan.sides, [broken], 0.1)
-        yield from self._far_away(_OTHER_FAR, 0.15)
+        # taken modulo a turn, 11 rad leads to the wrong end, and 1000 rad to the right one
+        yield from self._far_away((11.0, -1000.0), 0.15)
         if self.plan.phases & {"nan", "out-of-range"}:
             yield from self._everyone(
                 "recover", self._other_place(), after=self._bad_phases_since_recovery
             )
 
-    def _far_away(self, far: float, each: float) -> Steps:
+    def _far_away(self, goals: Sequence[float], each: float) -> Steps:
         """Commands far beyond both ends, to all sides at once.
 
-        :param far: q of every joint, rad.
-        :param each: seconds of each end.
+        :param goals: q of every joint, rad, one after the other.
+        :param each: seconds of each.
         """
         sides = self.plan.sides
         if "out-of-range" in self.plan.phases:
             joints = len(self._joints[sides[0]])
-            kinds = [{s: self._at(s, [q] * joints) for s in sides} for q in (far, -far)]
+            kinds = [{s: self._at(s, [q] * joints) for s in sides} for q in goals]
             yield from self._bad_commands("out-of-range", sides, kinds, each)
 
     @property
