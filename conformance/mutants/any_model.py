@@ -934,6 +934,7 @@ class GivesUpOnTwo(Service):
     also=(
         "DEX3-LIFE-02",
         "DEX1-LIFE-02",
+        "DEX1-SIDE-01",
     ),
 )
 class StaysWithTheNewest(Service):
