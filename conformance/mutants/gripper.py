@@ -758,6 +758,7 @@ class MirroredForce(_Fields):
 @wrong_hand(
     "DEX1-FORCE-20",
     also=("DEX1-FORCE-03", "DEX1-FORCE-08", "DEX1-FORCE-16"),
+    whole=True,
 )
 class SignTurns(_Fields):
     """Publishes tau_est with the other sign from 5 s on: its motor was enabled again."""
@@ -938,7 +939,7 @@ class _HoldingCurrent(ReferenceHand):
             self.still += dt
 
 
-@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH)
+@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True)
 class HoldingCurrent(ReferenceService):
     """Holds an object with a third of the torque from 0.3 s on, as the driver of a stepper does."""
 
