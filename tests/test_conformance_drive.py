@@ -116,6 +116,14 @@ def test_noise_of_q_does_not_hide_that_a_torque_moves_a_gripper() -> None:
     assert found == [Verdict.PASS] * 4
 
 
+def test_a_servo_that_stays_where_it_was_a_moment_ago_does_not_park() -> None:
+    """Released under way, it returns by what it moved within its latency."""
+    hand = parse("inspire-dfx/inspire_dfx:brake-release+soft-start+latency-20")
+    results = run_mutant(hand.service(), plan_for(hand.dialect.name, sides=hand.sides)).results
+    found = [r.verdict for r in results if r.requirement.id == "DFX-LIFE-06"]
+    assert found == [Verdict.PASS] * 2
+
+
 def test_a_default_run_of_hands_is_short_enough() -> None:
     """90 s, less the start of the service and the hands' own time to arrive: 3 s and more."""
     for name in ("dex1-1", "dex3-1"):

@@ -203,6 +203,10 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
     return worst
 
 
+_KNOWN_S = 0.1
+"""Seconds by which the position may be old at which a hand that is told to stay stays."""
+
+
 @check("DEX1-LIFE-06", "DEX3-LIFE-06")
 def no_new_goal(ctx: Context) -> Outcome:
     """Distance of the hand, after a restart of its service, from where it may be.
@@ -223,9 +227,10 @@ def no_new_goal(ctx: Context) -> Outcome:
             if not np.isfinite(place).all() or not math.isfinite(found):
                 continue
             speed = float(place[-1] - place[0]) / max(float(t[-1] - t[0]), 1e-3)
-            rad = found - float(place[-1])
+            recent = place[t >= t[-1] - _KNOWN_S]
+            away = max(float(recent.min()) - found, found - float(recent.max()), 0.0)
             moved = abs(speed) >= ctx.tolerance("min_speed_stroke", joint)
-            against = 0.0 if moved and rad * speed > 0.0 else abs(rad)
+            against = 0.0 if moved and (found - float(place[-1])) * speed > 0.0 else away
             part = against / spec.stroke
             if worst is None or part > worst[0]:
                 worst = part, against, float(place[-1]), joint, begin, end
