@@ -662,15 +662,11 @@ def independent(ctx: Context) -> Outcome:
             means = np.bincount(bins, positions[:, joint])[counts > 0] / counts[counts > 0]
             start = mean(before[:, joint])
             goals = given[np.isfinite(given[:, joint]), joint]
-            low = high = start
-            if name != first and len(goals):
-                # the later steps are shorter: the end of its own one may still be ahead
-                goal = float(np.clip(goals[-1], spec.q_min, spec.q_max))
-                ahead = ctx.tolerance("max_rest_stroke", joint)
-                low, high = (
-                    max(min(start, goal), start - ahead),
-                    min(max(start, goal), start + ahead),
-                )
+            goal = float(np.clip(goals[-1], spec.q_min, spec.q_max)) if len(goals) else start
+            # the later steps are shorter: the end of its own one may still be ahead
+            rest = 0.0 if name == first else ctx.tolerance("max_rest_stroke", joint)
+            end_q = float(np.clip(goal, start - rest, start + rest))
+            low, high = min(start, end_q), max(start, end_q)
             most = float(np.maximum(low - means, means - high).max(initial=0.0))
             moved.append((most / spec.stroke, most, joint, begin, end))
     if not moved:

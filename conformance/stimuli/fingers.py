@@ -120,8 +120,8 @@ of 6 calibrates a motor only with a certain torque, which these commands do not 
 (docs/sources/unitree-dex.md#g)."""
 _AT_SHUTDOWN = (30.0, 45.0)
 """Percent of closing from which hands move when their service ends: far enough from both ends and
-from the object that it is seen if one opens or closes then. The second is of one of two hands: a
-service that sends both to one place moves at least one of them."""
+from the object that it is seen if one opens or closes then. Two hands stand at different ones: a
+service that sends both to the same place moves at least one of them."""
 _STAYS = 4.1
 """Seconds after the time-out in which a hand must do what its protection says: a client that has
 died is started again within them, and its operator relies on what the hand holds."""
@@ -461,10 +461,10 @@ class FingerScript(HandScript):
 
     def _before_shutdown(self) -> Steps:
         """Move: what was commanded last must not be in force after the restart."""
-        sides, (near, far) = self.plan.sides, _AT_SHUTDOWN
+        sides, (less, more) = self.plan.sides, _AT_SHUTDOWN
         free = [s for s in sides if s not in self.plan.objects]
-        other = free[-1] if free and len(sides) > 1 else None
-        poses = {s: self._pose(s, far if s is other else near) for s in sides}
+        closed_more = free[-1] if free and len(sides) > 1 else None
+        poses = {s: self._pose(s, more if s is closed_more else less) for s in sides}
         yield from self._everyone("center", poses, most=1.5)
         yield from self._drive("drive", sides, {})
 
