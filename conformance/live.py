@@ -150,7 +150,13 @@ def record_run(
         heart = Heartbeat()
         recording = stack.enter_context(
             DdsRecording(
-                recorder_node, recorder, sorted(topics), poll=POLL, on_late=heart.note_late
+                recorder_node,
+                recorder,
+                sorted(topics),
+                poll=POLL,
+                on_late=heart.note_late,
+                # a backend of the kit's own starts later, on a domain that is free until then
+                fresh=rig_options.backend != EXTERNAL,
             )
         )
         if rig_options.backend != EXTERNAL:

@@ -10,7 +10,7 @@ import pytest
 
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS
-from dexkit.traces import Recorder, open_trace
+from dexkit.traces import Recorder, dds_recording, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from tests.dds_helpers import DdsNode, free_domain, wait_until
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, state
@@ -45,6 +45,18 @@ def test_known_topic_is_subscribed_before_it_has_a_writer(tmp_path: Path) -> Non
     ):
         assert recording.subscribed == [CMD]
         assert other.discovery.wait(lambda _: types_read(other) == expected, timeout=60)
+
+
+def test_topics_that_nothing_uses_yet_are_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dds_recording, "_DISCOVERY_WAIT", 3600.0)
+    with (
+        DdsNode(free_domain()) as node,
+        Recorder(tmp_path / "a.mcap") as out,
+        DdsRecording(node, out, [CMD], fresh=True) as recording,
+    ):
+        assert recording.subscribed == [CMD]
 
 
 def test_polling_records_every_sample_in_order(tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ class DdsRecording:
     :param on_late: only with ``poll``: called from the recording's thread with begin and end, ns
         since the epoch, of each time in which it did not look for samples, and the seconds that
         this was too long. What was received meanwhile has the time of the end.
+    :param fresh: nothing uses the topics yet, so that no type has to be waited for.
 
     Endpoints and their QoS, and what was lost, are stored whenever they change, so that a killed
     recording contains them.
@@ -87,11 +88,13 @@ class DdsRecording:
         max_topics: int = MAX_TOPICS,
         poll: float | None = None,
         on_late: Callable[[int, int, float], None] | None = None,
+        fresh: bool = False,
     ) -> None:
         if on_late is not None and poll is None:
             raise UsageError("only a recording that polls can tell when it was late")
         self.node = node
         self._poll = poll
+        self._discovery_wait = 0.0 if fresh else _DISCOVERY_WAIT
         self._on_late = on_late
         self.recorder = recorder
         self.losses = Losses()
@@ -138,7 +141,9 @@ class DdsRecording:
         def unused(endpoints: list[Endpoint]) -> set[str]:
             return guesses.keys() - {e.topic for e in endpoints if not e.own}
 
-        self.node.discovery.wait(lambda endpoints: not unused(endpoints), timeout=_DISCOVERY_WAIT)
+        self.node.discovery.wait(
+            lambda endpoints: not unused(endpoints), timeout=self._discovery_wait
+        )
         for topic in sorted(unused(self.node.endpoints())):
             for type_name in guesses[topic]:
                 self._subscribe(topic, type_name)
