@@ -33,8 +33,8 @@ def _pressures(
     if ctx.recording.dialect.touch_topic:
         touch = ctx.recording.touch.get(ctx.side if side is None else side)
         return None if touch is None else touch.median(begin, end)
-    states = ctx.states if side is None else ctx.recording.sides[side].states
-    columns = states.columns
+    hand = ctx.hand if side is None else ctx.recording.sides[side]
+    states, columns = hand.states, hand.states.columns
     rows = states.between(begin, end)
     if columns is None or not len(states.t[rows]):
         return None
@@ -42,10 +42,11 @@ def _pressures(
     least = int(count.min(initial=99))
     if not 0 < least < 99:
         return None
-    values = np.stack(
-        [columns[f"press_sensor_state[{i}].pressure"][rows] for i in range(least)], axis=1
-    )
-    found = np.median(values, axis=0)
+    packets = hand.known.setdefault("pressures", {})  # decoded once: there are many phases
+    for i in range(least):
+        if i not in packets:
+            packets[i] = columns[f"press_sensor_state[{i}].pressure"]
+    found = np.median(np.stack([packets[i][rows] for i in range(least)], axis=1), axis=0)
     found[found == _NO_VALUE] = np.nan
     return np.asarray(found)
 
