@@ -203,10 +203,6 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
     return worst
 
 
-_LATENCY_S = 0.1
-"""Seconds by which the position that a hand holds when its service ends may be old."""
-
-
 @check("DEX1-LIFE-06", "DEX3-LIFE-06")
 def no_new_goal(ctx: Context) -> Outcome:
     """Distance of the hand, after a restart of its service, from where it may be.
@@ -227,7 +223,7 @@ def no_new_goal(ctx: Context) -> Outcome:
             if not np.isfinite(place).all() or not math.isfinite(found):
                 continue
             speed = float(place[-1] - place[0]) / max(float(t[-1] - t[0]), 1e-3)
-            recent = place[t >= t[-1] - _LATENCY_S]
+            recent = place[t >= t[-1] - ctx.tolerance("latency_s")]
             away = max(float(recent.min()) - found, found - float(recent.max()), 0.0)
             moved = abs(speed) >= ctx.tolerance("min_speed_stroke", joint)
             against = 0.0 if moved and (found - float(place[-1])) * speed > 0.0 else away
