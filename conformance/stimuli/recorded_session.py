@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,9 +18,11 @@ from dexkit.traces import open_trace, sample_path
 
 __all__ = ["DEFAULT_SECONDS", "CommandSession"]
 
-DEFAULT_SECONDS = 5.5
-FINGERS_SECONDS = 3.9
+DEFAULT_SECONDS = 4.0
+FINGERS_SECONDS = 3.1
 """The same for hands of several joints, whose other stimuli take longer."""
+_MOTION, _BEFORE_MOTION = 0.02, 0.3
+"""A change of q that is a motion, rad, and seconds of a session before its first one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +35,13 @@ class CommandSession:
     commands: dict[Side, Commands]
 
     @classmethod
-    def load(cls, path: Path, *, seconds: float | None = None) -> CommandSession:
+    def load(
+        cls, path: Path, *, seconds: float | None = None, motion: bool = False
+    ) -> CommandSession:
         """The commands of a recording, from the first one on.
 
         :param seconds: no more than so much of it; None for all.
+        :param motion: from shortly before the first motion on.
         :raises ConformanceError: it holds no commands to a hand of the family.
         :raises TraceError: it cannot be read.
         """
@@ -57,6 +63,9 @@ class CommandSession:
                 hint="record a session with 'dexkit record' while it is commanded",
             )
         begin = min(float(c.t[0]) for c in found.values())
+        if motion:
+            moves = min(_first_motion(c) for c in found.values())
+            begin = max(begin, moves - _BEFORE_MOTION) if math.isfinite(moves) else begin
         last = max(float(c.t[-1]) for c in found.values())
         end = last if seconds is None else min(last, begin + seconds)
         return cls(
@@ -68,7 +77,7 @@ class CommandSession:
 
     @classmethod
     def default(cls, hand_model: str = DEX1_1.name) -> CommandSession:
-        """The session of that model's profile.
+        """The session of that model's profile, from its first motion on.
 
         :raises ConformanceError: it has none.
         """
@@ -80,7 +89,8 @@ class CommandSession:
             )
         path = session if isinstance(session, Path) else sample_path(session)
         fingers = not model(hand_model).dialects[0].is_gripper
-        return cls.load(path, seconds=FINGERS_SECONDS if fingers else DEFAULT_SECONDS)
+        seconds = FINGERS_SECONDS if fingers else DEFAULT_SECONDS
+        return cls.load(path, seconds=seconds, motion=True)
 
     def for_hand(self, target: Dialect) -> CommandSession:
         """The session itself, if a hand of that dialect can be asked to repeat it.
@@ -140,6 +150,12 @@ class CommandSession:
             )
             for k in range(c.q.shape[1])
         ]
+
+
+def _first_motion(c: Commands) -> float:
+    """Time of the first command whose q is not that of the first one; infinite if none is."""
+    away = np.flatnonzero((np.abs(c.q - c.q[0]) > _MOTION).any(axis=1))
+    return float(c.t[away[0]]) if len(away) else math.inf
 
 
 def _cut(c: Commands, begin: float, end: float) -> Commands:
