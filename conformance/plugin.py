@@ -120,7 +120,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "thorough",
         action="store_true",
-        help="every stimulus ten times, some ten minutes: what appears late or only sometimes",
+        help="every stimulus twelve times, some ten minutes: what appears late or only sometimes",
     )
     add("list", action="store_true", help=_as_in_pytest(texts.LIST))
     add(

@@ -16,7 +16,7 @@ from dexkit.robots import ROBOTS
 
 __all__ = ["THOROUGH_ROUNDS", "RunKind", "length", "print_selection", "quick"]
 
-THOROUGH_ROUNDS = 10
+THOROUGH_ROUNDS = 12
 """Rounds of a thorough run: about ten minutes of stimulus for a pair of grippers."""
 
 

@@ -216,9 +216,10 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-04",), whole=True)
-@wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02", "BRAINCO-SAFE-10"), whole=True)
+@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
+@wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
 @wrong_hand("DFX-FRESH-01", also=("DFX-SIDE-01",), whole=True)
+@wrong_hand("FTP-FRESH-01", whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -233,7 +234,7 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
-@wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
+@wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-04",), whole=True)
 @wrong_hand(("DEX1-FRESH-01", "BRAINCO-FRESH-01"), whole=True)
 class StaleLater(StaleState):
     """Measures five times a second from 12 s on."""
@@ -318,7 +319,7 @@ class SwapsBuffers(Service):
         return newest if self.turn % 2 or self.ended else past[0][1]
 
 
-@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01"))
+@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01"), also=("DEX1-FIELD-22",))
 class Frozen(Service):
     """Publishes its first measurement forever, at full rate."""
 
@@ -865,7 +866,7 @@ class DiesOfAnyType(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
-@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"), also=("DEX1-LOAD-03",))
+@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"), also=("DEX1-LOAD-03", "DEX1-MOVE-09"), whole=True)
 class QueuesCommands(Service):
     """Queues up to 600 commands and carries out at most two of them in each cycle."""
 
@@ -1090,7 +1091,7 @@ class WaitsForItsReaders(Service):
         return [] if self.loaded and self.now % 0.5 < 0.2 else super().publish()
 
 
-@wrong_hand(("DEX1-LOAD-03", "DEX3-LOAD-03"), also=("DEX1-FIELD-17",))
+@wrong_hand(("DEX1-LOAD-03", "DEX3-LOAD-03"), also=("DEX1-FIELD-16", "DEX1-FIELD-17"))
 class OldUnderLoad(Service):
     """Queues its states for a slow reliable reader: they are 0.3 s old when they leave."""
 

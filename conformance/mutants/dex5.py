@@ -188,7 +188,14 @@ class OneJointGoesOn(Dex5Service):
 
 # Faults that other hands have as well
 
-wrong_hand("DEX5-FRESH-01", also=("DEX5-GAIN-04", "DEX5-GAIN-03"), whole=True)(any_model.StaleState)
+wrong_hand(
+    "DEX5-FRESH-01",
+    also=(
+        *("DEX5-GAIN-03", "DEX5-GAIN-04"),
+        *(f"DEX5-SAFE-0{i}" for i in range(1, 7)),
+    ),
+    whole=True,
+)(any_model.StaleState)
 wrong_hand("DEX5-FRESH-01", whole=True)(any_model.StaleLater)
 wrong_hand("DEX5-FRESH-02", also=("DEX5-FIELD-19",), whole=True)(any_model.FreezesOnce)
 wrong_hand(
@@ -210,15 +217,14 @@ wrong_hand(
 wrong_hand("DEX5-FIELD-16", also=("DEX5-FIELD-19", "DEX5-FORCE-09"))(fingers.ShakenVelocity)
 wrong_hand(
     "DEX5-FIELD-20",
-    also=("DEX5-FIELD-05", "DEX5-FIELD-19", "DEX5-GAIN-04", "DEX5-GAIN-05"),
+    also=("DEX5-FIELD-05", "DEX5-FRESH-03", "DEX5-GAIN-04", "DEX5-GAIN-05"),
     whole=True,
 )(fingers.ShowsTheGoalNearIt)
+wrong_hand("DEX5-PATH-01", also=("DEX5-WDOG-03",))(fingers.BeginsAtZero)
 wrong_hand("DEX5-MOVE-02")(fingers.OtherScale)
 wrong_hand("DEX5-MOVE-03", whole=True)(fingers.Hunts)
 wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))(fingers.Slow)
-wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-TRACK-01", "DEX5-PATH-01"))(
-    fingers.Undamped
-)
+wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-PATH-01"))(fingers.Undamped)
 wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)(fingers.Coupled)
 wrong_hand("DEX5-MOVE-07", also=("DEX5-FORCE-09",))(fingers.Creeps)
 wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))(
@@ -239,7 +245,6 @@ wrong_hand("DEX5-WDOG-03")(fingers.SleepsWithoutGuard)
 wrong_hand(
     "DEX5-OPER-02",
     also=(
-        "DEX5-ABUSE-01",
         "DEX5-CMD-01",
         "DEX5-FORCE-09",
         "DEX5-LOAD-02",
@@ -268,7 +273,10 @@ wrong_hand(
 # the hands are not mirrored
 wrong_hand(
     "DEX5-SAFE-01",
-    also=("DEX5-MOVE-08", "DEX5-PATH-01", "DEX5-WDOG-01", "DEX5-WDOG-03"),
+    also=(
+        *("DEX5-MOVE-08", "DEX5-PATH-01", "DEX5-SAFE-06", "DEX5-SAFE-11"),
+        *("DEX5-WDOG-01", "DEX5-WDOG-03"),
+    ),
     sides=BOTH,
     whole=True,
 )(any_model.CrossesSidesAfterBadCommands)
@@ -278,6 +286,6 @@ wrong_hand(
     sides=BOTH,
     whole=True,
 )(any_model.SwappedWhenRestarted)
-wrong_hand("DEX5-FORCE-11", also=("DEX5-FIELD-05", "DEX5-FIELD-17"), sides=BOTH)(
+wrong_hand("DEX5-FORCE-11", also=("DEX5-FIELD-04", "DEX5-FIELD-05", "DEX5-FIELD-17"), sides=BOTH)(
     fingers.ReportsGoalsWhenStalled
 )

@@ -265,25 +265,23 @@ class _Filled(FingerService):
 @wrong_hand(
     "DEX3-FIELD-20",
     also=(
-        "DEX3-FIELD-04",
         "DEX3-FIELD-05",
         "DEX3-FIELD-19",
         "DEX3-GAIN-03",
         "DEX3-GAIN-04",
         "DEX3-GAIN-05",
-        "DEX3-SAFE-06",
     ),
     whole=True,
 )
 class ShowsTheGoalNearIt(FingerService):
-    """Publishes the commanded q of one joint within a tenth of its range from it."""
+    """Publishes the commanded q of one joint within 8 % of its range from it."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         joint = 3
         if len(motors) > joint and hand.newest:
             goal = float(np.clip(hand.newest[joint].q, hand.low[joint], hand.high[joint]))
-            if abs(goal - hand.q[joint]) < 0.1 * (hand.high[joint] - hand.low[joint]):
+            if abs(goal - hand.q[joint]) < 0.08 * (hand.high[joint] - hand.low[joint]):
                 motors["q"][joint] = goal
 
 
@@ -1108,11 +1106,6 @@ class _Tires(FingerHand):
 
 @wrong_hand(
     "DEX3-FORCE-06",
-    also=(
-        "DEX3-SENS-09",
-        "DEX3-FORCE-05",
-        "DEX3-FORCE-10",
-    ),
     sides=BOTH,
     whole=True,
 )
@@ -1404,7 +1397,7 @@ class GoesHome(FingerHand):
             self.law_on[0], self.law_q[0], self.law_kp[0] = True, self.floor[0], 1.5
 
 
-@wrong_hand("DEX3-WDOG-01", also=("DEX3-GUARD-01", "DEX3-LIFE-06", "DEX3-PATH-01"))
+@wrong_hand("DEX3-WDOG-01", also=("DEX3-GUARD-01", "DEX3-LIFE-06"))
 class FirstJointGoesHome(Dex3Service):
     """Sends its first joint to one end after the time-out, whatever was commanded."""
 
@@ -1505,7 +1498,7 @@ class _BeginsAtZero(FingerHand):
             self.goal = np.minimum(np.maximum(0.0, self.low), self.high)
 
 
-@wrong_hand("DEX3-PATH-01", also=("DEX3-WDOG-03",))
+@wrong_hand("DEX3-PATH-01", also=("DEX3-MODE-05", "DEX3-WDOG-03"))
 class BeginsAtZero(FingerService):
     """Goes towards 0 for 0.15 s when the commands come again after a silence."""
 

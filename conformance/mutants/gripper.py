@@ -39,7 +39,7 @@ class NanVelocity(_Fields):
 
 @wrong_hand(
     "DEX1-FIELD-21",
-    also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-FRESH-04", "DEX1-GAIN-03"),
+    also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-GAIN-03"),
     whole=True,
 )
 class ShowsTheGoalNearIt(_Fields):
@@ -528,7 +528,7 @@ class ShortStroke(ReferenceService):
         super().command(side, replace(motor, q=q))
 
 
-@wrong_hand("DEX1-SIDE-01", also=("DEX1-FORCE-18", "DEX1-SIDE-03", "DEX1-FORCE-12"))
+@wrong_hand("DEX1-SIDE-01", also=("DEX1-SIDE-03", "DEX1-FORCE-12"))
 class Coupled(ReferenceService):
     """The left hand's goal leaks into the right hand's."""
 

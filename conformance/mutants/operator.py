@@ -57,7 +57,7 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand("DEX1-OPER-06", also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-04"))
+@wrong_hand("DEX1-OPER-06", also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-04"), whole=True)
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a goal nearer than 0.16 rad: the client waits there and never moves on."""
 
@@ -85,12 +85,10 @@ class SaturatingGain(ReferenceService):
 @wrong_hand(
     "DEX3-OPER-02",
     also=(
-        "DEX3-ABUSE-01",
         "DEX3-CMD-01",
         "DEX3-LOAD-03",
         "DEX3-MODE-07",
         "DEX3-SAFE-06",
-        "DEX3-SAFE-11",
     ),
     where=obeys_gains,
 )
@@ -143,7 +141,7 @@ class LateState(ReferenceService):
         return {**found, **past[0][1]}
 
 
-@wrong_hand("DEX1-OPER-03", also=("DEX1-OPER-05",))
+@wrong_hand("DEX1-OPER-03", also=("DEX1-OPER-02",))
 class RunsAhead(_PerJoint, ReferenceService):
     """Extrapolates moving goals by 70 ms, and overshoots when they stop."""
 
@@ -214,12 +212,12 @@ class _OpenEnd(_PerJoint):
         raise AssertionError  # overridden
 
 
-@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05"))
+@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05", "DEX3-TRACK-01"))
 @wrong_hand("BRAINCO-OPER-01", also=("BRAINCO-OPER-05",))
 class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range per second."""
 
-    speed = 0.1
+    near = speed = 0.1
 
     def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
         taken = goal

@@ -241,7 +241,7 @@ class _LetsGo(ServoHand):
 
 @wrong_hand(
     "BRAINCO-GRIP-01",
-    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09", "FTP-FORCE-06", "FTP-TOUCH-05"),
+    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09", "FTP-FORCE-06"),
     sides=BOTH,
     whole=True,
 )
@@ -540,7 +540,7 @@ class _GivesUp(_WeakAgain):
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
-@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-06", "FTP-SENS-09"), sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
 class ForceGivesUp(_FeelingService):
     """Presses with a seventh of its force after a second of a grip."""
 

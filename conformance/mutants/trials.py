@@ -131,7 +131,7 @@ class TopicTrial(ABC):
             needed = select(every, prefixes=[mutant.kills, *mutant.also])
             return replace(full, phases=self._short(mutant, needed))
         if not any(r.id == mutant.kills and r.phase == OPERATOR for r in every):
-            # eleven seconds without a finding that other phases do not give
+            # six seconds without a finding that other phases do not give
             full = replace(full, phases=full.phases - {OPERATOR})
         return full
 

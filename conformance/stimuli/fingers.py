@@ -11,12 +11,14 @@ joint          one joint after the other closes; then every second one opens, an
                Where there are many, all of them open together. Joints that share a motor are one.
 step           one hand closes and opens again, the other holds
 fingerprint    steps to compare the ``recover`` steps with
-nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
-range, empty,  limits, no motors, one too few, one and more too many, two mode bytes with each
-short, long,   other's id, negative gains; and a client of another type on the topic. Each kind
-wrong-id,      stands for a while, on each side alone.
+nan, out-of-   bad commands, followed by ``recover``, a good step: not finite; far outside the
+range,         limits; a client of another type on the topic, no motors, one too few, one and more
+foreign,       too many, negative gains, unknown statuses, and two mode bytes with each other's id.
+empty, short,  Each kind stands for a while, on each side alone where it has a topic of its own.
+long,
 negative,
-foreign
+status,
+wrong-id
 beside         a step of one side while the other one gets bad commands, or none
 burst          hundreds of commands at once, of which the last one counts
 stiff, soft,   a step with the client's gains, with a tenth of its stiffness and with a third of it;
@@ -25,7 +27,6 @@ limp           zero gains, with a q far towards closed, and then with one toward
 lock           the first with the client's gains and status 0 or mode 0; again for a later client
 mixed          a step in which some joints are locked under way, by their mode byte, and the others
                go on: three times, with other joints
-status         mode bytes with every status that no document defines
 speeds         position servos: each joint with another speed, and one with none; again with others
 ends           one finger after the other to both ends of its range, with the thumb out of the way
 push, pull     a torque alone, without a position gain: some joints towards closed and the others
@@ -106,11 +107,11 @@ _SPLITS = ((1, 2, 3, 6), (1, 2, 4, 5), (0, 2, 4, 6))
 """Joints with another mode byte than the rest of the hand, in three commands: each joint is among
 them and not, and no two joints are treated alike three times. Where there are many, k counts these
 commands, and every joint without bit 0 of its index is among them, then those with bit 1 and 2."""
-_SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.4, 0.15
+_SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.3, 0.12
 """A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
-_RAMP, _RAMP_SECONDS = 12, 0.24
+_RAMP, _RAMP_SECONDS = 10, 0.2
 """Steps in which a soft hold becomes a firm one, and seconds for all of them."""
-_TOUCH_SECONDS = 0.26
+_TOUCH_SECONDS = 0.22
 """Seconds in which a finger presses on the object alone."""
 _TOUCH_STANDS, _TOUCH_MORE = 0.1, 12
 """Seconds in which it stands then, and how often it is waited for that."""
@@ -122,7 +123,7 @@ _AT_SHUTDOWN = (30.0, 45.0)
 """Percent of closing from which hands move when their service ends: far enough from both ends and
 from the object that it is seen if one opens or closes then. Two hands stand at different ones: a
 service that sends both to the same place moves at least one of them."""
-_STAYS = 4.1
+_STAYS = 3.0
 """Seconds after the time-out in which a hand must do what its protection says: a client that has
 died is started again within them, and its operator relies on what the hand holds."""
 _WIDE = (CLOSED + 5.0, 5.0)
@@ -154,8 +155,12 @@ _BAD = {
 }
 
 
-_TOGETHER = (("short", "long"), ("negative", "status", "wrong-id"))
-"""Bad commands with one step after all of them, to save time."""
+_TOGETHER = (
+    ("nan",),
+    ("out-of-range",),
+    ("foreign", "empty", "short", "long", "negative", "status", "wrong-id"),
+)
+"""Bad commands with one step after them, to save time. Each group begins at rest."""
 
 
 class FingerScript(HandScript):
@@ -165,7 +170,7 @@ class FingerScript(HandScript):
     _settling = 0.2
     _standing = 0.1
     _least = 0.5
-    _beside_s = 0.75
+    _beside_s = 0.6
 
     _turn_of_splits = 0
     """Number of times that joints got different treatment."""
@@ -184,11 +189,8 @@ class FingerScript(HandScript):
         if "fingerprint" in phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place(), most=1.5)
-        for name in _BAD:
-            if name in phases:
-                yield from self._bad(name)
-        if "foreign" in phases:
-            yield from self._foreign()
+        for group in _TOGETHER:
+            yield from self._group(group)
         if "burst" in phases:
             yield from self._flood()
         if phases & {"stiff", "soft", "mild"}:
@@ -214,7 +216,10 @@ class FingerScript(HandScript):
         if "old-stamps" in phases:
             yield from self._old_stamps()
         if "late-joiner" in phases:
+            self._goal.update({s: self._home(s) for s in sides})
             yield from self._late_joiner()
+        if "old-stamps" in phases:
+            yield from self._to("center", OPEN)
         guards = bool(phases & {"guard", "guard-latch", "guard-clear"})
         if "touch" in phases:
             yield from self._touches()
@@ -328,14 +333,26 @@ class FingerScript(HandScript):
             for s, moved in targets.items():
                 self._goal[s] = tuple(moved.get(i, q) for i, q in enumerate(self._goal[s]))
             phase = self._begin("joint", sides, targets=targets)
-            yield from self._until_settled(phase, sides, least=0.6, most=1.5)
+            yield from self._until_settled(phase, sides, least=0.5, most=1.5)
         if not few:
             yield from self._turn("center", {s: self._pose(s, OPEN) for s in sides}, least=0.5)
 
     def _alone(self, side: Side) -> Steps:
         self._report(f"the {side} hand alone; the other one must not move")
         for percent in (CLOSED - 5.0, OPEN):
-            yield from self._turn("step", {side: self._pose(side, percent)}, least=0.6)
+            yield from self._turn("step", {side: self._pose(side, percent)}, least=0.5)
+
+    def _group(self, names: Sequence[str]) -> Steps:
+        """Bad commands of these kinds, and a good step after all of them."""
+        these = [name for name in names if name in self.plan.phases]
+        for name in these:
+            if name != these[0]:
+                yield from self._hold(BETWEEN)
+            yield from self._foreign() if name == "foreign" else self._bad(name)
+        if these:
+            yield from self._everyone(
+                "recover", self._other_place(), most=1.5, after=" ".join(these)
+            )
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
@@ -344,7 +361,7 @@ class FingerScript(HandScript):
             for side in self.plan.sides:
                 kinds = [{side: motors} for motors in self._not_finite(side)]
                 # long enough for a step of the other side beside them
-                each = max(0.08, 1.05 * ASIDE_SECONDS / len(kinds))
+                each = max(0.065, ASIDE_SECONDS / len(kinds))
                 yield from self._bad_commands(name, (side,), kinds, each)
         elif name == "status":
             kinds = [
@@ -370,15 +387,8 @@ class FingerScript(HandScript):
             for alone in self._each_alone():
                 wrong = self._malformed(name, alone)
                 for malformed in wrong:
-                    each = 0.25 if name != "negative" else 0.25 / len(wrong)
+                    each = 0.18 if name != "negative" else 0.25 / len(wrong)
                     yield from self._bad_commands(name, alone, [malformed], each)
-        group = next((names for names in _TOGETHER if name in names), (name,))
-        these = [n for n in group if n in self.plan.phases]
-        if name != these[-1]:
-            yield from self._hold(BETWEEN)
-            return  # a later one has the step
-        after = " ".join(these)
-        yield from self._everyone("recover", self._other_place(), most=1.5, after=after)
 
     def _at(self, side: Side, q: Sequence[float]) -> Motors:
         return [replace(m, q=x) for m, x in zip(self._motors(side, tuple(q)), q, strict=True)]
@@ -446,7 +456,7 @@ class FingerScript(HandScript):
         every = {s: self._not_finite(s) for s in sides}
         kinds = [dict(zip(sides, each, strict=True)) for each in zip(*every.values(), strict=True)]
         kinds = kinds[::2]
-        yield from self._bad_commands("nan", sides, kinds, 0.08)
+        yield from self._bad_commands("nan", sides, kinds, 0.07)
         for name in ("empty", "short", "long", "negative"):
             if name in self.plan.phases:
                 yield from self._hold(BETWEEN)
@@ -474,7 +484,7 @@ class FingerScript(HandScript):
         if "guard" in self.plan.phases:
             splits = self._next_splits()
             yield from self._drive("guard-drive", sides, {}, guarded=splits)
-            yield from self._silence("guard", self._model.command_timeout + 0.5)
+            yield from self._silence("guard", self._model.command_timeout + 0.3)
             yield from self._latch_and_clear(splits)
         else:
             yield from self._silent_by_motion({})
@@ -780,7 +790,7 @@ class FingerScript(HandScript):
         targets = {s: {i: poses[s][i] for i in sorted(guarded[s])} for s in sides}
         phase = self._begin("guard-latch", sides, targets=targets)
         hands = {s: self._guarded(self._motors(s, poses[s]), s, guarded) for s in sides}
-        yield from self._hold(0.4, hands)
+        yield from self._hold(0.35, hands)
         self._end(phase)
         yield from self._everyone("guard-clear", poses, most=1.5)
 
@@ -876,7 +886,7 @@ class FingerScript(HandScript):
             phases.append(self._begin("squeeze", pressing, targets=targets))
         if still:
             phases.append(self._begin("guarded", tuple(still)))
-        yield from self._hold(2.0, {**squeeze, **still})
+        yield from self._hold(1.6, {**squeeze, **still})
         for phase in phases:
             self._end(phase)
         self._report("some joints have time-out protection, some of them move, and then ...")

@@ -13,9 +13,9 @@ stiffness      a torque pushes a hand that is held by kp without contact: before
 dead-zone      where a dialect has them (``unitree_hg``): the inner limits of the zones that mean
                fully open and fully closed
 fingerprint    steps to compare the ``recover`` steps with
-nan, out-of-   bad commands, each followed by ``recover``, a good step: not finite, far outside the
-range, empty,  stroke, no motor, motors too many, negative gains; and a client of another type on
-long,          the topic. Each kind stands for a while, on each side alone.
+nan, out-of-   bad commands, followed by ``recover``, a good step: not finite; far outside the
+range, empty,  stroke; no motor, and motors too many; negative gains; and a client of another type
+long,          on the topic. Each kind stands for a while, on each side alone.
 negative,
 foreign
 beside         a step of one side while the other one gets bad commands, or none
@@ -131,7 +131,7 @@ _SLOWEST_HZ, _FASTEST_HZ = 30.0, 1000.0
 _SOFTEST, _SOFT_STEP = 0.8, 0.3
 """kp, N m/rad, and size, in parts of the stroke, of a soft step."""
 _PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
-_FED_DQ, _FED_TAU, _FED_SECONDS = -0.5, 0.1, 0.7
+_FED_DQ, _FED_TAU, _FED_SECONDS = -0.5, 0.1, 0.6
 """A feed-forward towards closed and a torque towards open, rad/s and N m, and for how long, s: with
 the client's gains they move the end of a step by less than 0.02 rad. A hand that takes them for
 limits makes a quarter of the step."""
@@ -178,6 +178,7 @@ class GripperScript(HandScript):
                 yield from self._bad(name)
         if "foreign" in self.plan.phases:
             yield from self._foreign()
+            yield from self._everyone("recover", self._other_place(), most=1.5, after="foreign")
         yield from self._stiffness(sides)
         if "burst" in self.plan.phases:
             yield from self._flood()
@@ -195,6 +196,7 @@ class GripperScript(HandScript):
         if "old-stamps" in self.plan.phases:
             yield from self._old_stamps()
         if "late-joiner" in self.plan.phases:
+            self._goal.update(self._nearly_closed())
             yield from self._late_joiner()
         if self.plan.phases & _LATE:
             yield from self._squeeze_and_silence()
@@ -226,6 +228,11 @@ class GripperScript(HandScript):
             middle = max(self._middle(side), (0.5 if i == 0 else 0.6) * self._stroke)
             places[side] = (above if abs(above - here) > abs(middle - here) else middle,)
         return places
+
+    def _nearly_closed(self) -> dict[Side, Pose]:
+        """Where the sides without an object are before they are driven open."""
+        free = (s for s in self.plan.sides if s not in self.plan.objects)
+        return dict.fromkeys(free, (_NEARLY * self._stroke,))
 
     def _reachable(self, side: Side) -> bool:
         return self._goal[side][0] > self.plan.objects.get(side, -math.inf)
@@ -322,11 +329,13 @@ class GripperScript(HandScript):
         if name == "nan":
             for side in sides:
                 kinds = [{side: (m,)} for m in self._not_finite(side)]
-                yield from self._bad_commands(name, (side,), kinds, max(0.08, 1.2 / len(kinds)))
+                yield from self._bad_commands(
+                    name, (side,), kinds, max(0.065, ASIDE_SECONDS / len(kinds))
+                )
         elif name == "out-of-range":
             places = (1000.0, -1000.0, 1.3 * self._stroke, -0.3 * self._stroke)
             far = [dict.fromkeys(sides, (Motor(q=q),)) for q in places]
-            yield from self._beyond_each_end(name, far, 0.35)
+            yield from self._beyond_each_end(name, far, 0.3)
         elif name == "long":
             good = {s: self._motors(s, pose) for s, pose in self._goal.items()}
             for alone in self._each_alone():
@@ -344,11 +353,17 @@ class GripperScript(HandScript):
                 near = {s: self._aside(s, 0.1)[0] for s in alone}
                 for damping in (-kd, kd):
                     wrong = {s: (Motor(q=q, kp=-kp, kd=damping),) for s, q in near.items()}
-                    yield from self._bad_commands(name, alone, [wrong], 0.2)
+                    yield from self._bad_commands(name, alone, [wrong], 0.15)
         else:
             for alone in self._each_alone():
-                yield from self._bad_commands(name, alone, [self._empty(alone)], 0.3)
-        yield from self._everyone("recover", self._other_place(), after=name)
+                yield from self._bad_commands(name, alone, [self._empty(alone)], 0.25)
+        if name == "empty" and "long" in self.plan.phases:
+            yield from self._hold(BETWEEN)
+            return  # that one has the step after both
+        together = name == "long" and "empty" in self.plan.phases
+        yield from self._everyone(
+            "recover", self._other_place(), after="empty long" if together else name
+        )
 
     def _empty(self, sides: Sequence[Side]) -> Mapping[Side, Motors] | Payloads:
         if self._codec.shared:
@@ -404,8 +419,7 @@ class GripperScript(HandScript):
         self._grip = dict(self._squeeze(pressing))
         regrip = self._begin("regrip", pressing) if pressing else None
         if free:
-            nearly = dict.fromkeys(free, (_NEARLY * self._stroke,))
-            yield from self._turn("center", nearly, least=0.5, stand=self._standing)
+            yield from self._turn("center", self._nearly_closed(), least=0.5, stand=self._standing)
         if free and self._gains_used:
             yield from self._drive(free, 0.16)
         elif pressing:
@@ -551,8 +565,7 @@ class GripperScript(HandScript):
         pressing = [s for s in sides if s in self.plan.objects]
         free = [s for s in sides if s not in pressing]
         if free:
-            nearly_closed = dict.fromkeys(free, (_NEARLY * self._stroke,))
-            yield from self._everyone("center", {**self._goal, **nearly_closed})
+            yield from self._everyone("center", {**self._goal, **self._nearly_closed()})
         if phases & {"grip", "nudge"}:
             yield from self._hold_long(pressing, free)
         if pressing:
@@ -725,7 +738,7 @@ class GripperScript(HandScript):
         part: float,
         kd: float = 0.5,
         *,
-        seconds: float = 0.8,
+        seconds: float = 0.65,
         last_hz: float = 0.0,
     ) -> Steps:
         """Open at a steady low speed by velocity feedback alone, whatever the friction.

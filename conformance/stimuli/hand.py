@@ -39,16 +39,16 @@ PATIENCE = 6.0
 """Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
 FLOOD = 500
 """Commands of a burst."""
-LOADS = ((400.0, 1.5, 1), (2500.0, 0.8, 10))
+LOADS = ((400.0, 1.2, 1), (2500.0, 0.8, 10))
 """Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation
 sends, the second what Unitree's C++ example sends (docs/sources/unitree-dex.md#b1)."""
 ASIDE = 0.15
 """Part of a joint's range of a step that one side makes while the other gets bad commands."""
-ASIDE_SECONDS = 1.0
+ASIDE_SECONDS = 0.95
 """Least time, s, in which a side is asked to make such a step."""
 BETWEEN = 0.3
 """Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
-SINGLES, SINGLE_SECONDS = 10, 0.25
+SINGLES, SINGLE_SECONDS = 5, 0.25
 """Commands that are sent once, and how long none follows, s: less than any time-out."""
 
 
@@ -57,9 +57,9 @@ class HandScript(Script[Side]):
 
     _settling = 0.4
     """Seconds that a hand must stand near its goal in a step whose end is judged for ripple."""
-    _standing = 0.4
+    _standing = 0.2
     """The same in every other step."""
-    _least = 0.6
+    _least = 0.5
     """Least duration of such a step, s."""
     _beside_s = ASIDE_SECONDS
     """Seconds in which a side makes a step while the other one is silent."""
@@ -112,7 +112,7 @@ class HandScript(Script[Side]):
             yield from self._grips_again()
             if "nan" in self.plan.phases:
                 yield from self._again()
-        yield from self._hold(0.2)
+        yield from self._hold(0.1)
         if self.plan.phases & {"shutdown", "restarted", "service-restart"}:
             yield from self._service_restart()
 
@@ -466,7 +466,7 @@ class HandScript(Script[Side]):
         newest = {s: session.first(s, dialect) for s in sides}
         self._goal.update({s: tuple(m.q for m in motors) for s, motors in newest.items()})
         reachable = [s for s in sides if self._reachable(s)]
-        yield from self._until_settled(None, reachable, least=0.6, most=2.0)
+        yield from self._until_settled(None, reachable, least=0.4, most=2.0)
         self._report(f"replaying {session.duration:.0f} s of the recorded session {session.name}")
         phase = self._begin("replay", sides, session=session.name)
         start = self._obs.now_ns
@@ -504,7 +504,7 @@ class HandScript(Script[Side]):
     def _foreign(self) -> Steps:
         """Another participant publishes another type on the command topics, with far targets."""
         self._report("another type on the command topics: it must not reach the hand")
-        yield from self._hold(0.2)
+        yield from self._hold(0.1)
         far = self._codec.encode_foreign(
             {s: self._motors(s, pose) for s, pose in self._other_place().items()}
         )
@@ -512,22 +512,21 @@ class HandScript(Script[Side]):
         phase = self._begin("foreign", self.plan.sides)
         # two goals in turn cancel out in a servo whose speed does not depend on the distance
         turns = 3 if self.plan.dialect.position_servo else 1
-        yield from self._beside(phase, far, Role.STRANGER, 0.5, turns)
+        yield from self._beside(phase, far, Role.STRANGER, 0.4, turns)
         self._end(phase)
         yield from self._do(Leave(Role.STRANGER))
-        yield from self._everyone("recover", self._other_place(), most=1.5, after="foreign")
 
     def _flood(self) -> Steps:
         """Hundreds of commands at once to another place, the last of them back to this one."""
         self._report(f"{FLOOD} commands at once: only the last one counts")
-        yield from self._hold(0.2)
+        yield from self._hold(0.1)
         far = self._codec.encode(
             {s: self._motors(s, pose) for s, pose in self._other_place().items()}
         )
         phase = self._begin("burst", self.plan.sides)
         yield from self._do(Send(far * (FLOOD - 1), 0))
         phase.observed = {"sent_s": self._elapsed(phase)}
-        yield from self._hold(0.8)
+        yield from self._hold(0.6)
         self._end(phase)
 
     def _old_stamps(self) -> Steps:
@@ -535,7 +534,6 @@ class HandScript(Script[Side]):
         self._age_s = 3600.0
         yield from self._everyone("old-stamps", self._other_place(), most=1.5)
         self._age_s = 0.0
-        yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides}, most=1.5)
 
     def _load(self) -> Steps:
         """Many commands, and a reliable subscriber that hardly ever reads."""
@@ -567,13 +565,13 @@ class HandScript(Script[Side]):
 
     def _two_writers(self) -> Steps:
         self._report("a second client commands another place, and goes again")
-        yield from self._hold(0.2)
+        yield from self._hold(0.1)
         there = self._other_place()
         rival = self._codec.encode({s: self._motors(s, pose) for s, pose in there.items()})
         targets = {s: dict(enumerate(pose)) for s, pose in there.items()}
         yield from self._do(Join(Role.RIVAL))
         phase = self._begin("two-writers", self.plan.sides, targets=targets)
-        yield from self._beside(phase, rival, Role.RIVAL, 0.6)
+        yield from self._beside(phase, rival, Role.RIVAL, 0.5)
         self._end(phase)
         yield from self._do(Leave(Role.RIVAL))
         yield from self._everyone("recover", dict(self._goal), most=1.5, after="two-writers")

@@ -2,7 +2,7 @@
 
 In all other phases the commands do not depend on the hand's answers. Here they depend on the
 states, as with the genuine client: a hand whose state is late is commanded slowly. The operator's
-motion is the profile ``feel`` of :mod:`dexkit.teleop.profiles`, kept clear of an object; the
+motion is the profile ``check`` of :mod:`dexkit.teleop.profiles`, kept clear of an object; the
 phase's parameters are enough to compute the operator's goal at any time (:func:`operator_of`).
 
 The client gets the newest state each time its receiving thread would have read one. That a silent
@@ -28,7 +28,7 @@ __all__ = ["OPERATOR", "operate", "operator_of"]
 
 OPERATOR = "operator"
 """Name of the phase."""
-PROFILE = "feel"
+PROFILE = "check"
 _CLEAR = 0.1  # of the stroke: room left to the object
 _DEEPEST = 0.5  # how far the profile closes a hand of several joints
 _POLL = 0.001  # s between two reads while the client waits for a state

@@ -154,10 +154,13 @@ def _joined(first: float, one: Closing, two: Closing) -> Closing:
     return lambda t: one(t) if t < first else two(t - first)
 
 
-def _sine(low: float, high: float, period: float) -> Closing:
-    """Between two closings, beginning at the middle on the way to closed."""
-    middle, swing = (low + high) / 2, (high - low) / 2
-    return lambda t: (middle + swing * math.sin(2 * math.pi * t / period),)
+def _sine(low: float, high: float, period: float, begin: float = 0.0) -> Closing:
+    """Between two closings.
+
+    :param begin: phase at the beginning, degrees; 0 is the middle on the way to closed.
+    """
+    middle, swing, shift = (low + high) / 2, (high - low) / 2, math.radians(begin)
+    return lambda t: (middle + swing * math.sin(2 * math.pi * t / period + shift),)
 
 
 def _fingers(hand: HandModel, closing: Closing, **parts: float) -> Closing:
@@ -191,6 +194,24 @@ _FEEL = _joined(
     _course((0.0, 1.0), (1.6, 0.0), (3.2, 1.0), (4.6, 0.35), (5.4, 0.7), move=0.0),
     _sine(0.2, 0.8, 4.0),
 )
+_JUST_MISSED = 0.4 + 0.001
+"""A lead-in, s, after which steps at whole periods of the tracking data wait for the next one."""
+
+
+def _check(stroke: float, step: float) -> Closing:
+    """A stroke, a step clear of the stops, where a joint can overshoot, and a sine for the lag.
+
+    :param stroke: seconds until the step: the joint has arrived and rests by then, as the client's
+        filter may stick only then.
+    :param step: seconds until the sine.
+    """
+    course = _course((0.0, 1.0), (stroke, 0.35), move=0.0)
+    return _joined(stroke + step, course, _sine(0.2, 0.8, 4.0, begin=-30.0))
+
+
+_CHECK = _check(1.5, 0.9)
+# a gripper does not begin fully open, as a hand does whose client has no tracking data yet
+_OPEN_AND_CHECK = _joined(0.8, _course((0.0, 0.0), move=0.0), _check(1.8, 1.0))
 
 
 def finger_profiles(hand: HandModel) -> tuple[Profile, ...]:
@@ -247,10 +268,18 @@ def finger_profiles(hand: HandModel) -> tuple[Profile, ...]:
         Profile(
             "feel",
             hand.name,
-            "what the conformance suite does: all joints half closed, steps, sine",
+            "all joints half closed, steps, sine",
             0.6,
             10.2,
             _fingers(hand, _FEEL, thumb=0.5, middle=0.5, index=0.5),
+        ),
+        Profile(
+            "check",
+            hand.name,
+            "what the conformance suite does: all joints half closed, a step, sine",
+            _JUST_MISSED,
+            4.3,
+            _fingers(hand, _CHECK, thumb=0.5, middle=0.5, index=0.5),
         ),
     )
 
@@ -289,10 +318,18 @@ def gripper_profiles(hand: HandModel) -> tuple[Profile, ...]:
         Profile(
             "feel",
             hand.name,
-            "what the conformance suite does: strokes, steps, sine",
+            "strokes, steps, sine",
             0.6,
             10.2,
             _FEEL,
+        ),
+        Profile(
+            "check",
+            hand.name,
+            "what the conformance suite does: strokes, a step, sine",
+            _JUST_MISSED,
+            5.6,
+            _OPEN_AND_CHECK,
         ),
     )
 
