@@ -866,7 +866,8 @@ class DiesOfAnyType(Service):
         return [] if self.now < self.dead_until else super().publish()
 
 
-@wrong_hand(("DEX1-SAFE-07", "DEX3-SAFE-08"), also=("DEX1-LOAD-03", "DEX1-MOVE-09"), whole=True)
+@wrong_hand("DEX1-SAFE-07", also=("DEX1-LOAD-03", "DEX1-MOVE-09"), whole=True)
+@wrong_hand("DEX3-SAFE-08", brief=True)
 class QueuesCommands(Service):
     """Queues up to 600 commands and carries out at most two of them in each cycle."""
 
