@@ -404,13 +404,15 @@ _add("brake", _Holds, "brake-hold", "holds its position when it brakes")
 
 
 class _Releases(What):
-    """Lets its torque go within 0.3 s when it brakes."""
+    """Lets its torque go within 0.3 s when it brakes: that may stop a joint, but not turn it."""
 
     seconds = 0.3
 
     def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
         super().__init__(rig, side, joints)
         self.last: dict[int, float] = {}
+        self.dq: dict[int, float] = {}
+        """Velocity of each joint when it began to brake, rad/s."""
         self.since_brake: float | None = None
 
     def torque(self, joint: int, tau: float, dt: float) -> float:
@@ -418,9 +420,13 @@ class _Releases(What):
             self.since_brake = None
             # all of it: tau is without the law's damping in a hand of several joints
             self.last[joint] = self.rig.seen(self.side)[2][joint]
+            self.dq[joint] = self.rig.velocities(self.side)[joint]
             return tau
         if self.since_brake is None:
             self.since_brake = self.rig.now
+        before, now = self.dq.get(joint, 0.0), self.rig.velocities(self.side)[joint]
+        if before * self.last.get(joint, 0.0) < 0.0 and before * now <= 0.0:
+            self.last[joint] = 0.0
         left = 1.0 - (self.rig.now - self.since_brake) / self.seconds
         return tau + self.last.get(joint, 0.0) * max(0.0, left)
 
