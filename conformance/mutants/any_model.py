@@ -319,7 +319,7 @@ class SwapsBuffers(Service):
         return newest if self.turn % 2 or self.ended else past[0][1]
 
 
-@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01"), also=("DEX1-FIELD-22",))
+@wrong_hand(("DEX1-MOVE-01", "DEX3-JOINT-01"))
 class Frozen(Service):
     """Publishes its first measurement forever, at full rate."""
 
@@ -912,6 +912,7 @@ class StopsInABurst(Service):
         "DEX3-SAFE-10",
         "DEX1-RATE-03",
         "DEX3-RATE-03",
+        "DEX1-RATE-04",
     ),
 )
 class GivesUpOnTwo(Service):

@@ -738,7 +738,7 @@ class GripperScript(HandScript):
         part: float,
         kd: float = 0.5,
         *,
-        seconds: float = 0.65,
+        seconds: float = 0.8,
         last_hz: float = 0.0,
     ) -> Steps:
         """Open at a steady low speed by velocity feedback alone, whatever the friction.

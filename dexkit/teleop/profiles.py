@@ -327,7 +327,7 @@ def gripper_profiles(hand: HandModel) -> tuple[Profile, ...]:
             "check",
             hand.name,
             "what the conformance suite does: strokes, a step, sine",
-            _JUST_MISSED,
+            0.4,
             5.6,
             _OPEN_AND_CHECK,
         ),
