@@ -291,7 +291,11 @@ class FreezesOnce(Service):
     ),
     whole=True,
 )
-@wrong_hand("BRAINCO-FRESH-03", also=("BRAINCO-MOVE-06", "DFX-WDOG-01", "FTP-WDOG-01"), whole=True)
+@wrong_hand(
+    "BRAINCO-FRESH-03",
+    also=("BRAINCO-FIELD-04", "BRAINCO-MOVE-06", "DFX-WDOG-01", "FTP-WDOG-01"),
+    whole=True,
+)
 class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 

@@ -547,7 +547,8 @@ class ForceGivesUp(_FeelingService):
     hand_fault = _GivesUp
 
 
-@wrong_hand("BRAINCO-FORCE-05", sides=BOTH, whole=True)
+@wrong_hand("BRAINCO-FORCE-05", also=("BRAINCO-MOVE-09",), sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
 class WeakAfterRestart(_FeelingService):
     """Presses with a seventh of its force after a restart of the service."""
 
@@ -700,7 +701,11 @@ class SwapsForNewClients(_SwapsSome):
         return 0 < self.client < 1000 and not self.restarted
 
 
-@wrong_hand("BRAINCO-LIFE-03", also=("BRAINCO-WDOG-03",), whole=True)
+@wrong_hand(
+    "BRAINCO-LIFE-03",
+    also=("BRAINCO-WDOG-03", "DFX-MOVE-09", "DFX-PATH-01", "FTP-MOVE-09", "FTP-PATH-01"),
+    whole=True,
+)
 class SwapsAfterRestart(_SwapsSome):
     """Mixes two joints up in commands after a restart of the service."""
 

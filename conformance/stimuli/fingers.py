@@ -28,7 +28,8 @@ lock           the first with the client's gains and status 0 or mode 0; again f
 mixed          a step in which some joints are locked under way, by their mode byte, and the others
                go on: three times, with other joints
 speeds         position servos: each joint with another speed, and one with none; again with others
-ends           one finger after the other to both ends of its range, with the thumb out of the way
+ends           one finger after the other to both ends of its range, with the thumb out of the way;
+               position servos also after the restart of the service
 push, pull     a torque alone, without a position gain: some joints towards closed and the others
                towards open, and the other way round
 replay         a recorded session, as recorded
@@ -479,6 +480,9 @@ class FingerScript(HandScript):
         yield from self._drive("drive", sides, {})
 
     def _silent_again(self) -> Steps:
+        if "ends" in self.plan.phases and self.plan.dialect.position_servo:
+            # a device that calibrates itself at its start may come back with other ends
+            yield from self._to_the_ends()
         yield from self._to("center", OPEN)
         sides = self.plan.sides
         if "guard" in self.plan.phases:
