@@ -460,11 +460,13 @@ def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
         "dex1-1/unitree_go:faster+sags-down",  # falls while it is limp
         "dex1-1/unitree_go:backlash-more+top-speed-4.5+latency-20",
         "dex1-1/unitree_go:slower+predicts-150+pauses",  # no state at the end of a step
+        "dex1-1/unitree_go:lighter+top-speed-4.5+pauses",  # q changes most over a pause of states
         "dex1-1/unitree_actuator:backlash-more+soft-start+pauses+sags-down",
         "dex3-1/dex3:predicts-150",
         "dex3-1/dex3:state-late-10+pauses",
         "dex5-1/dex5:brake-release-fast+counts-16384+pauses+state-late-10",
         "brainco-revo2/brainco:backlash+counts-16384+jitter-5+state-late-10",
+        "brainco-revo2/brainco:brake-relax+soft-stops+predicts-100+sags-down",  # gives back 3 %
         "inspire-dfx/inspire_dfx:backlash+heavier+predicts-150",
     ],
 )

@@ -323,6 +323,9 @@ def _held_s(ctx: Context, joint: int) -> float:
     x = _Joint.from_context(ctx, joint)
     steps = np.diff(x.t)
     stairs = np.abs(np.diff(x.q)) >= _STAIR_PART * ctx.joints[joint].stroke
+    clock = ctx.states.clock
+    pauses = clock[np.flatnonzero(np.diff(clock) > UNSEEN_S)]  # of the states, not of q
+    stairs &= np.diff(np.searchsorted(pauses, x.t)) == 0
     steps = steps[stairs & (steps <= _LONGEST_HOLD_S)]
     return median(steps) if len(steps) >= _FEW else 0.0
 
