@@ -191,7 +191,7 @@ class FingerScript(HandScript):
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place(), most=1.5)
         for group in _TOGETHER:
-            yield from self._group(group)
+            yield from self._bad_together(group, most=1.5)
         if "burst" in phases:
             yield from self._flood()
         if phases & {"stiff", "soft", "mild"}:
@@ -342,18 +342,6 @@ class FingerScript(HandScript):
         self._report(f"the {side} hand alone; the other one must not move")
         for percent in (CLOSED - 5.0, OPEN):
             yield from self._turn("step", {side: self._pose(side, percent)}, least=0.5)
-
-    def _group(self, names: Sequence[str]) -> Steps:
-        """Bad commands of these kinds, and a good step after all of them."""
-        these = [name for name in names if name in self.plan.phases]
-        for name in these:
-            if name != these[0]:
-                yield from self._hold(BETWEEN)
-            yield from self._foreign() if name == "foreign" else self._bad(name)
-        if these:
-            yield from self._everyone(
-                "recover", self._other_place(), most=1.5, after=" ".join(these)
-            )
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])

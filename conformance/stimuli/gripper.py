@@ -142,6 +142,9 @@ _BAD = {
     "long": "commands for more motors than there are: nothing may move",
     "negative": "negative gains: the hand must not run away",
 }
+_NEGATIVE = ("negative",)
+_TOGETHER = (("nan",), ("out-of-range",), ("empty", "long"), _NEGATIVE)
+"""Bad commands with one step after them."""
 
 
 class GripperScript(HandScript):
@@ -173,12 +176,10 @@ class GripperScript(HandScript):
         if "fingerprint" in self.plan.phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place())
-        for name in _BAD:
-            if name in self.plan.phases and (name != "negative" or self._gains_used):
-                yield from self._bad(name)
-        if "foreign" in self.plan.phases:
-            yield from self._foreign()
-            yield from self._everyone("recover", self._other_place(), most=1.5, after="foreign")
+        for group in _TOGETHER:
+            if group != _NEGATIVE or self._gains_used:
+                yield from self._bad_together(group)
+        yield from self._bad_together(("foreign",), most=1.5)
         yield from self._stiffness(sides)
         if "burst" in self.plan.phases:
             yield from self._flood()
@@ -357,13 +358,6 @@ class GripperScript(HandScript):
         else:
             for alone in self._each_alone():
                 yield from self._bad_commands(name, alone, [self._empty(alone)], 0.25)
-        if name == "empty" and "long" in self.plan.phases:
-            yield from self._hold(BETWEEN)
-            return  # that one has the step after both
-        together = name == "long" and "empty" in self.plan.phases
-        yield from self._everyone(
-            "recover", self._other_place(), after="empty long" if together else name
-        )
 
     def _empty(self, sides: Sequence[Side]) -> Mapping[Side, Motors] | Payloads:
         if self._codec.shared:

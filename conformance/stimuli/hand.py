@@ -121,6 +121,10 @@ class HandScript(Script[Side]):
         """Every phase between the first motion and the operator."""
 
     @abstractmethod
+    def _bad(self, name: str) -> Steps:
+        """Bad commands of one kind, on each side."""
+
+    @abstractmethod
     def _again(self) -> Steps:
         """Bad commands of every kind once more, of another client."""
 
@@ -391,6 +395,21 @@ class HandScript(Script[Side]):
         if self.plan.phases & {"nan", "out-of-range"}:
             yield from self._everyone(
                 "recover", self._other_place(), after=self._bad_phases_since_recovery
+            )
+
+    def _bad_together(self, names: Sequence[str], *, most: float = 2.5) -> Steps:
+        """Bad commands of these kinds, and a good step after all of them.
+
+        :param most: seconds of the step; see :meth:`_until_settled`.
+        """
+        these = [name for name in names if name in self.plan.phases]
+        for name in these:
+            if name != these[0]:
+                yield from self._hold(BETWEEN)
+            yield from self._foreign() if name == "foreign" else self._bad(name)
+        if these:
+            yield from self._everyone(
+                "recover", self._other_place(), most=most, after=" ".join(these)
             )
 
     def _far_away(self, goals: Sequence[float], each: float) -> Steps:
