@@ -553,14 +553,15 @@ def test_delay_is_measured_as_lag_and_reaction() -> None:
     assert found.reaction_s == pytest.approx(0.12, abs=0.01)
 
 
-def test_hand_at_rest_has_infinite_stroke_time_and_no_lag() -> None:
+def test_hand_at_rest_has_infinite_stroke_time_and_lag() -> None:
     t: Floats = np.asarray(np.arange(0.0, 4.0, 0.002))
     still = tracking_figures(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
     assert still.stroke_s == math.inf
     assert math.isnan(still.reaction_s)
     assert still.stuck == pytest.approx(5.4)
     moving = tracking_figures(t, np.zeros_like(t), lambda x: 2.7 + math.sin(3 * x), 5.4)
-    assert math.isnan(moving.lag_s)
+    assert math.isinf(moving.lag_s)
+    assert math.isnan(moving.lag_rms)
 
 
 @given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))

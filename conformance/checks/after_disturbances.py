@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.firmness import STIFFNESS, nudges
+from dexkit.conformance.checks.firmness import STIFFNESS, as_far, nudges, ways_off
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
@@ -145,15 +145,17 @@ def fastest(step: Step) -> float | None:
 
 def _other_stiffness(ctx: Context) -> Outcome | None:
     """The failure of a hand that a torque displaces more or less than it did at first."""
-    found = nudges(ctx, [p for p in ctx.phases(STIFFNESS) if obeyed_before(ctx, p)])
+    pulses = [p for p in ctx.phases(STIFFNESS) if obeyed_before(ctx, p)]
+    found = nudges(ctx, pulses)
     if len(found) < 2:
         return None
     first, *later = sorted(found, key=lambda n: n.begin)
     if first.way < ctx.tolerance("min_motion_stroke"):
         return None
-    least, most = ctx.tolerance("min_way_part"), ctx.tolerance("max_way_part")
+    parts = ctx.tolerance("min_way_part"), ctx.tolerance("max_way_part")
+    off = ways_off(ctx, pulses)
     for nudge in later:
-        if not least * first.way <= nudge.way <= most * first.way:
+        if not as_far(first.way, nudge.way, parts, off):
             text = (
                 f"a torque displaced it by {nudge.way:.3f} {ctx.unit} at {nudge.begin:.1f} s, and "
                 f"by {first.way:.3f} {ctx.unit} before any bad command"

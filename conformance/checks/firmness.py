@@ -6,6 +6,7 @@ contact gives its stiffness; on an object it must press with the same stiffness.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,17 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
     return found
 
 
+def ways_off(ctx: Context, phases: Sequence[Phase]) -> float:
+    """By how much the noise of q may change the way of a pulse of these phases, rad."""
+    return _MEDIAN_OFF * noise_at_rest(ctx, 0, phases)
+
+
+def as_far(first: float, last: float, parts: tuple[float, float], off: float) -> bool:
+    """Whether a way is between two parts of an earlier one, where each may be off by so much."""
+    low, high = parts[0] * (first - off), parts[1] * (first + off)
+    return low - off <= last <= high + off
+
+
 @check("DEX1-HOLD-01")
 def held(ctx: Context) -> Outcome:
     """The displacement by a torque after a long hold, compared with that before it."""
@@ -74,7 +86,7 @@ def held(ctx: Context) -> Outcome:
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not shown:
         return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
-    off = _MEDIAN_OFF * noise_at_rest(ctx, 0, ctx.phases())
+    off = ways_off(ctx, ctx.phases())
     pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
     for first, last in pairs:
         text = (
@@ -82,8 +94,7 @@ def held(ctx: Context) -> Outcome:
             f"{last.begin - first.end:.1f} "
             f"s of equal commands by {last.way:.3f} {ctx.unit}"
         )
-        low, high = least * (first.way - off), most * (first.way + off)
-        if not low - off <= last.way <= high + off:
+        if not as_far(first.way, last.way, (least, most), off):
             place = ctx.at(ctx.states.topic, last.begin, last.end)
             return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
     if not pairs:

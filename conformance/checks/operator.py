@@ -138,13 +138,19 @@ def stroke(ctx: Context) -> Outcome:
 @check("DEX1-OPER-02", "DEX3-OPER-02")
 def lag(ctx: Context) -> Outcome:
     """Lag of the joint behind a slowly moving operator, seconds."""
+
+    def text(seconds: float) -> str:
+        if math.isinf(seconds):
+            return "does not follow a slow motion"
+        return f"lags {seconds * 1e3:.0f} ms"
+
     return _judge(
         ctx,
         "lag_s",
         "max_lag_s",
         lambda f: f.lag_s,
         None,
-        lambda x: f"lags {x * 1e3:.0f} ms",
+        text,
         "no slow motion was long enough",
     )
 

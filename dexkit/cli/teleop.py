@@ -327,11 +327,13 @@ def _finite(value: Any) -> Any:
 def sentence(values: Mapping[str, float], unit: str = "rad") -> str:
     """The figures of a joint in a line; ``unit`` is that of q."""
     formats: dict[str, Callable[[float], str]] = {
-        "stroke_s": lambda x: f"full stroke {x:.2f} s",
+        "stroke_s": lambda x: f"full stroke {x:.2f} s" if math.isfinite(x) else "hardly moves",
         "reaction_s": lambda x: f"reacts after {x * _MS:.0f} ms",
         "overshoot": lambda x: f"overshoots by {x:.3f} {unit}",
         "stuck": lambda x: f"rests {x:.3f} {unit} off",
-        "lag_s": lambda x: f"lags {x * _MS:.0f} ms",
+        "lag_s": lambda x: (
+            f"lags {x * _MS:.0f} ms" if math.isfinite(x) else "follows no slow motion"
+        ),
     }
     return ", ".join(
         format_figure(values[name]) for name, format_figure in formats.items() if name in values

@@ -71,7 +71,8 @@ class TrackingFigures:
     """The figures of one joint: the worst of its steps. NaN where there was no occasion.
 
     :param stroke_s: the slowest stroke, seconds; ``stroke_mean_s`` the mean of all.
-    :param lag_s: seconds; ``lag_rms`` is what remains when it is removed, rad.
+    :param lag_s: seconds, infinite where it does not follow a slow operator; ``lag_rms`` is what
+        remains when it is removed, rad.
     """
 
     stroke_s: float = math.nan
@@ -223,7 +224,7 @@ def _lag(grid: Floats, position: Floats, goal: Floats, stroke: float) -> tuple[f
     if len(use) * GRID < _LAG_LEAST:
         return math.nan, math.nan
     if float(np.ptp(position[use])) < _FOLLOWS * float(np.ptp(goal[use])):
-        return math.nan, math.nan  # it does not follow at all
+        return math.inf, math.nan  # it does not follow at all
     best, least = (math.nan, math.inf), math.inf
     there = position[use]
     for shift in range(back + 1):
