@@ -57,7 +57,11 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand("DEX1-OPER-06", also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-04"), whole=True)
+@wrong_hand(
+    "DEX1-OPER-06",
+    also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-02", "DEX1-OPER-04"),
+    whole=True,
+)
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a goal nearer than 0.16 rad: the client waits there and never moves on."""
 
