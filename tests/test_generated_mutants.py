@@ -461,6 +461,7 @@ def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
         "dex1-1/unitree_go:backlash-more+top-speed-4.5+latency-20",
         "dex1-1/unitree_go:slower+predicts-150+pauses",  # no state at the end of a step
         "dex1-1/unitree_go:lighter+top-speed-4.5+pauses",  # q changes most over a pause of states
+        "dex1-1/unitree_go:backlash-more+soft-start+pauses+latency-20",  # a jerk in the play
         "dex1-1/unitree_go:sticky+noise-q-wide+predicts-100+servo-stiff",  # hardly gives way
         "dex1-1/unitree_actuator:backlash-more+soft-start+pauses+sags-down",
         "dex3-1/dex3:predicts-150",

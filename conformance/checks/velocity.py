@@ -156,11 +156,11 @@ def at_rest(ctx: Context) -> Outcome:
         # an end may be one past the last row; where a cell is empty, the next row stands for it
         first = np.minimum(rows[:-1], len(q) - 1)
         low, high = np.minimum.reduceat(q, first), np.maximum.reduceat(q, first)
-        mean = np.add.reduceat(dq, first) / np.maximum(np.diff(rows), 1)
+        total, states = np.add.reduceat(dq, first), np.diff(rows)
         if len(low) <= count:
             continue
-        lows, highs, fulls, means = (
-            sliding_window_view(x, count + 1) for x in (low, high, full, mean)
+        lows, highs, fulls, totals, counts = (
+            sliding_window_view(x, count + 1) for x in (low, high, full, total, states)
         )
         rest = fulls.all(axis=1)
         rest &= highs.max(axis=1) - lows.min(axis=1) <= ctx.tolerance("max_ripple_stroke", joint)
@@ -168,8 +168,9 @@ def at_rest(ctx: Context) -> Outcome:
         if not rest.any():
             continue
         # without the first cell, in which it may come to rest, and the last, in which it may begin
-        # to move; a tremor in the play of a gear has zero mean
-        last = np.where(rest, np.abs(means[:, 1:-1].mean(axis=1)), 0.0)
+        # to move; a tremor in the play of a gear has zero mean, and may follow a pause of states
+        mean = totals[:, 1:-1].sum(axis=1) / np.maximum(counts[:, 1:-1].sum(axis=1), 1)
+        last = np.where(rest, np.abs(mean), 0.0)
         i = int(np.argmax(last))
         found = (float(last[i]) / spec.stroke, float(last[i]), joint, float(edges[i + count - 1]))
         worst = found if worst is None or found > worst else worst
