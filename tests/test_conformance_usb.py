@@ -24,6 +24,7 @@ from dexkit.conformance.mutants.matrix import WrongHandResult, try_one
 from dexkit.conformance.mutants.trials import run_usb_mutant
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Load, Verdict
+from dexkit.conformance.run_queue import Watched
 from dexkit.conformance.stimuli.usb import BUSES, DAMAGES
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
@@ -241,13 +242,18 @@ def test_speed_is_not_judged_with_few_samples() -> None:
 
 
 @pytest.fixture(scope="module")
-def hands() -> Iterator[str]:
+def emulator() -> Iterator[Tool]:
     with Tool("emulate", "dex3-usb", "--side", "both", "--port", "0") as tool:
         tool.wait_ready(threading.Event())
-        yield tool.place
+        yield tool
 
 
-def test_emulated_hand_passes_and_faulty_hand_fails(hands: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def hands(emulator: Tool) -> str:
+    return emulator.place
+
+
+def test_emulated_hand_passes_and_faulty_hand_fails(emulator: Tool, tmp_path: Path) -> None:
     messages: list[str] = []
     fault = ("--fault", "silent:id=3")
     with (
@@ -255,8 +261,13 @@ def test_emulated_hand_passes_and_faulty_hand_fails(hands: str, tmp_path: Path) 
         Recorder(tmp_path / "run.mcap") as recorder,
     ):
         faulty.wait_ready(threading.Event())
-        devices = {Side.LEFT: hands, Side.RIGHT: faulty.place}
-        assert run(devices, recorder, report=messages.append)
+        devices = {Side.LEFT: emulator.place, Side.RIGHT: faulty.place}
+        # as in a live run: a device that waited for a processor is not blamed for it
+        watched = [
+            Watched("the device", tool.pid, (side,))
+            for side, tool in ((Side.LEFT, emulator), (Side.RIGHT, faulty))
+        ]
+        assert run(devices, recorder, report=messages.append, processes=lambda: watched)
     recording = UsbRecording.decode(open_trace(tmp_path / "run.mcap"))
     assert recording is not None
     assert set(recording.sides) == set(Side)

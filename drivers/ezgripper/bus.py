@@ -465,10 +465,11 @@ class ServoBus:
         statistics = self.statistics
         problem = None
         for attempt in range(attempts):
-            statistics.transactions += 1
-            statistics.retries += attempt > 0
             with port_errors(self.path):
                 self._send(request)
+                # not before: a command that is too old by now is not sent
+                statistics.transactions += 1
+                statistics.retries += attempt > 0
                 answer = receive(self._deadline(size))
             if not isinstance(answer, _Problem):
                 return answer
