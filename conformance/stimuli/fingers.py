@@ -468,9 +468,6 @@ class FingerScript(HandScript):
         yield from self._drive("drive", sides, {})
 
     def _silent_again(self) -> Steps:
-        if "ends" in self.plan.phases and self.plan.dialect.position_servo:
-            # a device that calibrates itself at its start may come back with other ends
-            yield from self._to_the_ends()
         yield from self._to("center", OPEN)
         sides = self.plan.sides
         if "guard" in self.plan.phases:
@@ -898,6 +895,13 @@ class FingerScript(HandScript):
         yield from self._hold(0.45, hands)
         self._end(phase)
         self._goal.update(poses)
+
+    def _ends_again(self) -> Steps:
+        """A device that calibrates itself at its start may come back with other ends. Runs of hands
+        with gains have no time for it.
+        """
+        if "ends" in self.plan.phases and self.plan.dialect.position_servo:
+            yield from self._to_the_ends()
 
     def _grips_again(self) -> Steps:
         """A position servo's limits of force are its own: what a restart does to them is seen by a

@@ -142,9 +142,8 @@ _BAD = {
     "long": "commands for more motors than there are: nothing may move",
     "negative": "negative gains: the hand must not run away",
 }
-_NEGATIVE = ("negative",)
-_TOGETHER = (("nan",), ("out-of-range",), ("empty", "long"), _NEGATIVE)
-"""Bad commands with one step after them."""
+_TOGETHER = (("nan",), ("out-of-range",), ("empty", "long"))
+"""Bad commands with one step after them, to save time."""
 
 
 class GripperScript(HandScript):
@@ -177,8 +176,9 @@ class GripperScript(HandScript):
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place())
         for group in _TOGETHER:
-            if group != _NEGATIVE or self._gains_used:
-                yield from self._bad_together(group)
+            yield from self._bad_together(group)
+        if self._gains_used:
+            yield from self._bad_together(("negative",))
         yield from self._bad_together(("foreign",), most=1.5)
         yield from self._stiffness(sides)
         if "burst" in self.plan.phases:

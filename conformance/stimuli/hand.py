@@ -140,6 +140,10 @@ class HandScript(Script[Side]):
         """A short grip after a restart of the client or the service."""
         yield from ()
 
+    def _ends_again(self) -> Steps:
+        """To the ends of each joint after a restart of the service."""
+        yield from ()
+
     def _before_shutdown(self) -> Steps:
         """Commands to the hand before its service is stopped."""
         yield from ()
@@ -639,6 +643,7 @@ class HandScript(Script[Side]):
         yield from self._everyone("service-restart", self._after_shutdown(), most=4.0)
         yield from self._in_turn("service-restart")
         yield from self._grips_again()
+        yield from self._ends_again()
         if "silence" in self.plan.phases:
             yield from self._silent_again()
 
