@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.firmness import STIFFNESS, as_far, nudges, ways_off
+from dexkit.conformance.checks.firmness import STIFFNESS, displacement_noise, is_alike, nudges
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
@@ -153,9 +153,9 @@ def _other_stiffness(ctx: Context) -> Outcome | None:
     if first.way < ctx.tolerance("min_motion_stroke"):
         return None
     parts = ctx.tolerance("min_way_part"), ctx.tolerance("max_way_part")
-    off = ways_off(ctx, pulses)
+    noise = displacement_noise(ctx, pulses)
     for nudge in later:
-        if not as_far(first.way, nudge.way, parts, off):
+        if not is_alike(first.way, nudge.way, parts, noise):
             text = (
                 f"a torque displaced it by {nudge.way:.3f} {ctx.unit} at {nudge.begin:.1f} s, and "
                 f"by {first.way:.3f} {ctx.unit} before any bad command"

@@ -324,7 +324,8 @@ def _held_s(ctx: Context, joint: int) -> float:
     steps = np.diff(x.t)
     stairs = np.abs(np.diff(x.q)) >= _STAIR_PART * ctx.joints[joint].stroke
     clock = ctx.states.clock
-    pauses = clock[np.flatnonzero(np.diff(clock) > UNSEEN_S)]  # of the states, not of q
+    # over a pause of the states q changes as over a time between two measurements
+    pauses = clock[np.flatnonzero(np.diff(clock) > UNSEEN_S)]
     stairs &= np.diff(np.searchsorted(pauses, x.t)) == 0
     steps = steps[stairs & (steps <= _LONGEST_HOLD_S)]
     return median(steps) if len(steps) >= _FEW else 0.0

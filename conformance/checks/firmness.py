@@ -65,15 +65,19 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
     return found
 
 
-def ways_off(ctx: Context, phases: Sequence[Phase]) -> float:
-    """By how much the noise of q may change the way of a pulse of these phases, rad."""
+def displacement_noise(ctx: Context, phases: Sequence[Phase]) -> float:
+    """By how much the noise of q may change a displacement by a torque in these phases, rad."""
     return _MEDIAN_OFF * noise_at_rest(ctx, 0, phases)
 
 
-def as_far(first: float, last: float, parts: tuple[float, float], off: float) -> bool:
-    """Whether a way is between two parts of an earlier one, where each may be off by so much."""
-    low, high = parts[0] * (first - off), parts[1] * (first + off)
-    return low - off <= last <= high + off
+def is_alike(first: float, last: float, parts: tuple[float, float], noise: float) -> bool:
+    """Whether a displacement is like an earlier one, give or take the noise of both.
+
+    :param first: the earlier one, rad; ``last`` and ``noise`` likewise.
+    :param parts: least and most of ``last``, as parts of ``first``.
+    """
+    low, high = parts[0] * (first - noise), parts[1] * (first + noise)
+    return low - noise <= last <= high + noise
 
 
 @check("DEX1-HOLD-01")
@@ -86,7 +90,7 @@ def held(ctx: Context) -> Outcome:
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not shown:
         return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
-    off = ways_off(ctx, ctx.phases())
+    noise = displacement_noise(ctx, ctx.phases())
     pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
     for first, last in pairs:
         text = (
@@ -94,7 +98,7 @@ def held(ctx: Context) -> Outcome:
             f"{last.begin - first.end:.1f} "
             f"s of equal commands by {last.way:.3f} {ctx.unit}"
         )
-        if not as_far(first.way, last.way, (least, most), off):
+        if not is_alike(first.way, last.way, (least, most), noise):
             place = ctx.at(ctx.states.topic, last.begin, last.end)
             return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
     if not pairs:

@@ -168,7 +168,8 @@ def at_rest(ctx: Context) -> Outcome:
         if not rest.any():
             continue
         # without the first cell, in which it may come to rest, and the last, in which it may begin
-        # to move; a tremor in the play of a gear has zero mean, and may follow a pause of states
+        # to move; a tremor in the play of a gear has zero mean. Each state counts once: a cell with
+        # a pause of the states has few
         mean = totals[:, 1:-1].sum(axis=1) / np.maximum(counts[:, 1:-1].sum(axis=1), 1)
         last = np.where(rest, np.abs(mean), 0.0)
         i = int(np.argmax(last))
