@@ -36,7 +36,7 @@ from dexkit.drivers.ezgripper import (
 from dexkit.drivers.ezgripper import bus as bus_module
 from dexkit.drivers.ezgripper import gripper as gripper_module
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus, ServoError
-from dexkit.drivers.ezgripper.calibration import CalibrationFailed
+from dexkit.drivers.ezgripper.calibration import CalibrationFailed, measure_speed
 from dexkit.drivers.ezgripper.control import Phase
 from dexkit.drivers.ezgripper.discovery import (
     find_device,
@@ -45,6 +45,8 @@ from dexkit.drivers.ezgripper.discovery import (
     latency_warning,
 )
 from dexkit.drivers.ezgripper.gripper import ZeroGains
+from dexkit.drivers.ezgripper.register_block import Goal, Sample
+from dexkit.drivers.ezgripper.scaling import STROKE
 from dexkit.drivers.ezgripper.servo import exchange_bytes, line_time
 from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.mx64 import (
@@ -873,6 +875,51 @@ def test_estimator_uses_servo_limit_without_measured_speed() -> None:
     hand = EZGripper("/dev/nothing", Side.LEFT, GripperSettings())
     limit = 1.5 * DEX1_1.joints[Side.LEFT][0].stroke  # 150 % of the stroke a second
     assert hand.joint_speeds == ((pytest.approx(limit), pytest.approx(limit)),)
+
+
+class _SteadyDrive:
+    """Fingers of 150 % of the stroke a second, whose answers come late in the first strokes.
+
+    The clock is virtual: 5 ms from one exchange to the next.
+    """
+
+    def __init__(self, late: int) -> None:
+        self.late = late
+        self.strokes = 0
+        self.now = 0.0
+        self.goal = Goal(0, 0, 1)
+        self.position = 0.0
+
+    def exchange(self, goal: Goal) -> Sample:
+        self.strokes += abs(goal.position - self.goal.position) > STROKE / 2
+        self.goal = goal
+        return self.sample()
+
+    def sample(self) -> Sample:
+        self.now += 0.005
+        step = 1.5 * STROKE * 0.005
+        self.position += min(max(self.goal.position - self.position, -step), step)
+        late = 0.05 if 0 < self.strokes <= self.late else 0.0
+        place = round(self.position)
+        rest = (0, place, True, 0, 0, 0, 0, 0, place, 120, 30)
+        return Sample(self.now, self.now + late, *rest)
+
+    def engage(self, goal: Goal) -> None:
+        self.exchange(goal)
+
+    def rearm_watchdog(self) -> None: ...
+
+
+def test_a_speed_is_measured_again_where_answers_come_late() -> None:
+    lines: list[str] = []
+    found = measure_speed(_SteadyDrive(late=2), 0, runs=1, progress=lines.append)
+    assert found.opening == pytest.approx(150.0, rel=0.02)
+    assert found.closing == pytest.approx(150.0, rel=0.02)
+    again, done = lines
+    assert "answers came late" in again
+    assert done.startswith("run 1 of 1: opens 150 %/s")
+    with pytest.raises(CalibrationFailed, match="too few samples"):
+        measure_speed(_SteadyDrive(late=1000), 0, runs=1)
 
 
 @pytest.mark.usefixtures("_patient_servo")
