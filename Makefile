@@ -22,7 +22,9 @@ SUPPORTED := $(foreach v,3.10 3.11 3.12 3.13,$(v) $(v).%)
 UNSUPPORTED = $(if $(filter no,$(DDS)),,$(if $(filter $(SUPPORTED),$(PYTHON_VERSION)),,$(error \
 	Python $(PYTHON_VERSION) cannot be used: dexkit needs 3.10 to 3.13 (docs/install.md))))
 FOR_PYTHON := --python $(or $(FOUND_BY_PYENV),$(PYTHON_VERSION))
-RUN := $(UV) run --frozen $(FOR_PYTHON)
+# Not 'uv run': where another interpreter of this version is found than at the set-up, it makes the
+# environment anew, without DDS, and every test on DDS is skipped.
+RUN := PATH="$(CURDIR)/.venv/bin:$$PATH"
 
 # An environment activated by the caller must not leak in.
 # Nor may bytecode go unwritten: hundreds of processes would each compile NumPy.
@@ -103,7 +105,7 @@ docs: $(STAMP) ## write the generated pages, drawings and message modules (ARGS=
 	$(RUN) python -m tools.generate $(ARGS)
 
 docs-site: $(STAMP) ## the documentation as a site in build/site, with search, requirements and API; checks every link
-	$(RUN) --group site python -m mkdocs build --quiet -f tools/site/mkdocs.yml $(ARGS)
+	$(UV) run --frozen --python .venv/bin/python --group site python -m mkdocs build --quiet -f tools/site/mkdocs.yml $(ARGS)
 
 pictures: $(STAMP) ## make the pictures of docs/images that a browser draws (ARGS=view-hands makes one)
 	$(RUN) python -m tools.pictures $(ARGS)
