@@ -28,6 +28,7 @@ from tests.namespaces import Host, Link, network, unavailable
 from tests.optional import ssh_keygen
 from tests.patience import PATIENCE
 
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10: dexkit setup-dds")
 pytestmark = pytest.mark.soak
 
 SERVICES = {"serve", "emulate", "bridge", "record", "monitor", "view"}
