@@ -329,6 +329,8 @@ def course(began: float, now: float, first: float, asked: float) -> Course:
         (course(0.9, 0.1, 0.1, 0.9), 6),  # a reversed scale
         (course(0.1, 0.9, 0.1, 0.9), 0),
         (course(0.9, 0.6, 0.1, 0.9), 0),  # on its way: nobody knows
+        (course(0.85, 0.45, 0.1, 0.45), 0),  # has come to its goal from the other end
+        (course(0.85, 0.55, 0.1, 0.45), 0),  # a little late
         (course(0.0, 0.0, 0.0, 1.0), 0),  # does not move
     ],
 )

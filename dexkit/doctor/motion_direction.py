@@ -26,7 +26,8 @@ def moves_against(course: Course, ranges: Sequence[tuple[float, float]]) -> int:
     """Number of joints that moved against their commands; 0 if it is half or less of the moving
     joints.
 
-    Such a joint stands at the position of an inverted scale; a merely late joint does not.
+    Such a joint stands at the position of an inverted scale, and not where it is commanded to:
+    both are one place in the middle of the range, where a joint may have come from the other end.
     """
     moved = against = 0
     for began, now, first, asked, (low, high) in zip(*course, ranges, strict=True):
@@ -34,7 +35,8 @@ def moves_against(course: Course, ranges: Sequence[tuple[float, float]]) -> int:
         if abs(way) > _WAY and abs(wanted) > _WAY:
             moved += 1
             turned = abs(low + high - asked - now) < _NEAR * (high - low)
-            against += way * wanted < 0 and turned
+            elsewhere = abs(asked - now) > 2 * _NEAR * (high - low)
+            against += way * wanted < 0 and turned and elsewhere
     return against if against > moved / 2 else 0
 
 
