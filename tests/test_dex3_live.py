@@ -21,6 +21,7 @@ from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import real_time
 from tests.dds_helpers import dds_domain, dds_node
+from tests.process_helpers import started
 from tests.test_service_cli import serving
 
 __all__ = ["dds_domain", "dds_node"]
@@ -147,12 +148,7 @@ def test_emulator_accepts_realtime_priority() -> None:
     with real_time() as permitted:
         pass
     arguments = ["emulate", "dex3-usb", "--port", "0", "--real-time"]
-    with subprocess.Popen(
-        command_line(*arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    with started(command_line(*arguments), stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: usbip://127.0.0.1:")
         threads = [int(entry.name) for entry in Path(f"/proc/{process.pid}/task").iterdir()]

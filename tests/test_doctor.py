@@ -33,6 +33,7 @@ from dexkit.models import DIALECTS
 from tests import doctor_packets as packets
 from tests.dds_helpers import free_domain, wait_until
 from tests.patience import PATIENCE
+from tests.process_helpers import started
 
 CMDS, STATES = (f"unitree_go::msg::dds_::{name}" for name in ("MotorCmds_", "MotorStates_"))
 HAND_CMD, HAND_STATE = (f"unitree_hg::msg::dds_::{name}" for name in ("HandCmd_", "HandState_"))
@@ -425,14 +426,8 @@ def test_observation_leaves_no_reader_behind() -> None:
 def service() -> Iterator[int]:
     """The domain of a real ``dexkit serve`` in another process."""
     domain = free_domain()
-    with subprocess.Popen(
-        [
-            *command_line("serve", "sim-dex1", "--side", "both"),
-            *("--domain", str(domain), "--quiet"),
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
+    command = command_line("serve", "sim-dex1", "--side", "both")
+    with started([*command, "--domain", domain, "--quiet"]) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: ")
         assert process.stdout.readline().startswith("ready: ")
@@ -470,14 +465,8 @@ def test_unobservable_domain_gives_no_verdict() -> None:
 
 def test_watch_reports_when_a_client_would_start() -> None:
     domain = free_domain()
-    with subprocess.Popen(
-        [
-            *(sys.executable, "-m", "dexkit", "doctor", "--watch", "--domain", str(domain)),
-            *("--scan", "none", "--seconds", "0.3"),
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
+    command = (sys.executable, "-m", "dexkit", "doctor", "--watch", "--domain", domain)
+    with started([*command, "--scan", "none", "--seconds", "0.3"]) as process:
         assert process.stdout is not None
         lines = iter(process.stdout.readline, "")
         assert any("DDS-NOBODY" in line for line in lines)

@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 from dexkit.errors import DdsSetupError, UsageError
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
+from tests.process_helpers import started
 
 
 def _ids(*ports: SerialPort) -> set[str]:
@@ -79,12 +81,7 @@ def test_port_in_use_is_not_opened() -> None:
         "print('open', flush=True); sys.stdin.read()"
     )
     with _line(1_000_000) as path:
-        with subprocess.Popen(
-            [sys.executable, "-c", hold, path],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as other:
+        with started([sys.executable, "-c", hold, path], stdin=subprocess.PIPE) as other:
             assert other.stdin is not None
             assert other.stdout is not None
             assert other.stdout.readline() == "open\n"
@@ -221,9 +218,12 @@ def test_a_process_that_listens_to_a_domain_is_named() -> None:
 
 def test_command_line_and_start_time_of_a_process_are_read() -> None:
     assert "pytest" in command_line(os.getpid()) or "-c" in command_line(os.getpid())
-    began = start_time(os.getpid())
+    before = time.time()
+    with started([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        began, after = start_time(process.pid), time.time()
+        process.communicate("\n")
     assert began is not None
-    assert abs(began - os.stat(f"/proc/{os.getpid()}").st_ctime) < 5
+    assert before - 1 <= began <= after + 1  # the kernel counts from a whole second
     assert command_line(2**22 + 1) == ""
     assert start_time(2**22 + 1) is None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from dexkit.teleop.client import JointCommand
 from dexkit.teleop.client_codec import ClientCodec
 from tests.dds_helpers import free_domain
 from tests.patience import PATIENCE
+from tests.process_helpers import started
 
 WAYS = {"DDS-REVERSED", "DDS-SIDES-SWAPPED"}
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
@@ -32,7 +32,7 @@ def served(backend: str, name: str) -> Iterator[int]:
     """Both hands of a backend on a domain of their own, by ``dexkit serve``."""
     domain = free_domain()
     arguments = ("serve", backend, "--side", "both", "--domain", str(domain), "--quiet")
-    with subprocess.Popen(command_line(*arguments), stdout=subprocess.PIPE, text=True) as process:
+    with started(command_line(*arguments)) as process:
         assert process.stdout is not None
         for _ in {dialect(name).topics(side) for side in Side}:
             assert process.stdout.readline().startswith("ready: ")

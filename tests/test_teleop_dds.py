@@ -27,6 +27,7 @@ from dexkit.models import DIALECTS
 from dexkit.teleop import profile
 from dexkit.traces import open_trace
 from tests.dds_helpers import free_domain, take_until
+from tests.process_helpers import started
 from tests.slow_hand import SLOW, SLOW_DEX3
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
@@ -38,18 +39,11 @@ def served(backend: tuple[str, ...], side: str) -> Iterator[int]:
     """A domain on which ``dexkit serve`` serves a simulated hand."""
     domain = free_domain()
     arguments = command_line("serve", *backend, "--side", side, "--quiet")
-    with subprocess.Popen(
-        [*arguments, "--domain", str(domain)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    ) as process:
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline().startswith("ready: ")
-            yield domain
-        finally:
-            process.terminate()
+    with started([*arguments, "--domain", domain], stderr=subprocess.DEVNULL) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        yield domain
+        process.terminate()
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
 from dexkit.hand import Hand, HandCommand, Side
 from tests.conformance_helpers import SUITE
 from tests.dds_helpers import free_domain
+from tests.process_helpers import started
 
 if TYPE_CHECKING:
     import socketserver
@@ -154,8 +155,7 @@ def test_the_document_shows_the_hand_as_it_is() -> None:
 @contextmanager
 def service(domain: int) -> Iterator[subprocess.Popen[str]]:
     """The left gripper, once it serves."""
-    command = [sys.executable, str(SERVICE), "left", "--domain", str(domain)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with started([sys.executable, SERVICE, "left", "--domain", domain]) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: ")
         yield process
