@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from enum import Enum
-from functools import cache
 
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
+from dexkit.conformance.stimuli.script import default_objects
 from dexkit.hand import ROBOT, Side
 from dexkit.models import model
 from dexkit.robots import ROBOTS
@@ -40,44 +39,30 @@ class RunKind(str, Enum):
         return quick(every) if self is RunKind.QUICK else tuple(every)
 
 
-@cache
-def length(model_name: str, phases: frozenset[str], at_most: float = math.inf) -> float:
-    """Duration of these phases, s, with hands or a robot that reach every goal at once.
+def length(model_name: str, phases: frozenset[str]) -> float:
+    """Duration of these phases, s, with a pair of hands or a robot that reach every goal at once.
 
-    :param at_most: s; of phases that are longer it is only some number above this.
+    The hands have the model's objects.
     """
     if model_name in ROBOTS:
         plan = Plan(robot_dialect(model_name), (ROBOT,), phases=phases)
-        return script_class(model_name)(plan).length(at_most)
-    dialect = model(model_name).dialects[0]
-    return script_class(model_name)(Plan(dialect, tuple(Side), phases=phases)).length(at_most)
+        return script_class(model_name)(plan).length()
+    dialect, sides = model(model_name).dialects[0], tuple(Side)
+    objects = default_objects(dialect, sides)
+    return script_class(model_name)(Plan(dialect, sides, objects, phases=phases)).length()
 
 
 def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
-    """Select the MUSTs of a quick run.
+    """Select the MUSTs of a quick run: those for which its phases are enough."""
+    return tuple(
+        r
+        for r in requirements
+        if r.level is Level.MUST and r.layer != "usb" and phases_for([r]) <= _quick_phases(r.model)
+    )
 
-    Phases are added in the order of their duration per MUST, until the profile's
-    ``quick_seconds`` are used up. Requirements that need a recorded session are left out.
-    """
-    chosen: set[str] = set()
-    for name in dict.fromkeys(r.model for r in requirements):
-        needs: dict[frozenset[str], list[str]] = {}
-        for r in requirements:
-            if (r.model, r.level) == (name, Level.MUST) and r.layer != "usb":
-                own = phases_for([r])
-                if "replay" not in own:
-                    needs.setdefault(own, []).append(r.id)
-        budget = (ROBOTS.get(name) or model(name)).quick_seconds
-        least = length(name, frozenset()) - 0.1  # s; requirements that need no stimulus come first
-        lengths = {own: length(name, own, budget) for own in needs}
-        # what is too long alone fits in with nothing
-        short = [own for own in needs if lengths[own] <= budget]
-        phases: frozenset[str] = frozenset()
-        for own in sorted(short, key=lambda o: (lengths[o] - least) / len(needs[o])):
-            if length(name, phases | own, budget) <= budget:
-                phases |= own
-        chosen |= {id_ for own, ids in needs.items() if own <= phases for id_ in ids}
-    return tuple(r for r in requirements if r.id in chosen)
+
+def _quick_phases(model_name: str) -> frozenset[str]:
+    return frozenset((ROBOTS.get(model_name) or model(model_name)).quick_phases)
 
 
 def print_selection(requirements: Sequence[Requirement]) -> None:

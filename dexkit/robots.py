@@ -46,7 +46,7 @@ class RobotModel:
     :param lerobot_name: its name in LeRobot (``--robot.type``), or empty.
     :param requirements: its requirement files, in dexkit's own folder.
     :param script: its stimulus script in the conformance kit.
-    :param quick_seconds: seconds of stimulus of a quick conformance run.
+    :param quick_phases: phases of a quick conformance run.
     :param layout: how it is drawn in the docs.
     :param skeleton: makes the joint axes and origins, for the viewer.
     :param joints: by motor slot; None where the slot is not used.
@@ -73,7 +73,7 @@ class RobotModel:
     battery_cells: int
     teleop_name: str
     requirements: tuple[str, ...]
-    quick_seconds: float
+    quick_phases: tuple[str, ...]
     layout: Lazy[RobotLayout]
     skeleton: Lazy[Callable[[], Skeleton]]
     joints: tuple[JointSpec | None, ...]
@@ -218,7 +218,7 @@ H1 = RobotModel(
     battery_cells=15,  # as many as its state has fields for (docs/sources/unitree-dex.md#a2)
     teleop_name="H1",
     requirements=("h1.toml",),
-    quick_seconds=13.0,
+    quick_phases=("joint", "late-joiner"),
     layout=Lazy("dexkit.robot_layout:H1"),
     skeleton=Lazy("dexkit.models.skeletons:h1"),
     joints=_h1_joints,
@@ -289,7 +289,7 @@ G1 = RobotModel(
     teleop_name="G1_29",
     lerobot_name="unitree_g1",
     requirements=("g1.toml",),
-    quick_seconds=17.0,
+    quick_phases=("joint", "late-joiner"),
     layout=Lazy("dexkit.robot_layout:G1"),
     skeleton=Lazy("dexkit.models.skeletons:g1"),
     joints=_g1_joints,

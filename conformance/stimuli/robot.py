@@ -82,10 +82,10 @@ class RobotScript(Script[RobotSubject]):
         self._sent: tuple[object, bytes] = (None, b"")
         self._dry = False
 
-    def length(self, at_most: float = math.inf) -> float:
+    def length(self) -> float:
         """Seconds that :meth:`run` takes with a robot that reaches its goals at once, as there."""
         self._dry = True
-        return super().length(at_most)
+        return super().length()
 
     def run(self) -> Steps:
         """The whole script."""

@@ -176,12 +176,8 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
         self._age_s = 0.0
         self._period_ns = 0
 
-    def length(self, at_most: float = math.inf) -> float:
-        """Seconds that :meth:`run` takes with hands that reach their goals at once.
-
-        :param at_most: s; a script that is longer is not played to its end, and what is returned is
-            more than this.
-        """
+    def length(self) -> float:
+        """Seconds that :meth:`run` takes with hands that reach their goals at once."""
         now = 0
         stopped: dict[str, float | None] = {}
         still: dict[Subject, Pose] = {s: (0.0,) * len(self._joints[s]) for s in self.plan.sides}
@@ -197,7 +193,7 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
                 now += _SERVICE_START_NS
             return Observation(now, still | dict(self._goal.items()), still, joined, stopped)
 
-        play(self, carry_out, lambda: now > at_most * 1e9)
+        play(self, carry_out, lambda: False)
         return now / 1e9
 
     def _send(self, payloads: Payloads) -> Steps:

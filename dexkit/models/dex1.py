@@ -83,7 +83,7 @@ DEX1_1 = HandModel(
     requirements=("dex1.toml", "dex1_client.toml"),
     script=Lazy("dexkit.conformance.stimuli.gripper:GripperScript"),
     reference=Lazy("dexkit.conformance.virtual.gripper:ReferenceService"),
-    quick_seconds=7.0,
+    quick_phases=("late-joiner", "load", "soft", "squeeze", "step"),
     # 2.0 rad of opening, where the session closes on an object
     objects={Side.RIGHT: 37.0},
     session="dex1_pick_place",

@@ -116,7 +116,7 @@ DEX5_1 = HandModel(
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
     wrong_hands=Lazy("dexkit.conformance.mutants.dex5"),
-    quick_seconds=20.0,
+    quick_phases=("drive", "joint", "late-joiner"),
     # first flexing joints of four fingers: none of them shares its motor
     roles=JointRoles(driven=(1, 5), slow=(9, 13)),
     # nearly as far as the session closes

@@ -55,7 +55,7 @@ INSPIRE_DFX = HandModel(
     requirements=("inspire_dfx.toml",),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.inspire:InspireService"),
-    quick_seconds=20.0,
+    quick_phases=("burst", "empty", "joint", "late-joiner", "single"),
     roles=JointRoles(driven=(), slow=(1, 3)),
     objects={Side.RIGHT: 60.0},
     simulator="sim-inspire-dfx",
@@ -97,6 +97,7 @@ INSPIRE_FTP = replace(
     name="inspire-ftp",
     title="Inspire FTP hand",
     other_short_name="inspire-ftp",
+    quick_phases=("burst", "joint", "late-joiner", "squeeze"),
     dialects=(
         Dialect(
             name="inspire_ftp",

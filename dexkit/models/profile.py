@@ -335,7 +335,8 @@ class HandModel:
     :param roles: joints that the script uses; None for a gripper.
     :param objects: where the hands of a pair that the kit starts have an object; percent of
         opening for a gripper, of closing for others.
-    :param quick_seconds: seconds of stimulus of a quick run.
+    :param quick_phases: phases of a quick run, some eleven seconds: those by which most known wrong
+        hands fail. A MUST that needs any other phase is not judged in it.
     :param session: the recorded session to replay: name of a sample of dexkit, or path of a
         recording; empty where there is none.
     :param reference: service on a virtual clock that does everything right.
@@ -363,7 +364,7 @@ class HandModel:
     requirements: tuple[str | Path, ...]
     script: Lazy[type[Script[Side]]]
     reference: Lazy[type[Service]]
-    quick_seconds: float
+    quick_phases: tuple[str, ...]
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
     areas: tuple[TouchArea, ...] = ()

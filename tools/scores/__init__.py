@@ -24,12 +24,22 @@ from dexkit.conformance.mutants.generated.oracle import Severity
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.scores import FORMAT, Entry, Setting, catalogue_digest
 from dexkit.conformance.selection import RunKind
-from dexkit.conformance.stimuli import Plan
+from dexkit.conformance.stimuli import Plan, phases_for
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
 from dexkit.models import BUILT_IN, model
 
-__all__ = ["SEED", "Counts", "Task", "as_text", "counts_of", "entries_of", "scored_models", "tasks"]
+__all__ = [
+    "SEED",
+    "Counts",
+    "Task",
+    "as_text",
+    "counts_of",
+    "entries_of",
+    "is_current",
+    "scored_models",
+    "tasks",
+]
 
 SEED = 1
 Counts = Mapping[tuple[RunKind, Setting], int]
@@ -179,10 +189,26 @@ def entries_of(
     ]
 
 
+def is_current(entry: Entry) -> bool:
+    """Whether such a run still has the requirements, their limits and the phases of the trial."""
+    run = RunKind(entry.run)
+    plan = plan_for(next(iter(entry.fewer)), run=run)
+    return (
+        entry.catalogue == catalogue_digest(entry.model)
+        and (entry.phases, entry.rounds) == (plan.phases, plan.rounds)
+        and entry.requirements == tuple(r.id for r in run.requirements(catalogue(entry.model)))
+    )
+
+
 def _about(task: Task) -> dict[str, Any]:
     """What a trial of the task depends on, as plain data."""
-    digest = catalogue_digest(task.model)
-    return {"run": str(task.run), "setting": str(task.setting), "catalogue": digest, "seed": SEED}
+    return {
+        "run": str(task.run),
+        "setting": str(task.setting),
+        "catalogue": catalogue_digest(task.model),
+        "phases": sorted(phases_for(task.run.requirements(catalogue(task.model)))),
+        "seed": SEED,
+    }
 
 
 def _keep(file: Path | None, trials: Mapping[tuple[Task, str], Trial]) -> None:
@@ -202,6 +228,7 @@ def _kept(file: Path | None, every: Sequence[Task]) -> dict[tuple[Task, str], Tr
     if file is None or not file.exists():
         return {}
     found: dict[tuple[Task, str], Trial] = {}
+    wanted = {t: _about(t) for t in every}
     lines = file.read_text(encoding="utf-8").split("\n")[:-1]
     for line in lines:
         try:
@@ -209,7 +236,7 @@ def _kept(file: Path | None, every: Sequence[Task]) -> dict[tuple[Task, str], Tr
             about, trial = values["about"], Trial.from_dict(values["trial"])
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UsageError(f"{file} has a line that is no trial of a hand") from error
-        found |= {(t, trial.name): trial for t in every if _about(t) == about}
+        found |= {(t, trial.name): trial for t in every if wanted[t] == about}
     return found
 
 

@@ -62,7 +62,7 @@ TWOFINGER_1 = HandModel(
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     roles=JointRoles(driven=(0, 1), slow=(3, 4)),
     objects={Side.RIGHT: 60.0},
-    quick_seconds=15.0,
+    quick_phases=("burst", "joint", "late-joiner", "single"),
     reference=Lazy("twofinger_hand.reference:TwoFingerService"),
     wrong_hands=Lazy("twofinger_hand.wrong"),
 )
