@@ -67,8 +67,10 @@ def test_demo_passes_and_writes_its_files(tmp_path: Path) -> None:
     demo = start("--out", tmp_path)
     out, _ = demo.communicate(timeout=600)
     assert demo.returncode == 0, out
-    assert "PASS: every MUST that could be judged is met (35 requirements: 35 pass)" in out
     result = json.loads((tmp_path / "result.json").read_text())
+    judged = len({r["id"] for r in result["results"]})
+    assert judged > 100
+    assert f"PASS: every MUST that could be judged is met ({judged} requirements: " in out
     assert result["overall"] == "pass"
     assert (tmp_path / "report.html").stat().st_size > 50_000
     assert (tmp_path / "recording.mcap").exists()
