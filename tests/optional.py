@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -79,6 +80,7 @@ OPTIONAL = (
         ("dds_multicast", "docs_run", "lan", "lerobot_soak", "networks"),
     ),
     Optional("/proc/PID/schedstat", Path("/proc/self/schedstat").exists, ("conformance_waits",)),
+    Optional("Python 3.10 in this run", lambda: sys.version_info < (3, 11), ("vendor_action",)),
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
     Optional(

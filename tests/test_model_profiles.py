@@ -177,7 +177,7 @@ class Packages:
 def forget() -> None:
     """What was found out about installed packages."""
     from dexkit import lazy
-    from dexkit.conformance import requirements, selection
+    from dexkit.conformance import requirements
     from dexkit.conformance.mutants import registry
 
     importlib.invalidate_caches()
@@ -187,7 +187,7 @@ def forget() -> None:
     ]
     for cached in (
         *(requirements.catalogue, requirements._files, requirements._requirements),
-        *(requirements._document, selection.length, mutants, lazy._load),
+        *(requirements._document, mutants, lazy._load),
     ):
         cached.cache_clear()
 
