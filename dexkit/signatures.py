@@ -235,8 +235,9 @@ def _signed_by(tool: str, message: Path, signature: Path) -> str:
 
 
 def _minisign_id(text: str) -> str:
-    """The key id in a public key (42 bytes) or a signature (74 bytes) of minisign, as it prints it;
-    empty if it is none. The format: algorithm, 8 bytes of id in little-endian order, key.
+    """The key id in a public key (42 bytes) or a signature (74 bytes) of minisign, as version 0.11
+    writes it into key files (hexadecimal, no leading zeros); empty if it is none.
+    The format: algorithm, 8 bytes of id in little-endian order, key.
     """
     try:
         raw = base64.b64decode(text, validate=True)
@@ -244,7 +245,7 @@ def _minisign_id(text: str) -> str:
         return ""
     if len(raw) not in (42, 74) or raw[:2] not in (b"Ed", b"ED"):
         return ""
-    return raw[2:10][::-1].hex().upper()
+    return f"{int.from_bytes(raw[2:10], 'little'):X}"
 
 
 _STANDARD_INPUT = 0

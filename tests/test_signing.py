@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -213,7 +214,7 @@ def test_minisign_signs_and_verifies(signed: Signed, tmp_path: Path) -> None:
     code, out, err = dexkit("sign", signed.result, *tool)
     assert code == 0, err
     assert "manifest.json.minisig" in contents(archive)
-    key_id = public.read_text().split()[5]
+    key_id = f"{int(public.read_text().split()[5], 16):X}"
     assert f"minisign key {key_id}" in out
     code, out, err = verify(archive, public, "--no-rejudge")
     assert (code, err) == (0, "")
@@ -229,6 +230,13 @@ def test_minisign_signs_and_verifies(signed: Signed, tmp_path: Path) -> None:
             write(tmp_path / "x.zip", {**found, name: flipped(found[name])}), public
         )
         assert (code, name in out) == (1, True)
+
+
+def test_a_minisign_key_id_has_no_leading_zeros() -> None:
+    ident = bytes.fromhex("0DB2B37F30AEAB65")[::-1]
+    for length in (32, 64):  # a public key, a signature
+        text = base64.b64encode(b"Ed" + ident + bytes(length)).decode()
+        assert signatures._minisign_id(text) == "DB2B37F30AEAB65"
 
 
 # -------------------------------------------------------------------------- every change
