@@ -22,6 +22,7 @@ from dexkit.conformance.mutants.generated.times import WHENS
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
+from dexkit.digests import digest_of
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect, dialect, model
@@ -477,13 +478,38 @@ def test_good_hands_that_once_failed_pass(name: str) -> None:
     assert (trial.failed, trial.warned) == ((), ()), name
 
 
+def digest_of_the_code() -> str:
+    """What trials depend on: those of other code are not gone on with."""
+    folders = ("conformance", "dexkit", "drivers", "emulators", "traces")
+    files = (f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file())
+    code = sorted(f for f in files if f.suffix in {".py", ".toml"})
+    return digest_of(piece for f in code for piece in (f.name.encode(), f.read_bytes())).sha256
+
+
+def test_the_digest_of_the_code_depends_on_the_requirements(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "conformance" / "requirements"
+    folder.mkdir(parents=True)
+    monkeypatch.setitem(globals(), "ROOT", tmp_path)
+    (folder / "a.toml").write_text("limit = 1")
+    before = digest_of_the_code()
+    assert digest_of_the_code() == before
+    (folder / "a.toml").write_text("limit = 2")
+    assert digest_of_the_code() != before
+
+
 @pytest.mark.soak
-def test_a_campaign_of_all_models(tmp_path: Path) -> None:
-    """Bounded: every class, dialect and good deviation several times. The score is reported."""
-    campaign = Campaign(1, tmp_path / "campaign.jsonl")
+def test_a_trial_of_all_models(cache: pytest.Cache) -> None:
+    """Bounded: every class, dialect and good deviation several times. The score is reported.
+
+    It takes an hour or two: one that was stopped is gone on with, as long as the code is the same.
+    """
+    file = cache.mkdir("trials") / f"{digest_of_the_code()}.jsonl"
+    trial = Campaign(1, file)
     hands = generated.sample(400, 1, dialects()) + generated.sample_good(400, 1, dialects())
-    assert len(list(campaign.run(hands))) == 800
-    campaign.write_json(tmp_path / "score.json")
-    print(json.dumps(campaign.as_dict()["score"], indent=2))
-    assert [t.name for t in campaign.trials if t.errors] == []
-    assert [(t.name, t.failed + t.warned) for t in campaign.blamed] == []
+    assert len(list(trial.run(hands))) == 800
+    file.unlink()
+    print(json.dumps(trial.as_dict()["score"], indent=2))
+    assert [t.name for t in trial.trials if t.errors] == []
+    assert [(t.name, t.failed + t.warned) for t in trial.blamed] == []
