@@ -503,7 +503,7 @@ def test_the_digest_of_the_code_depends_on_the_requirements(
 def test_a_trial_of_all_models(cache: pytest.Cache) -> None:
     """Bounded: every class, dialect and good deviation several times. The score is reported.
 
-    It takes an hour or two: one that was stopped is gone on with, as long as the code is the same.
+    It takes two to three hours: one that was stopped is gone on with, if the code is the same.
     """
     file = cache.mkdir("trials") / f"{digest_of_the_code()}.jsonl"
     trial = Campaign(1, file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.brainco import BrainCoHand, BrainCoService
+from dexkit.conformance.virtual.inspire import FtpHand, FtpService
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
+from dexkit.hand import Side
 
 IDS = ("BRAINCO-FORCE-01", "BRAINCO-FORCE-05")
 
@@ -55,3 +58,67 @@ def test_grip_begins_anew_with_the_first_command_after_a_silence(
     found = [r for r in judge(recording, requirements=wanted).results if r.requirement.id in IDS]
     assert [r.observed for r in found if r.verdict is Verdict.FAIL] == []
     assert any(r.verdict is Verdict.PASS for r in found)
+
+
+class _Peaks(FtpHand):
+    """On contact the force rises with the speed, and settles there; without commands, it stops."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.part = np.ones(len(self.q))
+        self.pressed = np.zeros(len(self.q), np.bool_)
+
+    def expire(self) -> None:
+        self.place = list(self.q)
+        self.goal = np.array(self.place)
+
+    def step(self, dt: float) -> None:
+        fast = np.abs(self.dq) > 0.3
+        super().step(dt)
+        presses = np.abs(self.contact) > 0.05
+        began = presses & ~self.pressed
+        self.part[began] = np.where(fast[began], 1.0, 1.0 / 3.0)
+        self.pressed = presses
+
+
+class Peaks(FtpService):
+    """Presses with a third of the force on an object that it touches already."""
+
+    hand = _Peaks
+
+    def fill(self, motors: Any, hand: Any) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= hand.part
+
+
+class WeakerEachTime(FtpService):
+    """Reports two fifths of the force from the second client on."""
+
+    later = False
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.later = self.later or client > 0
+        super().receive(topic, payload, client)
+
+    def fill(self, motors: Any, hand: Any) -> None:
+        super().fill(motors, hand)
+        motors["tau_est"] *= 0.4 if self.later else 1.0
+
+
+@pytest.mark.parametrize(
+    ("hand", "verdict"), [(Peaks, Verdict.PASS), (WeakerEachTime, Verdict.FAIL)]
+)
+def test_squeezes_are_compared_that_begin_away_from_the_object(
+    hand: type[FtpService], verdict: Verdict
+) -> None:
+    plan = plan_for("inspire_ftp", sides=(Side.RIGHT,))
+    plan = replace(plan, phases=frozenset({"joint", "restart", "silence", "squeeze", "touch"}))
+    wanted = select(catalogue("inspire-ftp"), prefixes=("FTP-FORCE-07",))
+    recording = recording_of(run_virtual(plan, hand), plan.dialect.name, plan.sides)
+    (found,) = (
+        r
+        for r in judge(recording, requirements=wanted).results
+        if r.requirement.id == "FTP-FORCE-07"
+    )
+    assert found.verdict is verdict, found.observed
+    assert len(recording.phases("squeeze", Side.RIGHT)) == 3

@@ -24,6 +24,7 @@ the parts of a stretch."""
 _STANDS = 0.03  # of the stroke: motion in a stretch
 _AT_GOAL = 0.03  # of the stroke: distance from the goal of a joint that has reached it
 _NEAR, _CLEAR = 0.08, 0.08  # of the stroke: from where the object is, of one that touches or not
+_AWAY = 0.15  # of the stroke: way to the object of a squeeze that is compared with others
 _END = 0.05  # of the stroke: distance from the ends within which a stop may press
 _HEARD_S = 0.25  # s without a command, after which a hand may do what it does in a silence
 _FAST = 0.5  # part of the full speed from which a goal is soon beyond the object
@@ -241,3 +242,54 @@ def grips_alike(ctx: Context) -> Outcome:
         return ctx.passed(f"{part:.0%}", text, part=part)
     place = ctx.at(ctx.states.topic, one.begin, one.end)
     return ctx.failed(f"{part:.0%}", text, place, part=part).about(joint)
+
+
+@check("FTP-FORCE-07")
+def squeezes_alike(ctx: Context) -> Outcome:
+    """The weakest squeeze of a joint, relative to its strongest one that began as far away."""
+    if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
+        return skipped
+    unit = _unit(ctx)
+    worst: tuple[float, int, float, float, tuple[float, float]] | None = None
+    for joint, spec in enumerate(ctx.joints):
+        found = _squeezes(ctx, joint)
+        strongest = max((force for force, _ in found), default=0.0)
+        weak = strongest < ctx.tolerance("min_strongest_part") * spec.tau_max
+        if weak or len(found) < 2:
+            continue
+        weakest, when = min(found)
+        mine = weakest / strongest, joint, strongest, weakest, when
+        worst = min(worst or mine, mine, key=lambda w: w[:2])
+    if worst is None:
+        return ctx.skipped("no joint squeezed the object twice with enough force to compare")
+    part, joint, strongest, weakest, when = worst
+    text = ctx.named(
+        f"force_act of {weakest:.2f} {unit} in a squeeze, where it was {strongest:.2f} {unit} in "
+        "another one",
+        joint,
+    )
+    if part >= ctx.tolerance("min_part"):
+        return ctx.passed(f"{part:.0%}", text, part=part)
+    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *when), part=part).about(joint)
+
+
+def _squeezes(ctx: Context, joint: int) -> list[tuple[float, tuple[float, float]]]:
+    """The median force of a joint in each squeeze, and when it was.
+
+    Not of a squeeze that began at the object: on contact, the force rises with the speed.
+    """
+    at, spec = ctx.object_at, ctx.joints[joint]
+    if at is None or not spec.closing:
+        return []
+    contact = spec.closed_by(at / 100)
+    found = []
+    for phase in ctx.phases("squeeze"):
+        begin, end = ctx.span(phase)
+        q = ctx.states.q[ctx.states.between(begin - _GRID_S, begin), joint]
+        if not len(q) or (contact - q[-1]) * spec.closing < _AWAY * spec.stroke:
+            continue
+        inside = [s for s in stands(ctx) if begin <= s.begin and s.end <= end and s.presses[joint]]
+        if len(inside) >= FEW_STANDS:
+            force = float(np.median([s.force[-1, joint] for s in inside]))
+            found.append((force, (inside[0].begin, inside[-1].end)))
+    return found

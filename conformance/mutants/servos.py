@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -518,6 +519,7 @@ class ForceBacksOff(_FeelingService):
 
 class _WeakAgain(_Feels):
     weak = False
+    part = 0.15
 
     def is_weak(self) -> bool:
         return False
@@ -531,7 +533,7 @@ class _WeakAgain(_Feels):
     def changed(self) -> None:
         super().changed()
         if self.weak:
-            self.law_kp = [0.15 * k for k in self.law_kp]
+            self.law_kp = [self.part * k for k in self.law_kp]
 
 
 class _GivesUp(_WeakAgain):
@@ -540,7 +542,7 @@ class _GivesUp(_WeakAgain):
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
-@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-07",), sides=BOTH, whole=True)
 class ForceGivesUp(_FeelingService):
     """Presses with a seventh of its force after a second of a grip."""
 
@@ -548,7 +550,7 @@ class ForceGivesUp(_FeelingService):
 
 
 @wrong_hand("BRAINCO-FORCE-05", also=("BRAINCO-MOVE-09",), sides=BOTH, whole=True)
-@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-07",), sides=BOTH, whole=True)
 class WeakAfterRestart(_FeelingService):
     """Presses with a seventh of its force after a restart of the service."""
 
@@ -558,6 +560,27 @@ class WeakAfterRestart(_FeelingService):
         super().take_over(before)
         for hand in self.hands.values():
             hand.is_weak = lambda hand=hand: hand.grip > 0.0  # type: ignore[attr-defined]
+
+
+class _ThirdOfItsForce(_WeakAgain):
+    part = 0.3
+    other_client = False
+
+    def is_weak(self) -> bool:
+        return self.other_client
+
+
+@wrong_hand("FTP-FORCE-07", sides=BOTH, whole=True)
+class WeakForNewClients(_FeelingService):
+    """Presses with less than half of its force since a second program has commanded it."""
+
+    hand_fault = _ThirdOfItsForce
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if client:
+            for hand in self.hands.values():
+                hand.other_client = True  # type: ignore[attr-defined]
+        super().receive(topic, payload, client)
 
 
 # ----------------------------------------------------------------------------- tactile areas
@@ -687,7 +710,7 @@ class _SwapsSome(ServoService):
         super().motors(side, motors)
 
 
-@wrong_hand("BRAINCO-LIFE-02", whole=True)
+@wrong_hand("BRAINCO-LIFE-02", also=("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"), whole=True)
 class SwapsForNewClients(_SwapsSome):
     """Mixes two joints up in the commands of a restarted client."""
 
@@ -699,6 +722,62 @@ class SwapsForNewClients(_SwapsSome):
 
     def swaps(self) -> bool:
         return 0 < self.client < 1000 and not self.restarted
+
+
+@wrong_hand(
+    "BRAINCO-STILL-01",
+    also=(
+        *("BRAINCO-PATH-01", "BRAINCO-SAFE-03", "BRAINCO-SAFE-05"),
+        *("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
+    ),
+    sides=BOTH,
+    whole=True,
+)
+@wrong_hand(
+    "DFX-STILL-01",
+    also=("DFX-MOVE-08", "DFX-PATH-01", "DFX-SAFE-03", "DFX-SAFE-04", "DFX-SAFE-05"),
+    sides=BOTH,
+    whole=True,
+)
+@wrong_hand("FTP-STILL-01", also=("FTP-MOVE-08", "FTP-PATH-01"), sides=BOTH, whole=True)
+class OldClientReturns(ServoService):
+    """Obeys the earlier client's last goals on the left for a quarter of each second."""
+
+    client = 0
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.last: dict[Side, tuple[Motor, ...]] = {}
+        self.earlier: dict[Side, tuple[Motor, ...]] = {}
+        self.since = 0.0
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        if client < 1000 and client != self.client:
+            self.client, self.earlier, self.since = client, dict(self.last), self.now
+        super().receive(topic, payload, client)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        self.last[side] = motors
+        if side is Side.LEFT and (self.now - self.since) % 1.0 > 0.75:
+            motors = self.earlier.get(side, motors)
+        super().motors(side, motors)
+
+
+@wrong_hand("BRAINCO-SPEED-03", also=("BRAINCO-SPEED-01", "BRAINCO-SPEED-02"), whole=True)
+class OneSpeedForNewClients(ServoService):
+    """Moves all joints with the largest speed of a restarted client's command."""
+
+    client = 0
+
+    def receive(self, topic: str, payload: bytes, client: int) -> None:
+        self.client = client
+        super().receive(topic, payload, client)
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        if 0 < self.client < 1000:
+            most = max(m.dq for m in motors)
+            motors = tuple(replace(m, dq=most) for m in motors)
+        super().motors(side, motors)
 
 
 @wrong_hand(

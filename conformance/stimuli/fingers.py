@@ -27,7 +27,8 @@ limp           zero gains, with a q far towards closed, and then with one toward
 lock           the first with the client's gains and status 0 or mode 0; again for a later client
 mixed          a step in which some joints are locked under way, by their mode byte, and the others
                go on: three times, with other joints
-speeds         position servos: each joint with another speed, and one with none; again with others
+speeds         position servos: each joint with another speed, and one with none; again with others;
+               and all that for a new client
 ends           one finger after the other to both ends of its range, with the thumb out of the way;
                position servos also after the restart of the service
 push, pull     a torque alone, without a position gain: some joints towards closed and the others
@@ -58,8 +59,8 @@ operator       Unitree's client in a closed loop; see :mod:`~dexkit.conformance.
 two-writers    a second client commands another place, and goes
 company        a second client commands the same: steps of each side alone, and of both in
                opposite directions
-restart        the client goes away, another comes, and makes such steps; each kind of bad
-               commands again
+restart        the client goes away, another comes, and makes such steps; position servos stand
+               where it has sent them; each kind of bad commands again
 shutdown       the service is stopped and started again
 restarted      no commands
 service-       such steps after that; silence again
@@ -141,6 +142,9 @@ _SPEEDS_SECONDS = 0.5
 _GRIP_SECONDS, _REGRIP_SECONDS = 1.1, 0.6
 """Seconds of a grip after a restart of position servos, and of hands with gains: these touch the
 object after 0.2 s."""
+_BETWEEN_PLACES, _NEW_CLIENT_SECONDS = 30.0, 2.0
+"""Percent of closing at which position servos stand for a new client, between the places of other
+clients' commands, and for how many seconds."""
 _GRIP_ON_SECONDS = 1.5
 """Seconds for which position servos grip on after a silence, which they need not let go in: five
 seconds of contact, in which a force that fades within six is down to a sixth."""
@@ -917,6 +921,20 @@ class FingerScript(HandScript):
         self._report("squeezing the object again")
         yield from self._squeeze(pressing, _GRIP_SECONDS)
         yield from self._to("center", OPEN)
+
+    def _new_client(self) -> Steps:
+        """A position servo stands for a while where no other client has sent it, so that it is seen
+        if the goals of one are still in force; and gets speeds again. Runs of hands with gains have
+        no time for it.
+        """
+        if not self.plan.dialect.position_servo:
+            return
+        yield from self._to("center", _BETWEEN_PLACES)
+        yield from self._hold(_NEW_CLIENT_SECONDS)
+        if "speeds" in self.plan.phases:
+            yield from self._speeds()
+        else:
+            yield from self._to("center", OPEN)
 
     def _squeeze(self, sides: Sequence[Side], seconds: float, name: str = "squeeze") -> Steps:
         """All fingers close on the object, as a phase."""

@@ -110,6 +110,7 @@ class HandScript(Script[Side]):
             yield Restart()
             yield from self._in_turn("restart")
             yield from self._grips_again()
+            yield from self._new_client()
             if "nan" in self.plan.phases:
                 yield from self._again()
         yield from self._hold(0.1)
@@ -138,6 +139,10 @@ class HandScript(Script[Side]):
 
     def _grips_again(self) -> Steps:
         """A short grip after a restart of the client or the service."""
+        yield from ()
+
+    def _new_client(self) -> Steps:
+        """What a new client does besides the steps and grips."""
         yield from ()
 
     def _ends_again(self) -> Steps:
