@@ -317,11 +317,25 @@ class TestFailedExchanges:
 
 class TestPrediction:
     def test_auto_estimation_depends_on_the_rate_that_clients_need(self) -> None:
-        assert not Bench(io_rate=300.0).core.predicting
-        assert Bench(io_rate=30.0).core.predicting
+        speeds = [(2.0, 2.0)]
+        assert not Bench(io_rate=300.0, speeds=speeds).core.predicting
+        assert Bench(io_rate=30.0, speeds=speeds).core.predicting
+
+    def test_without_speeds_a_slow_link_publishes_measurements(self) -> None:
+        """At the joint's top speed, q would run ahead of a soft joint and jump back again."""
+        bench = Bench(io_rate=30.0)
+        assert (bench.core.predicting, bench.core.lacks_speeds) == (False, True)
+        bench.command(5.0, kp=0.01)
+        for _ in range(20):
+            bench.clock.advance(1 / 300)
+            view = bench.core.view()
+            assert view is not None
+            assert (view.state.q[0], view.state.measured) == (1.0, True)
+        assert not Bench(io_rate=300.0).core.lacks_speeds
+        assert not Bench(io_rate=30.0, estimation=Estimation.OFF).core.lacks_speeds
 
     def test_auto_prediction_measures_the_link_rate(self) -> None:
-        bench = Bench(io_rate=300.0)
+        bench = Bench(io_rate=300.0, speeds=[(2.0, 2.0)])
         bench.clock.advance(0.1)
         bench.exchange()
         assert not bench.core.predicting  # one hiccup is not a slow link

@@ -49,7 +49,8 @@ class Estimation(str, Enum):
     """When q is predicted between measurements.
 
     ``AUTO`` predicts while fewer measurements come than clients need (the model's
-    ``min_state_rate``); above that a measurement is published again until the next one comes.
+    ``min_state_rate``) from a hand whose joints' speeds are known; otherwise a measurement is
+    published again until the next one comes.
     """
 
     AUTO = "auto"
@@ -270,8 +271,14 @@ class HandCore:
     def predicting(self) -> bool:
         """Whether q is predicted between measurements now."""
         if self._estimation is Estimation.AUTO:
-            return self._slow
+            # at any other speed it would report motion that does not happen
+            return self._slow and self._speeds is not None
         return self._estimation is Estimation.PREDICT
+
+    @property
+    def lacks_speeds(self) -> bool:
+        """Whether q would be predicted if the joints' speeds were known."""
+        return self._estimation is Estimation.AUTO and self._slow and self._speeds is None
 
     @property
     def resyncs(self) -> int:

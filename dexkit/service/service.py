@@ -551,6 +551,12 @@ class HandService:
                 "ones (docs/backends.md)",
                 unit.side,
             )
+        if unit.core.lacks_speeds:
+            log.warning(
+                "%s: the hand is measured less often than clients need, and q is not predicted in "
+                "between: the backend has no joint_speeds (docs/backends.md)",
+                unit.side,
+            )
         try:
             unit.core.measured(unit.hand.exchange(unit.core.next_command()))
         except Exception as error:
