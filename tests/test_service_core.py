@@ -14,7 +14,7 @@ from dexkit.clock import ManualClock
 from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
 from dexkit.hand import HandCommand, HandState, MotorError, Side
-from dexkit.models import DEX1_1
+from dexkit.models import DEX1_1, DEX3_1
 from dexkit.service.hand_core import Estimation, HandCore
 from tests.each import each
 
@@ -317,25 +317,31 @@ class TestFailedExchanges:
 
 class TestPrediction:
     def test_auto_estimation_depends_on_the_rate_that_clients_need(self) -> None:
-        speeds = [(2.0, 2.0)]
-        assert not Bench(io_rate=300.0, speeds=speeds).core.predicting
-        assert Bench(io_rate=30.0, speeds=speeds).core.predicting
+        assert not Bench(io_rate=300.0).core.predicting
+        assert Bench(io_rate=30.0).core.predicting
 
-    def test_without_speeds_a_slow_link_publishes_measurements(self) -> None:
-        """At the joint's top speed, q would run ahead of a soft joint and jump back again."""
-        bench = Bench(io_rate=30.0)
-        assert (bench.core.predicting, bench.core.lacks_speeds) == (False, True)
-        bench.command(5.0, kp=0.01)
+    def test_slow_fingers_of_unknown_speed_publish_measurements(self) -> None:
+        """At the joints' top speed, q would run ahead of a soft joint and jump back again."""
+        clock = ManualClock(100.0)
+        spec = DEX3_1.spec(Side.LEFT, io_rate=30.0, simulated=True)
+        n = spec.n_joints
+        core = HandCore(spec, DEX3_1, clock)
+        core.opened(spec)
+        q = np.full(n, -0.1)
+        core.measured(HandState.from_values(q, stamp=clock.now()))
+        assert (core.predicting, core.lacks_speeds) == (False, True)
+        core.submit(HandCommand.position(np.full(n, -0.3), kp=0.2, kd=0.8))
         for _ in range(20):
-            bench.clock.advance(1 / 300)
-            view = bench.core.view()
+            clock.advance(1 / 300)
+            view = core.view()
             assert view is not None
-            assert (view.state.q[0], view.state.measured) == (1.0, True)
-        assert not Bench(io_rate=300.0).core.lacks_speeds
-        assert not Bench(io_rate=30.0, estimation=Estimation.OFF).core.lacks_speeds
+            assert view.state.measured
+            assert (view.state.q == q).all()
+        core.opened(spec, [(2.0, 2.0)] * n)
+        assert (core.predicting, core.lacks_speeds) == (True, False)
 
     def test_auto_prediction_measures_the_link_rate(self) -> None:
-        bench = Bench(io_rate=300.0, speeds=[(2.0, 2.0)])
+        bench = Bench(io_rate=300.0)
         bench.clock.advance(0.1)
         bench.exchange()
         assert not bench.core.predicting  # one hiccup is not a slow link

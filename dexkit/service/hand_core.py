@@ -49,8 +49,8 @@ class Estimation(str, Enum):
     """When q is predicted between measurements.
 
     ``AUTO`` predicts while fewer measurements come than clients need (the model's
-    ``min_state_rate``) from a hand whose joints' speeds are known; otherwise a measurement is
-    published again until the next one comes.
+    ``min_state_rate``); above that a measurement is published again until the next one comes. So
+    it is of a hand with several joints that obey gains, if their speeds are not known.
     """
 
     AUTO = "auto"
@@ -80,6 +80,7 @@ class HandCore:
         self._clock = clock
         self._timeout = model.command_timeout
         self._min_rate = model.min_state_rate
+        self._obeys_gains = spec.n_joints > 1 and not model.dialects[0].position_servo
         self._estimation = estimation
         self._gate = CommandGate(spec)
         self._brake = HandCommand.brake(spec.n_joints)
@@ -271,14 +272,18 @@ class HandCore:
     def predicting(self) -> bool:
         """Whether q is predicted between measurements now."""
         if self._estimation is Estimation.AUTO:
-            # at any other speed it would report motion that does not happen
-            return self._slow and self._speeds is not None
+            return self._slow and not self.lacks_speeds
         return self._estimation is Estimation.PREDICT
 
     @property
     def lacks_speeds(self) -> bool:
-        """Whether q would be predicted if the joints' speeds were known."""
-        return self._estimation is Estimation.AUTO and self._slow and self._speeds is None
+        """Whether q would be predicted if the joints' speeds were known.
+
+        Fingers that obey gains are sent away softly as well: at their top speed, a prediction would
+        report motion that does not happen.
+        """
+        unknown = self._obeys_gains and self._speeds is None
+        return self._estimation is Estimation.AUTO and self._slow and unknown
 
     @property
     def resyncs(self) -> int:
