@@ -49,8 +49,8 @@ class Estimation(str, Enum):
     """When q is predicted between measurements.
 
     ``AUTO`` predicts while fewer measurements come than clients need (the model's
-    ``min_state_rate``); above that a measurement is published again until the next one comes. So
-    it is of a hand with several joints that obey gains, if their speeds are not known.
+    ``min_state_rate``); above that a measurement is published again until the next one comes. It
+    does not predict a hand of several joints that obey gains and whose speeds are not known.
     """
 
     AUTO = "auto"
