@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
@@ -230,4 +231,8 @@ def _number(value: object) -> int:
 
 
 def _numbers(values: Sequence[object]) -> list[int]:
+    if set(map(type, values)) == {int}:  # looked at as one, as there are many
+        whole = cast(Sequence[int], values)
+        if min(whole) >= -_LATEST and max(whole) <= _LATEST:
+            return list(whole)
     return [_number(v) for v in values]

@@ -33,6 +33,7 @@ from dexkit.digests import sha256_of_file
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import ROBOT, Side, Subject
+from dexkit.interpreter import pause_collection
 from dexkit.models import DEX1_1, Dialect, dialect, model
 from dexkit.open_file_limit import require_open_files
 from dexkit.robots import ROBOTS
@@ -408,6 +409,7 @@ def run_suite(
             if not record_run(live_options(options, domain), path, report=report, stop=stop):
                 raise ConformanceError("the run was stopped; nothing is judged")
             report("judging the recording")
+            stack.enter_context(pause_collection())
             trace = open_trace(path)
             view = recording_of(trace, options.dialect.name, options.sides)
             if trace.damage:

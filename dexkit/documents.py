@@ -198,15 +198,17 @@ def _limit_depth(document: Any) -> None:
 
     :raises ValueError: it is.
     """
-    level, depth = [document], 0
+    level, depth = [[document]], 0
     while level:
         below: list[Any] = []
-        for value in level:
-            if isinstance(value, dict | list):
+        for values in level:
+            kinds = set(map(type, values))  # of all at once, as there may be many numbers
+            if dict in kinds or list in kinds:
                 if depth == DEEPEST:
                     raise ValueError(_TOO_DEEP)
-                below += value.values() if isinstance(value, dict) else value
-            elif isinstance(value, int) and abs(value) >= 10**_DIGITS:
+                below += (list(v.values()) for v in values if isinstance(v, dict))
+                below += (v for v in values if isinstance(v, list))
+            if int in kinds and max(abs(v) for v in values if isinstance(v, int)) >= 10**_DIGITS:
                 raise ValueError(f"a number has more than {_DIGITS} digits")
         level, depth = below, depth + 1
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["SWITCH_INTERVAL", "shorten_pauses", "timely_threads"]
+__all__ = ["SWITCH_INTERVAL", "pause_collection", "shorten_pauses", "timely_threads"]
 
 SWITCH_INTERVAL = 0.5e-3
 """Seconds after which a thread hands the interpreter over to one that waits for it. Python's own
@@ -42,3 +42,18 @@ def timely_threads() -> Iterator[None]:
         if not frozen:
             gc.unfreeze()
         sys.setswitchinterval(before)
+
+
+@contextmanager
+def pause_collection() -> Iterator[None]:
+    """No garbage collection for the time of a calculation that makes many objects and few cycles.
+
+    To look through the objects of a recording again and again takes a tenth of its judgement.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

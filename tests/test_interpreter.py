@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dexkit.interpreter import SWITCH_INTERVAL, timely_threads
+from dexkit.interpreter import SWITCH_INTERVAL, pause_collection, timely_threads
 
 
 @pytest.fixture
@@ -61,3 +61,15 @@ def test_settings_of_a_caller_stay() -> None:
     finally:
         gc.unfreeze()
         sys.setswitchinterval(interval)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_garbage_collection_is_as_before_after_a_pause(before: bool) -> None:
+    enabled = gc.isenabled()
+    try:
+        (gc.enable if before else gc.disable)()
+        with pause_collection():
+            assert not gc.isenabled()
+        assert gc.isenabled() == before
+    finally:
+        (gc.enable if enabled else gc.disable)()

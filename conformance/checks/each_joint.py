@@ -343,7 +343,8 @@ def low_rate_goes_on(ctx: Context) -> Outcome:
         if end - begin <= worst[0]:
             continue
         # a restarted service or a paused machine is silent on both
-        own = fast.t[(fast.t > begin) & (fast.t < end)]
+        rows = np.searchsorted(fast.t, begin, "right"), np.searchsorted(fast.t, end)
+        own = fast.t[rows[0] : rows[1]]
         quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
         worst = max(worst, (end - begin - quiet, begin))
     gap, at = worst

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,13 +67,19 @@ class Step:
         )
 
 
-def steps_of(ctx: Context, phase: Phase) -> list[Step]:
+def steps_of(ctx: Context, phase: Phase) -> tuple[Step, ...]:
     """A phase's targets as steps of this side's joints; joints without state are left out."""
+    targets = phase.targets.get(ctx.side, {})
+    what = ("steps", phase.begin_ns, phase.end_ns, *targets.items())
+    return ctx.once(what, lambda: tuple(_steps_to(ctx, phase, targets)))
+
+
+def _steps_to(ctx: Context, phase: Phase, targets: Mapping[int, float]) -> Iterator[Step]:
+    """A phase's motions to these targets, by joint."""
     begin, end = ctx.span(phase)
     states = ctx.states
     rows, before = states.between(begin, end), states.between(begin - 0.1, begin)
-    found = []
-    for joint, target in phase.targets.get(ctx.side, {}).items():
+    for joint, target in targets.items():
         t, q = states.t[rows], states.q[rows, joint]
         earlier = states.q[before, joint]
         earlier = earlier[np.isfinite(earlier)]
@@ -82,22 +88,19 @@ def steps_of(ctx: Context, phase: Phase) -> list[Step]:
         if not len(q):
             continue
         late = t >= end - 0.2
-        found.append(
-            Step(
-                name=ctx.named("", joint),
-                joint=joint,
-                stroke=ctx.joints[joint].stroke,
-                begin=begin,
-                end=end,
-                target=target,
-                start=median(earlier) if len(earlier) else float(q[0]),
-                final=median(q[late]) if late.any() else float(q[-1]),
-                t=t,
-                q=q,
-                unit=ctx.unit,
-            )
+        yield Step(
+            name=ctx.named("", joint),
+            joint=joint,
+            stroke=ctx.joints[joint].stroke,
+            begin=begin,
+            end=end,
+            target=target,
+            start=median(earlier) if len(earlier) else float(q[0]),
+            final=median(q[late]) if late.any() else float(q[-1]),
+            t=t,
+            q=q,
+            unit=ctx.unit,
         )
-    return found
 
 
 def speed_of(step: Step) -> float | None:
@@ -208,33 +211,78 @@ def limited_by_start(ctx: Context, step: Step) -> bool:
     return bool(grows) and median(np.array(grows)) <= _GROWS
 
 
-def _larger(ctx: Context, step: Step) -> Iterator[Step]:
-    """Motions of a step's joint after much larger changes of its goal, with the same stiffness."""
-    given, states, joint = ctx.commands, ctx.states, step.joint
-    spec = ctx.joints[joint]
+@dataclass(frozen=True)
+class _Change:
+    """What a joint does in the time after a change of its goal; see :class:`Step`.
+
+    :param kp: of the command.
+    """
+
+    kp: float
+    begin: float
+    end: float
+    target: float
+    start: float
+    t: Floats
+    q: Floats
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """The changes of one joint's goal, and the stiffness of all its commands by their times."""
+
+    t: Floats
+    kp: Floats
+    found: tuple[_Change, ...]
+
+    def stiffness(self, at: float) -> float:
+        """The kp of the newest command at a time."""
+        return float(self.kp[max(int(np.searchsorted(self.t, at)) - 1, 0)])
+
+
+def _changes(ctx: Context, joint: int) -> _Changes:
+    given = ctx.commands
     good = np.isfinite(given.q).all(axis=1) & np.isfinite(given.kp).all(axis=1)
     t, kp = given.t[good], given.kp[good, joint]
-    goal = np.clip(given.q[good, joint], spec.q_min, spec.q_max)
-    if not len(t):
-        return
-    stiff = float(
-        kp[max(int(np.searchsorted(t, step.begin + 0.5 * (step.end - step.begin))) - 1, 0)]
-    )
-    changes = np.flatnonzero(np.abs(np.diff(goal, prepend=goal[0])) > _CHANGE * spec.stroke)
+    return _Changes(t, kp, tuple(_changes_in(ctx, joint, t, given.q[good, joint], kp)))
+
+
+def _changes_in(ctx: Context, joint: int, t: Floats, q: Floats, kp: Floats) -> Iterator[_Change]:
+    """The changes of a joint's goal in its commands that are watched for long enough."""
+    states, spec = ctx.states, ctx.joints[joint]
+    least = _CHANGE * spec.stroke
+    goal = np.clip(q, spec.q_min, spec.q_max)
+    changes = np.flatnonzero(np.abs(np.diff(goal, prepend=goal[:1])) > least)
     for i, begin in zip(changes, t[changes].tolist(), strict=True):
-        later = np.flatnonzero(np.abs(goal[i:] - goal[i]) > _CHANGE * spec.stroke)
+        later = np.flatnonzero(np.abs(goal[i:] - goal[i]) > least)
         end = min(float(t[i + later[0]]) if len(later) else float(t[-1]), begin + _WATCHED_S)
         before, rows = states.between(begin - _PEAK_S, begin), states.between(begin, end)
-        if end - begin < _WATCHED_S / 2 or kp[i] < 0.99 * stiff or not len(states.t[before]):
+        if end - begin < _WATCHED_S / 2 or not len(states.t[before]) or len(states.t[rows]) < 2:
             continue
-        was = median(states.q[before, joint])
-        size = float(goal[i]) - was
-        tq, q = states.t[rows], states.q[rows, joint]
-        if not abs(size) >= _LARGER * abs(step.size) or len(q) < 2:
-            continue
-        one = replace(step, begin=begin, end=end, target=float(goal[i]), start=was, t=tq, q=q)
-        if abs(float(q[-1]) - was) >= _CHANGE * spec.stroke:  # nothing holds it back
-            yield one
+        start, after = median(states.q[before, joint]), states.q[rows, joint]
+        if abs(float(after[-1]) - start) >= least:  # nothing holds it back
+            yield _Change(float(kp[i]), begin, end, float(goal[i]), start, states.t[rows], after)
+
+
+def _larger(ctx: Context, step: Step) -> Iterator[Step]:
+    """Motions of a step's joint after much larger changes of its goal, with the same stiffness."""
+    joint = step.joint
+    changes = ctx.once(("changes of the goal", joint), lambda: _changes(ctx, joint))
+    if not changes.found:
+        return
+    stiff = changes.stiffness(step.begin + 0.5 * (step.end - step.begin))
+    for one in changes.found:
+        size = one.target - one.start
+        if one.kp >= 0.99 * stiff and abs(size) >= _LARGER * abs(step.size):
+            yield replace(
+                step,
+                begin=one.begin,
+                end=one.end,
+                target=one.target,
+                start=one.start,
+                t=one.t,
+                q=one.q,
+            )
 
 
 def half_way(step: Step) -> float | None:
