@@ -121,9 +121,13 @@ def _law(ctx: Context, rows: Rows, age: float = 0.0) -> tuple[Floats, NDArray[np
         + commands.kd[newest] * (commands.dq[newest] - states.dq[rows])
         + commands.tau[newest]
     )
-    mode = np.nan_to_num(commands.mode[newest]).astype(np.intp)
-    driven = MotorCodec(ctx.recording.dialect).status(mode) == JointMode.FOC
-    return tau, driven & np.isfinite(tau)
+    return tau, ctx.once("commands that drive", lambda: _driving(ctx))[newest] & np.isfinite(tau)
+
+
+def _driving(ctx: Context) -> NDArray[np.bool_]:
+    """Whether each command drives each joint, by its mode byte."""
+    mode = np.nan_to_num(ctx.commands.mode).astype(np.intp)
+    return np.asarray(MotorCodec(ctx.recording.dialect).status(mode) == JointMode.FOC)
 
 
 def _law_shown(ctx: Context, rows: Rows) -> tuple[Floats, NDArray[np.bool_]]:

@@ -7,6 +7,7 @@ misread an uninitialised byte, a value in another unit or a counter in a reserve
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,24 +150,45 @@ def _integral(t: Floats, x: Floats) -> Floats:
     return np.concatenate(([0.0], np.cumsum((x[1:] + x[:-1]) / 2 * np.diff(t))))
 
 
-def _bend(t: Floats, x: Floats, window: float) -> Floats:
-    """Second difference of x over a window to both sides, per second squared.
+@dataclass(frozen=True)
+class _Bends:
+    """Where a second difference over a window can be computed; the same for every joint.
 
-    0 where it cannot be computed: at a gap, and at samples with late timestamps. In such a short
-    window a timestamp that is late by a tenth of the window has the effect of an acceleration.
+    :param middle: rows of the samples, with ``before`` and ``behind`` a window away, and the
+        seconds to these, ``a`` and ``b``.
+    :param even: whether it can be computed there.
     """
-    middle = np.flatnonzero((t >= t[0] + window) & (t <= t[-1] - window))
-    before = np.searchsorted(t, t[middle] - window)
-    behind = np.searchsorted(t, t[middle] + window)
-    a, b = t[middle] - t[before], t[behind] - t[middle]
-    even = (np.abs(a - window) < 0.2 * window) & (np.abs(b - window) < 0.2 * window)
-    steps, usual = np.diff(t), median(np.diff(t))
-    uneven = (steps > usual + 0.1 * window) | (steps < 0.3 * usual)
-    count = np.concatenate(([0], np.cumsum(uneven)))
-    even &= count[behind] == count[before]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a gap has no even neighbours
-        slope = (x[behind] - x[middle]) / b - (x[middle] - x[before]) / a
-    return np.asarray(np.where(even, slope / window, 0.0))
+
+    window: float
+    middle: NDArray[np.intp]
+    before: NDArray[np.intp]
+    behind: NDArray[np.intp]
+    a: Floats
+    b: Floats
+    even: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, t: Floats, window: float) -> _Bends:
+        """Not at a gap, and not at samples with late timestamps. In such a short window a
+        timestamp that is late by a tenth of the window has the effect of an acceleration.
+        """
+        middle = np.flatnonzero((t >= t[0] + window) & (t <= t[-1] - window))
+        before = np.searchsorted(t, t[middle] - window)
+        behind = np.searchsorted(t, t[middle] + window)
+        a, b = t[middle] - t[before], t[behind] - t[middle]
+        even = (np.abs(a - window) < 0.2 * window) & (np.abs(b - window) < 0.2 * window)
+        steps, usual = np.diff(t), median(np.diff(t))
+        uneven = (steps > usual + 0.1 * window) | (steps < 0.3 * usual)
+        count = np.concatenate(([0], np.cumsum(uneven)))
+        even &= count[behind] == count[before]
+        return cls(window, middle, before, behind, a, b, even)
+
+    def bend(self, x: Floats) -> Floats:
+        """Second difference of x, per second squared; 0 where it cannot be computed."""
+        middle = x[self.middle]
+        with np.errstate(divide="ignore", invalid="ignore"):  # a gap has no even neighbours
+            slope = (x[self.behind] - middle) / self.b - (middle - x[self.before]) / self.a
+        return np.asarray(np.where(self.even, slope / self.window, 0.0))
 
 
 _MEDIANS = 6.0
@@ -182,13 +204,15 @@ def acceleration(ctx: Context) -> Outcome:
     window = ctx.tolerance("window_s")
     worst = (1.0, 0)
     judged = False
+    t = states.clock
+    bends = ctx.once(("bends", window), lambda: _Bends.of(t, window))
     for joint in range(len(ctx.joints)):
-        t, q = states.clock, states.q[:, joint]
+        q = states.q[:, joint]
         if STAIRS * held_s(ctx, joint) > window:
             continue  # it changes faster than it is measured
         # integrated twice, so that it can be compared with q over the same window
         dq = _integral(t, states.ddq[:, joint])
-        reported, seen = (_bend(t, x, window) for x in (_integral(t, dq), q))
+        reported, seen = map(bends.bend, (_integral(t, dq), q))
         # the steps of a coarse encoder are not an acceleration
         rounding = _STEPS * encoder_step(ctx, joint) / window**2
         noise = _MEDIANS * median(np.abs(seen))  # most of the time no joint accelerates
