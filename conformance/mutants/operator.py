@@ -126,7 +126,7 @@ class CoarseFingers(_Coarse, FingerService):
     grid = 1 / 20
 
 
-@wrong_hand("DEX1-OPER-02", also=("DEX1-OPER-01", "DEX1-OPER-05"))
+@wrong_hand("DEX1-OPER-02", also=("DEX1-OPER-01",))
 class LateState(ReferenceService):
     """Publishes the position of 60 ms ago in fresh messages."""
 

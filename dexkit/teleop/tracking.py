@@ -168,7 +168,10 @@ def _step(t: Floats, q: Floats, goal: float, stroke: float, ages: Floats) -> Ste
             float(t[0]), float(t[-1]), begin, goal, nothing, nothing, nothing, nothing, True
         )
     progress = (q - begin) / travel
-    moved = _first(progress * abs(travel) >= _MOVED * stroke)
+    # a joint that is still on its way to the goal before turns around first
+    back = np.minimum.accumulate(progress)
+    turns = back.min() * abs(travel) <= -_MOVED * stroke
+    moved = _first((progress - back if turns else progress) * abs(travel) >= _MOVED * stroke)
     started = _first(progress >= FROM)
     arrived = _first(progress >= TO)
     whole = TO - FROM
