@@ -32,7 +32,7 @@ __all__: list[str] = []
 
 _STEPS = (
     *("step", "joint", "ends", "fingerprint", "recover", "resume", "center", "beside"),
-    *("company", "restart", "service-restart"),
+    *("beside-grip", "company", "restart", "service-restart"),
 )
 """Phases in which a joint moves freely by a position command."""
 _LEAST_STEP = 0.1  # of the stroke

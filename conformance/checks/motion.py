@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -307,6 +308,9 @@ def steps(ctx: Context) -> list[Step]:
     return [s for p in ctx.phases() for s in steps_of(ctx, p)]
 
 
+_NEARLY, _CLEAR_WAY = 0.9, 0.3
+"""Part of its whole way after which the time of a step is taken, and the least part of the step
+that it must be to be compared."""
 _PLAIN = ("step", "joint", "recover", "resume", "company", "restart", "service-restart")
 """Steps with good commands only, which show that a hand obeys; each has its own requirement."""
 _NEWEST = 3  # steps; in a single one the hand may have been at its target already
@@ -738,6 +742,68 @@ def independent(ctx: Context) -> Outcome:
         motion_rad=most,
     )
     return outcome.about(joint).placed(most, limit)
+
+
+@check("DEX3-SIDE-03")
+def beside_grip(ctx: Context) -> Outcome:
+    """The way of each joint's step beside a grip, as a part of its way in the same time of the same
+    step before. So a slow hand passes.
+    """
+    known = [s for n in ("joint", "step") for p in ctx.phases(n) for s in steps_of(ctx, p)]
+    slack = ctx.tolerance("slack_s")
+    worst: tuple[float, Step, float, float] | None = None
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        found = steps_of(ctx, phase)
+        if not found:
+            when = "while the other hand pressed on an object"
+            return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
+        for step in found:
+            if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
+                continue
+            for like in (s for s in known if s.joint == step.joint):
+                if not 0.7 < step.size / (like.size or math.inf) < 1.4:
+                    continue
+                seconds, way = _most_of_way(like, step.end - step.begin - slack)
+                if way < _CLEAR_WAY:
+                    continue
+                now = _way_within(step, seconds + slack)
+                if worst is None or now / way < worst[0]:
+                    worst = now / way, step, seconds, way
+    if worst is None:
+        return ctx.skipped("no step that can be compared with an earlier one")
+    part, step, seconds, way = worst
+    limit = ctx.tolerance("min_part")
+    text = (
+        f"{step.name}after {seconds + slack:.2f} s it had made {part:.0%} of the way that it made "
+        f"in {seconds:.2f} s without a grip of the other hand"
+    )
+    made, least = part * way * abs(step.size), limit * way * abs(step.size)
+    if part >= limit:
+        met = ctx.passed(f"{part:.0%}", text, part=part)
+        return met.placed(made, least, at_least=True)
+    outcome = ctx.failed(
+        f"{part:.0%}", text, ctx.at(ctx.states.topic, step.begin, step.end), part=part
+    )
+    late = seconds * (limit - part)
+    return outcome.about(step.joint).placed(made, least, at_least=True).if_late(late)
+
+
+def _way_within(step: Step, seconds: float) -> float:
+    """The largest part of a step that was made in its first seconds, at least 0."""
+    q = step.q[step.t <= step.begin + seconds]
+    return float(((q - step.start) / step.size).max(initial=0.0))
+
+
+def _most_of_way(step: Step, longest: float) -> tuple[float, float]:
+    """The seconds after which nearly all of a step's way was made, no more than the longest, and
+    the part that was made then.
+    """
+    within = step.t <= step.begin + longest
+    part = np.maximum((step.q[within] - step.start) / step.size, 0.0)
+    if not len(part):
+        return longest, 0.0
+    way = float(part.max())
+    return float(step.t[within][int(np.argmax(part >= _NEARLY * way))]) - step.begin, _NEARLY * way
 
 
 @check("DEX1-SIDE-03")

@@ -293,9 +293,11 @@ class FreezesOnce(Service):
 )
 @wrong_hand(
     "BRAINCO-FRESH-03",
-    also=("BRAINCO-FIELD-04", "BRAINCO-MOVE-06", "DFX-WDOG-01", "FTP-WDOG-01"),
+    also=("BRAINCO-FIELD-04", "BRAINCO-MOVE-06"),
     whole=True,
 )
+@wrong_hand("DFX-FRESH-03", also=("DFX-MOVE-06", "DFX-STILL-02", "DFX-WDOG-01"), whole=True)
+@wrong_hand("FTP-FRESH-03", also=("FTP-MOVE-06", "FTP-WDOG-01"), whole=True)
 class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 
@@ -678,6 +680,25 @@ class OneWatchdogForBoth(Service):
         if all(math.isfinite(m.q) for m in motors):
             self.heard[side] = self.now
         if all(self.now - self.heard.get(s, self.now) < 1.0 for s in self.sides):
+            super().motors(side, motors)
+
+
+@wrong_hand(
+    "DEX3-SIDE-03",
+    also=(
+        *("DEX3-GUARD-02", "DEX3-LOAD-02"),
+        *("BRAINCO-LOAD-02", "DFX-LOAD-02", "FTP-LOAD-02"),
+    ),
+    sides=BOTH,
+    whole=True,
+)
+class WaitsForTheOtherGrip(Service):
+    """Drops the commands to one hand while the other one presses on an object."""
+
+    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+        hands = self.hands  # type: ignore[attr-defined]
+        others = [hands[s] for s in self.sides if s is not side and hands[s].touches]
+        if not any(abs(x) > 0.005 for hand in others for x in hand.contact):
             super().motors(side, motors)
 
 

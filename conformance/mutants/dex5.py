@@ -226,6 +226,9 @@ wrong_hand("DEX5-MOVE-03", whole=True)(fingers.Hunts)
 wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))(fingers.Slow)
 wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-PATH-01"))(fingers.Undamped)
 wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)(fingers.Coupled)
+wrong_hand("DEX5-SIDE-03", also=("DEX5-GAIN-03",), sides=BOTH, whole=True)(
+    any_model.WaitsForTheOtherGrip
+)
 wrong_hand("DEX5-MOVE-07", also=("DEX5-FORCE-09",))(fingers.Creeps)
 wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))(
     fingers.GainsOfFirstMotor
@@ -274,7 +277,7 @@ wrong_hand(
 wrong_hand(
     "DEX5-SAFE-01",
     also=(
-        *("DEX5-MOVE-08", "DEX5-PATH-01", "DEX5-SAFE-06", "DEX5-SAFE-11"),
+        *("DEX5-MOVE-08", "DEX5-PATH-01"),
         *("DEX5-WDOG-01", "DEX5-WDOG-03"),
     ),
     sides=BOTH,

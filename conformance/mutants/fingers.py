@@ -201,7 +201,7 @@ class VelocityByTurns(_Timed):
         motors["dq"] *= 2.0 * (self.turns % 2)
 
 
-@wrong_hand("DEX3-FIELD-19")
+@wrong_hand("DEX3-FIELD-19", where=obeys_gains)
 class VelocityOfTheLastDrive(_Timed):
     """Keeps the dq of the last motion while its joints are not driven."""
 
@@ -1621,7 +1621,7 @@ class _FedByNews(FingerHand):
 
 @wrong_hand(
     "DEX3-GUARD-02",
-    also=("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-10"),
+    also=(*("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-10", "DEX3-SIDE-03"),),
     sides=BOTH,
 )
 class DropsEqualCommands(Dex3Service):

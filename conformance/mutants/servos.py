@@ -377,7 +377,9 @@ class _SlowAfterNan(ServoHand):
 
 
 @wrong_hand(
-    "BRAINCO-ABUSE-01", also=("BRAINCO-SPEED-03", "DFX-MOVE-08", "DFX-WDOG-03"), where=takes_floats
+    "BRAINCO-ABUSE-01",
+    also=("BRAINCO-SPEED-03", "DFX-MOVE-08", "DFX-SIDE-03", "DFX-WDOG-03"),
+    where=takes_floats,
 )
 class SlowAfterNan(ServoService):
     """Moves with a third of each speed since it has got a command that is not finite."""
@@ -452,6 +454,16 @@ class ForceAgainstClosing(_FeelingService):
         super().fill(motors, hand)
         if hand.grip > 0.0:  # type: ignore[attr-defined]
             motors["tau_est"] *= -1.0
+
+
+@wrong_hand("BRAINCO-FIELD-19", sides=BOTH)
+class FullSpeedInContact(ServoService):
+    """Reports the full speed of a finger that presses on an object."""
+
+    def fill(self, motors: Any, hand: FingerHand) -> None:
+        super().fill(motors, hand)
+        if hand.touches:
+            motors["dq"][np.abs(hand.contact[: len(motors)]) > 0.05] = 1.0
 
 
 @wrong_hand("BRAINCO-FORCE-01", sides=BOTH)

@@ -44,6 +44,7 @@ PHASES = {
     "operator": "operator",
     "late-joiner": "late joiner",
     "squeeze": "squeeze",
+    "beside-grip": "beside a grip",
     "drive": "velocity",
     "regrip": "last grip",
     "silence": "silence",

@@ -9,7 +9,7 @@ listen         no commands; state must flow
 approach       slowly to nearly open
 joint          one joint after the other closes; then every second one opens, and the others.
                Where there are many, all of them open together. Joints that share a motor are one.
-step           one hand closes and opens again, the other holds
+step           one hand closes, the other holds; one opens while the other closes; that one opens
 fingerprint    steps to compare the ``recover`` steps with
 nan, out-of-   bad commands, followed by ``recover``, a good step: not finite; far outside the
 range,         limits; a client of another type on the topic, no motors, one too few, one and more
@@ -42,6 +42,7 @@ touch          one finger alone presses on the object, if there is one
 firmer         all fingers hold it softly, and one after the other presses firmly
 squeeze        all fingers close on it, for seconds; position servos also on, after a silence, and
                after each restart
+beside-grip    a step of a hand without an object meanwhile
 regrip         all fingers close on it once more, at the end: not of position servos
 guarded-step   some joints of each hand have time-out protection from here on (bit 7 of the mode
                byte); a step, and back
@@ -189,8 +190,7 @@ class FingerScript(HandScript):
         if "joint" in phases:
             yield from self._one_by_one()
         if "step" in phases:
-            for side in sides:
-                yield from self._alone(side)
+            yield from self._in_turns()
         if "fingerprint" in phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place(), most=1.5)
@@ -232,7 +232,7 @@ class FingerScript(HandScript):
             yield from self._firmer()
         if guards:
             yield from self._squeeze_and_guard()
-        elif phases & {"squeeze", "silence", "resume"}:
+        elif phases & {"squeeze", "beside-grip", "silence", "resume"}:
             yield from self._squeeze_and_silence()
         if phases & {"silence", "resume"}:
             yield from self._each_silent()
@@ -342,10 +342,16 @@ class FingerScript(HandScript):
         if not few:
             yield from self._turn("center", {s: self._pose(s, OPEN) for s in sides}, least=0.5)
 
-    def _alone(self, side: Side) -> Steps:
-        self._report(f"the {side} hand alone; the other one must not move")
-        for percent in (CLOSED - 5.0, OPEN):
-            yield from self._turn("step", {side: self._pose(side, percent)}, least=0.5)
+    def _in_turns(self) -> Steps:
+        self._report("each hand alone; the other one must not move")
+        first, *others = self.plan.sides
+        away, home = ({s: self._pose(s, p) for s in self.plan.sides} for p in (CLOSED - 5.0, OPEN))
+        yield from self._turn("step", {first: away[first]}, least=0.5)
+        before = {first: home[first]}
+        for side in others:
+            yield from self._turn("step", {**before, side: away[side]}, least=0.5)
+            before = {side: home[side]}
+        yield from self._turn("step", before, least=0.5)
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
@@ -868,7 +874,6 @@ class FingerScript(HandScript):
         for percent in (CLOSED - 5.0, OPEN):
             yield from self._protected_step(percent, splits)
         squeeze = self._squeezes(pressing, splits)
-        still = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
         phases: list[Phase] = []
         if pressing:
             self._report("squeezing the object")
@@ -877,9 +882,13 @@ class FingerScript(HandScript):
                 for s in pressing
             }
             phases.append(self._begin("squeeze", pressing, targets=targets))
-        if still:
-            phases.append(self._begin("guarded", tuple(still)))
-        yield from self._hold(1.6, {**squeeze, **still})
+        if free:
+            phases.append(self._begin("guarded", tuple(free)))
+        for seconds in (1.6 - ASIDE_SECONDS, ASIDE_SECONDS):
+            if seconds == ASIDE_SECONDS:
+                phases += self._beside_grip(pressing)
+            own = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
+            yield from self._hold(seconds, {**squeeze, **own})
         for phase in phases:
             self._end(phase)
         self._report("some joints have time-out protection, some of them move, and then ...")
@@ -936,16 +945,35 @@ class FingerScript(HandScript):
         else:
             yield from self._to("center", OPEN)
 
-    def _squeeze(self, sides: Sequence[Side], seconds: float, name: str = "squeeze") -> Steps:
-        """All fingers close on the object, as a phase."""
+    def _squeeze(
+        self, sides: Sequence[Side], seconds: float, name: str = "squeeze", *, beside: bool = False
+    ) -> Steps:
+        """All fingers close on the object, as a phase.
+
+        :param beside: the other hands make a step in the last part of it.
+        """
         squeeze = self._squeezes(sides, {})
         targets = {
             s: {i: m.q for i, m in enumerate(squeeze[s]) if self._joints[s][i].closing}
             for s in sides
         }
-        phase = self._begin(name, sides, targets=targets)
+        phases = [self._begin(name, sides, targets=targets)]
+        if beside:
+            yield from self._hold(seconds - ASIDE_SECONDS, squeeze)
+            phases += self._beside_grip(sides)
+            seconds = ASIDE_SECONDS
         yield from self._hold(seconds, squeeze)
-        self._end(phase)
+        for phase in phases:
+            self._end(phase)
+
+    def _beside_grip(self, pressing: Sequence[Side]) -> list[Phase]:
+        """Begin a step of the hands that do not press, while others do."""
+        free = [s for s in self.plan.sides if s not in pressing]
+        if not (free and pressing and "beside-grip" in self.plan.phases):
+            return []
+        self._goal.update({s: self._pose(s, CLOSED - 5.0) for s in free})
+        targets = {s: dict(enumerate(self._goal[s])) for s in free}
+        return [self._begin("beside-grip", free, targets=targets)]
 
     def _squeezes(
         self, sides: Sequence[Side], guarded: Mapping[Side, frozenset[int]]
@@ -967,7 +995,7 @@ class FingerScript(HandScript):
         squeeze = self._squeezes(pressing, {})
         if pressing:
             self._report("squeezing the object")
-            yield from self._squeeze(pressing, 2.0)
+            yield from self._squeeze(pressing, 2.0, beside=True)
         if self.plan.phases & {"silence", "resume"}:
             self._report("slow motion without protection, and then ...")
             yield from self._drive("drive", free, squeeze)
