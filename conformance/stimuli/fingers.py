@@ -190,7 +190,9 @@ class FingerScript(HandScript):
         if "joint" in phases:
             yield from self._one_by_one()
         if "step" in phases:
-            yield from self._in_turns()
+            self._report("each hand alone; the other one must not move")
+            away = {s: self._pose(s, CLOSED - 5.0) for s in sides}
+            yield from self._in_turn("step", away=away, stand=self._settling)
         if "fingerprint" in phases:
             for _ in range(2):
                 yield from self._everyone("fingerprint", self._other_place(), most=1.5)
@@ -341,17 +343,6 @@ class FingerScript(HandScript):
             yield from self._until_settled(phase, sides, least=0.5, most=1.5)
         if not few:
             yield from self._turn("center", {s: self._pose(s, OPEN) for s in sides}, least=0.5)
-
-    def _in_turns(self) -> Steps:
-        self._report("each hand alone; the other one must not move")
-        first, *others = self.plan.sides
-        away, home = ({s: self._pose(s, p) for s in self.plan.sides} for p in (CLOSED - 5.0, OPEN))
-        yield from self._turn("step", {first: away[first]}, least=0.5)
-        before = {first: home[first]}
-        for side in others:
-            yield from self._turn("step", {**before, side: away[side]}, least=0.5)
-            before = {side: home[side]}
-        yield from self._turn("step", before, least=0.5)
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])

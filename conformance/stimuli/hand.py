@@ -280,13 +280,23 @@ class HandScript(Script[Side]):
             phase, self.plan.sides, least=least, most=most, stand=self._standing
         )
 
-    def _in_turn(self, name: str, *, divided: bool = False) -> Steps:
+    def _in_turn(
+        self,
+        name: str,
+        *,
+        away: Mapping[Side, Pose] | None = None,
+        stand: float | None = None,
+        divided: bool = False,
+    ) -> Steps:
         """Steps of one side while the other rests, and of both in opposite directions, as phases
         of that name.
 
+        :param away: where they go from here; None for another place than this one.
+        :param stand: see :meth:`_until_settled`; None where ripple is not judged.
         :param divided: another client commands the other side in the last of them.
         """
-        home, away = dict(self._goal), self._apart(self._other_place())
+        home, away = dict(self._goal), away or self._apart(self._other_place())
+        stand = self._standing if stand is None else stand
         first, *others = self.plan.sides
         turns = [{first: away[first]}, {first: home[first]}]
         for side in others:
@@ -294,7 +304,7 @@ class HandScript(Script[Side]):
             turns.append({side: home[side]})
         for goals in turns:
             self._divided = divided and goals is turns[-1]
-            yield from self._turn(name, goals, least=0.5, stand=self._standing)
+            yield from self._turn(name, goals, least=0.5, stand=stand)
 
     def _turn(
         self,
