@@ -213,28 +213,15 @@ def limited_by_start(ctx: Context, step: Step) -> bool:
 
 
 @dataclass(frozen=True)
-class _Change:
-    """What a joint does in the time after a change of its goal; see :class:`Step`.
-
-    :param kp: of the command.
-    """
-
-    kp: float
-    begin: float
-    end: float
-    target: float
-    start: float
-    t: Floats
-    q: Floats
-
-
-@dataclass(frozen=True)
 class _Changes:
-    """The changes of one joint's goal, and the stiffness of all its commands by their times."""
+    """The changes of one joint's goal: the motion after each, with the kp of its command.
+
+    :param t: times of all commands to the joint, s, with their ``kp``.
+    """
 
     t: Floats
     kp: Floats
-    found: tuple[_Change, ...]
+    motions: tuple[tuple[float, Step], ...]
 
     def stiffness(self, at: float) -> float:
         """The kp of the newest command at a time."""
@@ -245,11 +232,15 @@ def _changes(ctx: Context, joint: int) -> _Changes:
     given = ctx.commands
     good = np.isfinite(given.q).all(axis=1) & np.isfinite(given.kp).all(axis=1)
     t, kp = given.t[good], given.kp[good, joint]
-    return _Changes(t, kp, tuple(_changes_in(ctx, joint, t, given.q[good, joint], kp)))
+    return _Changes(t, kp, tuple(_motions(ctx, joint, t, given.q[good, joint], kp)))
 
 
-def _changes_in(ctx: Context, joint: int, t: Floats, q: Floats, kp: Floats) -> Iterator[_Change]:
-    """The changes of a joint's goal in its commands that are watched for long enough."""
+def _motions(
+    ctx: Context, joint: int, t: Floats, q: Floats, kp: Floats
+) -> Iterator[tuple[float, Step]]:
+    """The motion after each change of a joint's goal in its commands, where it is watched for long
+    enough and nothing holds it back.
+    """
     states, spec = ctx.states, ctx.joints[joint]
     least = _CHANGE * spec.stroke
     goal = np.clip(q, spec.q_min, spec.q_max)
@@ -260,30 +251,34 @@ def _changes_in(ctx: Context, joint: int, t: Floats, q: Floats, kp: Floats) -> I
         before, rows = states.between(begin - _PEAK_S, begin), states.between(begin, end)
         if end - begin < _WATCHED_S / 2 or not len(states.t[before]) or len(states.t[rows]) < 2:
             continue
-        start, after = median(states.q[before, joint]), states.q[rows, joint]
-        if abs(float(after[-1]) - start) >= least:  # nothing holds it back
-            yield _Change(float(kp[i]), begin, end, float(goal[i]), start, states.t[rows], after)
+        after = states.q[rows, joint]
+        motion = Step(
+            name=ctx.named("", joint),
+            joint=joint,
+            stroke=spec.stroke,
+            begin=begin,
+            end=end,
+            target=float(goal[i]),
+            start=median(states.q[before, joint]),
+            final=float(after[-1]),
+            t=states.t[rows],
+            q=after,
+            unit=ctx.unit,
+        )
+        if abs(motion.final - motion.start) >= least:
+            yield float(kp[i]), motion
 
 
 def _larger(ctx: Context, step: Step) -> Iterator[Step]:
     """Motions of a step's joint after much larger changes of its goal, with the same stiffness."""
     joint = step.joint
     changes = ctx.once(("changes of the goal", joint), lambda: _changes(ctx, joint))
-    if not changes.found:
+    if not changes.motions:
         return
     stiff = changes.stiffness(step.begin + 0.5 * (step.end - step.begin))
-    for one in changes.found:
-        size = one.target - one.start
-        if one.kp >= 0.99 * stiff and abs(size) >= _LARGER * abs(step.size):
-            yield replace(
-                step,
-                begin=one.begin,
-                end=one.end,
-                target=one.target,
-                start=one.start,
-                t=one.t,
-                q=one.q,
-            )
+    for kp, motion in changes.motions:
+        if kp >= 0.99 * stiff and abs(motion.size) >= _LARGER * abs(step.size):
+            yield motion
 
 
 def half_way(step: Step) -> float | None:

@@ -1621,7 +1621,7 @@ class _FedByNews(FingerHand):
 
 @wrong_hand(
     "DEX3-GUARD-02",
-    also=(*("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-10", "DEX3-SIDE-03"),),
+    also=("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-10", "DEX3-SIDE-03"),
     sides=BOTH,
 )
 class DropsEqualCommands(Dex3Service):

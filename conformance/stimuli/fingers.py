@@ -875,11 +875,11 @@ class FingerScript(HandScript):
             phases.append(self._begin("squeeze", pressing, targets=targets))
         if free:
             phases.append(self._begin("guarded", tuple(free)))
-        for seconds in (1.6 - ASIDE_SECONDS, ASIDE_SECONDS):
-            if seconds == ASIDE_SECONDS:
-                phases += self._beside_grip(pressing)
-            own = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
-            yield from self._hold(seconds, {**squeeze, **own})
+        still = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
+        yield from self._hold(1.6 - ASIDE_SECONDS, {**squeeze, **still})
+        phases += self._beside_grip(pressing)
+        moved = {s: self._guarded(self._motors(s, self._goal[s]), s, splits) for s in free}
+        yield from self._hold(ASIDE_SECONDS, {**squeeze, **moved})
         for phase in phases:
             self._end(phase)
         self._report("some joints have time-out protection, some of them move, and then ...")
