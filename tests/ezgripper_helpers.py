@@ -14,7 +14,7 @@ from dexkit.emulators.mx64 import EmulatedThread, emulated_ezgripper
 from dexkit.errors import HandFault, HandTimeout
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.wire import mx64
-from tests.patience import PATIENCE
+from tests.patience import PATIENCE, StallFreeClock
 
 ZERO = 1510
 """Where the emulated gripper's fingers are closed, by default."""
@@ -29,6 +29,7 @@ BRAKE = HandCommand.brake(1)
 
 @contextmanager
 def emulated(**options: object) -> Iterator[EmulatedThread]:
+    options.setdefault("clock", StallFreeClock())
     with emulated_ezgripper(**options) as gripper:  # type: ignore[arg-type]
         assert isinstance(gripper, EmulatedThread)
         yield gripper
@@ -85,8 +86,9 @@ def at(q: float) -> Callable[[HandState], bool]:
 
 
 def travel(gripper: EmulatedThread) -> int:
-    """Ticks from closed, from inside the servo."""
-    return (gripper.servo.get(mx64.PRESENT_POSITION) - ZERO) % 4096
+    """Ticks from closed, from inside the servo; below 0 where it presses into its stop."""
+    ticks: int = (gripper.servo.get(mx64.PRESENT_POSITION) - ZERO + 500) % 4096 - 500
+    return ticks
 
 
 def fault_of(hand: EZGripper, command: HandCommand, timeout: float = LONG) -> HandFault:

@@ -7,7 +7,7 @@ import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 
-from dexkit.clock import RealClock
+from dexkit.clock import Clock, RealClock
 from dexkit.emulators.faults import MX64_FAULTS, parse_fault
 from dexkit.emulators.mx64.bus import Bus
 from dexkit.emulators.mx64.servo import Servo
@@ -105,6 +105,7 @@ def emulated_ezgripper(
     seed: int = 0,
     firmware: Firmware | None = None,
     physics: Physics | None = None,
+    clock: Clock | None = None,
     extra: Sequence[str] = (),
 ) -> Iterator[EmulatedThread | EmulatedProcess]:
     """An emulated EZGripper that answers at ``.path``, and takes faults by ``.inject``.
@@ -119,7 +120,7 @@ def emulated_ezgripper(
     :param faults: specifications, see :mod:`dexkit.emulators.faults`.
     :param start: opening at power-on, percent.
     :param closed_at: encoder tick at which it is closed.
-    :param firmware: and ``physics``: only in a thread.
+    :param firmware: and ``physics`` and ``clock``: only in a thread.
     :param extra: more arguments of the command: only for a process.
     :raises EmulatorError: it did not become ready.
     :raises UsageError: an option is invalid.
@@ -127,8 +128,8 @@ def emulated_ezgripper(
     gripper: EmulatedThread | EmulatedProcess
     ids = tuple(servo_ids) or (servo_id,)
     if process:
-        if firmware is not None or physics is not None:
-            raise UsageError("firmware and physics can be given to a thread only")
+        if firmware is not None or physics is not None or clock is not None:
+            raise UsageError("firmware, physics and a clock can be given to a thread only")
         gripper = EmulatedProcess(
             [
                 f"--baudrate={baudrate}",
@@ -154,7 +155,8 @@ def emulated_ezgripper(
             mechanics = dataclasses.replace(mechanics, object_pct=object_pct)
         if closed_at is not None:
             mechanics = dataclasses.replace(mechanics, closed_at=closed_at)
-        now = RealClock().now()
+        clock = clock or RealClock()
+        now = clock.now()
         servos = [
             Servo(
                 number,
@@ -174,7 +176,7 @@ def emulated_ezgripper(
             start=now,
             seed=seed,
         )
-        gripper = EmulatedThread(bus, Port(bus, link, check_baudrate=check_baudrate))
+        gripper = EmulatedThread(bus, Port(bus, link, clock=clock, check_baudrate=check_baudrate))
     try:
         yield gripper
     finally:
