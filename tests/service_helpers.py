@@ -17,7 +17,10 @@ from tests.patience import PATIENCE
 
 
 class ScriptedHand:
-    """A hand that reaches its goal at once; can be unplugged, made to fail, or to hang."""
+    """A hand that reaches its goal at once; can be unplugged, made to fail, or to hang.
+
+    :param exchange_timeout: seconds; short only where a hand hangs: a busy machine makes it late.
+    """
 
     def __init__(
         self,
@@ -27,8 +30,11 @@ class ScriptedHand:
         simulated: bool = True,
         clock: Clock | None = None,
         q: float = 0.0,
+        exchange_timeout: float = 5.0,
     ) -> None:
-        self._spec = DEX1_1.spec(side, io_rate=io_rate, simulated=simulated, exchange_timeout=0.05)
+        self._spec = DEX1_1.spec(
+            side, io_rate=io_rate, simulated=simulated, exchange_timeout=exchange_timeout
+        )
         self.clock: Clock = clock if clock is not None else RealClock()
         self.q = q
         self.plugged = True

@@ -45,6 +45,7 @@ from dexkit.traces.recorder import Recorder
 from dexkit.wire import crc32, dex3_usb
 from tests.conformance_helpers import usb_run
 from tests.each import each
+from tests.patience import PATIENCE
 from tests.reproduction_helpers import write_usb
 
 BY_NAME = {m.name: m for m in mutants("usb")}
@@ -292,8 +293,8 @@ def test_host_unlinks_transfer_after_timeout(hands: str) -> None:
         for _ in range(3):
             assert host.read(0x81, 4096, 0.02) == (TIMED_OUT, b"")
         frame = frames.pack_command({})
-        assert host.write(0x02, frame, 1.0) == 0
-        status, data = host.read(0x81, 4096, 5.0)
+        assert host.write(0x02, frame, PATIENCE) == 0
+        status, data = host.read(0x81, 4096, PATIENCE)
         assert (status, len(data)) == (0, 1270)
         assert host.read(0x81, 4096, 0.02) == (TIMED_OUT, b"")
         host.reopen()
@@ -307,7 +308,7 @@ def test_libusb_host_calls_pyusb_correctly(hands: str, monkeypatch: pytest.Monke
     import usbip_backend
 
     parts = urlsplit(hands)
-    backend = usbip_backend.get_backend(parts.hostname, parts.port)
+    backend = usbip_backend.get_backend(parts.hostname, parts.port, PATIENCE)
     find = usb.core.find
     monkeypatch.setattr(usb.core, "find", lambda **what: find(backend=backend, **what))
     host = open_device("", Side.RIGHT)
@@ -315,8 +316,8 @@ def test_libusb_host_calls_pyusb_correctly(hands: str, monkeypatch: pytest.Monke
         assert host.descriptors.strings[2] == "Dexthree RightHand"
         out, inward = bulk_pair(host.descriptors) or pytest.fail("no endpoints")
         for _ in range(2):
-            assert host.write(out.address, frames.pack_command({}), 1.0) == 0
-            status, data = host.read(inward.address, 4096, 5.0)
+            assert host.write(out.address, frames.pack_command({}), PATIENCE) == 0
+            status, data = host.read(inward.address, 4096, PATIENCE)
             assert (status, len(data)) == (0, 1270)
             host.reopen()
     finally:

@@ -38,6 +38,8 @@ from tests.patience import PATIENCE
 
 OUT_EP, IN_EP = 0x02, 0x81
 BOTH = (Side.LEFT, Side.RIGHT)
+LONG = int(PATIENCE * 1000)
+"""Milliseconds to wait for a transfer that should take far less."""
 REST = np.array(DEX3_1.rest_q[Side.LEFT])
 
 
@@ -51,11 +53,12 @@ class Host:
     """A host's view of a server: PyUSB, with the USB/IP client of ``pyusb-usbip-backend``."""
 
     def __init__(self, port: int) -> None:
-        self.backend = usbip_backend.get_backend("127.0.0.1", port)
+        self.backend = usbip_backend.get_backend("127.0.0.1", port, PATIENCE)
 
     def find(self, side: Side = Side.LEFT) -> Any:
         device = usb.core.find(backend=self.backend, idVendor=VENDOR_ID, idProduct=PRODUCT_ID[side])
         assert device is not None
+        device.default_timeout = LONG
         device.set_configuration()
         return device
 
@@ -79,8 +82,8 @@ def brake(side: Side = Side.LEFT) -> bytes:
 
 def exchange(device: Any, frame: bytes = b"", side: Side = Side.LEFT) -> HandState:
     frame = frame or brake(side)
-    assert device.write(OUT_EP, frame, 1000) == len(frame)
-    answer = bytes(device.read(IN_EP, STATE.size, 1000))
+    assert device.write(OUT_EP, frame, LONG) == len(frame)
+    answer = bytes(device.read(IN_EP, STATE.size, LONG))
     return HandCodec(DEX3_1.joints[side]).decode(answer, 0.0)
 
 
@@ -197,10 +200,10 @@ def test_frames_in_without_reading_leave_the_newest_answer() -> None:
         device = computer.find()
         codec = HandCodec(DEX3_1.joints[Side.LEFT])
         foc = codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2))
-        device.write(OUT_EP, brake(), 1000)
-        device.write(OUT_EP, brake(), 1000)
-        device.write(OUT_EP, foc, 1000)
-        answer = codec.decode(bytes(device.read(IN_EP, STATE.size, 1000)), 0.0)
+        device.write(OUT_EP, brake(), LONG)
+        device.write(OUT_EP, brake(), LONG)
+        device.write(OUT_EP, foc, LONG)
+        answer = codec.decode(bytes(device.read(IN_EP, STATE.size, LONG)), 0.0)
         assert answer.mode.tolist() == [JointMode.FOC] * 7
         with pytest.raises(usb.core.USBError):
             device.read(IN_EP, STATE.size, 50)
@@ -216,9 +219,9 @@ def test_a_longer_queue_keeps_answers_in_order() -> None:
         codec = HandCodec(DEX3_1.joints[Side.LEFT])
         foc = codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2))
         for frame in (brake(), brake(), foc):
-            device.write(OUT_EP, frame, 1000)
+            device.write(OUT_EP, frame, LONG)
         modes = [
-            int(codec.decode(bytes(device.read(IN_EP, STATE.size, 1000)), 0.0).mode[0])
+            int(codec.decode(bytes(device.read(IN_EP, STATE.size, LONG)), 0.0).mode[0])
             for _ in range(2)
         ]
         assert modes == [0, 1]
@@ -229,15 +232,15 @@ def test_a_transfer_ends_with_a_short_packet() -> None:
         device = computer.find()
         frame = brake()
         for part in (frame[:512], frame[512:1024], frame[1024:]):
-            device.write(OUT_EP, part, 1000)
-        assert len(device.read(IN_EP, STATE.size, 1000)) == STATE.size
+            device.write(OUT_EP, part, LONG)
+        assert len(device.read(IN_EP, STATE.size, LONG)) == STATE.size
         counters = inside(hands).device().counters
         assert (counters.frames, counters.bad_size) == (1, 0)
         # what never ends is no frame, and does not pile up
         for _ in range(20):
-            device.write(OUT_EP, bytes(4096), 1000)
-        device.write(OUT_EP, b"", 1000)
-        device.read(IN_EP, STATE.size, 1000)
+            device.write(OUT_EP, bytes(4096), LONG)
+        device.write(OUT_EP, b"", LONG)
+        device.read(IN_EP, STATE.size, LONG)
         assert counters.bad_size == 1
         exchange(device)
 
@@ -245,8 +248,8 @@ def test_a_transfer_ends_with_a_short_packet() -> None:
 def test_an_answer_can_be_read_in_packets() -> None:
     with emulated_dex3() as hands, host(inside(hands).port) as computer:
         device = computer.find()
-        device.write(OUT_EP, brake(), 1000)
-        parts = [bytes(device.read(IN_EP, 512, 1000)) for _ in range(3)]
+        device.write(OUT_EP, brake(), LONG)
+        parts = [bytes(device.read(IN_EP, 512, LONG)) for _ in range(3)]
         assert [len(part) for part in parts] == [512, 512, 246]
         HandCodec(DEX3_1.joints[Side.LEFT]).decode(b"".join(parts), 0.0)
 
@@ -259,8 +262,8 @@ def test_endpoint_numbers_and_serial_are_options() -> None:
         device = computer.find()
         assert [e.bEndpointAddress for e in device[0][(0, 0)]] == [0x01, 0x83]
         assert usb.util.get_string(device, device.ctrl_transfer(0x80, 6, 0x0100, 0, 18)[16]) == "X7"
-        device.write(0x01, brake(), 1000)
-        assert len(device.read(0x83, STATE.size, 1000)) == STATE.size
+        device.write(0x01, brake(), LONG)
+        assert len(device.read(0x83, STATE.size, LONG)) == STATE.size
 
 
 @each(
@@ -352,13 +355,13 @@ def test_delayed_answers_keep_their_order() -> None:
         device = computer.find()
         codec = HandCodec(DEX3_1.joints[Side.LEFT])
         started = time.monotonic()
-        device.write(OUT_EP, brake(), 1000)
-        first = codec.decode(bytes(device.read(IN_EP, STATE.size, 2000)), 0.0)
+        device.write(OUT_EP, brake(), LONG)
+        first = codec.decode(bytes(device.read(IN_EP, STATE.size, LONG)), 0.0)
         assert time.monotonic() - started > 0.075
-        device.write(OUT_EP, brake(), 1000)
-        device.write(OUT_EP, codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2)), 1000)
+        device.write(OUT_EP, brake(), LONG)
+        device.write(OUT_EP, codec.encode(HandCommand.position(REST, kp=1.5, kd=0.2)), LONG)
         second, third = (
-            codec.decode(bytes(device.read(IN_EP, STATE.size, 2000)), 0.0) for _ in range(2)
+            codec.decode(bytes(device.read(IN_EP, STATE.size, LONG)), 0.0) for _ in range(2)
         )
         assert [s.mode[0] for s in (first, second, third)] == [0, 0, 1]
 
@@ -366,7 +369,7 @@ def test_delayed_answers_keep_their_order() -> None:
 def test_a_dropped_answer_is_a_time_out_and_nothing_stale_follows() -> None:
     with emulated_dex3(faults=["drop:for=10s"]) as hands, host(inside(hands).port) as computer:
         device = computer.find()
-        device.write(OUT_EP, brake(), 1000)
+        device.write(OUT_EP, brake(), LONG)
         with pytest.raises(usb.core.USBError) as caught:
             device.read(IN_EP, STATE.size, 100)
         assert caught.value.errno == errno.ETIMEDOUT

@@ -761,9 +761,9 @@ def test_missing_answer_times_out_within_documented_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with emulated() as gripper:
-        with gripper_on(gripper.path, configured(tmp_path, timeout=0.03)) as hand:
+        with gripper_on(gripper.path, configured(tmp_path, timeout=0.1)) as hand:
             hand.exchange(BRAKE)
-            gripper.inject("drop:for=600ms")
+            gripper.inject("drop:for=1500ms")
             deadline = time.monotonic() + LONG
             waits = waits_of(monkeypatch, select, "select", lambda *given: given[3])
             while True:

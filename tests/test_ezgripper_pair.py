@@ -161,7 +161,7 @@ def test_position_is_the_mean_and_force_the_sum(tmp_path: Path) -> None:
 def test_a_missing_servo_is_named_and_nothing_driven(tmp_path: Path) -> None:
     with pair(ids=(1,)) as gripper:
         hand = EZGripper(
-            gripper.path, Side.LEFT, configured(tmp_path, gripper.path, timeout=0.05, retries=0)
+            gripper.path, Side.LEFT, configured(tmp_path, gripper.path, timeout=0.5, retries=0)
         )
         with pytest.raises(HandNotFound, match="id 2") as missing:
             hand.open()

@@ -29,6 +29,7 @@ from dexkit.errors import UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction
 from tests.each import each
+from tests.patience import PATIENCE
 
 # FTDI AN232B-05, table of divisors for a 48 MHz chip: rate, value of the request
 _DIVISORS = [
@@ -257,15 +258,16 @@ def test_a_client_finds_the_adapter_on_the_server() -> None:
     lines = [Bus([Servo(number, now=now)], start=now) for number in (1, 2)]
     with FtdiPort([FtdiUsb(lines[0], "DK1"), FtdiUsb(lines[1], "DK2", model=FT232H)]) as port:
         port.start()
-        backend: Any = usbip_backend.get_backend("127.0.0.1", port.port)
+        backend: Any = usbip_backend.get_backend("127.0.0.1", port.port, PATIENCE)
         found = usb.core.find(idVendor=0x0403, idProduct=0x6014, backend=backend)
         assert found is not None
+        found.default_timeout = int(PATIENCE * 1000)
         found.set_configuration()
         assert usb.util.get_string(found, 3) == "DK2"
         assert bytes(found.ctrl_transfer(0xC0, Request.GET_LATENCY, 0, 0, 1)) == b"\x10"
         found.ctrl_transfer(0x40, Request.SET_BAUDRATE, 2, 0x0200)
         found.ctrl_transfer(0x40, Request.SET_LATENCY, 1, 0)
-        data = bytes(found.read(0x81, 512, timeout=5000))
+        data = bytes(found.read(0x81, 512, timeout=int(PATIENCE * 1000)))
         assert data == b"\xb2\x60"
         usb.util.dispose_resources(found)
         assert port.adapters[1].chip.baudrate == 6_000_000

@@ -144,7 +144,8 @@ def test_a_locked_joint_is_reported_at_once(emulated: Rh56TcpHand) -> None:
 
 
 def test_lost_answers_cost_an_exchange(emulated: Rh56TcpHand) -> None:
-    with driver(emulated.path, timeout=0.05) as hand:
+    with driver(emulated.path) as hand:
+        hand._line.timeout = 0.05  # not of opening it, on a busy machine
         emulated.inject("drop:p=1,for=200ms")
         with pytest.raises(HandTimeout):
             until(hand, HandCommand.brake(N), lambda s: False)

@@ -98,7 +98,8 @@ def test_locked_hand_is_cleared_and_does_not_continue_to_its_old_goal(
 
 
 def test_lost_and_late_answers_cost_one_exchange() -> None:
-    with Rh56TcpHand() as emulated, driver(emulated.path, timeout=0.05) as hand:
+    with Rh56TcpHand() as emulated, driver(emulated.path) as hand:
+        hand._line.timeout = 0.05  # not of opening it, on a busy machine
         for fault in ("drop:p=0.3,for=300ms", "delay:p=0.3,ms=70,for=300ms"):
             emulated.inject(fault)
             failed = 0

@@ -248,9 +248,10 @@ def test_driver_reports_errors_and_clears_them_when_it_opens(emulated: Rh56Hand)
 
 @each("fault", ["drop:p=0.3", "corrupt:p=0.3"])
 def test_lost_and_damaged_answers_cost_one_exchange(fault: str) -> None:
-    with Rh56Hand() as emulated, driver(emulated, timeout=0.05) as hand:
+    with Rh56Hand() as emulated, driver(emulated) as hand:
+        hand._line.timeout = 0.05  # not of opening it, on a busy machine
         emulated.inject(fault)
-        before = hand.statistics.timeouts  # of opening it on a busy machine
+        before = hand.statistics.timeouts
         good = failed = 0
         ends = time.monotonic() + 60.0
         while (good < 5 or failed < 2) and time.monotonic() < ends:

@@ -80,7 +80,7 @@ def test_local_hand_obeys_brakes_without_commands_and_at_the_end() -> None:
 
 
 def test_local_hand_raises_faults_and_does_not_obey_earlier_commands() -> None:
-    device = ScriptedHand(io_rate=200.0)
+    device = ScriptedHand(io_rate=200.0, exchange_timeout=1.0)
     with LocalHand(device) as hand:
         for wrong in ([math.nan], [1.0, 2.0]):
             with pytest.raises(CommandRejected):

@@ -136,7 +136,7 @@ def test_state_after_a_pause_reports_the_brake() -> None:
 
 
 def test_hanging_exchange_is_a_pause_of_that_hand_only() -> None:
-    hands = {side: ScriptedHand(side) for side in Side}
+    hands = {side: ScriptedHand(side, exchange_timeout=0.05) for side in Side}
     node, clock = FakeNode(), Suspendable()
     topic = ACTUATOR.cmd_topic
     both = encode(unitree_go.MotorCmds_([unitree_go.MotorCmd_(q=2.0, kp=5.0)] * 2))

@@ -256,7 +256,7 @@ class TestLink:
             assert (counters.losses, hand.opens) == (0, 1)
 
     def test_hanging_exchange_is_visible_in_the_published_state(self) -> None:
-        hand, node = ScriptedHand(), FakeNode()
+        hand, node = ScriptedHand(exchange_timeout=0.05), FakeNode()
         with serve(hand, node) as service:
             hand.hang.clear()
             wait_until(lambda: newest(node).reserve[0] == LINK)
@@ -358,7 +358,7 @@ class TestStop:
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("dexkit.service.service._JOIN", 0.05)
-        hand, node = ScriptedHand(), FakeNode()
+        hand, node = ScriptedHand(exchange_timeout=0.05), FakeNode()
         service = serve(hand, node)
         service.start()
         hand.hang.clear()
