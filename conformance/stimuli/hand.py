@@ -27,6 +27,7 @@ from dexkit.conformance.stimuli.script import (
     Steps,
     StopService,
 )
+from dexkit.conformance.stimuli.standing import Standing
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import HandModel, model
@@ -222,24 +223,15 @@ class HandScript(Script[Side]):
         begin = nearer_at = self._obs.now_ns
         stand = self._settling if stand is None else stand
         best = math.inf
-        near_since: int | None = None
-        low: dict[Side, Pose] = {}
-        high: dict[Side, Pose] = {}
+        still = Standing([0.5 * SETTLED * stroke for s in sides for stroke in self._strokes[s]])
         while True:
             yield from self._command()
             now, q = self._obs.now_ns, self._obs.q
-            if not all(s in q and self._near(s, q[s], self._goal[s]) for s in sides):
-                near_since = None
-            elif near_since is None:
-                near_since = now
-                low = {s: q[s] for s in sides}
-                high = dict(low)
+            if all(s in q and self._near(s, q[s], self._goal[s]) for s in sides):
+                still.add(now, [x for s in sides for x in q[s]])
             else:
-                low = {s: tuple(map(min, low[s], q[s])) for s in sides}
-                high = {s: tuple(map(max, high[s], q[s])) for s in sides}
-                if not all(self._near(s, low[s], high[s], 0.5) for s in sides):
-                    near_since = None
-            settled = near_since is not None and now - near_since >= stand * 1e9
+                still.restart()
+            settled = still.lasts(now) >= stand
             left = sum(self._left(s, q[s]) for s in sides if s in q)
             if left < best - 0.01:
                 best, nearer_at = left, now
@@ -255,10 +247,9 @@ class HandScript(Script[Side]):
         strokes = self._strokes[side]
         return sum(abs(a - b) / s for a, b, s in zip(here, self._goal[side], strokes, strict=True))
 
-    def _near(self, side: Side, a: Pose, b: Pose, part: float = 1.0) -> bool:
-        part *= SETTLED
+    def _near(self, side: Side, a: Pose, b: Pose) -> bool:
         for x, y, stroke in zip(a, b, self._strokes[side], strict=True):
-            if not abs(x - y) <= part * stroke:
+            if not abs(x - y) <= SETTLED * stroke:
                 return False
         return True
 
