@@ -95,7 +95,7 @@ class RigOptions:
 class Rig:
     """The processes of a live run; a context manager.
 
-    Entering it starts the emulated devices, :meth:`serve` the services on them.
+    Entering it starts the emulated devices, :meth:`start_services` the services on them.
 
     :param stop: ends the wait for a process that is starting.
     """
@@ -147,11 +147,8 @@ class Rig:
             tool.wait_ready(self._stop)
             self.devices[s] = str(folder / f"hand-{s}") if emulator.linked else tool.place
 
-    def serve(self) -> None:
-        """Start the services, and wait until they are ready.
-
-        :raises ConformanceError: one does not get ready.
-        """
+    def start_services(self) -> None:
+        """Start the services, without waiting for them."""
         options = self.options
         if options.backend == EXTERNAL or self._stop.is_set():
             return
@@ -159,7 +156,13 @@ class Rig:
             self._services = [self._start_robot(ROBOT_EMULATORS[options.backend])]
         else:
             self._services = self._start_hands()
-        for tool in self._services:
+
+    def wait_ready(self) -> None:
+        """Wait until the services are ready.
+
+        :raises ConformanceError: one does not get ready.
+        """
+        for tool in () if self._stop.is_set() else self._services:
             tool.wait_ready(self._stop)
 
     def _start_robot(self, emulator: str) -> Tool:

@@ -2,7 +2,7 @@
 
 The kit creates three DDS participants: the commanding client, the recorder, and later a monitor
 that joins during the run. A fourth one sends the messages of the calibration, and leaves before
-the stimulus begins.
+the first command.
 """
 
 from __future__ import annotations
@@ -167,14 +167,9 @@ def record_run(
         # before the services: a busy machine shows in their first states already
         stack.enter_context(heart)
         queue = stack.enter_context(RunQueue(lambda: _processes(rig, recorder_node)))
-        rig.serve()
-        if stop.is_set():
-            return False
-        if rig_options.backend == EXTERNAL:
+        rig.start_services()
+        if rig_options.backend == EXTERNAL and not stop.is_set():
             _require_hand(recorder_node, options)
-        loopback = stack.enter_context(
-            Loopback(recorder_node, domain=rig_options.domain, interface=rig_options.interface)
-        )
         # a second client would interfere, and a real hand may hold something
         sole = SolePublisher(
             [NodeTopics(recorder_node, {dialect.topics(s)[0] for s in rig_options.sides})],
@@ -183,12 +178,18 @@ def record_run(
             yields=True,
         )
         sole.search()
+        rig.wait_ready()
+        if stop.is_set():
+            return False
+        loopback = stack.enter_context(
+            Loopback(recorder_node, domain=rig_options.domain, interface=rig_options.interface)
+        )
         plan = options.plan()
         script = script_for(plan, report)
         player = stack.enter_context(_LivePlayer(rig, plan, sole))
         sole.settle()
         _wait_for_endpoints(recorder_node, plan)
-        calibration = loopback.result()
+        # the calibration goes on while the script listens
         finished = player.play_script(script, stop)
         recording.stop()
         player.close()
@@ -201,7 +202,7 @@ def record_run(
             objects={s: plan.objects.get(s) for s in plan.sides},
             stalls=heart.stalls,
             beats=heart.beats,
-            calibration=calibration,
+            calibration=loopback.result(),
             waits=queue.waits,
             planned=Planned(plan.phases, plan.rounds),
         )
@@ -353,7 +354,8 @@ class _LivePlayer:
             self._stop_service()
         elif isinstance(action, StartService):
             self._newest.clear()
-            self.rig.serve()
+            self.rig.start_services()
+            self.rig.wait_ready()
 
     def _send(self, action: Send) -> None:
         sender = self._client if action.by is None else self._others[action.by]

@@ -60,8 +60,8 @@ def script_for(plan: Plan[S], report: Callable[[str], None] = lambda text: None)
 
 def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:
     """The phases that ``requirements`` and what they depend on need."""
-    by_id = {r.id: r for r in catalogue(None, None)}
     todo = list(requirements)
+    by_id = {r.id: r for name in {r.model for r in todo} for r in catalogue(name, None)}
     names: set[str] = set()
     seen: set[str] = set()
     while todo:
