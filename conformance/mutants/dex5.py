@@ -196,11 +196,11 @@ wrong_hand(
     ),
     whole=True,
 )(any_model.StaleState)
-wrong_hand("DEX5-FRESH-01", whole=True)(any_model.StaleLater)
+wrong_hand("DEX5-FRESH-01", also=("DEX5-GAIN-04",), whole=True)(any_model.StaleLater)
 wrong_hand("DEX5-FRESH-02", also=("DEX5-FIELD-19",), whole=True)(any_model.FreezesOnce)
 wrong_hand(
     "DEX5-FRESH-03",
-    also=("DEX5-FIELD-04", "DEX5-FIELD-05", "DEX5-FIELD-16", "DEX5-MOVE-06", "DEX5-FIELD-15"),
+    also=("DEX5-FIELD-04", "DEX5-FIELD-05", "DEX5-FIELD-16", "DEX5-MOVE-06"),
     whole=True,
 )(any_model.SwapsBuffers)
 # the first requirement that finds that nothing moves is about the mode byte

@@ -1433,7 +1433,7 @@ class GainsOfTheOtherSide(ReferenceService):
             left.goal = replace(left.goal, kp=right.goal.kp, kd=right.goal.kd)
 
 
-@wrong_hand("DEX1-STILL-01")
+@wrong_hand("DEX1-STILL-01", also=("DEX1-SAFE-01",))
 class TakesTheOtherSides(ReferenceService):
     """When commands arrive together, the left hand sometimes gets the right hand's command."""
 

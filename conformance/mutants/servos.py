@@ -747,11 +747,11 @@ class SwapsForNewClients(_SwapsSome):
 )
 @wrong_hand(
     "DFX-STILL-01",
-    also=("DFX-MOVE-08", "DFX-PATH-01", "DFX-SAFE-03", "DFX-SAFE-04", "DFX-SAFE-05"),
+    also=("DFX-PATH-01", "DFX-SAFE-03", "DFX-SAFE-04", "DFX-SAFE-05"),
     sides=BOTH,
     whole=True,
 )
-@wrong_hand("FTP-STILL-01", also=("FTP-MOVE-08", "FTP-PATH-01"), sides=BOTH, whole=True)
+@wrong_hand("FTP-STILL-01", also=("FTP-PATH-01",), sides=BOTH, whole=True)
 class OldClientReturns(ServoService):
     """Obeys the earlier client's last goals on the left for a quarter of each second."""
 
