@@ -126,7 +126,8 @@ class Rig:
         self.stop()
 
     def stop(self) -> None:
-        """End all processes. May be called twice."""
+        """End all processes, the services before the devices. May be called twice."""
+        self.end_services()
         self._stack.close()
 
     def _start_devices(self) -> None:
