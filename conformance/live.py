@@ -126,16 +126,6 @@ def record_run(
             Recorder(path, overwrite=True, metadata={"conformance": rig_options.backend})
         )
         dialect = rig_options.dialect
-        about = run_record(
-            backend=rig_options.backend,
-            dialect=dialect.name,
-            sides=rig_options.sides,
-            phases=options.phases,
-            rounds=options.rounds,
-            requirements=options.requirements,
-            claims=options.claims,
-        )
-        recorder.add_metadata(RUN, about)
         topics = {
             t
             for s in Side
@@ -178,6 +168,17 @@ def record_run(
             yields=True,
         )
         sole.search()
+        # while the services start
+        about = run_record(
+            backend=rig_options.backend,
+            dialect=dialect.name,
+            sides=rig_options.sides,
+            phases=options.phases,
+            rounds=options.rounds,
+            requirements=options.requirements,
+            claims=options.claims,
+        )
+        recorder.add_metadata(RUN, about)
         rig.wait_ready()
         if stop.is_set():
             return False
