@@ -533,6 +533,8 @@ class TestService:
                 node.deliver(CMD, COMMANDS.encode(commands))
                 wait_until(lambda n=number: service.counters.received > n)  # type: ignore[misc]
             wait_until(lambda: newest(node).motor_state[0].q == pytest.approx(high[0]))
+            # a command is counted as received before it is looked into
+            wait_until(lambda: service.snapshot()["hands"]["left"]["clamped"] == 2)
         snapshot = service.snapshot()
         hand = snapshot["hands"]["left"]
         assert (hand["wrong_ids"], hand["unknown_status"], hand["clamped"]) == (2, 2, 2)
