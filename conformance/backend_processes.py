@@ -159,11 +159,13 @@ class Rig:
             self._services = self._start_hands()
 
     def wait_ready(self) -> None:
-        """Wait until the services are ready.
+        """Wait until the services are ready, or the run is stopped.
 
         :raises ConformanceError: one does not get ready.
         """
-        for tool in () if self._stop.is_set() else self._services:
+        if self._stop.is_set():
+            return
+        for tool in self._services:
             tool.wait_ready(self._stop)
 
     def _start_robot(self, emulator: str) -> Tool:
