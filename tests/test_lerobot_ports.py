@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import signal
+import socket
 from collections.abc import Iterator
 from typing import Any
 
@@ -31,6 +32,7 @@ from dexkit.wire import low_level
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until
 from tests.each import each
 from tests.lerobot_client import LerobotClient, command_json
+from tests.patience import PATIENCE
 from tests.test_emulate_all import whole_robot
 
 __all__ = ["dds_domain", "dds_node"]
@@ -249,6 +251,39 @@ def test_second_client_stops_the_commands_until_it_leaves(
         wait_until(lambda: bench.served.clients == 1)
         assert bench.send(client, command_json({}), 8) >= 1
     assert "two clients are connected" in caplog.text
+
+
+def _post_of_frames(payload: bytes) -> bytes:
+    """What a web page can make a browser send: to ZMTP 1.0 they are frames, the last its own.
+
+    The first byte of a frame is the length of what follows. "P" of POST is one, and the page's path
+    has the next: "~", 126 bytes, which end with the head.
+    """
+    start = b"POST /".ljust(1 + ord("P"), b"a") + b"~b"
+    more = b" HTTP/1.1\r\nHost: 127.0.0.1\r\nX: "
+    head = start + more.ljust(126 - 1 - 4, b"x") + b"\r\n\r\n"
+    return head + b"\xff" + (1 + len(payload)).to_bytes(8, "big") + b"\0" + payload
+
+
+def test_web_page_cannot_command_the_robot(bench: Bench) -> None:
+    """It could where ZMTP 1.0 is taken, at a port that browsers do not block, as they do 6000."""
+    counters = bench.served.counters
+    with socket.create_connection(("127.0.0.1", bench.served.ports.commands), PATIENCE) as sock:
+        sock.setblocking(False)
+        sock.sendall(_post_of_frames(command_json({ELBOW: 1.0})))
+
+        def ended() -> bool:
+            try:
+                return sock.recv(100) == b""
+            except BlockingIOError:
+                return False
+            except ConnectionResetError:
+                return True
+
+        wait_until(lambda: ended() or counters.commands)
+    assert counters.commands == 0
+    with LerobotClient(bench.served.ports.commands) as client:
+        assert bench.send(client, command_json({}), 12) >= 1
 
 
 def test_port_that_is_taken_is_an_error_and_all_are_released(bench: Bench) -> None:

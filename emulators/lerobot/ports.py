@@ -150,6 +150,9 @@ class LerobotPorts:
     def _socket(self, kind: int) -> zmq.Socket[bytes]:
         made: zmq.Socket[bytes] = self._context.socket(kind)
         made.setsockopt(self._zmq.LINGER, 0)
+        # With a domain of authentication, which nobody enforces here, ZMTP before 3.0 is refused.
+        # Its frames can be written by a web page, in what it posts to this port.
+        made.setsockopt(self._zmq.ZAP_DOMAIN, b"dexkit")
         return made
 
     def _bind(self, socket: zmq.Socket[bytes], address: str, port: int) -> int:
