@@ -5,13 +5,15 @@ Ray is no part of ``make setup``: ``.tools/bin/uv pip install 'ray>=2.40'`` lets
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -31,6 +33,53 @@ def test_missing_ray_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match="needs Ray"):
         Limits().cluster("auto")
+
+
+def test_cluster_of_this_machine_has_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its servers listen on every address, and run the code that they are given."""
+    asked: list[tuple[str, Any, str, str]] = []
+
+    def init(address: str, **options: Any) -> None:
+        mode, token = os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN"]
+        asked.append((address, options["include_dashboard"], mode, token))
+
+    ray = SimpleNamespace(
+        __version__="2.60.0", init=init, remote=lambda **options: lambda function: function
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
+        monkeypatch.setenv(name, "")  # as before, afterwards
+    for _ in range(2):
+        Limits().cluster("local")
+    (first, second) = asked
+    assert first[:3] == second[:3] == ("local", False, "token")
+    assert len({first[3], second[3]}) == 2
+    assert len(first[3]) == 64
+    ray.__version__ = "2.51.1"
+    with pytest.raises(UsageError, match="would run code for every network"):
+        Limits().cluster("local")
+    assert len(asked) == 2
+
+
+@pytest.mark.soak
+def test_nobody_else_runs_code_on_the_cluster_of_this_machine() -> None:
+    pytest.importorskip("ray", reason="install it: .tools/bin/uv pip install 'ray>=2.52'")
+    script = """
+import os, subprocess, sys
+from dexkit.conformance.audit.audit import Limits
+Limits().cluster("local")
+import ray
+address = ray.get_runtime_context().gcs_address
+client = f"import ray; ray.init('{address}', log_to_driver=False); print(ray.get(ray.put(7)))"
+for names in (), ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
+    env = {k: v for k, v in os.environ.items() if k not in names}
+    done = subprocess.run([sys.executable, "-c", client], env=env, capture_output=True, text=True)
+    print(done.returncode, done.stdout.strip())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "0 7\n1 \n", (done.stdout, done.stderr)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
+import secrets
 import signal
 import socket
 from collections.abc import Iterable, Iterator
@@ -29,6 +30,7 @@ __all__ = ["THIS_MACHINE", "Cluster"]
 
 THIS_MACHINE = "local"
 """The address of a cluster of this machine alone, which ends with the audit."""
+_HAS_TOKENS = (2, 52)  # the version of Ray that learned to ask for one
 _PATIENCE = 10.0  # seconds for the head node to answer
 _LOOK = 0.2  # seconds between looks at the stop request
 _AGAIN = 3  # times that a task is done again whose process or node died
@@ -43,20 +45,37 @@ class Cluster:
         ``local`` for a new one on this machine.
     :param limits: what one file may take. Time is taken by the task's own process, so that a task
         that waits for a processor does not lose any.
-    :raises UsageError: Ray is not installed.
+    :raises UsageError: Ray is not installed, or is too old for a cluster of its own.
     :raises ConformanceError: there is no such cluster.
+
+    Whoever reaches a cluster can run code on it, and Ray's servers listen on every address of the
+    machine, also for a cluster of this machine alone. So that one has a token, drawn for the audit.
     """
 
     def __init__(self, address: str, limits: Limits) -> None:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to anybody
+        local = address == THIS_MACHINE
+        if local:  # before Ray is imported, which reads it then; its servers inherit it
+            os.environ["RAY_AUTH_MODE"] = "token"
+            os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
         try:
             import ray
         except ImportError:
             raise UsageError("--ray needs Ray", hint="pip install 'dexkit[ray]'") from None
         self._ray: Any = ray
+        if local and tuple(map(int, ray.__version__.split(".")[:2])) < _HAS_TOKENS:
+            raise UsageError(
+                f"a cluster of Ray {ray.__version__} would run code for every network",
+                hint="pip install 'ray>=2.52', or --jobs instead of --ray local",
+            )
         try:
             _check_address(address, ray)  # Ray itself would try for minutes
-            ray.init(address, log_to_driver=False, logging_level="ERROR", include_dashboard=None)
+            ray.init(
+                address,
+                log_to_driver=False,
+                logging_level="ERROR",
+                include_dashboard=False if local else None,
+            )
         except (OSError, ValueError, RuntimeError) as error:
             raise ConformanceError(
                 f"no Ray cluster at {address}: {one_line(str(error), 300)}",
