@@ -14,6 +14,7 @@ from dexkit.clock import Clock
 from dexkit.emulators.line_server import CHUNK, LineServer
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
+from dexkit.tcp_listener import listen
 
 __all__ = ["TcpPort"]
 
@@ -58,18 +59,14 @@ class TcpPort(LineServer):
         return -1 if here is None else here.fileno()
 
     def _plug(self) -> None:
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind((_HOST, self.port))
-            listener.listen()
-            listener.setblocking(False)
+            listener = listen(_HOST, self.port)
         except OSError as error:
-            listener.close()
             raise EmulatorError(
                 f"cannot listen on {self.path}: {error.strerror}",
                 hint="another emulator may use the port; 0 takes a free one",
             ) from error
+        listener.setblocking(False)
         self.port = listener.getsockname()[1]
         self._listener = listener
 

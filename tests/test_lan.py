@@ -552,10 +552,11 @@ _KNOWN = {
         "bind"
     },  # tries whether a port is free; the page has an address
     "dexkit/view/foxglove_viewer.py": {"start_server"},  # likewise, by the library
-    "emulators/lerobot/ports.py": {"bind"},  # loopback only
+    "emulators/lerobot/ports.py": {"bind", "listen"},  # the library takes the listener's socket
     "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address
-    "emulators/dex3_mcu/server.py": {"bind", "listen"},
-    "emulators/tcp_port.py": {"bind", "listen"},  # loopback only
+    "dexkit/tcp_listener.py": {"bind", "listen"},
+    "emulators/dex3_mcu/server.py": {"listen"},
+    "emulators/tcp_port.py": {"listen"},
 }
 
 

@@ -44,10 +44,10 @@ from typing import Any, Protocol
 from usbip import protocol
 from usbip.device import USBDevice
 
-from dexkit import interface_filter
 from dexkit.clock import Clock, RealClock
 from dexkit.errors import EmulatorError
 from dexkit.escaping import one_line
+from dexkit.tcp_listener import listen
 from dexkit.threads import Worker
 
 __all__ = [
@@ -519,25 +519,10 @@ class _Connection:
         self.outbox += _RETURN.pack(command, urb.seqnum, urb.devid, urb.direction, urb.ep, status)
 
 
-def _drop_remote_packets(listener: socket.socket) -> None:
-    """Drop packets from networks: with route_localnet the kernel accepts them for 127.0.0.1."""
-    try:
-        interface_filter.restrict(listener, "lo")
-    except OSError as error:
-        # without this option the loopback address keeps them out, unless route_localnet is set
-        log.warning("packets from networks are not kept from 127.0.0.1: %s", error.strerror)
-
-
 def _listen(host: str, port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((host, port))
-        if listener.getsockname()[0].startswith("127."):
-            _drop_remote_packets(listener)
-        listener.listen(MAX_CONNECTIONS)
+        listener = listen(host, port, MAX_CONNECTIONS)
     except (OSError, TypeError, ValueError) as error:  # the latter two: no host has such a name
-        listener.close()
         hint = "--host takes an address of this machine"
         if not isinstance(error, OSError):
             what = f"cannot serve USB/IP on {one_line(host, 80)!r}: no such host"

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dexkit.clock import Clock, Rate, RealClock
 from dexkit.dds import DdsNode
@@ -21,6 +21,7 @@ from dexkit.emulators.lerobot.freshness import CommandStream
 from dexkit.emulators.lerobot.low_level_json import MOST, command_from, state_json
 from dexkit.errors import EmulatorError, ExtraMissing, WireError
 from dexkit.robots import G1
+from dexkit.tcp_listener import listen
 from dexkit.threads import Worker
 from dexkit.wire import low_level
 
@@ -156,15 +157,23 @@ class LerobotPorts:
         return made
 
     def _bind(self, socket: zmq.Socket[bytes], address: str, port: int) -> int:
+        """Listen, on a socket that keeps networks out where the address is of loopback."""
         try:
-            socket.bind(f"tcp://{address}:{port or '*'}")
-        except self._zmq.ZMQError as error:
+            listener = listen(address, port)
+        except (OSError, TypeError, ValueError) as error:
             raise EmulatorError(
-                f"cannot listen on {address}:{port}: {error.strerror}",
+                f"cannot listen on {address}:{port}: {getattr(error, 'strerror', None) or error}",
                 hint="is another robot server running? LeRobot's client knows only these ports",
             ) from error
-        place: Any = socket.getsockopt(self._zmq.LAST_ENDPOINT)
-        return int(place.rstrip(b"\0").rpartition(b":")[2])
+        host, port = listener.getsockname()
+        socket.setsockopt(self._zmq.USE_FD, listener.fileno())
+        try:
+            socket.bind(f"tcp://{host}:{port}")
+        except BaseException:
+            listener.close()
+            raise
+        listener.detach()  # the library closes it
+        return int(port)
 
     def _record_failure(self, error: Exception) -> None:
         self.failure = self.failure or error

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from collections.abc import Callable
 from typing import Any
 
+from dexkit.tcp_listener import listen
 from tools.lab.devices import Devices
 from tools.lab.report import Case
 
@@ -30,7 +30,7 @@ class Control:
         self._on_case = on_case
         self.facts: dict[str, Any] = {}
         self.finished = False
-        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener = listen("127.0.0.1", 0)
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._serve, name="control", daemon=True).start()
 

@@ -32,6 +32,7 @@ from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.emulators.mx64 import Bus, Servo
 from dexkit.errors import DexkitError
 from dexkit.hand import HandCommand, Side
+from dexkit.tcp_listener import listen
 from dexkit.usbip import Connection, UsbIpBackend
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import m4010
@@ -346,7 +347,7 @@ def usbip_client(case: Inputs, count: int) -> None:
         if (i + 1) % 20 == 0 or i + 1 == count:
             connection.close()
             peer.close()
-    listener = socket.create_server(("127.0.0.1", 0))
+    listener = listen("127.0.0.1", 0)
     try:
         for _ in range(max(1, count // 20)):
             stream = _greeting(case)
