@@ -55,6 +55,7 @@ _SO_GET_FILTER = 26
 _INSTRUCTION = struct.Struct("=HBBI")  # sock_filter: code, jump if true, jump if false, operand
 _LOAD_WORD, _JUMP_EQUAL, _RETURN = 0x20, 0x15, 0x06  # BPF_LD|W|ABS, BPF_JMP|JEQ|K, BPF_RET|K
 _INCOMING_INDEX = 0xFFFFF008  # SKF_AD_OFF + SKF_AD_IFINDEX
+_SENDER = 0xFFF0000C  # SKF_NET_OFF + the place of the sender's address in an IPv4 header
 _WHOLE, _DROP = 0xFFFFFFFF, 0  # how many bytes of the packet are kept
 _SIOCGIFADDR, _SIOCGIFFLAGS, _SIOCGIFCONF = 0x8915, 0x8913, 0x8912
 _REQUEST = 16 + 24  # ifreq: name and a union of 24 bytes (64 bit)
@@ -131,25 +132,33 @@ def accepted_indices(interface: str) -> tuple[int, ...]:
     )
 
 
-def program(indices: Sequence[int]) -> bytes:
-    """A filter that keeps packets that came in by one of these interfaces, and drops the others."""
+def program(indices: Sequence[int], sender: str | None = None) -> bytes:
+    """A filter that keeps packets that came in by one of these interfaces, and drops the others.
+
+    :param sender: of those, keep the packets from this IPv4 address.
+    """
     count = len(indices)
     lines = [(_LOAD_WORD, 0, 0, _INCOMING_INDEX)]
     # from line 1 + i to the last line
     lines += [(_JUMP_EQUAL, count - i, 0, index) for i, index in enumerate(indices)]
-    lines += [(_RETURN, 0, 0, _DROP), (_RETURN, 0, 0, _WHOLE)]
+    lines += [(_RETURN, 0, 0, _DROP)]
+    if sender is not None:
+        wanted = int.from_bytes(socket.inet_aton(sender), "big")
+        lines += [(_LOAD_WORD, 0, 0, _SENDER), (_JUMP_EQUAL, 1, 0, wanted), (_RETURN, 0, 0, _DROP)]
+    lines += [(_RETURN, 0, 0, _WHOLE)]
     # never reached: qemu-user reads a program back into memory for four instructions, whoever asks.
     # The kernel refuses a longer one, where a short one overwrites the emulator's stack.
     lines += [(_RETURN, 0, 0, _DROP)] * (5 - len(lines))
     return b"".join(_INSTRUCTION.pack(*line) for line in lines)
 
 
-def accept_only(sock: socket.socket, indices: Sequence[int]) -> None:
+def accept_only(sock: socket.socket, indices: Sequence[int], sender: str | None = None) -> None:
     """Accept packets only from interfaces with these indices, from now on.
 
+    :param sender: and from this IPv4 address only.
     :raises OSError: the system has no such filter.
     """
-    code = program(indices)
+    code = program(indices, sender)
     if sys.platform != "linux":
         raise OSError(errno.ENOPROTOOPT, "this system has no socket filters")
     memory = array.array("B", code)

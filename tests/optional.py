@@ -102,7 +102,7 @@ OPTIONAL = (
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
     Optional("pyzmq", _package("zmq"), ("lerobot_ports",)),
     Optional("pyte", _package("pyte"), ("monitor_terminal",)),
-    Optional("viser", _package("viser"), ("view", "view_browser", "view_soak")),
+    Optional("viser", _package("viser"), ("view", "view_browser", "view_soak", "web_pages")),
     Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),
     Optional("ray", _package("ray"), ("audit_ray",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),

@@ -23,8 +23,8 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.recording_marks import phase_marks, verdict_marks
 from dexkit.errors import ExtraMissing, UsageError
 from dexkit.hand import MotorError, Side
-from dexkit.messages import encode, unitree_go
-from dexkit.models import INSPIRE_DFX
+from dexkit.messages import encode, message_type, unitree_go, unitree_hg
+from dexkit.models import DEX3_1, INSPIRE_DFX
 from dexkit.traces import open_trace, sample_path
 from dexkit.view.curve_points import common_times, thin
 from dexkit.view.html_tables import hand_table, time_strip, topics_table
@@ -34,11 +34,14 @@ from dexkit.view.viewer_process import viewer
 from dexkit.watch import Collector, Mark
 from dexkit.watch.number_format import seconds
 from tests.cli_helpers import running
+from tests.dds_helpers import dds_domain, wait_until
 from tests.patience import PATIENCE
 from tests.watch_helpers import closing_hands, ns
 
 if TYPE_CHECKING:
     from dexkit.view.browser_page import Page
+
+__all__ = ["dds_domain"]
 
 FEW = settings(max_examples=25, deadline=None)
 
@@ -240,6 +243,69 @@ def test_page_is_bound_to_this_machine_and_to_a_free_port(page: Page) -> None:
 
 def test_page_asks_nobody_for_a_share_link(page: Page) -> None:
     assert page._server.request_share_url() is None
+
+
+def test_nothing_on_the_page_can_command_a_hand(
+    dds_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client of its WebSocket changes every control to every value that it offers."""
+    import msgspec
+    import viser
+    from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
+
+    from dexkit.dds import DdsNode
+    from dexkit.view.browser_page import Page
+    from dexkit.view.sources import Live
+    from dexkit.watch.listener import Listener
+
+    topic, kind = "rt/dex3/left/state", message_type(DEX3_1.dialects[0].state_type)
+    written: list[object] = []
+    with (
+        DdsNode(dds_domain) as hand,
+        hand.writer(topic, kind) as writer,
+        DdsNode(dds_domain) as node,
+        Listener(node, Collector()) as listener,
+        Page([Live("live", listener)], port=0) as page,
+    ):
+        monkeypatch.setattr(DdsNode, "writer", lambda *a, **k: written.append(a))
+
+        def arrived() -> bool:
+            writer.write_raw(encode(unitree_hg.HandState_([unitree_hg.MotorState_()] * 7)))
+            page.step(0.0)
+            return "-" not in page._choices and bool(page._choices)
+
+        wait_until(arrived)
+        controls = dict(page._server.gui._gui_input_handle_from_uuid)
+        named = {uuid: type(c).__name__ for uuid, c in controls.items()}
+        assert set(named.values()) == {
+            *("GuiButtonGroupHandle", "GuiButtonHandle", "GuiSliderHandle", "GuiDropdownHandle")
+        }
+        camera = {
+            **dict.fromkeys(("position", "look_at", "up_direction"), (0.0, 0.0, 1.0)),
+            **dict.fromkeys(("image_height", "image_width"), 100),
+            **dict.fromkeys(("fov", "near", "far"), 1.0),
+            **{"type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0)},
+        }
+        spoken = Subprotocol(f"viser-v{viser.__version__}")
+        url = page.url.replace("http", "ws")
+        with connect(url, subprotocols=[spoken], max_size=None) as client:
+            client.send(msgspec.msgpack.encode(camera))  # its page is up
+            wait_until(page._server.get_clients)
+            for uuid, control in controls.items():
+                values = getattr(control, "options", None) or [
+                    getattr(control, "min", True),
+                    getattr(control, "max", True),
+                ]
+                began = control.update_timestamp
+                for value in values:
+                    update = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
+                    client.send(msgspec.msgpack.encode(update))
+                wait_until(lambda c=control, b=began: c.update_timestamp > b)  # type: ignore[misc]
+            wait_until(lambda: page._transports[0].paused)
+        endpoints = node.discovery.endpoints()
+    assert written == []
+    assert {e.topic for e in endpoints if e.kind == "writer"} == {topic}
 
 
 # -- the command -----------------------------------------------------------------------------------

@@ -90,6 +90,20 @@ def test_options_that_do_not_go_together_are_refused(options: tuple[str, ...]) -
     assert "--to rerun --out session.rrd" in (result.exception.hint or "")
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--allow-origin", "*"), "no origin"),
+        (("--to", "rerun", "--out", "x.rrd", "--allow-origin", "http://a"), "does not"),
+    ],
+)
+def test_origins_that_cannot_be_allowed_are_refused(options: tuple[str, ...], said: str) -> None:
+    pytest.importorskip("viser")
+    result = CliRunner().invoke(command, [str(sample_path("dex3_pinch")), "--no-open", *options])
+    assert isinstance(result.exception, UsageError)
+    assert said in str(result.exception)
+
+
 # the SDKs are large, and not among the tools of this project: pip install 'dexkit[rerun,foxglove]'
 
 
@@ -151,3 +165,22 @@ def test_foxglove_is_sent_scene_and_numbers() -> None:
             thread.join(PATIENCE)
     assert set(numbers) >= {"q", "dq", "tau_est", "pressure", "faults"}
     assert len(numbers["q"]) == 7
+
+
+@pytest.mark.soak
+def test_foxglove_is_read_by_allowed_pages_only() -> None:
+    pytest.importorskip("foxglove")
+    client = pytest.importorskip("websockets.sync.client")
+    from websockets.exceptions import InvalidStatus
+
+    from dexkit.view.foxglove_viewer import ORIGINS, FoxgloveViewer
+
+    with closing(FoxgloveViewer("127.0.0.1", 0, ["https://viewer.example"])) as viewer:
+        for origin in (None, *ORIGINS, "https://viewer.example"):
+            with client.connect(
+                viewer.url, subprotocols=["foxglove.sdk.v1"], origin=origin
+            ) as socket:
+                assert json.loads(socket.recv(PATIENCE))["op"] == "serverInfo"
+        for origin in ("http://evil.example", "null", "https://app.foxglove.dev.evil.example"):
+            with pytest.raises(InvalidStatus, match="403"):
+                client.connect(viewer.url, subprotocols=["foxglove.sdk.v1"], origin=origin)

@@ -47,6 +47,14 @@ __all__ = ["command", "recorded"]
 )
 @port_option("TCP port of the page; 0 for any.  [default: the first free one from 8720]")
 @click.option(
+    "--allow-origin",
+    "origins",
+    multiple=True,
+    metavar="ORIGIN",
+    help="Also answer web pages of this origin, such as https://viewer.example:8443, and requests "
+    "to its host; may be repeated.  [default: the page itself; Foxglove's with --to foxglove]",
+)
+@click.option(
     "--open/--no-open",
     "open_browser",
     default=None,
@@ -87,6 +95,7 @@ def command(
     interface: str,
     host: str,
     port: int | None,
+    origins: tuple[str, ...],
     open_browser: bool | None,
     judge: bool,
     urdfs: tuple[str, ...],
@@ -109,6 +118,8 @@ def command(
         raise UsageError("at most two recordings can be shown at once")
     if (out is None) is (to == "rerun"):
         raise UsageError("--to rerun and --out go together", hint="--to rerun --out session.rrd")
+    if to == "rerun" and origins:
+        raise UsageError("--allow-origin is for what listens; --to rerun does not")
     from dexkit.view.forward import forward
 
     # names the extra before anything else is done
@@ -131,7 +142,9 @@ def command(
             timer.daemon = True
             timer.start()
         if to is None:
-            page = stack.enter_context(Page(sources, host=host, port=port, skeletons=skeletons))
+            page = stack.enter_context(
+                Page(sources, host=host, port=port, origins=origins, skeletons=skeletons)
+            )
             click.echo(f"ready: {page.url} shows {what}")
             _open(page.url, open_browser)
             page.run(stop.event)
@@ -145,7 +158,9 @@ def command(
             )
         else:
             chosen = DEFAULT_PORT if port is None else port
-            foxglove = stack.enter_context(contextlib.closing(FoxgloveViewer(host, chosen)))
+            foxglove = stack.enter_context(
+                contextlib.closing(FoxgloveViewer(host, chosen, origins))
+            )
             click.echo(f"ready: {foxglove.url} shows {what}")
             while not stop.event.is_set():  # a recording begins again
                 forward(sources, foxglove, stop.event, skeletons=skeletons)

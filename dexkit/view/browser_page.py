@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import socket
 import threading
 import time
 from collections import Counter
@@ -13,14 +12,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from dexkit.errors import ExtraMissing, UsageError
+from dexkit.errors import ExtraMissing
 from dexkit.hand import Subject
 from dexkit.kinematics import Skeleton
 from dexkit.robots import RobotModel
 from dexkit.view.drawing import places
+from dexkit.view.guarded_server import GuardedPort
 from dexkit.view.html_tables import hand_table, time_strip, topics_table
 from dexkit.view.sources import HISTORY, Source
 from dexkit.view.transport import SPEEDS, Transport
+from dexkit.view.web_origins import Allowed
 from dexkit.watch import Mark, Picture, SubjectView
 from dexkit.watch.number_format import subject_name
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 __all__ = ["DEFAULT_PORT", "Page"]
 
 DEFAULT_PORT = 8720
+_PORTS = 50  # how many are tried from there
 _RATE = 30.0
 _TABLES = 0.25  # seconds between updates of the tables
 _CHARTS = 0.1
@@ -82,8 +84,9 @@ class Page:
     :param sources: side by side; two recordings share their controls.
     :param host: address that it is bound to.
     :param port: None for the first free one from :data:`DEFAULT_PORT`.
+    :param origins: of other web pages that may read the view.
     :param skeletons: by model and subject (``left``, ``robot``), instead of the model's own.
-    :raises UsageError: the port is taken.
+    :raises UsageError: the port is taken, or pages that may not read cannot be kept out.
     """
 
     def __init__(
@@ -92,12 +95,22 @@ class Page:
         *,
         host: str = "127.0.0.1",
         port: int | None = None,
+        origins: Sequence[str] = (),
         skeletons: Mapping[tuple[str, str], Skeleton] | None = None,
     ) -> None:
-        chosen = _free_port(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server = _Server(host=host, port=chosen, verbose=False, label="dexkit view")
-        self.host, self.port = host, int(self._server.get_port())
+        first = DEFAULT_PORT if port is None else port
+        ports = range(first, first + (_PORTS if port is None else 1))
+        with contextlib.ExitStack() as stack:
+            self._guard = stack.enter_context(GuardedPort(host, ports, Allowed(host, origins)))
+            hidden = self._guard.hidden
+            with contextlib.redirect_stdout(io.StringIO()):
+                self._server = _Server(
+                    host=hidden.host, port=hidden.port, verbose=False, label="dexkit view"
+                )
+                stack.callback(self._stop_server)
+            self._guard.open()
+            stack.pop_all()
+        self.host, self.port = host, self._guard.port
         self._skeletons = dict(skeletons or {})
         self._charts: list[Chart] = []
         self._window = 10.0
@@ -110,11 +123,14 @@ class Page:
     @property
     def url(self) -> str:
         """URL for browsers."""
-        host = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
+        return f"http://{self._guard.authority}"
 
     def close(self) -> None:
         """End the server."""
+        self._guard.close()
+        self._stop_server()
+
+    def _stop_server(self) -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -441,25 +457,3 @@ def _escaped(text: str) -> str:
     from html import escape
 
     return escape(text)
-
-
-def _free_port(host: str, port: int | None) -> int:
-    """A port that can be bound.
-
-    :raises UsageError: the given one cannot, or none.
-    """
-    first = DEFAULT_PORT if port is None else port
-    for candidate in range(first, first + (50 if port is None else 1)):
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((host, candidate))
-            except OSError as error:
-                reason = error.strerror or str(error)
-            else:
-                return int(probe.getsockname()[1])
-    raise UsageError(
-        f"the page cannot be bound to {host}, port {first}: {reason}",
-        hint="choose another one: --port",
-    )

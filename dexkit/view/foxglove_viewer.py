@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,6 +14,8 @@ from dexkit.hand import Floats
 from dexkit.kinematics import quaternions
 from dexkit.view.drawing import GHOST, Colors
 from dexkit.view.forward import Moment
+from dexkit.view.guarded_server import GuardedPort
+from dexkit.view.web_origins import Allowed
 
 try:
     import foxglove
@@ -23,10 +26,12 @@ except ImportError as error:
         "--to foxglove needs the package foxglove-sdk", hint="pip install 'dexkit[foxglove]'"
     ) from error
 
-__all__ = ["DEFAULT_PORT", "SCENE", "FoxgloveViewer", "numbers_topic"]
+__all__ = ["DEFAULT_PORT", "ORIGINS", "SCENE", "FoxgloveViewer", "numbers_topic"]
 
 DEFAULT_PORT = 8765  # the one that Foxglove proposes
 SCENE = "/dexkit/scene"
+ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev")
+"""Foxglove in a browser: its pages may connect."""
 
 
 def numbers_topic(name: str) -> str:
@@ -38,30 +43,37 @@ class FoxgloveViewer:
     """A server that Foxglove connects to.
 
     :param port: 0 for any.
-    :raises UsageError: the port is taken.
+    :param origins: of web pages that may connect, beside :data:`ORIGINS`.
+    :raises UsageError: the port is taken, or other web pages cannot be kept out.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, origins: Sequence[str] = ()) -> None:
         self._context = foxglove.Context()
-        try:
-            self._server = foxglove.start_server(
-                name="dexkit", host=host, port=port, context=self._context
-            )
-        except (OSError, RuntimeError) as error:
-            raise UsageError(
-                f"cannot serve on {host}:{port}: {error}", hint="choose another --port, or 0"
-            ) from error
-        self.host, self.port = host, self._server.port
+        allowed = Allowed(host, (*ORIGINS, *origins))
+        with contextlib.ExitStack() as stack:
+            self._guard = stack.enter_context(GuardedPort(host, range(port, port + 1), allowed))
+            hidden = self._guard.hidden
+            try:
+                self._server = foxglove.start_server(
+                    name="dexkit", host=hidden.host, port=hidden.port, context=self._context
+                )
+            except (OSError, RuntimeError) as error:
+                raise UsageError(f"the server of Foxglove's SDK does not start: {error}") from error
+            stack.callback(self._server.stop)
+            self._guard.open()
+            stack.pop_all()
+        self.host, self.port = host, self._guard.port
         self._scene = SceneUpdateChannel(SCENE, context=self._context)
         self._channels: dict[str, foxglove.Channel] = {}
 
     @property
     def url(self) -> str:
         """URL for Foxglove."""
-        return f"ws://{self.host}:{self.port}"
+        return f"ws://{self._guard.authority}"
 
     def close(self) -> None:
         """End the server."""
+        self._guard.close()
         self._server.stop()
 
     def show(self, time_ns: int, moments: Sequence[Moment]) -> None:
