@@ -10,6 +10,8 @@ from __future__ import annotations
 import ast
 import ctypes
 import errno
+import fnmatch
+import importlib.util
 import json
 import os
 import re
@@ -51,7 +53,7 @@ ip address add 239.255.0.1/32 dev net1 autojoin
 _STRANGER = """
 echo 1 > /proc/sys/net/ipv4/conf/port1/route_localnet
 ip address delete 127.0.0.1/8 dev lo
-ip route add 127.0.0.1 via 10.9.1.1 dev port1
+ip route add 127.0.0.0/8 via 10.9.1.1 dev port1
 ip route add 10.9.0.0/24 via 10.9.1.1
 ip route add 239.0.0.0/8 dev port1
 """
@@ -436,22 +438,147 @@ def test_clients_and_robots_on_loopback_filter_their_sockets(hosts: dict[str, Ho
             _hears_this_machine_only(name, program)
 
 
-def test_usbip_server_is_not_reachable_from_a_network(hosts: dict[str, Host]) -> None:
-    script = """
-import socket, sys
-for host in "127.0.0.1", "10.9.1.1":
-    try:
-        socket.create_connection((host, int(sys.argv[1])), timeout=float(sys.argv[2])).close()
-        print("reached", host)
-    except OSError as error:
-        print("not", host)
+# what listens, by its row of docs/security.md; on the ports that it has by default
+_LISTENING: dict[str, tuple[object, ...]] = {
+    "serve": (*GRIPPER, "--domain", 120),
+    "doctor": ("doctor", "--watch", "--domain", 121),
+    "emulate dex3-usb": ("emulate", "dex3-usb"),
+    "emulate lerobot-g1": ("emulate", "lerobot-g1", "--domain", 122),
+    "emulate rh56 --modbus-tcp": ("emulate", "rh56", "--modbus-tcp", 1502),
+    "view": ("view", "--no-open", "--domain", 123),
+    "view --to foxglove": ("view", "--to", "foxglove", "--domain", 124),
+    "view --to rerun": (
+        *("view", "--to", "rerun", "--out", "rerun+http://127.0.0.1:9/proxy", "--domain", 125),
+    ),
+}
+_ON_DDS = ("doctor", "emulate lerobot-g1", "view", "view --to foxglove", "view --to rerun")
+_NEEDS = {
+    "emulate lerobot-g1": "zmq",
+    "view": "viser",
+    "view --to foxglove": "foxglove",
+    "view --to rerun": "rerun",
+}
+_TABLE = ROOT / "docs" / "security.md"
+
+
+def _rows() -> list[list[str]]:
+    """The cells of the table of listeners."""
+    section = _TABLE.read_text().split("## What is open by default")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[2:]]
+
+
+def _documented() -> dict[str, list[str]]:
+    """Sockets that the table names, such as ``tcp 127.0.0.1:3240``, by command."""
+    found = {}
+    for row in _rows():
+        sockets = re.findall(r"`((?:tcp|udp) [^`]+)`", row[1])
+        found |= dict.fromkeys(re.findall(r"`([^`]+)`", row[0]), sockets)
+    return found
+
+
+def _seen(program: Program) -> set[tuple[str, str, int]]:
+    """Protocol, address and port of what a program and its children take packets on."""
+    found = set()
+    for pid in _family(program.process.pid):
+        with suppress(FileNotFoundError, ProcessLookupError):  # a child that has ended meanwhile
+            own = _sockets(pid)
+            for protocol in ("udp", "udp6", "tcp", "tcp6"):
+                for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
+                    fields = line.split()
+                    if fields[9] in own and (protocol[:3] == "udp" or fields[3] == "0A"):
+                        address, port = fields[1].split(":")
+                        words = bytes.fromhex(address)
+                        packed = b"".join(words[i : i + 4][::-1] for i in range(0, len(words), 4))
+                        kind = socket.AF_INET6 if len(packed) > 4 else socket.AF_INET
+                        shown = socket.inet_ntop(kind, packed)
+                        found.add((protocol[:3], shown, int(port, 16)))
+    return found
+
+
+_REACH = """
+import errno, select, socket, sys, time
+waiting = {}
+for place in sys.argv[2:]:
+    host, port = place.split(":")
+    sock = socket.socket()
+    sock.setblocking(False)
+    if sock.connect_ex((host, int(port))) in (0, errno.EINPROGRESS):
+        waiting[sock] = place
+end = time.monotonic() + float(sys.argv[1])
+while waiting and (left := end - time.monotonic()) > 0:
+    for sock in select.select([], list(waiting), [], left)[1]:
+        if not sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            print(waiting[sock])
+        del waiting[sock]
 """
-    with programs(hosts["robot"], ("emulate", "dex3-usb", "--port", 0)) as (server,):
-        port = server.wait_line("ready: ").split()[1].rsplit(":", 1)[1]
-        robot = hosts["robot"].run(sys.executable, "-c", script, port, 20)
-        stranger = hosts["stranger"].run(sys.executable, "-c", script, port, 0.3)
-    assert robot == "reached 127.0.0.1\nnot 10.9.1.1\n"
-    assert stranger == "not 127.0.0.1\nnot 10.9.1.1\n"
+_OPEN = """
+import socket
+with socket.create_server(("127.0.0.1", 9001)):
+    print("ready: open", flush=True)
+    input()
+"""
+
+
+def _reached(host: Host, places: Iterable[str], seconds: float) -> set[str]:
+    """Those of these TCP ports, ``ADDRESS:PORT``, that a host can connect to."""
+    return set(host.run(sys.executable, "-c", _REACH, seconds, *places).split())
+
+
+def test_what_listens_is_documented_and_reached_by_this_machine_only(
+    hosts: dict[str, Host],
+) -> None:
+    """On each port of TCP, a server without a filter beside them: the network reaches that one."""
+    documented = _documented()
+    robot, stranger = hosts["robot"], hosts["stranger"]
+    with ExitStack() as stack:
+        started = {}
+        for name, words in _LISTENING.items():
+            if name in _NEEDS and importlib.util.find_spec(_NEEDS[name]) is None:
+                continue
+            program = started[name] = Program(robot, *words)
+            stack.callback(lambda p=program: p.process.poll() is None and p.end())
+        unfiltered = robot.popen(sys.executable, "-c", _OPEN, stdin=subprocess.PIPE)
+        stack.callback(unfiltered.communicate)
+        assert unfiltered.stdout is not None
+        assert unfiltered.stdout.readline() == "ready: open\n"
+        tcp = {("127.0.0.1", 9001)}
+        for name, program in started.items():
+            if name == "doctor":
+                _hears_this_machine_only(name, program)
+            else:
+                program.wait_line("^ready: ")
+            found = _seen(program)
+            own = [p.replace("PORT", "1502") for p in documented[name]]
+            known = own + (documented["serve"] if name in _ON_DDS else [])
+            for listener in found:
+                shown = _shown(listener)
+                assert any(fnmatch.fnmatch(shown, p) for p in known), (name, shown)
+            for pattern in own:
+                assert fnmatch.filter(map(_shown, found), pattern), (name, pattern, found)
+            tcp |= {(address, port) for protocol, address, port in found if protocol == "tcp"}
+        addresses = ("127.0.0.1", "10.9.1.1", "10.9.0.1")
+        ways = {f"{a}:{port}" for own, port in tcp for a in (*addresses, own)}
+        assert _reached(stranger, ways, 1.0) == {"127.0.0.1:9001"}
+        # not the server behind another, which has an address of its own: as for a browser
+        public = {f"{address}:{port}" for address, port in tcp if address == "127.0.0.1"}
+        assert _reached(robot, ways, 1.0) == public
+
+
+def _shown(listener: tuple[str, str, int]) -> str:
+    """As the table writes it."""
+    protocol, address, port = listener
+    return f"{protocol} {address}:{port}"
+
+
+def test_table_of_listeners_names_tests_that_there_are() -> None:
+    rows = _rows()
+    assert len(rows) > len(_LISTENING)
+    for row in rows:
+        names = re.findall(r"`(test_\w+)\.py::(test_\w+)`", row[-1])
+        assert names, row
+        for file, name in names:
+            assert f"def {name}(" in (ROOT / "tests" / f"{file}.py").read_text(), (row, name)
 
 
 # --- without networks
