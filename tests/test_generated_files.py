@@ -33,6 +33,7 @@ def test_every_generator_contributes() -> None:
         "docs/layouts/plotjuggler-dex3-1.xml",
         "docs/models.md",
         "docs/mutants.md",
+        "docs/sources/real-hands.md",
     }
 
 

@@ -8,6 +8,7 @@
 :mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
 :mod:`~.doctor_page`           the table of docs/doctor.md, from the doctor's diagnoses
 :mod:`~.conformity_page`       docs/conformity.md, from conformity.toml
+:mod:`~.real_hands_page`       docs/sources/real-hands.md, from real_hands.toml
 :mod:`~.layouts`               docs/layouts, for Foxglove and PlotJuggler, from the model profiles
 =============================  ==================================================================
 
@@ -35,6 +36,7 @@ def generated_files() -> dict[Path, str]:
         layouts,
         message_modules,
         models_page,
+        real_hands_page,
         requirement_pages,
     )
 
@@ -45,6 +47,7 @@ def generated_files() -> dict[Path, str]:
         **dex3_protocol_page.files(),
         **doctor_page.files(),
         **conformity_page.files(),
+        **real_hands_page.files(),
         **layouts.files(),
     }
 
