@@ -66,6 +66,18 @@ class RigOptions:
         return None if self.devices else emulator_of(self.backend)
 
     @property
+    def subject(self) -> dict[str, str]:
+        """Backend, device and object, for the run record and a result's ``subject``."""
+        about = {"backend": self.backend}
+        if self.devices:
+            about["device"] = ", ".join(f"{s} {d}" for s, d in self.devices.items())
+        elif emulator_of(self.backend) is not None:
+            about["device"] = "emulated"
+        if self.objects:
+            about["object"] = ", ".join(f"{s} at {p:g} %" for s, p in self.objects.items())
+        return about
+
+    @property
     def usb_server(self) -> str:
         """USB/IP server named by a setting, or empty."""
         settings = dict(s.partition("=")[::2] for s in self.settings)

@@ -21,6 +21,7 @@ from dexkit.conformance.measurement_error import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
+from dexkit.conformance.run_record import recorded_subject
 from dexkit.conformance.scores import Score, score_of
 from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.verdicts import Judgement, excuse
@@ -43,7 +44,8 @@ def judge(
 
     :param requirements: those to report; what they depend on is judged as well. None for all.
     :param claims: what the vendor claims of the hand.
-    :param subject: entries for the result's ``subject``: backend, device, recording.
+    :param subject: entries for the result's ``subject`` beside those of the run record: the
+        recording.
     """
     claims = claims or Claims()
     wanted = None if requirements is None else {r.id for r in requirements}
@@ -68,7 +70,12 @@ def judge(
     }
     when = datetime.fromtimestamp(recording.origin_ns / 1e9, tz=timezone.utc)
     return RunResult(
-        subject={**claims.subject, **about, **(subject or {})},
+        subject={
+            **claims.subject,
+            **about,
+            **recorded_subject(recording.run),
+            **(subject or {}),
+        },
         results=chosen,
         client=[r for r in client if wanted is None or r.requirement.id in wanted],
         stage={str(s): _stage(recording, s) for s in recording.judged},

@@ -170,7 +170,7 @@ def record_run(
         sole.search()
         # while the services start
         about = run_record(
-            backend=rig_options.backend,
+            subject=rig_options.subject,
             dialect=dialect.name,
             sides=rig_options.sides,
             phases=options.phases,

@@ -30,19 +30,21 @@ __all__ = [
     "catalogue_digest",
     "recorded_claims",
     "recorded_dialect",
+    "recorded_subject",
     "recorded_subjects",
     "run_record",
 ]
 
 RECORD = "dexkit.run"
 VERSION = "1"
+_SUBJECT = ("backend", "device", "object")
 NO_SEED = "none: the stimulus has no random numbers"
 _CPUS = Path("/proc/cpuinfo")
 
 
 def run_record(
     *,
-    backend: str,
+    subject: Mapping[str, str],
     dialect: str,
     sides: Iterable[Subject],
     phases: Iterable[str],
@@ -52,6 +54,7 @@ def run_record(
 ) -> dict[str, str]:
     """The content of the record of a live run that begins now.
 
+    :param subject: backend, device and object of the run, as in the result's ``subject``.
     :param phases: of the stimulus.
     :param rounds: of the stimulus.
     """
@@ -67,7 +70,7 @@ def run_record(
         "cores": str(os.cpu_count() or 0),
         "seed": NO_SEED,
         "catalogue": catalogue_digest(),
-        "backend": backend,
+        **{name: subject.get(name, "") for name in _SUBJECT},
         "dialect": dialect,
         "sides": json.dumps([str(side) for side in sides]),
         "phases": json.dumps(sorted(phases)),
@@ -109,6 +112,17 @@ def recorded_subjects(run: Mapping[str, str]) -> tuple[Subject, ...]:
     names = _parsed(run, "sides")
     names = names if isinstance(names, list) else []
     return tuple(known[n] for n in names if isinstance(n, str) and n in known)
+
+
+def recorded_subject(run: Mapping[str, str]) -> dict[str, str]:
+    """Backend, device and object of the run, for a result's ``subject``.
+
+    None of them where the record does not say whether the device was emulated: an earlier dexkit
+    wrote the backend only.
+    """
+    if "device" not in run:
+        return {}
+    return {name: run[name] for name in _SUBJECT if run.get(name)}
 
 
 def recorded_claims(run: Mapping[str, str]) -> Claims:

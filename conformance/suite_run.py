@@ -239,18 +239,6 @@ class SuiteOptions:
             settings=self.settings,
         )
 
-    @property
-    def subject(self) -> dict[str, str]:
-        """Backend, device and object, for a result's ``subject``."""
-        about = {"backend": self.backend}
-        if self.devices:
-            about["device"] = ", ".join(f"{s} {d}" for s, d in self.devices.items())
-        elif emulator_of(self.backend) is not None:
-            about["device"] = "emulated"
-        if self.objects:
-            about["object"] = ", ".join(f"{s} at {p:g} %" for s, p in self.objects.items())
-        return about
-
 
 def selection(config: pytest.Config) -> tuple[Requirement, ...]:
     """The requirements that the command line selects; of every model where it names no hand.
@@ -432,7 +420,7 @@ def _why_again(result: RunResult) -> str:
 
 def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
     """Judge the run's recording and write the files that were asked for."""
-    subject = dict(options.subject)
+    subject = {}  # the rest is in the run record, so that any judging of the recording has it
     if options.recording:
         subject["recording"] = options.recording.name
         if options.recording.is_file():

@@ -28,7 +28,7 @@ def write_run(path: Path) -> Path:
     trace = copy_of(short_run())
     with_beats(trace, usual_us=1_234)
     about = run_record(
-        backend="virtual",
+        subject={"backend": "virtual"},
         dialect="unitree_go",
         sides=[Side.LEFT],
         phases=["step", "silence"],

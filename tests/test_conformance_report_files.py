@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from dexkit.cli import cli
+from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.mutants.robot import NoCrc
@@ -33,6 +34,7 @@ from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.result_file import read_json
 from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.run_record import RECORD, run_record
 from dexkit.conformance.suite_run import SuiteOptions, judge_recording
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual
@@ -41,7 +43,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX3_1
 from dexkit.traces import Recorder, open_trace, sample_path
-from tests.conformance_helpers import short_run
+from tests.conformance_helpers import copy_of, short_run
 from tests.each import each
 from tests.report_helpers import HOSTILE, result_of_every_kind, run_named
 from tests.reproduction_helpers import write_trace, write_usb
@@ -244,7 +246,17 @@ def test_suite_writes_requested_report_files(tmp_path: Path) -> None:
         markdown=tmp_path / "r.md",
         report=tmp_path / "r.html",
     )
-    judge_recording(options, Recording.decode(short_run(), sides=(Side.LEFT,)))
+    trace = copy_of(short_run())
+    trace.metadata[RECORD] = run_record(
+        subject=options.rig(0).subject,
+        dialect="unitree_go",
+        sides=(Side.LEFT,),
+        phases=(),
+        rounds=1,
+        requirements=(),
+        claims=Claims(),
+    )
+    judge_recording(options, Recording.decode(trace, sides=(Side.LEFT,)))
     assert (tmp_path / "r.md").read_text().startswith("## ")
     assert "simulated" in (tmp_path / "r.html").read_text()
     with pytest.raises(UsageError, match="no such directory"):

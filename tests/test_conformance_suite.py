@@ -186,7 +186,7 @@ def test_suite_options_have_their_defaults() -> None:
     assert options.sides == (Side.LEFT, Side.RIGHT)
     assert options.domain is None
     assert options.objects == {Side.RIGHT: 37.0}
-    assert options.subject["device"] == "emulated"
+    assert options.rig(0).subject["device"] == "emulated"
     real = SuiteOptions.make(backend="ezgripper", devices=["/dev/ttyUSB0"])
     assert (real.sides, real.domain, real.objects) == ((Side.LEFT,), 0, {})
     outside = SuiteOptions.make(backend="external", side="right", objects=["right=25"])

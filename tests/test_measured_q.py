@@ -134,7 +134,7 @@ def test_manual_test_is_claimed_and_kept_with_the_recording() -> None:
     claims = Claims.parse(text)
     assert claims.manual_test == "2026-11-20: held, 0.01 rad"
     run = run_record(
-        backend="x",
+        subject={"backend": "x"},
         dialect="unitree_go",
         sides=(Side.LEFT,),
         phases=(),
