@@ -37,6 +37,7 @@ from dexkit.hand import Side
 
 __all__ = [
     "FORMAT",
+    "SEVERITY",
     "UNDISTURBED",
     "VERSION",
     "Disturbance",
@@ -79,7 +80,7 @@ class Verdict(str, Enum):
         return self in (Verdict.PASS, Verdict.FAIL, Verdict.WARN)
 
 
-_SEVERITY = [
+SEVERITY = [
     Verdict.FAIL,
     Verdict.ERROR,
     Verdict.BLOCKED,
@@ -88,11 +89,12 @@ _SEVERITY = [
     Verdict.NOT_CLAIMED,
     Verdict.NOT_APPLICABLE,
 ]
+"""The verdicts, from that which counts most where several sides have one each."""
 
 
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
     """The verdict that counts when several sides have one each."""
-    return min(verdicts, key=_SEVERITY.index, default=Verdict.NOT_APPLICABLE)
+    return min(verdicts, key=SEVERITY.index, default=Verdict.NOT_APPLICABLE)
 
 
 class Overall(str, Enum):
@@ -281,17 +283,20 @@ class Grade:
     """The verdict on the requirements of one kind: drop-in, or safety.
 
     :param counts: those requirements by verdict, sides taken together.
+    :param partial: whether the run was about a part of the catalogue: then a pass is one of that
+        part only.
     """
 
     kind: Kind
     overall: Overall
     counts: Mapping[Verdict, int]
+    partial: bool = False
 
     @classmethod
-    def from_results(cls, kind: Kind, results: Iterable[Result]) -> Grade:
+    def from_results(cls, kind: Kind, results: Iterable[Result], *, partial: bool = False) -> Grade:
         """The grade of the results of that kind."""
         found = [r for r in results if r.requirement.kind is kind]
-        return cls(kind, overall_of(found), counts_of(found))
+        return cls(kind, overall_of(found), counts_of(found), partial)
 
     @property
     def total(self) -> int:
@@ -307,7 +312,9 @@ class Grade:
     def sentence(self) -> str:
         """The grade in one sentence."""
         heads = {
-            Overall.PASS: "PASS: every MUST that could be judged is met",
+            Overall.PASS: "A PART PASSES: every selected MUST that could be judged is met"
+            if self.partial
+            else "PASS: every MUST that could be judged is met",
             Overall.FAIL: "FAIL: a MUST is not met",
             Overall.INCONCLUSIVE: "INCONCLUSIVE: a MUST could not be judged",
         }
@@ -386,7 +393,7 @@ class RunResult:
 
     def grade(self, kind: Kind) -> Grade:
         """The verdict on the requirements of that kind."""
-        return Grade.from_results(kind, self.results)
+        return Grade.from_results(kind, self.results, partial=self.partial)
 
     def exit_code(self, kind: Kind | None = None) -> int:
         """0 pass, 1 fail, 2 not usable: of one kind, or of the whole run."""
