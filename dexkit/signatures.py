@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from dexkit import documents
-from dexkit.errors import SigningError, UsageError
+from dexkit.errors import ArchiveError, SigningError, UsageError
 from dexkit.escaping import one_line
 from dexkit.temporary_folder import TemporaryFolder
 
@@ -46,6 +46,21 @@ _KEY = r"(?P<type>(?:ssh-|ecdsa-sha2-|sk-)[a-z0-9@.-]{1,60}) (?P<blob>[A-Za-z0-9
 _SSH_KEY = re.compile(rf"{_KEY}(?: .*)?")
 _SIGNER = re.compile(rf"\S.* {_KEY}(?: .*)?")
 _GOOD = re.compile(r"^Good .* with (?P<kind>\S+) key (?P<print>\S+:\S+)$", re.MULTILINE)
+_ARMOR = re.compile(
+    rb"-----BEGIN SSH SIGNATURE-----\n"
+    rb"(?:[A-Za-z0-9+/]{70}\n)*[A-Za-z0-9+/]{1,70}={0,2}\n"
+    rb"-----END SSH SIGNATURE-----\n"
+)
+_COMMENT = "signature of a dexkit result"
+_MINISIGN = re.compile(
+    rb"untrusted comment: %b\n"
+    rb"[A-Za-z0-9+/]{99}=\n"
+    rb"trusted comment: [^\n]*\n"
+    rb"[A-Za-z0-9+/]{86}==\n" % _COMMENT.encode()
+)
+_FORMS = {SSH_KEYGEN: _ARMOR, MINISIGN: _MINISIGN}
+"""The files that ``sign`` makes, to the byte. The tools read the first signature of a file and
+leave the rest, and do not sign minisign's first line: whoever has the file could write there."""
 _US = "signer"  # the principal of a bare public key
 
 
@@ -145,7 +160,7 @@ def sign(tool: str, data: bytes, key: Path) -> tuple[bytes, str]:
             command = ["-Y", "sign", "-q", "-n", NAMESPACE, "-f", path, str(message)]
         else:
             command = ["-S", "-s", path, "-m", str(message), "-x", str(signature)]
-            command += ["-t", NAMESPACE, "-c", "signature of a dexkit result"]
+            command += ["-t", NAMESPACE, "-c", _COMMENT]
         # minisign asks on standard input, ssh-keygen on the terminal
         stdin = _STANDARD_INPUT if tool == MINISIGN else subprocess.DEVNULL
         done = _run(tool, *command, stdin=stdin)
@@ -160,12 +175,22 @@ def sign(tool: str, data: bytes, key: Path) -> tuple[bytes, str]:
         return made, _signed_by(tool, message, signature)
 
 
-def check(key: PublicKey, data: bytes, signature: bytes) -> Checked:
+def check(
+    key: PublicKey, data: bytes, signature: bytes, origin: object = "the signature"
+) -> Checked:
     """Check the signature of ``data``.
 
+    :param origin: what to call the signature.
+    :raises ArchiveError: it is not one signature as :func:`sign` makes it, and nothing else.
     :raises SigningError: the tool is missing.
     :raises UsageError: it cannot use the public key.
     """
+    if not _FORMS[key.tool].fullmatch(signature):
+        raise ArchiveError(
+            f"{origin} is not one signature of {key.tool} and nothing else",
+            hint="its file was changed, or another program wrote it: verify the archive as "
+            "'dexkit sign' made it",
+        )
     with TemporaryFolder("verify") as folder:
         message, file = folder / "manifest.json", folder / "manifest.json.sig"
         message.write_bytes(data)

@@ -226,10 +226,22 @@ def test_minisign_signs_and_verifies(signed: Signed, tmp_path: Path) -> None:
     assert "is signed by minisign, and the key is one of ssh-keygen" in err
     for name in (MANIFEST, "manifest.json.minisig"):
         found = contents(archive)
-        code, out, _ = verify(
+        code, out, err = verify(
             write(tmp_path / "x.zip", {**found, name: flipped(found[name])}), public
         )
-        assert (code, name in out) == (1, True)
+        assert code == 1 or (code == 2 and name != MANIFEST)
+        assert name in out + err
+    found = contents(archive)
+    good = found["manifest.json.minisig"]
+    for bad in (
+        good + b"x",
+        good + good,
+        b"\n" + good,
+        good.replace(b"of a dexkit", b"by Unitree"),
+    ):
+        altered = {**found, "manifest.json.minisig": bad}
+        code, _, err = verify(write(tmp_path / "x.zip", altered), public)
+        assert (code, "manifest.json.minisig is not one signature of minisign" in err) == (2, True)
 
 
 def test_a_minisign_key_id_has_no_leading_zeros() -> None:
@@ -254,6 +266,9 @@ def test_one_changed_byte_is_found_and_named(name: str, signed: Signed, tmp_path
     plain.write_bytes(raw)
     for archive in (repaired, plain):
         code, out, err = verify(archive, signed.public)
+        if name == SIGNATURE and code == 2:  # a byte that no signature has
+            assert f"{SIGNATURE} is not one signature of ssh-keygen and nothing else" in err
+            continue
         assert (code, err) == (1, "")
         assert out.startswith("NOT VERIFIED")
         assert f"  {name}: " in out or (archive == repaired and name == MANIFEST)
@@ -340,6 +355,26 @@ def test_edited_verdict_is_found_though_well_signed(signed: Signed, tmp_path: Pa
     assert code == 1
     assert f"{failed['id']} {failed['side']}: MUST pass in the result, MUST fail when judged" in out
     assert verify(archive, signed.public, "--no-rejudge")[0] == 0  # which says so
+
+
+def test_signature_is_exactly_one(signed: Signed, tmp_path: Path) -> None:
+    members = contents(signed.archive)
+    good = members[SIGNATURE]
+    for bad in (
+        good + b"\n",
+        good + b"approved by the vendor\n",
+        good + good,
+        b"\n" + good,
+        good.rstrip(b"\n"),
+        good.replace(b"\n", b"\r\n"),
+        good.replace(b"\n", b"\n\n", 2),
+        b"",
+    ):
+        code, out, err = verify(
+            write(tmp_path / "a.zip", {**members, SIGNATURE: bad}), signed.public
+        )
+        assert (code, out) == (2, "")
+        assert f"{SIGNATURE} is not one signature of ssh-keygen and nothing else" in err
 
 
 def test_manifest_with_additional_statements_is_detected(signed: Signed, tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ class _Verification:
         signature = self._bytes(wanted, _LARGEST_SIGNATURE)
         if data is None or signature is None:
             return
-        checked = signatures.check(self._key, data, signature)
+        checked = signatures.check(self._key, data, signature, f"{self._origin}: {wanted}")
         self._found.key = checked.key
         if checked.good:
             who = f", {checked.who}" if checked.who else ""
