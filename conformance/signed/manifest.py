@@ -14,7 +14,7 @@ from typing import Any
 from dexkit import documents
 from dexkit.conformance.report.labels import device_kind
 from dexkit.conformance.requirements import Kind
-from dexkit.conformance.results import Grade, RunResult
+from dexkit.conformance.results import Overall, RunResult
 from dexkit.errors import ArchiveError
 from dexkit.escaping import one_line
 from dexkit.signatures import MINISIGN, SSH_KEYGEN
@@ -22,6 +22,7 @@ from dexkit.stored_zip import LARGEST_MEMBER, is_safe_name
 
 __all__ = [
     "FORMAT",
+    "INCOMPLETE",
     "LARGEST",
     "MANIFEST",
     "SIGNATURES",
@@ -36,6 +37,8 @@ VERSION = 1
 LARGEST = 64 * 1024
 """Bytes of a manifest; one with all that it can hold has less than half of them."""
 MANIFEST = "manifest.json"
+INCOMPLETE = "incomplete"
+"""Word for a part of the requirements of which no MUST failed: no pass, as the others may fail."""
 SIGNATURES = {"manifest.json.sig": SSH_KEYGEN, "manifest.json.minisig": MINISIGN}
 """Names of the signature, by the tool that makes it."""
 ROLES = ("result", "recording", "page")
@@ -77,7 +80,8 @@ class Judged:
     :param about: model, dialect, sides, hand, backend, device; ``nature``: emulated, simulated,
         recorded or empty; ``requirements``: how many of how many; recorded_at; ``dexkit``: the
         version that judged. Empty where the result does not say.
-    :param overall: pass, fail or inconclusive.
+    :param overall: pass, fail or inconclusive; :data:`INCOMPLETE` instead of a pass where only a
+        part of the requirements was judged.
     :param grades: likewise of each kind of requirement; or "not judged".
     """
 
@@ -98,13 +102,18 @@ class Judged:
         }
         return cls(
             about={name: one_line(known.get(name, ""), _LONGEST) for name in _ABOUT},
-            overall=str(result.overall),
-            grades={str(kind): _word(result.grade(kind)) for kind in Kind},
+            overall=_word(result.overall, result.partial),
+            grades={str(kind): _grade_word(result, kind) for kind in Kind},
         )
 
 
-def _word(grade: Grade) -> str:
-    return str(grade.overall) if grade.judged else "not judged"
+def _grade_word(result: RunResult, kind: Kind) -> str:
+    grade = result.grade(kind)
+    return _word(grade.overall, result.partial) if grade.judged else "not judged"
+
+
+def _word(overall: Overall, is_part: bool) -> str:
+    return INCOMPLETE if is_part and overall is Overall.PASS else str(overall)
 
 
 @dataclass(frozen=True)

@@ -1,93 +1,295 @@
-"""Judge the recording of a result again, and compare the verdicts."""
+"""Compare a result with its recording: judge the recording again, and compare the two documents.
+
+All of a result follows from its recording, and so all of it is compared, member by member, except
+:data:`STATED`: a member that a later version adds is compared without a word here. What is an
+input of judging is taken as follows:
+
+* dialect and sides from the result; sides of the recording that it leaves out are named;
+* the vendor's claims from the run record; in a session, which has none, from the result, and they
+  are then named as stated;
+* the requirements: all that apply, whatever the result lists. A result that lists fewer is
+  compared with a judging of that part, and the others are named with the verdicts that they get.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
-from dexkit.conformance.requirements import CAPABILITIES, Kind
-from dexkit.conformance.results import VERSION, Result, RunResult
+from dexkit.conformance.recording import Recording
+from dexkit.conformance.result_file import parse_result
+from dexkit.conformance.results import SEVERITY, VERSION, Result, RunResult, Verdict, grouped, worst
+from dexkit.conformance.run_record import recorded_claims
+from dexkit.conformance.selection import RunKind
+from dexkit.digests import sha256_of_file
+from dexkit.errors import UsageError
+from dexkit.escaping import one_line
 from dexkit.traces import open_trace
 
-__all__ = ["claimed_differences", "judged_again", "verdict_differences"]
+__all__ = [
+    "STATED",
+    "STATED_WITHOUT_RUN",
+    "Comparison",
+    "Difference",
+    "compare_with_recording",
+    "document_differences",
+    "self_differences",
+]
 
-_ABOUT = ("model", "dialect", "sides")
+STATED = ("subject.recording", "environment.python", "environment.system")
+"""Members of a result that no recording tells: the name its file had, and where it was judged."""
+STATED_WITHOUT_RUN = (
+    "claims",
+    "subject.hand",
+    "subject.vendor",
+    "subject.firmware",
+    "measured_q.manual_test",
+)
+"""What is taken from the result where the recording has no run record: the vendor's claims."""
+
+_ABSENT = object()
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
+_LONGEST = 160  # characters of a value that a line shows
 
 
-def judged_again(found: RunResult, recording: Path) -> tuple[RunResult, list[str]]:
-    """Judge a recording as a result was: same dialect, sides, claims and requirements.
+@dataclass(frozen=True)
+class Difference:
+    """A member of a result that is not what follows from the recording.
 
-    Returns the new result, and remarks on damage of the recording.
+    :param path: of the member in the result's JSON, as ``results[12].verdict``.
+    :param stated: its value in the result, as JSON text; empty if it is not there.
+    :param judged: likewise of the new judging.
+    :param about: the requirement and side that it belongs to, or empty.
+    """
 
+    path: str
+    stated: str
+    judged: str
+    about: str = ""
+
+    def __str__(self) -> str:
+        about = f" ({self.about})" if self.about else ""
+        return one_line(
+            f"{self.path}{about}: {self.stated or 'nothing'} in the result, "
+            f"{self.judged or 'nothing'} when judged again",
+            3 * _LONGEST,
+        )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A result beside a new judging of its recording.
+
+    :param stated: members that are not verified, by path, with their values.
+    :param whole: the judging of all sides' requirements that apply.
+    :param left_out: requirements that the result does not list, with the verdicts they get now.
+    :param left_out_sides: hands of the recording that the result is not about.
+    :param kind: ``quick`` where the part is that of such a run; else empty.
+    :param remarks: damage of the recording, and choices of the result that show in nothing else.
+    """
+
+    differences: tuple[Difference, ...]
+    stated: Mapping[str, Any]
+    whole: RunResult
+    left_out: Mapping[str, Verdict]
+    left_out_sides: tuple[str, ...]
+    kind: str
+    remarks: tuple[str, ...]
+
+    @property
+    def is_part(self) -> bool:
+        """Whether the result is about a chosen part only, and so proves no drop-in."""
+        return bool(self.left_out or self.left_out_sides)
+
+    def part(self) -> list[str]:
+        """The part and what it leaves out, as lines; none for a whole result."""
+        if not self.is_part:
+            return []
+        every = len(_by_id(self.whole))
+        count = f"{every - len(self.left_out)} of {every} requirements"
+        name = f"those of a {self.kind} run" if self.kind else "a chosen part"
+        lines = [f"a part only: {count}, {name}" if self.left_out else f"a part only: all {count}"]
+        lines += [f"left out: the {side} hand" for side in self.left_out_sides]
+        for verdict in sorted(set(self.left_out.values()), key=SEVERITY.index):
+            names = [name for name, v in self.left_out.items() if v is verdict]
+            lines.append(f"left out, {verdict} when judged: {', '.join(names)}")
+        lines.append(f"all requirements together: {self.whole.sentence()}")
+        return lines
+
+
+def compare_with_recording(document: Mapping[str, Any], recording: Path) -> Comparison:
+    """Judge a recording again, and compare everything that follows from it with a result.
+
+    :param document: the JSON of a result file.
+    :raises UsageError: it is no result file, or one of an earlier version, which holds less.
     :raises DexkitError: the recording cannot be read, or is not of that kind of hand.
     """
+    found = parse_result(document, "the result")
+    if document["version"] != VERSION:
+        raise UsageError(
+            f"the result is of version {document['version']}, which cannot be compared",
+            hint="judge the recording again: dexkit check RECORDING.mcap --json RESULT.json",
+        )
     trace = open_trace(recording)
-    view = recording_of(trace, found.subject.get("dialect"), found.hands)
-    claims = Claims()
-    if found.claims is not None:
-        claims = Claims({unit: found.claims.get(unit, False) for unit in CAPABILITIES})
-    wanted = [r.requirement for r in (*found.results, *found.client)]
-    again = judge(view, requirements=wanted, claims=claims)
-    return again, list(trace.damage)
-
-
-def verdict_differences(found: RunResult, again: RunResult) -> list[str]:
-    """One line for each difference between a result and what its recording was judged now.
-
-    Compared are: what was judged, when it was recorded, each verdict with the level of its
-    requirement, and both grades. Figures and texts are not.
-    """
-    lines = [
-        f"{name}: {found.subject.get(name, '')} in the result, {again.subject[name]} when judged "
-        "again"
-        for name in _ABOUT
-        if found.subject.get(name, "") != again.subject[name]
-    ]
-    if found.recorded_at != again.recorded_at:
-        lines.append(
-            f"recorded at: {found.recorded_at} in the result, {again.recorded_at} when judged again"
+    remarks = [f"the recording is damaged: {text}" for text in trace.damage]
+    usual = recording_of(trace, None, ())
+    view, about = usual, found.subject
+    if (about["dialect"], about["sides"]) != (usual.dialect.name, _sides(usual)):
+        view = recording_of(trace, about["dialect"], found.hands)
+    left_out_sides: tuple[str, ...] = ()
+    if view.dialect.name == usual.dialect.name:
+        left_out_sides = tuple(str(s) for s in usual.judged if s not in view.judged)
+    else:
+        remarks.append(
+            f"judged as {view.dialect.name}, as the result says; without being told dexkit judges "
+            f"this recording as {usual.dialect.name}"
         )
-    before, now = _verdicts(found), _verdicts(again)
-    for id_, side in dict.fromkeys([*before, *now]):
-        was, is_ = before.get((id_, side), "not judged"), now.get((id_, side), "not judged")
-        if was != is_:
-            lines.append(f"{id_} {side}: {was} in the result, {is_} when judged again")
-    for kind in Kind:
-        was, is_ = str(found.grade(kind).overall), str(again.grade(kind).overall)
-        if was != is_:
-            lines.append(f"{kind}: {was} in the result, {is_} when judged again")
-    if lines and found.environment.get("dexkit") != again.environment["dexkit"]:
-        lines.append(
-            f"dexkit: {found.environment.get('dexkit') or 'an unknown version'} made the result, "
-            f"{again.environment['dexkit']} judged again, which may be the reason"
-        )
-    return lines
+    stated = list(STATED)
+    if "claims" in view.run:
+        claims = recorded_claims(view.run)
+    else:
+        claims = _stated_claims(found)
+        stated += STATED_WITHOUT_RUN
+    subject = {"recording": recording.name, "recording_sha256": sha256_of_file(trace.path)}
+    whole = judge(view, claims=claims, subject=subject)
+    every, listed = _by_id(whole), _by_id(found)
+    again = whole
+    if not every.keys() <= listed.keys():
+        some = [results[0].requirement for name, results in every.items() if name in listed]
+        again = judge(view, requirements=some, claims=claims, subject=subject)
+    return Comparison(
+        differences=tuple(document_differences(document, again, STATED)),
+        stated={p: v for p in stated if (v := _member_of(document, p)) not in (_ABSENT, None, "")},
+        whole=whole,
+        left_out={
+            name: worst(r.verdict for r in results)
+            for name, results in every.items()
+            if name not in listed
+        },
+        left_out_sides=left_out_sides,
+        kind=_kind(every, listed),
+        remarks=tuple(remarks),
+    )
 
 
-def _verdicts(result: RunResult) -> dict[tuple[str, str], str]:
-    every: list[Result] = [*result.results, *result.client]
-    return {(r.requirement.id, r.side): f"{r.requirement.level} {r.verdict}" for r in every}
+def self_differences(document: Mapping[str, Any], found: RunResult) -> list[Difference]:
+    """Where a result contradicts itself: summaries and sentences that its own verdicts do not give,
+    and members that no result has. The recording is not needed.
 
-
-def claimed_differences(document: Mapping[str, Any], found: RunResult) -> list[str]:
-    """One line for each summary in a result file that is not that of its own verdicts.
-
-    :param document: the file, which has ``overall``, ``counts`` and ``grades`` beside the results.
+    :param found: the result that was read from ``document``.
     """
-    if document.get("version") != VERSION:
-        return []
-    real = found.as_dict()
-    pairs = [("overall", document.get("overall"), real["overall"])]
-    pairs.append(("counts", document.get("counts"), real["counts"]))
-    for kind, grade in document.get("grades", {}).items():
-        for name in ("overall", "counts"):
-            pairs.append((f"grade {kind}, {name}", grade[name], real["grades"][kind][name]))
-    return [
-        f"{name}: the result does not say what follows from its own verdicts"
-        for name, said, follows in pairs
-        if said != follows
-    ]
+    return list(document_differences(document, found))
+
+
+def document_differences(
+    document: Mapping[str, Any], judged: RunResult, but: Sequence[str] = ()
+) -> Iterator[Difference]:
+    """Every difference between the JSON of a result and that of a judging.
+
+    :param but: paths of members that are not compared.
+    """
+    written = json.loads(json.dumps(judged.as_dict()))
+    for difference in _differences(document, written, "", ""):
+        if difference.path not in but:
+            yield difference
+
+
+def _differences(stated: Any, judged: Any, path: str, about: str) -> Iterator[Difference]:
+    if isinstance(stated, dict) and isinstance(judged, dict):
+        for name in dict.fromkeys([*judged, *stated]):
+            yield from _differences(
+                stated.get(name, _ABSENT), judged.get(name, _ABSENT), _join(path, name), about
+            )
+    elif isinstance(stated, list) and isinstance(judged, list):
+        if _are_results([*stated, *judged]):
+            yield from _results_differences(stated, judged, path)
+            return
+        for i in range(max(len(stated), len(judged))):
+            here, now = (v[i] if i < len(v) else _ABSENT for v in (stated, judged))
+            yield from _differences(here, now, f"{path}[{i}]", about)
+    elif stated != judged or isinstance(stated, bool) is not isinstance(judged, bool):
+        yield Difference(path, _shown(stated), _shown(judged), about)
+
+
+def _results_differences(
+    stated: Sequence[Mapping[str, Any]], judged: Sequence[Mapping[str, Any]], path: str
+) -> Iterator[Difference]:
+    """Differences of results, each compared with that of the same requirement and side."""
+    left = {_about(row): row for row in judged}
+    order = [name for row in stated if (name := _about(row)) in left]
+    for i, row in enumerate(stated):
+        other = left.pop(_about(row), _ABSENT)
+        yield from _differences(row, other, f"{path}[{i}]", _about(row))
+    for name, row in left.items():
+        yield Difference(path, "", _shown(row), name)
+    now = [name for row in judged if (name := _about(row)) in order]
+    if order != now and sorted(order) == sorted(now):
+        yield Difference(path, "another order", "the catalogue's order")
+
+
+def _are_results(rows: Sequence[Any]) -> bool:
+    return bool(rows) and all(isinstance(r, dict) and {"id", "side"} <= r.keys() for r in rows)
+
+
+def _about(row: Mapping[str, Any]) -> str:
+    return f"{row['id']} {row['side']}"
+
+
+def _join(path: str, name: str) -> str:
+    if _PLAIN.fullmatch(name):
+        return f"{path}.{name}" if path else name
+    return f"{path}[{json.dumps(name)}]"
+
+
+def _shown(value: Any) -> str:
+    if value is _ABSENT:
+        return ""
+    if isinstance(value, dict) and "verdict" in value:
+        return f"a result of the verdict {json.dumps(value['verdict'])}"
+    return one_line(json.dumps(value, ensure_ascii=False), _LONGEST)
+
+
+def _member_of(document: Any, path: str) -> Any:
+    for name in path.split("."):
+        document = document.get(name, _ABSENT) if isinstance(document, dict) else _ABSENT
+    return document
+
+
+def _sides(view: Recording) -> str:
+    return ", ".join(str(s) for s in view.judged)
+
+
+def _stated_claims(found: RunResult) -> Claims:
+    """The claims of a result; none where it has none.
+
+    :raises UsageError: about a unit that there is not.
+    """
+    if found.claims is None:
+        return Claims()
+    about = {"hand": "name", "vendor": "vendor", "firmware": "firmware"}
+    return Claims.of_document(
+        {
+            "hand": {key: found.subject[n] for n, key in about.items() if n in found.subject},
+            "claims": found.claims,
+            "manual_test": {"q_is_measured": found.manual_test},
+        },
+        "the claims of the result",
+    )
+
+
+def _by_id(result: RunResult) -> dict[str, list[Result]]:
+    every: Iterable[Result] = (*result.results, *result.client)
+    return {requirement.id: results for requirement, results in grouped(every)}
+
+
+def _kind(every: Mapping[str, Sequence[Result]], listed: Mapping[str, Any]) -> str:
+    """``quick`` where the results are those of such a run; else empty."""
+    quick = RunKind.QUICK.requirements([r[0].requirement for r in every.values()])
+    return str(RunKind.QUICK) if {r.id for r in quick} == set(listed) else ""

@@ -19,11 +19,7 @@ from dexkit.conformance.signed.manifest import (
     Judged,
     Manifest,
 )
-from dexkit.conformance.signed.rejudge import (
-    claimed_differences,
-    judged_again,
-    verdict_differences,
-)
+from dexkit.conformance.signed.rejudge import self_differences
 from dexkit.digests import Digest, digest_of, file_pieces
 from dexkit.errors import ConformanceError, SigningError, UsageError
 from dexkit.stored_zip import Content, is_safe_name, pack
@@ -67,10 +63,12 @@ def sign_result(
     _check_names(paths)
     document = documents.read_json(result)
     found = parse_result(document, result)
-    wrong = claimed_differences(document, found)
+    wrong = self_differences(document, found)
     if wrong:
         raise ConformanceError(
-            f"{result} was changed: {wrong[0]}", hint=f"judge again: dexkit check {recording}"
+            f"{result} was changed, or an earlier dexkit wrote it: {wrong[0].path} is not what "
+            "follows from its verdicts",
+            hint=f"judge again: dexkit check {recording} --json RESULT.json",
         )
     digests = {role: digest_of(file_pieces(path)) for role, path in paths.items()}
     how = _match_recording(found, recording, digests["recording"])
@@ -116,26 +114,14 @@ def _match_recording(found: RunResult, recording: Path, digest: Digest) -> str:
     :raises ConformanceError: it is another one.
     """
     named = found.subject.get(RECORDING_DIGEST, "")
-    if named:
-        if named != digest.sha256:
-            raise ConformanceError(
-                f"{recording} is not the recording that the result was judged from: its SHA-256 is "
-                f"{digest.sha256}, that of the result's recording {named}",
-                hint="give the recording that was judged with --recording, or judge this one: "
-                f"dexkit check {recording} --json RESULT.json",
-            )
-        return "the result names its SHA-256 digest"
-    again, _ = judged_again(found, recording)
-    if different := verdict_differences(found, again):
+    if named != digest.sha256:
         raise ConformanceError(
-            f"{recording} does not give the verdicts of the result: {different[0]}"
-            + (f" (and {len(different) - 1} more)" if len(different) > 1 else ""),
+            f"{recording} is not the recording that the result was judged from: its SHA-256 is "
+            f"{digest.sha256}, that of the result's recording {named or 'is not in the result'}",
             hint="give the recording that was judged with --recording, or judge this one: "
             f"dexkit check {recording} --json RESULT.json",
         )
-    return (
-        "the result names no digest, so it was judged again: all verdicts are those of the result"
-    )
+    return "the result names its SHA-256 digest"
 
 
 def _match_page(found: RunResult, page: Path) -> str:
@@ -144,15 +130,12 @@ def _match_page(found: RunResult, page: Path) -> str:
     :raises ConformanceError: it is not.
     """
     text = documents.read_text(page)
-    named = found.subject.get(RECORDING_DIGEST, "")
-    if not named:
-        return "not compared: the result names no digest that the page could show"
-    if named not in text:
+    if found.subject[RECORDING_DIGEST] not in text:
         raise ConformanceError(
             f"{page} does not show the digest of the recording that the result was judged from",
             hint="write the page of this result: dexkit report RESULT.json --report PAGE.html",
         )
-    return "it shows the digest of the recording"
+    return "it shows the digest of the recording; nothing else on it is compared"
 
 
 def _of_bytes(name: str, data: bytes) -> Content:

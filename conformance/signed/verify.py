@@ -1,4 +1,4 @@
-"""Verify a signed archive: signature, digests, members, and the verdicts by judging again.
+"""Verify a signed archive: signature, digests, members, and the result by judging again.
 
 What anybody can have written is read in the order of trust: the archive's headers, then the bytes
 of manifest and signature, then what the manifest says, and only of an archive without a difference
@@ -7,13 +7,13 @@ the result and the recording.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from dexkit import __version__, documents, signatures
 from dexkit.conformance.result_file import parse_result
-from dexkit.conformance.results import RunResult
 from dexkit.conformance.signed.manifest import (
     LARGEST,
     MANIFEST,
@@ -22,9 +22,9 @@ from dexkit.conformance.signed.manifest import (
     Manifest,
 )
 from dexkit.conformance.signed.rejudge import (
-    claimed_differences,
-    judged_again,
-    verdict_differences,
+    Comparison,
+    compare_with_recording,
+    self_differences,
 )
 from dexkit.conformance.signed.sign import RECORDING_DIGEST
 from dexkit.digests import Digest, digest_of
@@ -48,18 +48,20 @@ class Verified:
     :param notes: what was verified, and how, one line each.
     :param manifest: None where it could not be read.
     :param key: the key that signed: kind and fingerprint.
+    :param comparison: of the result with its recording; None where that was not judged again.
     """
 
     differences: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     manifest: Manifest | None = None
     key: str = ""
+    comparison: Comparison | None = None
 
 
 def verify_archive(archive: Path, key: PublicKey, *, rejudge: bool = True) -> Verified:
     """Verify an archive.
 
-    :param rejudge: judge the recording again, and compare the verdicts.
+    :param rejudge: judge the recording again, and compare the result.
     :raises ArchiveError: it is no archive that could be verified.
     :raises UsageError: it cannot be read, or the key is of another tool than the signature.
     :raises SigningError: the tool is missing.
@@ -98,9 +100,9 @@ class _Verification:
         if found.differences:
             found.notes.append("not judged again, because of these differences")
             return found
-        result = self._result(manifest)
-        if result is not None:
-            self._compare(manifest, result, rejudge)
+        document = self._result(manifest, rejudge)
+        if document is not None and rejudge:
+            self._compare(manifest, document)
         return found
 
     def _bytes(self, name: str, most: int) -> bytes | None:
@@ -181,26 +183,36 @@ class _Verification:
     def _digest(self, member: Member) -> Digest:
         return digest_of(member_pieces(self._file, member))
 
-    def _result(self, manifest: Manifest) -> RunResult | None:
-        """The result; None where it does not say what the manifest says of it."""
+    def _result(self, manifest: Manifest, rejudge: bool) -> Any:
+        """The document of the result; None where the other files do not agree with it."""
         file = manifest.file("result")
         assert file is not None, "a manifest lists a result"
         name = f"{self._origin}: {file.name}"
         document = documents.parse_json(self._text(file.name, name), name)
         found = parse_result(document, name)
         differences = self._found.differences
-        differences += [f"{file.name}: {line}" for line in claimed_differences(document, found)]
+        if not rejudge:
+            self._found.notes.append(f"{file.name}: not judged again, as was asked for")
+            differences += [
+                f"{file.name}: {d.path} is not what follows from the result's own verdicts"
+                for d in self_differences(document, found)
+            ]
         differences += _manifest_differences(manifest.judged, Judged.from_result(found))
         recording, page = manifest.file("recording"), manifest.file("page")
         named = found.subject.get(RECORDING_DIGEST, "")
-        if named and recording is not None and named != recording.sha256:
+        if recording is not None and named != recording.sha256:
             differences.append(
                 f"{recording.name}: not the recording that the result was judged from, whose "
-                f"SHA-256 is {named}"
+                f"SHA-256 is {named or 'not in the result'}"
             )
-        if named and page is not None and named not in self._text(page.name, page.name):
-            differences.append(f"{page.name}: does not show the digest of the recording")
-        return None if differences else found
+        if page is not None:
+            if named not in self._text(page.name, page.name):
+                differences.append(f"{page.name}: does not show the digest of the recording")
+            self._found.notes.append(
+                f"page: {page.name} is not compared with the result, and may show anything beside "
+                f"the digest; write your own: dexkit report {file.name} --report PAGE.html"
+            )
+        return None if differences else document
 
     def _text(self, name: str, where: str) -> str:
         member = self._members[name]
@@ -211,25 +223,35 @@ class _Verification:
         except UnicodeDecodeError as why:
             raise ArchiveError(f"{where} is not UTF-8 text (at byte {why.start})") from None
 
-    def _compare(self, manifest: Manifest, result: RunResult, rejudge: bool) -> None:
-        notes, differences = self._found.notes, self._found.differences
-        if not rejudge:
-            notes.append("verdicts: not judged again, as was asked for")
-            return
-        file = manifest.file("recording")
-        assert file is not None, "a manifest lists a recording"
+    def _compare(self, manifest: Manifest, document: Any) -> None:
+        notes = self._found.notes
+        result, recording = manifest.file("result"), manifest.file("recording")
+        assert result is not None, "a manifest lists a result"
+        assert recording is not None, "a manifest lists a recording"
         with TemporaryFolder("verify") as folder:
             path = folder / "recording.mcap"
-            documents.write_file(path, member_pieces(self._file, self._members[file.name]))
-            again, damage = judged_again(result, path)
-        differences += verdict_differences(result, again)
-        if not differences:
-            count = len(result.results) + len(result.client)
+            documents.write_file(path, member_pieces(self._file, self._members[recording.name]))
+            compared = compare_with_recording(document, path)
+        self._found.comparison = compared
+        self._found.differences += [f"{result.name}: {d}" for d in compared.differences]
+        if compared.differences:
+            made_by = document["environment"].get("dexkit", "of an unknown version")
+            if made_by != __version__:
+                self._found.differences.append(
+                    f"{result.name}: dexkit {made_by} judged, and this is {__version__}: verify "
+                    "with that version"
+                )
+        else:
             notes.append(
-                f"verdicts: {file.name} was judged again by dexkit {__version__}, and all {count} "
-                "verdicts are those of the result"
+                f"result: {recording.name} was judged again by dexkit {__version__}, with all "
+                f"requirements that apply, and gives all of {result.name} but what is stated below"
             )
-            notes += [f"the recording is damaged, then as now: {text}" for text in damage]
+        notes += compared.remarks
+        notes += compared.part()
+        notes += [
+            f"stated by the signer, not verified: {path} {json.dumps(value, ensure_ascii=False)}"
+            for path, value in compared.stated.items()
+        ]
 
 
 def _manifest_differences(said: Judged, real: Judged) -> list[str]:
