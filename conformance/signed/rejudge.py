@@ -114,6 +114,8 @@ class Comparison:
             return []
         every = len(_by_id(self.whole))
         count = f"{every - len(self.left_out)} of {every} requirements"
+        if self.whole.client:
+            count += " (those about the client included)"
         name = f"those of a {self.kind} run" if self.kind else "a chosen part"
         lines = [f"a part only: {count}, {name}" if self.left_out else f"a part only: all {count}"]
         lines += [f"left out: the {side} hand" for side in self.left_out_sides]
