@@ -14,7 +14,6 @@ import fcntl
 import json
 import math
 import os
-import secrets
 import stat
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -25,6 +24,7 @@ import tomli
 
 from dexkit.errors import DexkitError, UsageError
 from dexkit.escaping import one_line, output_error
+from dexkit.staging import whole_file
 
 __all__ = [
     "DEEPEST",
@@ -256,51 +256,20 @@ def write_file(path: Path, content: str | bytes | Iterable[bytes]) -> None:
     data = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
     pieces = [data] if isinstance(data, bytes) else data
     try:
-        target = Path(os.path.realpath(path))
-        mode = target.stat().st_mode if target.exists() else None
-        if mode is not None and stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if mode is not None and not stat.S_ISREG(mode):
-            with target.open("wb", buffering=0) as file:
-                _write_all(file.fileno(), pieces)
-            return
-        if mode is not None and not os.access(target, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        _replace(target, pieces)
+        with whole_file(path) as place:
+            _write_pieces(place, pieces)
     except (OSError, ValueError) as why:
         found = why if isinstance(why, OSError) else OSError(errno.EINVAL, str(why))
         raise output_error(path, found) from why
 
 
-def _replace(target: Path, pieces: Iterable[bytes]) -> None:
-    """Write beside a file, flush to the disk and rename; permissions and, as far as permitted, the
-    owner stay.
-    """
-    temporary = target.with_name(f".dexkit-{secrets.token_hex(8)}")
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-    descriptor = os.open(temporary, flags, 0o666)  # less the mask, as of any new file
+def _write_pieces(place: Path, pieces: Iterable[bytes]) -> None:
+    flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
+    descriptor = os.open(place, flags, 0o666)  # less the mask, as of any new file
     try:
-        try:
-            with contextlib.suppress(FileNotFoundError):
-                known = target.stat()
-                with contextlib.suppress(PermissionError):
-                    os.fchown(descriptor, known.st_uid, known.st_gid)
-                os.fchmod(descriptor, stat.S_IMODE(known.st_mode))
-            _write_all(descriptor, pieces)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        os.replace(temporary, target)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-    with contextlib.suppress(OSError):  # some file systems have no fsync of folders
-        folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        _write_all(descriptor, pieces)
+    finally:
+        os.close(descriptor)
 
 
 def _write_all(descriptor: int, pieces: Iterable[bytes]) -> None:
@@ -319,8 +288,9 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
 
     Reading and writing happen under an exclusive lock on ``.NAME.lock`` beside the file, which
     stays there. The new content is written beside the file, flushed to the disk and renamed over
-    it: whenever the program is killed, the file is the old or the new one. A symbolic link stays
-    one, and the file keeps its permissions and, as far as permitted, its owner.
+    it (:mod:`dexkit.staging`): whenever the program is killed, the file is the old or the new one.
+    A symbolic link stays one, and the file keeps its permissions and, as far as permitted, its
+    owner.
     """
     try:
         target = path.resolve()
@@ -332,7 +302,8 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
                 before = None
             after = change(before)
             if after != before:
-                _replace(target, [after.encode()])
+                with whole_file(target) as place:
+                    _write_pieces(place, [after.encode()])
     except UnicodeDecodeError as error:
         raise UsageError(f"cannot read {path}: it is not UTF-8 text") from error
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links (Python 3.10)

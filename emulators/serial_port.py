@@ -12,7 +12,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import threading
 import time
 import tty
 from pathlib import Path
@@ -21,6 +20,7 @@ from dexkit.clock import Clock
 from dexkit.emulators.line_server import BUSY_TICK, CHUNK, LineServer
 from dexkit.emulators.serial_line import SerialLine
 from dexkit.errors import EmulatorError
+from dexkit.staging import Staged
 from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = ["Port", "client_baudrate"]
@@ -122,13 +122,14 @@ class Port(LineServer):
                 f"{path} is a link to {os.readlink(path)}, which exists",
                 hint="another emulator may serve it; choose another path, or remove it",
             )
-        temporary = f"{self.path}.{os.getpid()}.{threading.get_ident()}"
         try:
-            os.symlink(self._terminal, temporary)
-            os.replace(temporary, self.path)
+            staged = Staged(path)
+            try:
+                os.symlink(self._terminal, staged.path)
+                staged.publish()
+            finally:
+                staged.discard()
         except OSError as error:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
             raise EmulatorError(
                 f"cannot make the link {path}: {error.strerror}",
                 hint="its directory must exist and be writable",

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -15,9 +14,10 @@ from typing import Protocol, TypeVar
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE
+from dexkit.documents import write_file
 from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.emulators.wear import WEAR_SETTING, JointWear, Wear, Worn, parse_wear
-from dexkit.errors import HandLost, UsageError
+from dexkit.errors import HandLost, OutputError, UsageError
 from dexkit.escaping import one_line
 from dexkit.hand import HandCommand, HandSpec, HandState
 
@@ -135,13 +135,10 @@ class SimulatedHand:
 
     def _save_pose(self, file: Path) -> None:
         q = self._mechanics.state(self._last).q.tolist()
-        part = file.with_name(f"{file.name}.part")
         try:
-            part.write_text(json.dumps(q) + "\n", encoding="utf-8")
-            os.replace(part, file)  # replaced atomically
-        except (OSError, ValueError) as error:
-            name, why = one_line(str(file), 200), one_line(str(error), 200)
-            raise UsageError(f"pose: {name} cannot be written: {why}") from error
+            write_file(file, json.dumps(q) + "\n")
+        except OutputError as error:
+            raise UsageError(f"pose: {one_line(error.message, 400)}") from error
 
     def exchange(self, command: HandCommand) -> HandState:
         """Advance to the present time under the last command, apply this one, and return the state.

@@ -77,5 +77,5 @@ def test_a_damaged_file_is_refused_and_kept(text: str, tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     hand = sim_dex3.make(_options(tmp_path / "none" / "pose.json"))
     hand.open()
-    with pytest.raises(UsageError, match=r"none/pose\.json cannot be written"):
+    with pytest.raises(UsageError, match=r"cannot write .*none/pose\.json"):
         hand.close()

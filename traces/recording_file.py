@@ -3,17 +3,19 @@
 * Written data stay in memory until :meth:`RecordingFile.commit`, which writes them to the file. If
   that fails part-way, the file is truncated to the last commit, so every message reported as
   written can be read.
-* A recording that replaces another is written to the same name with ``.part``, and renamed when it
-contains a message. Until then the old one is untouched.
+* A live recording that replaces another is written to the same name with ``.part``, and renamed
+  when it contains a message. Until then the old one is untouched.
+* A recording that is made of existing data (``whole``) is written beside its name
+  (:mod:`dexkit.staging`), and gets that when it is finished.
 * Changes by other programs are detected: deletion, renaming or truncation at the next commit,
   changed bytes at the end.
 * The file is locked (``flock``) while it is written. A second recorder is refused; readers do
   not look at the lock and may follow the file as it grows.
 
-What is left after kill -9: without ``overwrite`` the file itself, at any time. With it, either
-the old recording and a ``.part`` without messages, which the next recorder takes over, or the
-new one. Only in the instant between the first commit and the renaming there is a ``.part`` with
-messages; it is never overwritten.
+What is left of a live recording after kill -9: without ``overwrite`` the file itself, at any time.
+With it, either the old recording and a ``.part`` without messages, which the next recorder takes
+over, or the new one. Only in the instant between the first commit and the renaming there is a
+``.part`` with messages; it is never overwritten.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from pathlib import Path
 from mcap.records import ChunkIndex
 
 from dexkit.errors import TraceError, UsageError
+from dexkit.staging import Staged
 from dexkit.traces import mcap_records
 from dexkit.traces.mcap_records import HEAD, MAGIC, Opcode, walk
 
@@ -52,11 +55,12 @@ class RecordingFile:
 
     :param path: its final name. A link is followed.
     :param overwrite: replace what is there.
+    :param whole: it gets its name when it is closed, not before.
 
     :ivar displaced: what happened to the file's name while it was written, or empty.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
+    def __init__(self, path: Path, *, overwrite: bool, whole: bool = False) -> None:
         self.path = path
         self.displaced = ""
         self._target = Path(os.path.realpath(path))
@@ -64,6 +68,8 @@ class RecordingFile:
             raise UsageError(f"cannot record to {str(path)!r}: it is a folder")
         self._part = self._target.with_name(self._target.name + _PART)
         self._overwrite = overwrite
+        self._whole = whole
+        self._staged: Staged | None = None
         self._fd = -1
         self._regular = True
         self._is_part = False  # still written as ``.part``
@@ -105,6 +111,10 @@ class RecordingFile:
             self._fd = self._open_device()
             return
         self._refuse_other_recorder(self._part)
+        if self._whole:
+            self._refuse_other_recorder(self._target)
+            self._fd = self._open_staged(existing)
+            return
         if existing is None:
             self._fd = self._open_new()
             return
@@ -145,6 +155,20 @@ class RecordingFile:
                 self._target.unlink()
             os.close(fd)
             raise
+        return fd
+
+    def _open_staged(self, existing: os.stat_result | None) -> int:
+        """Create the file beside its name."""
+        self._staged = staged = Staged(self._target)
+        self._part, self._is_part = staged.path, True
+        try:
+            fd = os.open(self._part, _CREATE | os.O_EXCL, 0o666)
+        except BaseException:
+            staged.discard()
+            raise
+        if existing is not None:
+            with contextlib.suppress(OSError):
+                os.fchmod(fd, stat.S_IMODE(existing.st_mode))
         return fd
 
     def _open_device(self) -> int:
@@ -222,6 +246,8 @@ class RecordingFile:
                 place.unlink()
         finally:
             os.close(fd)
+            if self._staged is not None:
+                self._staged.discard()
 
     def publish(self, fd: int | None = None) -> None:
         """Rename it to its final name, unless that is done.
@@ -235,15 +261,21 @@ class RecordingFile:
             self._refuse_other_recorder(self._target)
             if not self._is_at(self._part, fd):
                 raise TraceError(f"{self._part} was deleted while it was recorded")
-            os.replace(self._part, self._target)
+            if self._staged is None:
+                os.replace(self._part, self._target)
+            else:
+                self._staged.publish(replace=self._overwrite)
         except UsageError as error:
-            raise TraceError(error.message, hint=f"this recording is {self._part}") from None
+            raise TraceError(error.message, hint=self._kept_hint) from None
         except OSError as error:
             raise TraceError(
-                f"cannot replace {self.path}: {error.strerror}",
-                hint=f"this recording is {self._part}",
+                f"cannot replace {self.path}: {error.strerror}", hint=self._kept_hint
             ) from error
         self._is_part = False
+
+    @property
+    def _kept_hint(self) -> str:
+        return f"this recording is {self._part}" if self._staged is None else ""
 
     # -- for the writer ------------------------------------------------------------------------
 

@@ -52,7 +52,7 @@ class RecordingWriter:
         self.written = 0
         self._counts: dict[int, int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._file = RecordingFile(self.path, overwrite=overwrite)
+        self._file = RecordingFile(self.path, overwrite=overwrite, whole=True)
         self._file.open()
         self._writer = Writer(
             cast(BinaryIO, self._file),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from dexkit.conformance.audit.file_records import FINDING, FileRecord
 from dexkit.documents import write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error
+from dexkit.staging import whole_file
 
 __all__ = ["FILE", "FINDINGS", "have_parquet", "write_tables"]
 
@@ -151,17 +151,15 @@ def _write_parquet(
 
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
     schema = pa.schema([(name, kinds[kind]) for name, kind in columns.items()])
-    temporary = path.with_name(f".dexkit-{secrets.token_hex(8)}")
     try:
-        try:
-            with pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
-                for batch in _batches(records):
-                    every = [row for record in batch for row in rows(record)]
-                    values = {name: [row[name] for row in every] for name in columns}
-                    writer.write_table(pa.table(values, schema=schema))
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with (
+            whole_file(path) as place,
+            pq.ParquetWriter(place, schema, compression="zstd") as writer,
+        ):
+            for batch in _batches(records):
+                every = [row for record in batch for row in rows(record)]
+                values = {name: [row[name] for row in every] for name in columns}
+                writer.write_table(pa.table(values, schema=schema))
     except OSError as error:
         raise output_error(path, error) from error
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dexkit.documents import write_file
 from dexkit.errors import UsageError
 from tools.campaign.case import Finding
 
@@ -86,9 +86,7 @@ class State:
             "findings": {name: f.as_dict() for name, f in self.findings.items()},
             "times": self.times,
         }
-        new = self.path.with_suffix(".new")
-        new.write_text(json.dumps(content, indent=1) + "\n")
-        os.replace(new, self.path)
+        write_file(self.path, json.dumps(content, indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path, seed: str | None, *, fresh: bool) -> State:

@@ -7,7 +7,6 @@ recording is sampled at one rate.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from dexkit import __version__
 from dexkit.errors import SessionError
 from dexkit.hand import Floats
+from dexkit.staging import whole_folder
 from dexkit.traces.reader import Trace
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.frames import RULE, Source, open_source, sample
@@ -45,16 +45,12 @@ def export_episodes(
     :param task: of all episodes; None for what each recording says.
     :raises SessionError: ``out`` exists, cannot be written, or no recording can be used.
     """
-    if out.exists():
-        raise SessionError(f"{out} exists", hint="choose another name, or delete it")
-    part = out.with_name(out.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
     result = Result()
-    try:
+    with whole_folder(out, error=SessionError) as root:
         for trace in traces:
             try:
                 for info, text, items, pictures in _episodes(trace, fps, task, result):
-                    folder = part / f"episode_{result.episodes:04d}"
+                    folder = root / f"episode_{result.episodes:04d}"
                     for kind in ("colors", "depths", "audios"):
                         (folder / kind).mkdir(parents=True, exist_ok=True)
                     for name, data in pictures:
@@ -71,11 +67,6 @@ def export_episodes(
                 result.problems.append(f"{trace.path.name}: refused: {error.message}")
         if not result.episodes:
             raise SessionError("none of the recordings can be exported")
-        part.rename(out)
-    except OSError as error:
-        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return result
 
 

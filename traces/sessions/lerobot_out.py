@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +21,7 @@ from dexkit.digests import sha256_of_file
 from dexkit.errors import ExtraMissing, SessionError
 from dexkit.hand import Floats
 from dexkit.robots import ROBOTS
+from dexkit.staging import whole_folder
 from dexkit.traces.reader import Trace
 from dexkit.traces.sessions.frames import RULE, Frames, Source, open_source, sample
 from dexkit.traces.sessions.lerobot_format import (
@@ -103,12 +103,8 @@ def export_dataset(
     :raises SessionError: ``out`` exists, cannot be written, or no recording can be used.
     """
     parquet_library()
-    if out.exists():
-        raise SessionError(f"{out} exists", hint="choose another name, or delete it")
-    part = out.with_name(out.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        writer = _Writer(part, fps, task)
+    with whole_folder(out, error=SessionError) as root:
+        writer = _Writer(root, fps, task)
         for trace in traces:
             try:
                 writer.add(trace)
@@ -117,11 +113,6 @@ def export_dataset(
                     raise
                 writer.result.problems.append(f"{trace.path.name}: refused: {error.message}")
         writer.close()
-        part.rename(out)
-    except OSError as error:
-        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return writer.result
 
 

@@ -7,8 +7,9 @@ that of 2024) are converted to the present one, with a note.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from dexkit import __version__
 from dexkit.errors import DexkitError, ExtraMissing, SessionError, TraceUnsupported, WireError
 from dexkit.messages import message_type
 from dexkit.messages.layout import STRUCTS
+from dexkit.staging import whole_folder
 from dexkit.traces import schemas
 from dexkit.traces.names import dds_topic, dds_type
 from dexkit.traces.reader import Definition, Trace
@@ -239,8 +241,8 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
     library = _library()
     plugin = library.StoragePlugin.MCAP if storage == "mcap" else library.StoragePlugin.SQLITE3
     lost = ["source timestamps of the samples (publish time): a bag has one time a message"]
-    try:
-        writer = library.Writer(out, version=9, storage_plugin=plugin)
+    with whole_folder(out, error=SessionError) as root, _named_errors(library, out):
+        writer = library.Writer(root, version=9, storage_plugin=plugin)
         with writer:
             connections = {}
             for key, d in trace.definitions.items():
@@ -264,11 +266,15 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
             for name, values in trace.metadata.items():
                 writer.set_custom_data(f"{_METADATA}{name}", json.dumps(values))
             writer.set_custom_data(_LOSSES, json.dumps(lost))
-    except OSError as error:
-        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
+    return lost
+
+
+@contextlib.contextmanager
+def _named_errors(library: Any, out: Path) -> Iterator[None]:
+    try:
+        yield
     except library.WriterError as error:
         raise SessionError(f"cannot write {out}: {error}") from error
-    return lost
 
 
 def _type_hash(ros_name: str, text: str) -> str:

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.documents import read_bytes, write_file
+from dexkit.documents import read_bytes
 from dexkit.errors import DexkitError, ExtraMissing, SessionError, UsageError
 from dexkit.messages import MessageType, message_type
 from dexkit.messages.columns import encode_columns
 from dexkit.messages.layout import Primitive, Struct
+from dexkit.staging import whole_folder
 from dexkit.traces.reader import ChannelInfo, Definition, Trace
 from dexkit.traces.sessions.lerobot_format import parquet_library, read_parquet
 from dexkit.traces.sessions.model import Problems
@@ -96,8 +97,8 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
     lost = [
         "encapsulation and padding bytes of the payloads, and sequence numbers of the messages",
     ]
-    try:
-        out.mkdir(parents=True, exist_ok=False)
+    with whole_folder(out, error=SessionError) as root:
+        root.mkdir()
         topics = []
         for number, ((topic, type_name), d) in enumerate(sorted(trace.definitions.items())):
             name = f"{number:03d}_{_file_name(topic)}.{form}"
@@ -112,14 +113,11 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
                 else [*d.schema[:2], base64.b64encode(d.schema[2]).decode()],
             }
             info = next(c for c in trace.channels if (c.topic, c.type_name) == (topic, type_name))
-            _export_topic(trace, info, out / name, form, entry, lost)
+            _export_topic(trace, info, root / name, form, entry, lost)
             topics.append(entry)
         about = {_KEY: 1, "topics": topics, "metadata": trace.metadata, "lost": lost}
-        write_file(out / _ABOUT, json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-    except FileExistsError:
-        raise SessionError(f"{out} exists", hint="choose another name, or delete it") from None
-    except OSError as error:
-        raise SessionError(f"cannot write {out}: {error.strerror or error}") from error
+        text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
+        (root / _ABOUT).write_bytes(text.encode("utf-8", "backslashreplace"))
     return lost
 
 
