@@ -20,6 +20,7 @@ from dexkit.conformance.run_queue import Watched
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side, Subject
 from dexkit.models import Dialect
+from dexkit.redaction import redact
 from dexkit.temporary_folder import TemporaryFolder
 
 __all__ = ["Rig", "RigOptions", "Tool"]
@@ -70,7 +71,7 @@ class RigOptions:
         """Backend, device and object, for the run record and a result's ``subject``."""
         about = {"backend": self.backend}
         if self.devices:
-            about["device"] = ", ".join(f"{s} {d}" for s, d in self.devices.items())
+            about["device"] = ", ".join(f"{s} {redact(d)}" for s, d in self.devices.items())
         elif emulator_of(self.backend) is not None:
             about["device"] = "emulated"
         if self.objects:

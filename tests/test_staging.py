@@ -12,8 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from dexkit import staging
+from dexkit.cli import cli
+from dexkit.conformance.audit.sessions import find
 from dexkit.documents import write_file
 from dexkit.emulators.mx64 import Bus, Port, Servo
 from dexkit.emulators.sim_dex5 import SimDex5
@@ -377,3 +380,29 @@ def test_the_pose_and_the_link_of_an_emulator_take_nothing_that_is_there(tmp_pat
     assert all(path.is_symlink() for path in beside)
     assert victim.read_text() == "mine"
     assert left(tmp_path) == []
+
+
+def test_a_name_with_a_slash_at_its_end_is_no_file(tmp_path: Path, session: Path) -> None:
+    out = tmp_path / "out.html"
+    for arguments in (
+        ["info", str(session), "--html", f"{out}/"],
+        ["check", str(session), "--json", f"{out}/"],
+        ["check", str(session), "--junit", f"{out}/"],
+        ["cut", str(session), f"{out}/"],
+        ["record", f"{out}/"],
+    ):
+        result = CliRunner().invoke(cli, arguments)
+        assert isinstance(result.exception, UsageError), arguments
+        assert "is the name of a folder" in str(result.exception)
+    result = CliRunner().invoke(
+        cli, ["export", str(session), "--to", "csv", "--out", f"{tmp_path}/ds/"]
+    )
+    assert result.exit_code == 0, result.output
+    assert [p.name for p in tmp_path.iterdir()] == ["ds"]
+
+
+def test_an_audit_does_not_look_into_unfinished_outputs(tmp_path: Path) -> None:
+    assert killed(a_recording, tmp_path / "a.mcap", "replace")
+    (folder,) = left(tmp_path)
+    assert (tmp_path / folder / "a.mcap").exists()
+    assert list(find(str(tmp_path))) == []

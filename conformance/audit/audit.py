@@ -15,6 +15,7 @@ from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.documents import write_file
+from dexkit.redaction import redact
 
 __all__ = ["FAIL_ON", "Audit", "AuditProgress", "Limits", "Progress", "Runner", "in_this_process"]
 
@@ -213,7 +214,8 @@ class Audit:
         session = task.session
         if isinstance(result, WorkerLost):
             state = State.TOO_LARGE if "longer" in result else State.FAILED
-            record = FileRecord(session.name, session.size, session.tag, state, error=result)
+            error = redact(result, session.place)
+            record = FileRecord(session.name, session.size, session.tag, state, error=error)
         elif task.known and result.sha256 == task.known:
             record = replace(
                 journal.read(self._before[session.name]), size=session.size, tag=session.tag
@@ -231,5 +233,6 @@ class Audit:
             self.folder, lambda: journal.records(names), parquet=self._parquet
         )
         page = self.folder / "summary.html"
-        write_file(page, render(summary, locations=self.locations, left=len(names) - outcome.done))
+        locations = [redact(location, location) for location in self.locations]
+        write_file(page, render(summary, locations=locations, left=len(names) - outcome.done))
         outcome.files.append(page)

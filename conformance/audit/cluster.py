@@ -22,6 +22,7 @@ from dexkit.conformance.audit.file_records import FileRecord
 from dexkit.conformance.audit.workers import WorkerLost
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.escaping import one_line
+from dexkit.redaction import redact
 
 if TYPE_CHECKING:
     from dexkit.conformance.audit.audit import Limits
@@ -78,7 +79,8 @@ class Cluster:
             )
         except (OSError, ValueError, RuntimeError) as error:
             raise ConformanceError(
-                f"no Ray cluster at {address}: {one_line(str(error), 300)}",
+                f"no Ray cluster at {redact(address, address)}: "
+                f"{one_line(redact(error, address), 300)}",
                 hint="'ray start --head' starts one; --ray local starts one for this audit only",
             ) from error
         self._examine = ray.remote(num_cpus=1, max_retries=_AGAIN)(_examine)

@@ -23,6 +23,7 @@ from dexkit.conformance.run_record import catalogue_digest, recorded_claims
 from dexkit.errors import DexkitError
 from dexkit.escaping import one_line
 from dexkit.hand import Floats
+from dexkit.redaction import redact
 from dexkit.traces import Trace, open_trace
 from dexkit.traces.container import OpenFile
 
@@ -70,11 +71,11 @@ def examine(task: Task) -> FileRecord:
             else:
                 record = FileRecord(session.name, state=State.JUDGED)
     except (DexkitError, OSError, MemoryError) as error:
-        record = problem_of(session.name, error)
+        record = problem_of(session.name, error, session.place)
         if isinstance(error, MemoryError):
             record.error, record.hint = "it needs more memory than it may use", "--memory"
     except Exception as error:  # of a storage, or a mistake of dexkit: a row, not an end
-        record = problem_of(session.name, error)
+        record = problem_of(session.name, error, session.place)
         if digest:
             record.state = State.FAILED
             record.error = f"{_where()}: {record.error}"
@@ -165,7 +166,7 @@ def _labels(metadata: Mapping[str, Mapping[str, str]], names: Sequence[str]) -> 
     for record in metadata.values():
         for key, value in record.items():
             if key.lower() in names and value:
-                found.setdefault(key.lower(), one_line(value, 100))
+                found.setdefault(key.lower(), one_line(redact(value), 100))
     return found
 
 

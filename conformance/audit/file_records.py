@@ -12,7 +12,8 @@ from dexkit.conformance.results import Overall, Result, Verdict, worst
 __all__ = ["FINDING", "FORMAT", "VERSION", "FileRecord", "Finding", "State", "finding_of"]
 
 FORMAT = "dexkit-audit"
-VERSION = 1
+VERSION = 2
+"""Journals of version 1 may hold the credentials of URLs."""
 
 Finding = list[Any]
 """One requirement on one side; its values are those of :data:`FINDING`, in that order."""
@@ -69,7 +70,8 @@ class State(str, Enum):
 class FileRecord:
     """One file of an archive.
 
-    :param name: path or URL; ``tag`` changes whenever the file does: an etag, or a time.
+    :param name: path, or URL without credentials; ``tag`` changes whenever the file does: an etag,
+        or a time.
     :param error: why it was not judged, or what is damaged; empty if all is well.
     :param settings: what the verdicts depend on besides the file; see
         :func:`~dexkit.conformance.audit.examine.settings_key`.

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from dexkit.errors import UsageError
+from dexkit.redaction import redact, redact_logs
 
 __all__ = ["BLOCK", "Object", "RangeFile", "file_system", "tag_of"]
 
@@ -34,18 +35,22 @@ _TAGS = (
 def file_system(url: str) -> tuple[Any, str]:
     """The file system of a URL, and the path in it.
 
-    :raises UsageError: fsspec, or what it needs for that kind of URL, is not installed.
+    :raises UsageError: fsspec, or what it needs for that kind of URL, is not installed; or the URL
+        is none.
     """
+    redact_logs()
     try:
         import fsspec
     except ImportError:
         raise UsageError(
-            f"{url} is a URL, which needs fsspec", hint="pip install 'dexkit[audit]'"
+            f"{redact(url, url)} is a URL, which needs fsspec", hint="pip install 'dexkit[audit]'"
         ) from None
     try:
         return fsspec.core.url_to_fs(url)  # type: ignore[no-any-return]
-    except (ImportError, ValueError) as error:
-        raise UsageError(f"{url}: {error}", hint="pip install s3fs, gcsfs, ... for it") from None
+    except Exception as error:  # each file system has errors of its own
+        raise UsageError(
+            f"{redact(url, url)}: {redact(error, url)}", hint="pip install s3fs, gcsfs, ... for it"
+        ) from None
 
 
 def tag_of(about: dict[str, Any]) -> str:

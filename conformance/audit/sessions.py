@@ -16,6 +16,8 @@ from dexkit.conformance.audit.objects import Object, file_system, tag_of
 from dexkit.digests import file_pieces
 from dexkit.errors import DexkitError, TraceUnreadable, UsageError
 from dexkit.escaping import one_line
+from dexkit.redaction import redact, url_name
+from dexkit.staging import PREFIX
 from dexkit.temporary_folder import TemporaryFolder
 from dexkit.traces.container import OpenFile
 
@@ -33,7 +35,8 @@ class TooLarge(DexkitError):
 class SessionFile:
     """A file that is to be judged.
 
-    :param name: how the rows call it; ``place`` is the path or URL itself.
+    :param name: how the rows call it, and by what it is found in the journal; without credentials.
+        ``place`` is the path or URL itself.
     :param size: bytes; ``tag`` changes whenever the file does.
     """
 
@@ -69,7 +72,7 @@ def find(location: str, working_folder: Path | None = None) -> Iterator[SessionF
         return
     problems: list[OSError] = []
     for folder, folders, files in os.walk(base, onerror=problems.append):
-        folders.sort()
+        folders[:] = sorted(name for name in folders if not name.startswith(PREFIX))
         for file in sorted(files):
             if file.lower().endswith(_SUFFIX):
                 found = Path(folder, file)
@@ -94,7 +97,7 @@ def _find_objects(url: str) -> Iterator[SessionFile | FileRecord]:
         if not found and not files.exists(root):
             raise FileNotFoundError(2, "there is no such object or folder")
     except Exception as error:  # each storage has errors of its own
-        yield problem_of(url, error)
+        yield problem_of(url_name(url), error, url)
         return
     for path, info in sorted(found.items()):
         if not path.lower().endswith(_SUFFIX) and path != root:
@@ -104,13 +107,17 @@ def _find_objects(url: str) -> Iterator[SessionFile | FileRecord]:
             if not tag_of(info) or not info.get("size"):  # a web server's list has only names
                 info = files.info(path)
         except Exception as error:
-            yield problem_of(place, error)
+            yield problem_of(url_name(place), error, place)
             continue
-        yield SessionFile(one_line(place, 4096), place, int(info.get("size") or 0), tag_of(info))
+        name = one_line(url_name(place), 4096)
+        yield SessionFile(name, place, int(info.get("size") or 0), tag_of(info))
 
 
-def problem_of(name: str, error: BaseException) -> FileRecord:
-    """The record of a file or folder that its storage does not give."""
+def problem_of(name: str, error: BaseException, place: str = "") -> FileRecord:
+    """The record of a file or folder that its storage does not give.
+
+    :param place: its path or URL, whose credentials the error may show.
+    """
     cause: BaseException | None = error
     state = State.UNREADABLE if isinstance(error, DexkitError) else State.UNAVAILABLE
     while cause is not None:
@@ -126,6 +133,7 @@ def problem_of(name: str, error: BaseException) -> FileRecord:
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     if state is State.UNAVAILABLE and not isinstance(error, OSError):
         text = f"{type(error).__name__}: {text}"
+    text = redact(text, place)
     hint = error.hint if isinstance(error, DexkitError) else ""
     return FileRecord(
         one_line(name, 4096), state=state, error=one_line(text, 2000), hint=one_line(hint, 2000)
@@ -161,7 +169,7 @@ def opened(session: SessionFile, most: int) -> Iterator[tuple[Path, OpenFile | N
                 )
             for piece in source.pieces():
                 digest.update(piece)
-            yield Path(session.place), source.open, digest.hexdigest()
+            yield Path(session.name), source.open, digest.hexdigest()
             source.check()
             return
         path = folder / "session.mcap"

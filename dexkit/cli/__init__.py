@@ -138,6 +138,7 @@ def _run(argv: list[str] | None) -> int:
         click.echo("interrupted", err=True)
         return 130
     except click.ClickException as error:
+        error.message = _redact(error.message)  # type: ignore[misc]
         error.show()
         return error.exit_code
     except OutputError:
@@ -161,6 +162,12 @@ def _print_error(error: DexkitError) -> None:
     """Print an error: one line, then the hint, indented, so that no part of it can be taken for
     other output of dexkit.
     """
-    click.echo(f"error: {one_line(error.message, REMARK)}", err=True)
-    for line in error.hint.splitlines():
+    click.echo(f"error: {one_line(_redact(error.message), REMARK)}", err=True)
+    for line in _redact(error.hint).splitlines():
         click.echo(f"  {one_line(line, REMARK)}", err=True)
+
+
+def _redact(text: str) -> str:
+    from dexkit.redaction import redact  # which a command without an error does not need
+
+    return redact(text)

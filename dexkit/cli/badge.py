@@ -6,13 +6,17 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import grade_option, output_option
+from dexkit.cli.options import (
+    LocalPath,
+    grade_option,
+    output_option,
+)
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
 
 
 @click.command("badge")
-@click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
+@click.argument("result", type=LocalPath(exists=True), metavar="RESULT.json")
 @output_option("FILE.svg", "Where to write it; - prints it.", "badge.svg")
 @grade_option(
     "Draw only the badge of this grade. The drop-in badge is never drawn alone if safety failed.  "

@@ -11,7 +11,13 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.options import Number, device_option, dry_run_option, one_side_option
+from dexkit.cli.options import (
+    LocalPath,
+    Number,
+    device_option,
+    dry_run_option,
+    one_side_option,
+)
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import (
     EZGripper,
@@ -136,7 +142,7 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
 )
 @click.option(
     "--config",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     help="File to store in, instead of the user's.",
 )
 @dry_run_option("Only print the servo's state: nothing moves, nothing is written.")

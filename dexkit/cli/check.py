@@ -9,6 +9,8 @@ import click
 
 from dexkit import option_texts
 from dexkit.cli.options import (
+    FILE,
+    LocalPath,
     dialect_option,
     grade_option,
     html_option,
@@ -31,7 +33,7 @@ from dexkit.robots import ROBOTS
 @click.command("check")
 @click.argument(
     "recording",
-    type=click.Path(exists=True, path_type=Path),
+    type=LocalPath(exists=True),
     metavar="IN.mcap",
     required=False,
 )
@@ -46,7 +48,7 @@ from dexkit.robots import ROBOTS
 @grade_option(option_texts.GRADE)
 @click.option(
     "--capabilities",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="FILE.toml",
     help=f"{option_texts.CAPABILITIES}. Default: what the recording of a run says",
 )

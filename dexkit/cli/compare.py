@@ -7,7 +7,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import html_option, markdown_option
+from dexkit.cli.options import (
+    LocalPath,
+    html_option,
+    markdown_option,
+)
 from dexkit.cli.report import recording_beside, write_text
 from dexkit.digests import sha256_of_file
 from dexkit.documents import check_output_paths
@@ -21,7 +25,7 @@ if TYPE_CHECKING:
     "results",
     nargs=-1,
     required=True,
-    type=click.Path(exists=True, path_type=Path),
+    type=LocalPath(exists=True),
     metavar="A.json B.json ...",
 )
 @html_option()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import FILE, Number, overwrite_option, topic_option
+from dexkit.cli.options import FILE, OUTPUT_FILE, Number, overwrite_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
 
@@ -20,7 +20,7 @@ __all__ = ["command"]
 
 @click.command("cut")
 @click.argument("file", type=FILE)
-@click.argument("out", type=FILE)
+@click.argument("out", type=OUTPUT_FILE)
 @click.option(
     "--from",
     "begin",

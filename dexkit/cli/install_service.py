@@ -12,6 +12,7 @@ import click
 
 from dexkit.backends import backend
 from dexkit.cli.options import (
+    LocalPath,
     devices_by_side,
     devices_option,
     dialect_option,
@@ -50,7 +51,7 @@ _UNITS, _RULES = Path("/etc/systemd/system"), Path("/etc/udev/rules.d")
 @click.option("--no-udev", is_flag=True, help="Write no udev rules; use device paths as given.")
 @click.option(
     "--directory",
-    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    type=LocalPath(file_okay=False, exists=True),
     metavar="DIR",
     help="Write all files here.  [default: /etc/systemd/system and /etc/udev/rules.d]",
 )

@@ -22,6 +22,8 @@ from dexkit.models import DIALECTS
 __all__ = [
     "DOMAIN",
     "FILE",
+    "OUTPUT_FILE",
+    "LocalPath",
     "Number",
     "any_baudrate_option",
     "dds_options",
@@ -123,7 +125,47 @@ class _Sides(click.Choice):  # type: ignore[type-arg]
 
 DOMAIN = click.IntRange(0, 230)
 """A DDS domain; those above have no ports (RTPS 9.6.1.1)."""
-FILE = click.Path(path_type=Path)
+
+
+class LocalPath(click.Path):
+    """A path of this machine, as a :class:`~pathlib.Path`; not a URL.
+
+    :param exists: it must be there.
+    :param file_okay: whether it may be a file, if it is there; ``dir_okay`` likewise for a folder.
+    :param folder: whether it may be written as a folder is, with a slash at the end.
+    """
+
+    def __init__(
+        self,
+        *,
+        exists: bool = False,
+        file_okay: bool = True,
+        dir_okay: bool = True,
+        folder: bool = True,
+    ) -> None:
+        super().__init__(exists=exists, file_okay=file_okay, dir_okay=dir_okay, path_type=Path)
+        self._folder = folder and dir_okay
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path.
+
+        :raises UsageError: it is a URL, or the name of a folder where a file is meant.
+        """
+        text = os.fsdecode(value)
+        if "://" in text and not (os.path.lexists(text) or os.path.isdir(os.path.dirname(text))):
+            from dexkit.redaction import redact  # which no other start needs
+
+            raise UsageError(
+                f"{redact(text, text)} is a URL, and a file or a folder of this machine is needed",
+                hint="copy it to this machine first; 'dexkit audit' alone reads behind URLs",
+            )
+        if not self._folder and text.endswith("/"):
+            raise UsageError(f"{text} is the name of a folder, and a file is needed")
+        return super().convert(value, param, ctx)
+
+
+FILE = LocalPath()
+OUTPUT_FILE = LocalPath(folder=False)
 
 
 # ------------------------------------------------------------------------------ DDS
@@ -575,7 +617,7 @@ def json_option(help: str) -> Callable[[F], F]:
 
 def json_file_option(help: str) -> Callable[[F], F]:
     """``--json FILE`` of the commands that write their result, as ``json_path``."""
-    return click.option("--json", "json_path", type=FILE, metavar="FILE", help=help)
+    return click.option("--json", "json_path", type=OUTPUT_FILE, metavar="FILE", help=help)
 
 
 def html_option(help: str = option_texts.PAGE, *, report: bool = True) -> Callable[[F], F]:
@@ -584,14 +626,14 @@ def html_option(help: str = option_texts.PAGE, *, report: bool = True) -> Callab
     :param report: the page is a report, and ``--report`` is another name of the option.
     """
     names = ("--report", "--html") if report else ("--html",)
-    return click.option(*names, "html_path", type=FILE, metavar="FILE", help=help)
+    return click.option(*names, "html_path", type=OUTPUT_FILE, metavar="FILE", help=help)
 
 
 def output_option(metavar: str, help: str, default: str | None = None) -> Callable[[F], F]:
     """``-o``, ``--output``: the only file that a command writes."""
     return click.option(
         *("-o", "--output"),
-        type=FILE,
+        type=OUTPUT_FILE,
         default=default,
         show_default=default is not None,
         metavar=metavar,
@@ -603,7 +645,7 @@ def out_option(default: str, help: str) -> Callable[[F], F]:
     """``--out DIR``: the folder for all that a command writes."""
     return click.option(
         "--out",
-        type=click.Path(file_okay=False, path_type=Path),
+        type=LocalPath(file_okay=False),
         default=Path(default),
         show_default=True,
         metavar="DIR",
@@ -613,7 +655,9 @@ def out_option(default: str, help: str) -> Callable[[F], F]:
 
 def junit_option() -> Callable[[F], F]:
     """``--junit FILE``, as ``junit_path``."""
-    return click.option("--junit", "junit_path", type=FILE, metavar="FILE", help="Write JUnit XML.")
+    return click.option(
+        "--junit", "junit_path", type=OUTPUT_FILE, metavar="FILE", help="Write JUnit XML."
+    )
 
 
 def markdown_option(default: str = "") -> Callable[[F], F]:
@@ -622,7 +666,7 @@ def markdown_option(default: str = "") -> Callable[[F], F]:
     return click.option(
         "--markdown",
         "markdown_path",
-        type=FILE,
+        type=OUTPUT_FILE,
         metavar="FILE",
         help=f"{option_texts.SUMMARY}; - prints it.{suffix}",
     )
@@ -635,7 +679,7 @@ def recording_option(then: str = "") -> Callable[[F], F]:
     """
     return click.option(
         "--recording",
-        type=click.Path(exists=True, path_type=Path),
+        type=LocalPath(exists=True),
         metavar="RUN.mcap",
         help=f"The recording that was judged{then}. Default: the one that the result names, if it "
         "lies beside it.",

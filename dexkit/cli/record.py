@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit import threads
-from dexkit.cli.options import FILE, dds_options, duration_option, overwrite_option, topic_option
+from dexkit.cli.options import (
+    FILE,
+    LocalPath,
+    dds_options,
+    duration_option,
+    overwrite_option,
+    topic_option,
+)
 from dexkit.cli.remarks import remark, remarks
 from dexkit.cli.status_line import Stderr
 from dexkit.errors import DexkitError, TraceError, UsageError
@@ -28,7 +35,7 @@ __all__ = ["command"]
 
 
 @click.command("record")
-@click.argument("out", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("out", type=LocalPath(dir_okay=False))
 @topic_option("Record", "every topic of a known type, also those that appear later")
 @dds_options()
 @duration_option()

@@ -27,6 +27,7 @@ from dexkit.cli.options import (
 from dexkit.command_age import PAUSE
 from dexkit.errors import DdsError, UsageError
 from dexkit.escaping import REMARK, one_line
+from dexkit.redaction import redact
 
 if TYPE_CHECKING:
     from dexkit.conformance.virtual.rehearsal import Rehearsal
@@ -373,7 +374,7 @@ def _options(ctx: click.Context) -> str:
             value = ctx.params.get(name)
             shown = [] if parameter.is_flag else value if isinstance(value, tuple) else [value]
             words += [parameter.opts[0], *map(str, shown)]
-    return " ".join(words)
+    return redact(" ".join(words))
 
 
 def _print_rehearsal(rehearsal: Rehearsal) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.options import (
+    LocalPath,
     html_option,
     junit_option,
     markdown_option,
@@ -18,6 +19,7 @@ from dexkit.cli.options import (
 from dexkit.documents import check_output_paths, write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
+from dexkit.redaction import redact
 
 if TYPE_CHECKING:
     from dexkit.conformance.recording import Recording
@@ -33,14 +35,19 @@ def write_text(path: Path, text: str) -> None:
 
 
 def _address(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
-    """An address of the web, or a path; no other scheme."""
+    """An address of the web without credentials, or a path; no other scheme."""
+    if redact(text, text) != text:
+        raise click.BadParameter(
+            f"{redact(text, text)}: everybody who has the page would read what *** stands for; "
+            "leave it out"
+        )
     if not re.match(r"https?://|[\w./-]*$", text):
         raise click.BadParameter(f"{one_line(text)} is no address that begins with http")
     return text
 
 
 @click.command("report")
-@click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
+@click.argument("result", type=LocalPath(exists=True), metavar="RESULT.json")
 @recording_option(": the page then shows plots")
 @html_option()
 @markdown_option()

@@ -13,7 +13,10 @@ from typing import IO, TYPE_CHECKING
 
 import click
 
-from dexkit.cli.options import dry_run_option
+from dexkit.cli.options import (
+    LocalPath,
+    dry_run_option,
+)
 from dexkit.errors import DdsInstallError, OutputError
 from dexkit.escaping import REMARK, one_line
 
@@ -29,14 +32,14 @@ __all__ = ["command"]
 @click.option(
     "--from-source",
     "source",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=LocalPath(exists=True, file_okay=False),
     metavar="DIR",
     help="Build the CycloneDDS C library 0.10.x of this checkout; it becomes part of the wheel.",
 )
 @click.option(
     "--wheel",
     "wheel_folder",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=LocalPath(file_okay=False),
     metavar="DIR",
     help="Keep the wheel here, for other environments and machines.",
 )
@@ -47,7 +50,7 @@ __all__ = ["command"]
 @dry_run_option("Print what would be done, and do nothing.")
 @click.option(
     "--log",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     metavar="FILE",
     help="Log file of commands and their output.  [default: dexkit/setup-dds.log in the user's "
     "folder for logs]",

@@ -6,24 +6,28 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.options import output_option, recording_option
+from dexkit.cli.options import (
+    LocalPath,
+    output_option,
+    recording_option,
+)
 from dexkit.documents import check_output_paths
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 
 
 @click.command("sign")
-@click.argument("result", type=click.Path(exists=True, path_type=Path), metavar="RESULT.json")
+@click.argument("result", type=LocalPath(exists=True), metavar="RESULT.json")
 @recording_option()
 @click.option(
     "--page",
-    type=click.Path(exists=True, path_type=Path),
+    type=LocalPath(exists=True),
     metavar="PAGE.html",
     help="Also sign this report page of the result.",
 )
 @click.option(
     "--key",
-    type=click.Path(exists=True, path_type=Path),
+    type=LocalPath(exists=True),
     required=True,
     metavar="KEY",
     help="Private key to sign with; of ssh, or of minisign with --tool minisign.",

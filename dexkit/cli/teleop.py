@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.options import (
+    LocalPath,
     dds_options,
     dialect_option,
     duration_option,
@@ -85,7 +86,7 @@ _MS = 1e3
 @click.option(
     "--record",
     "record_path",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     metavar="F.mcap",
     help="Also record the hands' topics, for 'dexkit check'.",
 )

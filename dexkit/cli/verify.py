@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.options import LocalPath
 from dexkit.escaping import REMARK, one_line
 
 _MOST = 40
@@ -13,10 +14,10 @@ _MOST = 40
 
 
 @click.command("verify")
-@click.argument("archive", type=click.Path(exists=True, path_type=Path), metavar="ARCHIVE.zip")
+@click.argument("archive", type=LocalPath(exists=True), metavar="ARCHIVE.zip")
 @click.option(
     "--public-key",
-    type=click.Path(exists=True, path_type=Path),
+    type=LocalPath(exists=True),
     required=True,
     metavar="FILE",
     help="Accepted signer: an ssh public key, an allowed_signers file, or a public key of "

@@ -24,6 +24,7 @@ from dexkit.cli.status_line import StatusLine
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.escaping import REMARK, one_line
 from dexkit.hand import ROBOT, JointSpec, Side
+from dexkit.redaction import redact
 from dexkit.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ def command(
         elif out is not None:
             status = stack.enter_context(contextlib.closing(_Written()))
             rerun = stack.enter_context(contextlib.closing(RerunViewer(out)))
-            click.echo(f"ready: {what} to {out}")
+            click.echo(f"ready: {what} to {redact(out, out)}")
             paced = "://" in out
             forward(
                 sources, rerun, stop.event, skeletons=skeletons, paced=paced, progress=status.show

@@ -9,13 +9,17 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from dexkit.redaction import redact
+
 __all__ = ["command_line", "environment_of", "holders", "open_sockets", "start_time"]
 
 _PROC = Path("/proc")
 
 
 def command_line(pid: int) -> str:
-    """Command line of a process, its interpreter and paths shortened, or empty."""
+    """Command line of a process, its interpreter and paths shortened, or empty; URLs in it without
+    their credentials.
+    """
     try:
         words = (_PROC / str(pid) / "cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
@@ -23,7 +27,7 @@ def command_line(pid: int) -> str:
     words = [word for word in words if word]
     if len(words) > 1 and Path(words[0]).name.startswith("python") and words[1][:1] != "-":
         words = words[1:]
-    return " ".join([Path(words[0]).name, *words[1:]]) if words else ""
+    return " ".join([Path(words[0]).name, *map(redact, words[1:])]) if words else ""
 
 
 def environment_of(pid: int, name: str) -> str:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import IO, Protocol
 
+from dexkit.redaction import redact
 from dexkit.stop_signals import StopRequest
 
 __all__ = ["Done", "Interrupted", "ProcessRunner", "Runner"]
@@ -121,7 +122,7 @@ class ProcessRunner:
 
     def _write(self, text: str) -> None:
         with contextlib.suppress(OSError):  # a full disk is reported where it does harm
-            self._log.write(text)
+            self._log.write(redact(text))
             self._log.flush()
 
 

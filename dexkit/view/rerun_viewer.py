@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from dexkit.errors import ExtraMissing, UsageError
+from dexkit.escaping import output_error
 from dexkit.hand import Floats
 from dexkit.kinematics import quaternions
+from dexkit.redaction import redact
+from dexkit.staging import Staged
 from dexkit.view.drawing import GHOST, Colors
 from dexkit.view.forward import Moment
 
@@ -34,23 +37,30 @@ class RerunViewer:
     def __init__(self, out: str) -> None:
         self._stream = rr.RecordingStream("dexkit")
         self._faults: dict[str, list[str]] = {}
-        self._file = None if "://" in out else Path(out)
-        self._part = self._file and self._file.with_name(f".{self._file.name}.part.rrd")
+        self._staged: Staged | None = None
         try:
-            if self._part is None:
+            if "://" in out:
                 self._stream.connect_grpc(out)
             else:
-                self._stream.save(self._part)
+                self._staged = Staged(Path(os.path.realpath(out)))
+                self._stream.save(self._staged.path)
         except (OSError, RuntimeError, ValueError) as error:
-            raise UsageError(f"cannot write {out}: {error}") from error
+            if self._staged is not None:
+                self._staged.discard()
+            raise UsageError(f"cannot write {redact(out, out)}: {redact(error, out)}") from error
         self._stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def close(self) -> None:
         """Write the buffered data."""
         self._stream.flush()
         self._stream.disconnect()
-        if self._file is not None and self._part is not None:
-            os.replace(self._part, self._file)
+        if self._staged is not None:
+            try:
+                self._staged.publish()
+            except OSError as error:
+                raise output_error(self._staged.target, error) from error
+            finally:
+                self._staged.discard()
 
     def show(self, time_ns: int, moments: Sequence[Moment]) -> None:
         """Log a moment on the time line ``time``."""

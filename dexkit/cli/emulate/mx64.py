@@ -14,6 +14,7 @@ import click
 from dexkit import documents
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
 from dexkit.cli.options import (
+    LocalPath,
     any_baudrate_option,
     fault_options,
     latency_timer_option,
@@ -75,7 +76,7 @@ __all__ = ["emulate_mx64"]
 @seed_option("the faults and of measurement noise")
 @click.option(
     "--eeprom",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=LocalPath(dir_okay=False),
     metavar="FILE",
     help="Keep the servos' EEPROM in this file between runs; it overrides --id and --baudrate.",
 )
