@@ -301,3 +301,24 @@ def test_options_on_a_page_and_the_device_of_a_result_are_redacted() -> None:
     about: Callable[..., dict[str, str]] = SuiteOptions.subject.fget  # type: ignore[attr-defined]
     stand_in = type("Options", (), {"backend": "x", "devices": {"left": URL}, "objects": {}})
     assert about(stand_in) == {"backend": "x", "device": "left https://***@host/a.mcap?***"}
+
+
+@each(
+    "uri",
+    [
+        ("<Domain><Security><IdentityCertificate>data:,secret</IdentityCertificate></Security>"
+         "<Password>hunter2</Password><Peer address='secret'/></Domain>",
+         "<Domain <Security <IdentityCertificate <Password <Peer"),
+        ("file:///etc/cyclonedds.xml", "file:///etc/cyclonedds.xml"),
+        ("http://user:secret@host/x", "http://***@host/x"),
+        ("", ""),
+    ],
+)  # fmt: skip
+def test_the_doctor_keeps_no_contents_of_a_dds_configuration(
+    uri: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dexkit.doctor import environment as module
+
+    monkeypatch.setattr(module, "_import_problem", lambda name: "")
+    monkeypatch.setenv("CYCLONEDDS_URI", uri[0])
+    assert module.environment().uri == uri[1]

@@ -16,6 +16,7 @@ from dexkit import interface_filter
 from dexkit.child_processes import process_id
 from dexkit.doctor import rtps
 from dexkit.doctor.awaited_topics import AWAITED
+from dexkit.doctor.environment import shown_uri
 from dexkit.doctor.link import percentile
 from dexkit.doctor.network import address_of
 from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
@@ -378,5 +379,5 @@ def _participant(data: rtps.ParticipantData, interface: str) -> Participant:
         interface=interface,
         command=command_line(pid) if here else "",
         started=start_time(pid) if here else None,
-        dds_config=environment_of(pid, "CYCLONEDDS_URI") if here else "",
+        dds_config=shown_uri(environment_of(pid, "CYCLONEDDS_URI")) if here else "",
     )

@@ -13,8 +13,9 @@ from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 
 from dexkit.doctor.observations import Environment
+from dexkit.redaction import redact
 
-__all__ = ["environment", "uri_problem"]
+__all__ = ["environment", "shown_uri", "uri_problem"]
 
 _PATIENCE = 20.0  # seconds for an import
 _SDK = ("unitree-sdk2", "unitree-sdk2py", "unitree_sdk2py")
@@ -32,8 +33,8 @@ def environment() -> Environment:
         cyclonedds_error=_import_problem("cyclonedds.core") if cyclonedds else "",
         sdk=sdk,
         sdk_error=_import_problem("unitree_sdk2py") if sdk else "",
-        uri=uri,
-        uri_error=uri_problem(uri),
+        uri=shown_uri(uri),
+        uri_error=redact(uri_problem(uri)),
     )
 
 
@@ -67,6 +68,13 @@ def _import_problem(module: str) -> str:
     lines = done.stderr.strip().splitlines()
     # the path at the end has no more information
     return re.sub(r" \(/[^()]*\)$", "", lines[-1]) if lines else f"'{code}' fails"
+
+
+def shown_uri(uri: str) -> str:
+    """A CYCLONEDDS_URI as it may be shown. Of XML that is the names of its elements: their contents
+    may be the password and the key of DDS Security.
+    """
+    return " ".join(re.findall(r"<\w+", uri)) if "<" in uri else redact(uri)
 
 
 def uri_problem(uri: str) -> str:

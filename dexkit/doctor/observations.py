@@ -39,7 +39,8 @@ class Participant:
     :param interface: the interface on which it was found.
     :param command: its command line, if it runs on this machine and may be read.
     :param started: when it began, seconds since the epoch, if it runs on this machine.
-    :param dds_config: its CYCLONEDDS_URI, if it runs on this machine and has one.
+    :param dds_config: its CYCLONEDDS_URI, if it runs on this machine and has one; of XML the names
+        of the elements alone.
     """
 
     key: str
