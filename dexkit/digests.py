@@ -6,13 +6,12 @@ The file is read in pieces, so that a recording of any size needs little memory.
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from dexkit.documents import open_ordinary
 from dexkit.errors import DexkitError, UsageError
 
 __all__ = ["Digest", "digest_of", "file_pieces", "sha256_of_file"]
@@ -49,19 +48,15 @@ def file_pieces(path: Path, *, error: type[DexkitError] = UsageError) -> Iterato
 
     :param error: what is raised when it cannot be read, or is no ordinary file.
     """
-    try:
-        # a pipe without a writer is not waited for
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with open(descriptor, "rb", buffering=0) as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise error(f"cannot read {path}: it is not an ordinary file")
-            while piece := file.read(_PIECE):
-                yield piece
-    except (OSError, ValueError) as why:  # ValueError: a null character in the name
-        if isinstance(why, DexkitError):
-            raise
-        reason = why.strerror if isinstance(why, OSError) else str(why)
-        raise error(f"cannot read {path}: {reason}") from why
+    with open_ordinary(path, error=error) as file:
+        while True:
+            try:
+                piece = file.read(_PIECE)
+            except OSError as why:
+                raise error(f"cannot read {path}: {why.strerror}") from why
+            if not piece:
+                return
+            yield piece
 
 
 def sha256_of_file(path: Path) -> str:

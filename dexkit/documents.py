@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import io
 import json
 import math
 import os
@@ -31,6 +32,7 @@ __all__ = [
     "LARGEST",
     "LOCK_PATIENCE",
     "check_output_paths",
+    "open_ordinary",
     "parse_json",
     "parse_toml",
     "read_bytes",
@@ -56,6 +58,26 @@ _POLL_INTERVAL = 0.01  # seconds between attempts
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS})
 
 
+def open_ordinary(
+    path: Path, *, error: type[DexkitError] = UsageError, hint: str = ""
+) -> io.BufferedReader:
+    """Open an ordinary file to be read. A pipe without a writer would be waited for, without end,
+    and a device may never end; neither is opened to be read.
+
+    :param error: what is raised when it is no ordinary file, or cannot be opened.
+    :param hint: what to do then.
+    """
+    try:
+        file = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115
+    except (OSError, ValueError) as why:  # ValueError: a null character in the name
+        reason = why.strerror if isinstance(why, OSError) else str(why)
+        raise error(f"cannot read {path}: {reason}", hint=hint) from why
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
+    return file
+
+
 def read_bytes(
     path: Path,
     largest: int = LARGEST,
@@ -69,16 +91,13 @@ def read_bytes(
     :param hint: what to do then.
     """
     data = bytearray()
-    try:
-        with open(path, "rb", opener=_open_without_waiting) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise error(f"cannot read {path}: it is not an ordinary file", hint=hint)
+    with open_ordinary(path, error=error, hint=hint) as file:
+        try:
             # in pieces: read(largest) would reserve so much memory first
             while len(data) <= largest and (piece := file.read(_PIECE)):
                 data += piece
-    except (OSError, ValueError) as why:  # ValueError: a null character in the name
-        reason = why.strerror if isinstance(why, OSError) else str(why)
-        raise error(f"cannot read {path}: {reason}", hint=hint) from why
+        except OSError as why:
+            raise error(f"cannot read {path}: {why.strerror}", hint=hint) from why
     if len(data) > largest:
         raise error(f"cannot read {path}: it is larger than {largest >> 20} MB", hint=hint)
     return bytes(data)
@@ -296,16 +315,11 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
         target = path.resolve()
         target.parent.mkdir(parents=True, exist_ok=True)
         with _locked(target):
-            try:
-                before: str | None = target.read_text(encoding="utf-8")
-            except FileNotFoundError:
-                before = None
+            before = read_text(target) if target.exists() else None
             after = change(before)
             if after != before:
                 with whole_file(target) as place:
                     _write_pieces(place, [after.encode()])
-    except UnicodeDecodeError as error:
-        raise UsageError(f"cannot read {path}: it is not UTF-8 text") from error
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links (Python 3.10)
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise UsageError(

@@ -152,6 +152,7 @@ def sign(tool: str, data: bytes, key: Path) -> tuple[bytes, str]:
         one an agent holds.
     :raises SigningError: the tool is missing, or cannot use the key.
     """
+    documents.open_ordinary(key, error=SigningError).close()  # the tool would wait for a pipe
     with TemporaryFolder("sign") as folder:
         message, signature = folder / "manifest.json", folder / "manifest.json.sig"
         message.write_bytes(data)

@@ -8,15 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, ParseError
 
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import fromstring
+
+from dexkit.documents import read_bytes
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec
 from dexkit.kinematics import BASE, Box, Segment, Skeleton, Vector, rotation
 
 __all__ = ["read_urdf"]
 
-_LARGEST = 16 * 2**20
+_LARGEST = 4 * 2**20  # bytes; that of a whole robot has less than a tenth
 _MOST_LINKS = 2000
 _MOVING = ("revolute", "continuous", "prismatic")
 
@@ -34,7 +38,7 @@ def read_urdf(path: Path, joints: Sequence[JointSpec], mount: Vector = (0.0, 0.0
     """
     root = _parse(path)
     names = _names(joints)
-    by_child: dict[str, ElementTree.Element] = {}
+    by_child: dict[str, Element] = {}
     links = {e.get("name", ""): e for e in root.iter("link")}
     for joint in root.findall("joint"):
         child = joint.find("child")
@@ -79,15 +83,16 @@ def read_urdf(path: Path, joints: Sequence[JointSpec], mount: Vector = (0.0, 0.0
     return Skeleton(tuple(segments), tuple(boxes), mount=mount, note=f"from {path.name}")
 
 
-def _parse(path: Path) -> ElementTree.Element:
-    if path.stat().st_size > _LARGEST:
-        raise UsageError(f"{path} is larger than {_LARGEST // 2**20} MB, which is no URDF")
-    data = path.read_bytes()
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise UsageError(f"{path} defines entities, which a URDF does not need")
+def _parse(path: Path) -> Element:
+    data = read_bytes(path, _LARGEST)
     try:
-        root = ElementTree.fromstring(data)  # entities are refused above
-    except ElementTree.ParseError as error:
+        root: Element = fromstring(data, forbid_dtd=True)
+    except DefusedXmlException:
+        raise UsageError(
+            f"{path} has a document type or entities, which a URDF does not need",
+            hint="xacro writes a URDF without them",
+        ) from None
+    except (ParseError, ValueError, LookupError) as error:  # the others: of its encoding
         raise UsageError(f"{path} is no XML: {error}") from None
     if root.tag != "robot":
         raise UsageError(f"{path} is no URDF: it holds a {root.tag}, not a robot")
@@ -106,7 +111,7 @@ def _names(joints: Sequence[JointSpec]) -> dict[str, int]:
 
 
 def _driver(
-    joint: ElementTree.Element, moved: dict[str, ElementTree.Element], names: dict[str, int]
+    joint: Element, moved: dict[str, Element], names: dict[str, int]
 ) -> tuple[int | None, float, float]:
     """Index in q of what moves a joint, with factor and offset; a chain of mimics is followed."""
     factor, offset, seen = 1.0, 0.0, 0
@@ -124,9 +129,7 @@ def _driver(
     return names[joint.get("name", "")], factor, offset
 
 
-def _in_order(
-    by_child: dict[str, ElementTree.Element], links: dict[str, ElementTree.Element], path: Path
-) -> Iterator[str]:
+def _in_order(by_child: dict[str, Element], links: dict[str, Element], path: Path) -> Iterator[str]:
     """Links that hang on a joint, parents first."""
     children: dict[str, list[str]] = {}
     for child, joint in by_child.items():
@@ -145,23 +148,21 @@ def _in_order(
         raise UsageError(f"{path}: its links form a loop")
 
 
-def _origin(element: ElementTree.Element, path: Path) -> tuple[Vector, Vector]:
+def _origin(element: Element, path: Path) -> tuple[Vector, Vector]:
     origin = element.find("origin")
     if origin is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     return _vector(origin.get("xyz", "0 0 0"), path), _vector(origin.get("rpy", "0 0 0"), path)
 
 
-def _axis(joint: ElementTree.Element, path: Path) -> Vector:
+def _axis(joint: Element, path: Path) -> Vector:
     element = joint.find("axis")
     x, y, z = _vector(element.get("xyz", "1 0 0"), path) if element is not None else (1.0, 0.0, 0.0)
     length = math.sqrt(x * x + y * y + z * z)
     return (x / length, y / length, z / length) if length > 0 else (1.0, 0.0, 0.0)
 
 
-def _boxes(
-    links: dict[str, ElementTree.Element], places: dict[str, int], path: Path
-) -> Iterator[Box]:
+def _boxes(links: dict[str, Element], places: dict[str, int], path: Path) -> Iterator[Box]:
     for name, link in links.items():
         for visual in link.findall("visual") or link.findall("collision"):
             size = _size(visual, path)
@@ -172,7 +173,7 @@ def _boxes(
             yield Box(places.get(name, BASE), centre, size, along=(x, y, z))
 
 
-def _size(visual: ElementTree.Element, path: Path) -> Vector | None:
+def _size(visual: Element, path: Path) -> Vector | None:
     shape = visual.find("geometry/*")
     if shape is None:
         return None
@@ -220,7 +221,7 @@ def _vector(text: str, path: Path) -> Vector:
     return x, y, z
 
 
-def _float(text: str, element: ElementTree.Element) -> float:
+def _float(text: str, element: Element) -> float:
     try:
         value = float(text)
     except ValueError:

@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 from dexkit.backends import BackendOptions
 from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE
-from dexkit.documents import write_file
+from dexkit.documents import read_bytes, write_file
 from dexkit.emulators.joint_mechanics import FixedSteps
 from dexkit.emulators.wear import WEAR_SETTING, JointWear, Wear, Worn, parse_wear
 from dexkit.errors import HandLost, OutputError, UsageError
@@ -30,7 +30,7 @@ COMMON_SETTINGS = {
 }
 """The settings of every simulated hand."""
 
-_POSE_CHARACTERS = 65_536
+_LARGEST_POSE = 65_536
 """Largest pose file, bytes; more than the positions of any hand need."""
 
 
@@ -91,10 +91,8 @@ class SimulatedHand:
         try:
             if not file.exists():
                 return
-            if not file.is_file():  # reading a device or a pipe would never end
-                raise ValueError("it is not a regular file")
-            with file.open(encoding="utf-8") as stream:
-                q = [float(value) for value in json.loads(stream.read(_POSE_CHARACTERS))]
+            data = read_bytes(file, _LARGEST_POSE)
+            q = [float(value) for value in json.loads(data)]
         except (OSError, ValueError, TypeError, RecursionError) as error:
             why = one_line(str(error), 200)
             raise UsageError(f"pose: {name} is not readable: {why}") from error

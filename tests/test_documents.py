@@ -6,23 +6,33 @@ import errno
 import json
 import os
 import random
+import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
-from dexkit import documents
+from dexkit import digests, documents
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.result_file import read_json
+from dexkit.conformance.signed.verify import verify_archive
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.usb.record import UsbRecord
+from dexkit.doctor.environment import uri_problem
 from dexkit.drivers.ezgripper.calibration_file import Store
+from dexkit.emulators.simulated_hand import Mechanics, SimulatedHand
 from dexkit.errors import DexkitError, OutputError, UsageError
 from dexkit.hand import Side
+from dexkit.models import DEX1_1
+from dexkit.signatures import SSH_KEYGEN, PublicKey, sign
+from dexkit.traces import open_trace
+from dexkit.traces.sessions.lerobot_format import read_parquet
+from dexkit.traces.sessions.rosbag import import_bag
+from dexkit.urdf import read_urdf
 from tests import hostile
 from tests.conformance_helpers import short_run
 from tests.report_helpers import result_of_every_kind
@@ -75,6 +85,52 @@ def test_special_file_is_refused(tmp_path: Path) -> None:
             documents.read_text(Path(name))
     with pytest.raises(UsageError, match="No such file"):
         documents.read_text(tmp_path / "none")
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "urdf": lambda path: read_urdf(path, DEX1_1.joints[Side.LEFT]),
+    "recording": open_trace,
+    "digest": digests.sha256_of_file,
+    "archive": lambda path: verify_archive(path, PublicKey(SSH_KEYGEN, "")),
+    "key": PublicKey.read,
+    "private key": lambda path: sign(SSH_KEYGEN, b"", path),
+    "settings, to be changed": lambda path: documents.update_file(path, lambda text: text or ""),
+    "pose": lambda path: SimulatedHand(
+        DEX1_1.spec(Side.LEFT, io_rate=100.0), cast(Mechanics, None), 0.01
+    ).keep_pose(path),
+    "table": read_parquet,
+    "bag": lambda path: import_bag(path, path.with_name("out.mcap")),
+    "capabilities": documents.read_toml,
+}
+SPECIAL = ("pipe", "socket", "folder", "device")
+
+
+@pytest.mark.parametrize("kind", SPECIAL)
+@pytest.mark.parametrize("reader", READERS)
+def test_only_ordinary_files_are_opened_to_be_read(
+    tmp_path: Path, reader: str, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # the name of a socket is short
+    path = tmp_path / f"{kind}.db3"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(path.name)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(DexkitError):
+        READERS[reader](path)
+
+
+def test_a_configuration_of_dds_is_an_ordinary_file_without_entities(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert "not an ordinary file" in uri_problem(f"file://{tmp_path}/pipe")
+    laughs = '<!DOCTYPE x [<!ENTITY a "ha">]><CycloneDDS>&a;</CycloneDDS>'
+    (tmp_path / "laughs.xml").write_text(laughs)
+    assert uri_problem(f"file://{tmp_path}/laughs.xml")
 
 
 def test_unreadable_file_leaves_no_descriptor_open(tmp_path: Path) -> None:

@@ -208,10 +208,17 @@ def test_a_bad_urdf_is_refused(tmp_path: Path) -> None:
         f'<joint name="j{a}" type="fixed"><parent link="{a}"/><child link="{b}"/></joint>'
         for a, b in ("ab", "ba")
     )
+    levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 8}">' for i in range(1, 17))
+    laughs = f'<!DOCTYPE robot [<!ENTITY e0 "haha">{levels}]><robot name="&e16;"/>'
     for text, why in (
         ("no xml", "is no XML"),
         ("<html/>", "is no URDF"),
         ('<!DOCTYPE x [<!ENTITY e "e">]><robot/>', "entities"),
+        *((f'<?xml version="1.0" encoding="{code}"?>{laughs}'.encode(code), "entities")
+          for code in ("utf-8", "utf-16", "latin-1")),
+        *((f'<?xml version="1.0" encoding="{code}"?><robot/>', "is no XML")
+          for code in ("utf-16-le", "x-nosuch", "utf-32", "cp037", "zlib", "idna", "big5")),
+        ("<robot>" + "<a>" * 100_000 + "</a>" * 100_000 + "</robot>", "none of the hand's"),
         ('<robot name="x"/>', "none of the hand's joints"),
         (f"<robot>{ring}</robot>", "loop"),
         ('<robot><joint name="gripper" type="revolute"><parent link="a"/><child link="b"/>'
@@ -219,6 +226,6 @@ def test_a_bad_urdf_is_refused(tmp_path: Path) -> None:
         ('<robot><joint name="gripper" type="revolute"><parent link="a"/><child link="b"/>'
          '<origin xyz="0 0 nan"/></joint></robot>', "not a position"),
     ):  # fmt: skip
-        path.write_text(text)
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
         with pytest.raises(UsageError, match=why):
             read_urdf(path, DEX1_1.joints[Side.LEFT])

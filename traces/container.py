@@ -10,7 +10,6 @@ the next offset at which whole records follow each other. Chunks are verified wh
 from __future__ import annotations
 
 import os
-import stat
 import struct
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +25,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from dexkit.documents import open_ordinary
 from dexkit.errors import TraceUnreadable
 from dexkit.messages.packed import rows_at
 from dexkit.traces import mcap_records
@@ -926,18 +926,11 @@ def _heads_at(data: bytes, starts: NDArray[np.int64]) -> Heads | None:
 
 
 def _open_ordinary(path: Path) -> BinaryIO:
-    """Open a file that is not a pipe or device.
-
-    :raises TraceUnreadable: it is one.
-    """
-    file = open(path, "rb", opener=_open_nonblocking)  # noqa: SIM115
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
-        raise TraceUnreadable(
-            f"cannot read {path}: it is not an ordinary file",
-            hint="a recording that comes through a pipe must be stored first",
-        )
-    return file
+    return open_ordinary(
+        path,
+        error=TraceUnreadable,
+        hint="a recording that comes through a pipe must be stored first",
+    )
 
 
 def _size_of(file: BinaryIO) -> int:
@@ -948,8 +941,3 @@ def _size_of(file: BinaryIO) -> int:
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
         return size
-
-
-def _open_nonblocking(path: str, flags: int) -> int:
-    """Open a file without blocking; a named pipe would block until it has a writer."""
-    return os.open(path, flags | os.O_NONBLOCK)

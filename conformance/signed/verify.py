@@ -66,10 +66,8 @@ def verify_archive(archive: Path, key: PublicKey, *, rejudge: bool = True) -> Ve
     :raises UsageError: it cannot be read, or the key is of another tool than the signature.
     :raises SigningError: the tool is missing.
     """
-    if not archive.is_file():
-        raise UsageError(f"cannot read {archive}: it is not an ordinary file")
     signatures.require(key.tool)
-    with archive.open("rb") as file:
+    with documents.open_ordinary(archive) as file:
         return _Verification(file, archive, key).run(rejudge)
 
 

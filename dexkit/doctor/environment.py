@@ -10,9 +10,13 @@ import sys
 from importlib import metadata
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
-from xml.etree import ElementTree
+from xml.etree.ElementTree import ParseError
+
+from defusedxml.ElementTree import fromstring
 
 from dexkit.doctor.observations import Environment
+from dexkit.documents import read_text
+from dexkit.errors import UsageError
 from dexkit.redaction import redact
 
 __all__ = ["environment", "shown_uri", "uri_problem"]
@@ -84,18 +88,15 @@ def uri_problem(uri: str) -> str:
         if not part.startswith("<"):
             try:
                 path = Path(unquote(urlsplit(part).path) if part.startswith("file:") else part)
-                text = path.read_text(encoding="utf-8")
-            except (OSError, ValueError) as error:  # ValueError: no text, or no name of a file
-                reason = getattr(error, "strerror", None) or (
-                    "it is not text"
-                    if isinstance(error, UnicodeDecodeError)
-                    else "that is no name of a file"
-                )
-                return f"{part} cannot be read: {reason}"
+                text = read_text(path)
+            except UsageError as error:
+                return str(error)
+            except ValueError:
+                return f"{part} cannot be read: that is no name of a file"
         try:
             # a configuration may be several elements in a row
-            root = ElementTree.fromstring(f"<all>{_without_declaration(text)}</all>")
-        except (ElementTree.ParseError, UnicodeEncodeError) as error:
+            root = fromstring(f"<all>{_without_declaration(text)}</all>")
+        except (ParseError, ValueError) as error:  # ValueError: entities, or lone surrogates
             return f"it is not XML: {error}"
         if not len(root):
             return "it holds no configuration"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-import stat
 import struct
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+
+from dexkit.documents import read_bytes
+from dexkit.errors import UsageError
 
 __all__ = ["Picture", "parse_picture", "read_picture", "safe_path"]
 
@@ -48,16 +50,12 @@ def read_picture(folder: Path, name: str) -> tuple[Picture | None, str]:
     if path is None:
         return None, "are not below the session's folder"
     try:
-        with open(path, "rb", opener=lambda p, f: os.open(p, f | os.O_NONBLOCK)) as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                return None, "are not files"
-            if found.st_size > _LARGEST:
-                return None, f"are larger than {_LARGEST >> 20} MB"
-            data = file.read(found.st_size)
-    except FileNotFoundError:
-        return None, "are missing"
-    except OSError:
+        if not path.is_file():
+            return None, "are not files" if path.exists() else "are missing"
+        if path.stat().st_size > _LARGEST:
+            return None, f"are larger than {_LARGEST >> 20} MB"
+        data = read_bytes(path, _LARGEST)
+    except (OSError, UsageError):
         return None, "cannot be read"
     picture = parse_picture(data)
     return picture, "" if picture is not None else "are neither JPEG nor PNG"

@@ -30,7 +30,7 @@ from dexkit.conformance.scores import wilson
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.console import Console
-from dexkit.documents import parse_json, write_file
+from dexkit.documents import parse_json, read_text, write_file
 from dexkit.errors import UsageError
 from dexkit.hand import Subject
 
@@ -210,7 +210,7 @@ class Campaign:
         if self.file is None or not self.file.exists():
             return {}
         found = {}
-        lines = self.file.read_text(encoding="utf-8").splitlines()
+        lines = read_text(self.file).splitlines()
         for number, line in enumerate(lines, 1):
             try:
                 values = parse_json(line, f"{self.file}:{number}")
