@@ -17,6 +17,8 @@ import zstandard
 from mcap.writer import CompressionType
 
 from dexkit.cli import main
+from dexkit.cli.info import _print as print_info
+from dexkit.cli.info import summary
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.stimuli.recorded_session import CommandSession
@@ -368,6 +370,17 @@ def many_channels(n: int) -> bytes:
     ]
     spread = b"".join(chunk(message(i, i)) for i in range(1, n))
     return HEADER + b"".join(found) + spread + END
+
+
+def test_what_info_shows_takes_as_long_as_there_are_channels(tmp_path: Path) -> None:
+    def printed(n: int) -> int:
+        path = tmp_path / f"{n}.mcap"
+        write(path, many_channels(n))
+        trace = open_trace(path)
+        return count_calls(lambda: print_info(summary(trace)))[1]
+
+    printed(10)  # imports
+    assert printed(400) < 5 * printed(100)
 
 
 def overlapping(n: int) -> bytes:

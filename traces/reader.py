@@ -12,7 +12,7 @@ import heapq
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -300,17 +300,17 @@ class Trace:
         """The topics, sorted."""
         return sorted({c.topic for c in self._info.values()})
 
-    @property
+    @cached_property
     def message_count(self) -> int:
         """Messages in all channels."""
         return sum(c.message_count for c in self._info.values())
 
-    @property
+    @cached_property
     def first_ns(self) -> int:
         """Log time of the first message, ns since the epoch; 0 in an empty recording."""
         return min((c.first_ns for c in self._info.values() if c.message_count), default=0)
 
-    @property
+    @cached_property
     def last_ns(self) -> int:
         """Log time of the last message, ns since the epoch; 0 in an empty recording."""
         return max((c.last_ns for c in self._info.values() if c.message_count), default=0)

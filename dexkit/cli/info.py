@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from dexkit.traces import Trace
 
 __all__ = ["command", "summary"]
+
+_NUMBERS = ("messages", "mean Hz", "p50 ms", "p99 ms", "max ms", "first s")
+_HEADINGS = ("topic", *_NUMBERS, "type", "schema")
 
 
 def summary(trace: Trace) -> dict[str, Any]:
@@ -39,7 +43,9 @@ def summary(trace: Trace) -> dict[str, Any]:
             row["first_s"] = (int(times[0]) - trace.first_ns) / 1e9
             if len(times) > 1 and times[-1] > times[0]:
                 gaps = np.diff(times) / 1e6
-                p50, p99, worst = np.percentile(gaps, (50, 99, 100))
+                p50, p99, worst = (
+                    np.percentile(gaps, (50, 99, 100)) if len(gaps) > 1 else gaps.repeat(3)
+                )
                 row["mean_hz"] = (len(times) - 1) * 1e9 / int(times[-1] - times[0])
                 row["gap_ms"] = {"p50": float(p50), "p99": float(p99), "max": float(worst)}
         topics.append(row)
@@ -114,8 +120,6 @@ def command(files: tuple[Path, ...], as_json: bool, plot: bool, html_path: Path 
 
 
 def _print(data: dict[str, Any]) -> None:
-    from rich.table import Table
-
     from dexkit.console import Console
     from dexkit.console import markup as escape
     from dexkit.escaping import LONGEST
@@ -138,30 +142,10 @@ def _print(data: dict[str, Any]) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    if data["topics"]:
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        table.add_column("topic", no_wrap=True)
-        for heading in ("messages", "mean Hz", "p50 ms", "p99 ms", "max ms", "first s"):
-            table.add_column(heading, justify="right", no_wrap=True)
-        table.add_column("type", no_wrap=True)
-        table.add_column("schema", no_wrap=True)
-        for row in data["topics"]:
-            gaps = row.get("gap_ms", {})
-            table.add_row(
-                escape(row["topic"], LONGEST),
-                f"{row['messages']:,}",
-                _number(row.get("mean_hz"), 1),
-                _number(gaps.get("p50"), 2),
-                _number(gaps.get("p99"), 2),
-                _number(gaps.get("max"), 1),
-                _number(row.get("first_s"), 2),
-                escape(row["type"].replace("::msg::dds_::", " ") or "?", LONGEST),
-                escape(row["schema_encoding"] or "none", LONGEST),
-            )
-        console.print()
-        console.print(table)
     # in one call: rich needs a fraction of a millisecond for each, and there may be thousands
-    lines = []
+    lines: list[str] = []
+    if data["topics"]:
+        lines += ["", *_table(data["topics"])]
     for name, values in data["metadata"].items():
         lines += ["", f"[bold]{escape(name)}[/bold]"]
         lines += [f"  {escape(key, LONGEST)}: {escape(value)}" for key, value in values.items()]
@@ -171,6 +155,47 @@ def _print(data: dict[str, Any]) -> None:
         lines += [f"note: {escape(note)}" for note in data["notes"]]
     if lines:
         console.print("\n".join(lines), highlight=False, soft_wrap=True)
+
+
+def _table(topics: Sequence[dict[str, Any]]) -> list[str]:
+    """A line for each topic, and the headings. A table of rich takes a millisecond for a row."""
+    from rich.markup import escape
+
+    from dexkit.escaping import LONGEST, one_line
+
+    rows = [_HEADINGS]
+    for row in topics:
+        gaps = row.get("gap_ms", {})
+        rows.append(
+            (
+                one_line(row["topic"], LONGEST),
+                f"{row['messages']:,}",
+                _number(row.get("mean_hz"), 1),
+                _number(gaps.get("p50"), 2),
+                _number(gaps.get("p99"), 2),
+                _number(gaps.get("max"), 1),
+                _number(row.get("first_s"), 2),
+                one_line(row["type"].replace("::msg::dds_::", " ") or "?", LONGEST),
+                one_line(row["schema_encoding"] or "none", LONGEST),
+            )
+        )
+    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for number, cells in enumerate(rows):
+        padded = []
+        for place, (cell, width) in enumerate(zip(cells, widths, strict=True)):
+            blank = " " * (width - _width(cell))
+            padded.append(blank + cell if 1 <= place <= len(_NUMBERS) else cell + blank)
+        line = escape("  ".join(padded).rstrip())
+        lines.append(line if number else f"[bold]{line}[/bold]")
+    return lines
+
+
+def _width(text: str) -> int:
+    """Columns of the terminal that it takes."""
+    from rich.cells import cell_len
+
+    return len(text) if text.isascii() else cell_len(text)
 
 
 def _number(value: float | None, digits: int) -> str:
