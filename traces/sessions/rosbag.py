@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from dexkit.traces import schemas
 from dexkit.traces.names import dds_topic, dds_type
 from dexkit.traces.reader import Definition, Trace
 from dexkit.traces.sessions import old_layouts
+from dexkit.traces.sessions.bag_checks import Unpacker, checked_bag
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.model import Problems
 from dexkit.traces.writer import RecordingWriter, definition
@@ -65,24 +67,24 @@ def import_bag(
     :raises SessionError: it cannot be read, or nothing in it can be used.
     """
     library = _library()
-    files = [source, *(source.iterdir() if source.is_dir() else ())]
-    for path in files:
-        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for
-            raise SessionError(f"cannot read {path}: it is not an ordinary file")
     problems = Problems()
     corrections: list[str] = []
-    with RecordingWriter(out, overwrite=overwrite) as writer:
+    with (
+        checked_bag(source) as (bag, unpack),
+        RecordingWriter(out, overwrite=overwrite) as writer,
+    ):
         try:
-            with library.Reader(source) as reader:
+            with library.Reader(bag) as reader:
                 channels = {}
                 for connection in reader.connections:
-                    found = _channel(reader, connection, problems, corrections)
+                    messages = (data for _, _, data in reader.messages([connection]))
+                    found = _channel(messages, connection, unpack, problems, corrections)
                     if found is not None:
                         channel, convert = found
                         channels[connection.id] = (writer.add_channel(channel), convert)
                 wanted = [c for c in reader.connections if c.id in channels]
                 if wanted:
-                    _copy(wanted, reader.messages(wanted), channels, writer, problems)
+                    _copy(wanted, reader.messages(wanted), channels, unpack, writer, problems)
                 _write_metadata(writer, reader, source, problems, corrections)
         except DexkitError:
             raise
@@ -100,6 +102,7 @@ def _copy(
     wanted: Sequence[Connection],
     messages: Iterable[tuple[Connection, int, object]],
     channels: dict[int, tuple[int, Convert | None]],
+    unpack: Unpacker | None,
     writer: RecordingWriter,
     problems: Problems,
 ) -> None:
@@ -118,15 +121,16 @@ def _copy(
             )
             continue
         payload = bytes(data)
-        if convert is not None:
-            try:
+        try:
+            if unpack is not None:
+                payload = unpack(payload)
+            if convert is not None:
                 payload = convert(payload)
-            except WireError as error:
-                problems.add(
-                    f"{connection.topic}: messages that cannot be read are left out",
-                    error.message,
-                )
-                continue
+        except WireError as error:
+            problems.add(
+                f"{connection.topic}: messages that cannot be read are left out", error.message
+            )
+            continue
         writer.put(number, payload, time_ns)
     for connection in wanted:
         if missing[connection.id] > 0:
@@ -137,7 +141,11 @@ def _copy(
 
 
 def _channel(
-    reader: Any, connection: Connection, problems: Problems, corrections: list[str]
+    messages: Iterator[object],
+    connection: Connection,
+    unpack: Unpacker | None,
+    problems: Problems,
+    corrections: list[str],
 ) -> tuple[Definition, Convert | None] | None:
     """The channel for a connection; None if it is left out."""
     topic, type_name = dds_topic(connection.topic), dds_type(connection.msgtype)
@@ -169,10 +177,10 @@ def _channel(
             )
         return ours, convert
     some = []
-    for _, _, data in reader.messages([connection]):
-        some.append(bytes(data) if isinstance(data, bytes | bytearray | memoryview) else b"")
-        if len(some) == _TRIED:
-            break
+    for data in islice(messages, _TRIED):
+        payload = bytes(data) if isinstance(data, bytes | bytearray | memoryview) else b""
+        with contextlib.suppress(WireError):
+            some.append(unpack(payload) if unpack is not None else payload)
     layout = old_layouts.matching_layout(type_name, some)
     if layout is None:
         problems.add(
