@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from dexkit.documents import open_ordinary
 from dexkit.errors import ExtraMissing, SessionError
+from dexkit.traces.container import MAX_RATIO, SPARE
 
 __all__ = [
     "ACTION",
@@ -16,6 +20,7 @@ __all__ = [
     "PRESSURE",
     "STATE_COLUMN",
     "parquet_library",
+    "parquet_pieces",
     "read_parquet",
 ]
 
@@ -33,6 +38,9 @@ PRESSURE = "observation.pressure"
 EXTENSION = "dexkit"
 """Key of ``meta/info.json`` that other programs ignore."""
 
+_LEAST_ROW = 8  # bytes that a row is taken to have
+_ROWS_AT_ONCE, _VALUES_AT_ONCE, _TEXTS_AT_ONCE = 65_536, 2**20, 64 * 2**20
+
 
 def parquet_library() -> tuple[ModuleType, Any]:
     """(pyarrow, pyarrow.parquet)
@@ -49,20 +57,71 @@ def parquet_library() -> tuple[ModuleType, Any]:
     return pyarrow, pyarrow.parquet
 
 
-def read_parquet(path: Path) -> Any:
-    """The table in a Parquet file.
+def read_parquet(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Any:
+    """The table in a Parquet file, or those of its columns whose name is wanted.
 
     :raises ExtraMissing: pyarrow is not installed.
-    :raises SessionError: it is missing, no ordinary file, or no Parquet.
+    :raises SessionError: as :func:`parquet_pieces`.
+    """
+    arrow, _ = parquet_library()
+    return arrow.concat_tables(list(parquet_pieces(path, wanted)))
+
+
+def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Iterator[Any]:
+    """The table in a Parquet file, some rows at a time; at least one piece, which may be empty.
+
+    :param wanted: whether a column of that name is.
+    :raises ExtraMissing: pyarrow is not installed.
+    :raises SessionError: it is missing, no ordinary file, no Parquet, or its rows take more memory
+        than its size accounts for: a column that does not change takes next to none in a file.
     """
     arrow, parquet = parquet_library()
-    try:
-        if not path.is_file():  # a pipe would be waited for
-            why = "is no ordinary file" if path.exists() else "is missing"
-            raise SessionError(f"{path} {why}")
-        table = parquet.read_table(path)
-        table.column_names  # noqa: B018 - decodes them
-    except (OSError, ValueError, arrow.lib.ArrowException) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
-    return table
+    with open_ordinary(path, error=SessionError) as source:
+        left = MAX_RATIO * os.fstat(source.fileno()).st_size + SPARE
+        too_large = SessionError(
+            f"{path} has more than {MAX_RATIO} times as much data as its size",
+            hint="is it damaged? If not, write its rows to several files",
+        )
+        try:
+            with parquet.ParquetFile(source) as file:
+                names = [name for name in file.schema_arrow.names if wanted(name)]
+                if len(set(names)) < len(names):
+                    raise SessionError(f"{path} has two columns of one name")
+                if file.metadata.num_rows * _LEAST_ROW > left or _unpacked(file) > left:
+                    raise too_large
+                yield file.schema_arrow.empty_table().select(names)
+                for group in range(file.metadata.num_row_groups):
+                    for batch in file.iter_batches(
+                        _rows_at_once(file.metadata.row_group(group)), [group], columns=names
+                    ):
+                        left -= max(batch.nbytes, batch.num_rows * _LEAST_ROW)
+                        if left < 0:
+                            raise too_large
+                        yield arrow.Table.from_batches([batch]).select(names)
+        except (OSError, ValueError, arrow.lib.ArrowException) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
+
+
+def _unpacked(file: Any) -> int:
+    """Bytes of the pages of a Parquet file, unpacked, as it says."""
+    groups = (file.metadata.row_group(i) for i in range(file.metadata.num_row_groups))
+    return sum(int(group.total_byte_size) for group in groups)
+
+
+def _rows_at_once(group: Any) -> int:
+    """Rows of a row group that are decoded at once: about a million values, and 64 MB of texts.
+
+    A long text may be in many rows, and in the file once.
+    """
+    columns = [group.column(i) for i in range(group.num_columns)]
+    each = sum(c.num_values for c in columns) // max(1, group.num_rows)
+    repeated = [c.total_uncompressed_size for c in columns if _repeats_texts(c)]
+    by_text = (_TEXTS_AT_ONCE // max(1, max(repeated))) if repeated else _ROWS_AT_ONCE
+    return max(1, min(_ROWS_AT_ONCE, _VALUES_AT_ONCE // max(1, each), max(8, by_text)))
+
+
+def _repeats_texts(column: Any) -> bool:
+    return "BYTE_ARRAY" in column.physical_type and bool(
+        {"RLE_DICTIONARY", "PLAIN_DICTIONARY"} & set(column.encodings)
+    )

@@ -40,6 +40,8 @@ __all__ = ["Dataset", "is_dataset"]
 
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
 _INDEXES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+MOST_FRAMES = 1_000_000
+"""Frames of an episode: 9 hours at 30 a second."""
 _MAX_JSON = 256 * 2**20
 
 
@@ -163,7 +165,7 @@ class Dataset:
         if not path.is_file():
             return {}
         found = {}
-        for row in _table_rows(path, self._open(path)):
+        for row in _table_rows(path, read_parquet(path)):
             texts = [v for v in row.values() if isinstance(v, str)]
             if isinstance(row.get("task_index"), int) and texts:
                 found[row["task_index"]] = texts[0]
@@ -177,9 +179,8 @@ class Dataset:
         else:
             rows = []
             for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
-                table = self._open(path)
-                wanted = [c for c in table.column_names if not c.startswith("stats/")]
-                rows += _table_rows(path, table.select(wanted))
+                table = read_parquet(path, lambda name: not name.startswith("stats/"))
+                rows += _table_rows(path, table)
         found = {
             row["episode_index"]: row for row in rows if isinstance(row.get("episode_index"), int)
         }
@@ -189,7 +190,8 @@ class Dataset:
 
     def _open(self, path: Path) -> Any:
         if path not in self._tables:
-            self._tables = {path: read_parquet(path)}
+            self._tables.clear()  # before another one takes as much
+            self._tables[path] = read_parquet(path, lambda name: name != "index")
         return self._tables[path]
 
     def _table(self, episode: int, row: Mapping[str, Any]) -> tuple[Path, Any]:
@@ -209,7 +211,10 @@ class Dataset:
             where = np.flatnonzero(column == episode)
             if not len(where):
                 raise SessionError(f"{path} has no frame of episode {episode}")
-            table = table.take(where)
+            if len(where) <= MOST_FRAMES:
+                table = table.take(where)
+        if table.num_rows > MOST_FRAMES:
+            raise SessionError(f"{path} has more than {MOST_FRAMES} frames of episode {episode}")
         return path, table
 
     def _path(self, pattern: str, values: Mapping[str, Any]) -> Path:
@@ -467,13 +472,13 @@ def _column(table: Any, name: str) -> Floats | None:
     """A column of numbers; None if it is not one."""
     if name not in table.column_names:
         return None
-    values = _as_numbers(table[name].to_pylist())
+    values = _as_numbers(table[name])
     return values if values is not None and values.ndim == 1 and np.isfinite(values).all() else None
 
 
 def _matrix(table: Any, name: str) -> Floats | None:
     """A column of vectors (or of single numbers) as a table; None if it is anything else."""
-    values = _as_numbers(table[name].to_pylist())
+    values = _as_numbers(table[name])
     if values is None:
         return None
     if values.ndim == 1:
@@ -481,14 +486,30 @@ def _matrix(table: Any, name: str) -> Floats | None:
     return values if values.ndim == 2 and values.shape[1] else None
 
 
-def _as_numbers(rows: list[Any]) -> Floats | None:
-    """Rows of numbers as an array; None if they are of different lengths, or texts."""
-    try:
-        values = np.asarray(rows)
-        # numpy would take the text "1" for a number
-        return values.astype(np.float64) if values.dtype.kind in "fiub" else None
-    except (TypeError, ValueError):
+def _as_numbers(column: Any) -> Floats | None:
+    """A column of numbers, or of lists of them, as an array; None if lists differ in length, a
+    value is missing, or it is of another kind.
+    """
+    arrow, _ = parquet_library()
+    kinds = arrow.types
+    values, shape = column.combine_chunks(), [len(column)]
+    if values.null_count:
         return None
+    kind = values.type
+    if kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind):
+        # a few different lengths only: those of all rows would be as many as the values
+        lengths = values.value_lengths().unique().to_pylist()
+        if len(lengths) > 1:
+            return None
+        shape += lengths
+        values = values.flatten()
+        kind = values.type
+    if not (kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind)):
+        return None
+    if values.null_count:
+        return None
+    found: Floats = np.asarray(values.to_numpy(zero_copy_only=False), np.float64).reshape(shape)
+    return found
 
 
 def _names(feature: Mapping[str, Any], count: int) -> tuple[str, ...] | None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import base64
 import csv
+import io
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.documents import read_bytes
+from dexkit.documents import open_ordinary, read_bytes
 from dexkit.errors import DexkitError, ExtraMissing, SessionError, UsageError
 from dexkit.messages import MessageType, message_type
 from dexkit.messages.columns import encode_columns
 from dexkit.messages.layout import Primitive, Struct
 from dexkit.staging import whole_folder
 from dexkit.traces.reader import ChannelInfo, Definition, Trace
-from dexkit.traces.sessions.lerobot_format import parquet_library, read_parquet
+from dexkit.traces.sessions.lerobot_format import parquet_library, parquet_pieces
 from dexkit.traces.sessions.model import Problems
 from dexkit.traces.writer import RecordingWriter, definition
 
@@ -35,9 +37,14 @@ _ABOUT = "session.json"
 _KEY = "dexkit_tables"
 _TIMES = ("log_time_ns", "publish_time_ns")
 _PAYLOAD = "payload"
+# Bytes of a CSV file, and of session.json.
 _LARGEST = 1 << 30
+_LARGEST_ABOUT = 64 * 2**20
 # Largest number of sequence elements with columns.
 _LONGEST = 256
+_MOST_COLUMNS = 2**16
+_VALUES_AT_ONCE = 2**20
+_LONGEST_LINE = 64 * 2**20  # characters
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,7 @@ class _Leaf:
 def is_tables(source: Path) -> bool:
     """Whether it looks like a folder of tables."""
     try:
-        return _KEY in json.loads(read_bytes(source / _ABOUT, _LARGEST))
+        return _KEY in json.loads(read_bytes(source / _ABOUT, _LARGEST_ABOUT))
     except (UsageError, ValueError, TypeError, RecursionError):
         return False
 
@@ -228,7 +235,7 @@ def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: they cannot be read, or nothing in them can be used.
     """
-    data = read_bytes(source / _ABOUT, _LARGEST, error=SessionError)
+    data = read_bytes(source / _ABOUT, _LARGEST_ABOUT, error=SessionError)
     try:
         about = json.loads(data)
         topics = [e for e in about["topics"] if isinstance(e, dict)]
@@ -275,12 +282,15 @@ def _import_topic(
         raise SessionError(f"{source / _ABOUT} points outside its folder: {name!r}")
     path = source / name
     topic = str(entry.get("topic", ""))
-    header, columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
-    if header[:2] != list(_TIMES):
-        raise SessionError(f"{name} does not begin with the columns {', '.join(_TIMES)}")
     given = entry.get("metadata")
     metadata = {str(k): str(v) for k, v in given.items()} if isinstance(given, dict) else {}
     found: list[tuple[int, int, bytes]] = []
+
+    def report(lines: list[int]) -> None:
+        for line in sorted(lines):
+            problems.add(f"{name}: rows that cannot be read are left out", f"row {line}")
+
+    pieces = _pieces(path)
     if entry.get("columns") == "payload":
         schema = entry.get("schema")
         try:
@@ -294,18 +304,22 @@ def _import_topic(
             )
         except (ValueError, TypeError, LookupError) as error:
             raise SessionError(f"{name}: its schema cannot be read: {error}") from error
-        for line, row in enumerate(zip(*columns, strict=True), 2):
-            try:
-                data = row[2] if isinstance(row[2], bytes) else base64.b64decode(row[2])
-                found.append((int(row[0]), int(row[1]), data))
-            except (ValueError, TypeError, LookupError):
-                problems.add(f"{name}: rows that cannot be read are left out", f"row {line}")
+        for piece in pieces:
+            bad = list(piece.short)
+            for line, row in zip(piece.lines, zip(*piece.columns, strict=True), strict=True):
+                try:
+                    data = row[2] if isinstance(row[2], bytes) else base64.b64decode(row[2])
+                    found.append((int(row[0]), int(row[1]), data))
+                except (ValueError, TypeError, LookupError):
+                    bad.append(line)
+            report(bad)
         return channel, found
     mt = message_type(str(entry.get("type", "")))
     channel = definition(topic, mt, metadata)
-    found, bad = _encode(mt, header, columns, name)
-    for number in bad:
-        problems.add(f"{name}: rows that cannot be read are left out", f"row {number + 2}")
+    for piece in pieces:
+        encoded, numbers = _encode(mt, piece.header, piece.columns, name)
+        found += encoded
+        report([*piece.short, *(piece.lines[number] for number in numbers)])
     return channel, found
 
 
@@ -316,8 +330,9 @@ def _encode(
     table = dict(zip(header, columns, strict=True))
     sequences = [f.name for f in mt.layout.fields if f.sequence]
     lengths = dict.fromkeys(sequences, 0)
+    indexed = {c.partition("]")[0] for c in header if "]" in c}
     for s in sequences:
-        while any(c.startswith(f"{s}[{lengths[s]}]") for c in header):
+        while f"{s}[{lengths[s]}" in indexed:
             lengths[s] += 1
             if lengths[s] > _LONGEST:
                 raise SessionError(f"{name} has too many columns of {s}")
@@ -399,24 +414,82 @@ def _number(value: Any, kind: np.dtype[Any]) -> Any:
     return whole if limits is None or limits.min <= whole <= limits.max else None
 
 
-def _read_csv(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
-    try:
-        text = read_bytes(path, _LARGEST, error=SessionError).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise SessionError(f"{path} is not UTF-8 text") from error
-    try:
-        header, *rows = list(csv.reader(text.splitlines())) or [[]]
-    except (ValueError, csv.Error) as error:
-        raise SessionError(f"{path} cannot be read as CSV: {error}") from error
-    width = len(header)
-    # a short row lacks its last values, which are reported as missing
-    rows = [row[:width] + [""] * (width - len(row)) for row in rows]
-    return header, list(zip(*rows, strict=True)) if rows else [()] * width
+@dataclass(frozen=True)
+class _Piece:
+    """Some rows of a table, by columns.
+
+    :param lines: the number of each row in a CSV file.
+    :param short: those of rows between them that are left out, for they lack values.
+    """
+
+    header: Sequence[str]
+    columns: Sequence[Sequence[Any]]
+    lines: Sequence[int]
+    short: Sequence[int] = ()
 
 
-def _read_parquet(path: Path) -> tuple[list[str], list[Sequence[Any]]]:
-    table = read_parquet(path)
-    try:
-        return list(table.column_names), [c.to_pylist() for c in table.columns]
-    except UnicodeDecodeError as error:
-        raise SessionError(f"{path} has a text that is not UTF-8") from error
+def _pieces(path: Path) -> Iterator[_Piece]:
+    """A table, some rows at a time; at least one piece, which may be empty.
+
+    :raises SessionError: it cannot be read, or has not the columns of times.
+    """
+    pieces = _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path)
+    for piece in pieces:
+        if list(piece.header[:2]) != list(_TIMES):
+            raise SessionError(f"{path.name} does not begin with the columns {', '.join(_TIMES)}")
+        yield piece
+
+
+def _csv_pieces(path: Path) -> Iterator[_Piece]:
+    with open_ordinary(path, error=SessionError) as file:
+        if os.fstat(file.fileno()).st_size > _LARGEST:
+            raise SessionError(f"cannot read {path}: it is larger than {_LARGEST >> 20} MB")
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        try:
+            reader = csv.reader(_lines(text, path))
+            header = next(reader, [])
+            width = len(header)
+            if width > _MOST_COLUMNS:
+                raise SessionError(f"{path} has {width} columns, more than {_MOST_COLUMNS}")
+            at_once = max(1, _VALUES_AT_ONCE // max(1, width))
+            rows: list[list[str]] = []
+            lines: list[int] = []
+            short: list[int] = []
+            for line, row in enumerate(reader, 2):
+                # one that is short is not filled up: it may be a byte for each of many columns
+                if len(row) < width:
+                    short.append(line)
+                    continue
+                rows.append(row[:width])
+                lines.append(line)
+                if len(rows) == at_once:
+                    yield _Piece(header, list(zip(*rows, strict=True)), lines, short)
+                    rows, lines, short = [], [], []
+            columns = list(zip(*rows, strict=True)) if rows else [()] * width
+            yield _Piece(header, columns, lines, short)
+        except UnicodeDecodeError as error:
+            raise SessionError(f"{path} is not UTF-8 text") from error
+        except OSError as error:
+            raise SessionError(f"cannot read {path}: {error.strerror}") from error
+        except csv.Error as error:
+            raise SessionError(f"{path} cannot be read as CSV: {error}") from error
+
+
+def _lines(text: io.TextIOBase, path: Path) -> Iterator[str]:
+    while line := text.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise SessionError(f"{path} has a line of more than {_LONGEST_LINE >> 20} MB")
+        yield line
+
+
+def _parquet_pieces(path: Path) -> Iterator[_Piece]:
+    line = 2
+    for table in parquet_pieces(path):
+        if table.num_columns > _MOST_COLUMNS:
+            raise SessionError(f"{path} has more than {_MOST_COLUMNS} columns")
+        try:
+            header, columns = list(table.column_names), [c.to_pylist() for c in table.columns]
+        except UnicodeDecodeError as error:
+            raise SessionError(f"{path} has a text that is not UTF-8") from error
+        yield _Piece(header, columns, range(line, line + table.num_rows))
+        line += table.num_rows

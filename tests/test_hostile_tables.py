@@ -1,0 +1,159 @@
+"""Tables that would take more memory or time than their size accounts for are refused."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from dexkit.errors import SessionError
+from dexkit.traces.sessions import lerobot_in, topic_tables
+from dexkit.traces.sessions.lerobot_format import parquet_pieces, read_parquet
+from dexkit.traces.sessions.topic_tables import import_tables
+from tests.test_sessions_import import NAMES, dataset
+
+TIMES = "log_time_ns,publish_time_ns"
+
+
+def constant(path: Path) -> None:
+    """Five million rows that do not change."""
+    table = pa.table({name: np.zeros(500_000, np.int64) for name in "ab"})
+    with pq.ParquetWriter(path, table.schema, compression="zstd") as writer:
+        for _ in range(10):
+            writer.write_table(table)
+
+
+def wide(path: Path) -> None:
+    """Few rows, each with a vector of a million zeros."""
+    values = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(10**7, np.int8)), 10**6)
+    pq.write_table(pa.table({"a": values}), path, compression="zstd")
+
+
+def one_text_in_many_rows(path: Path) -> None:
+    text = pa.array(["x" * 2**20])
+    column = pa.DictionaryArray.from_arrays(pa.array(np.zeros(2000, np.int32)), text)
+    pq.write_table(pa.table({"a": column}), path, compression="zstd", store_schema=False)
+
+
+def one_packed_text(path: Path) -> None:
+    pq.write_table(pa.table({"a": [b"x" * 2**25]}), path, compression="zstd")
+
+
+def no_columns(path: Path) -> None:
+    pq.write_table(pa.table({"a": np.zeros(10**7, np.int8)}), path)
+
+
+@pytest.mark.parametrize(
+    "make", [constant, wide, one_text_in_many_rows, one_packed_text, no_columns]
+)
+def test_a_parquet_file_has_as_much_data_as_its_size_accounts_for(
+    tmp_path: Path, make: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "a.parquet"
+    make(path)
+    before = pa.total_allocated_bytes()
+
+    def read() -> None:
+        for _ in parquet_pieces(path):
+            assert pa.total_allocated_bytes() - before < 400 * 2**20
+
+    with pytest.raises(SessionError, match="times as much data"):
+        read()
+    with pytest.raises(SessionError, match="times as much data"):
+        read_parquet(path)
+
+
+def test_columns_that_are_not_wanted_are_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    pq.write_table(pa.table({"a": [1], "a.b": [2], "c": ["x"]}), path)
+    assert read_parquet(path, lambda name: name == "a").to_pydict() == {"a": [1]}
+    assert read_parquet(path).to_pydict() == {"a": [1], "a.b": [2], "c": ["x"]}
+
+
+def test_an_episode_has_a_limited_number_of_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lerobot_in, "MOST_FRAMES", 10)
+    for frames in (10, 11):
+        root = dataset(tmp_path / str(frames), "v2.1", NAMES, np.full((frames, 28), 0.1))
+        if frames == 10:
+            assert len(lerobot_in.Dataset(root).read(0).times_ns) == 10
+        else:
+            with pytest.raises(SessionError, match="more than 10 frames"):
+                lerobot_in.Dataset(root).read(0)
+
+
+@pytest.mark.parametrize(
+    ("values", "shape"),
+    [
+        (pa.array([1, 2]), (2,)),
+        (pa.array([[1.5, 2], [3, 4]]), (2, 2)),
+        (pa.array([[1], [2]], pa.list_(pa.float32(), 1)), (2, 1)),
+        (pa.array([[1.5], [3, 4]]), None),
+        (pa.array([1, None]), None),
+        (pa.array([[1, None]]), None),
+        (pa.array([[1], None]), None),
+        (pa.array(["1"]), None),
+        (pa.array([[[1]]]), None),
+        (pa.array([], pa.int64()), (0,)),
+        (pa.array([], pa.list_(pa.int64())), (0,)),
+    ],
+    ids=str,
+)
+def test_columns_of_numbers(values: Any, shape: tuple[int, ...] | None) -> None:
+    found = lerobot_in._as_numbers(pa.chunked_array([values]))
+    assert (None if found is None else found.shape) == shape
+
+
+def tables(folder: Path, content: str | bytes) -> Path:
+    folder.mkdir()
+    entry = {"topic": "rt/x", "type": "x", "file": "x.csv", "columns": "payload"}
+    (folder / "session.json").write_text(json.dumps({"dexkit_tables": 1, "topics": [entry]}))
+    data = content if isinstance(content, bytes) else content.encode()
+    (folder / "x.csv").write_bytes(data)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (f"{TIMES},payload{',' * 70_000}\n", "more than 65536"),
+        (f"{TIMES},payload\n{'x' * 5000}", "a line of more than"),
+        (f"{TIMES},payload{',' * 900}\n" + "1\n" * 10_000, "no message"),
+        (f"{TIMES},payload\n\xff".encode("latin-1"), "not UTF-8"),
+        (f"{TIMES},payload\n\0,\0", ""),
+    ],
+    ids=["columns", "line", "short rows", "no text", "zeros"],
+)
+def test_a_hostile_csv_is_refused(
+    tmp_path: Path, content: str | bytes, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if why == "a line of more than":
+        monkeypatch.setattr(topic_tables, "_LONGEST_LINE", 1000)
+    source = tables(tmp_path / "t", content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(SessionError) as raised:
+            import_tables(source, tmp_path / "out.mcap")
+        assert tracemalloc.get_traced_memory()[1] < 16 * 2**20
+    finally:
+        tracemalloc.stop()
+    assert why in f"{raised.value} {raised.value.hint}"
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_tables_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(topic_tables, "_VALUES_AT_ONCE", 6)
+    rows = "".join(f"{i},{i},eA==\n" + "5\n" * (i == 3) for i in range(1, 8))
+    written, problems = import_tables(
+        tables(tmp_path / "t", f"{TIMES},payload\n{rows}"), tmp_path / "out.mcap"
+    )
+    assert written == 7
+    assert "row 5" in " ".join(problems.sentences())
