@@ -118,7 +118,8 @@ def _rows_at_once(group: Any) -> int:
     each = sum(c.num_values for c in columns) // max(1, group.num_rows)
     repeated = [c.total_uncompressed_size for c in columns if _repeats_texts(c)]
     by_text = (_TEXTS_AT_ONCE // max(1, max(repeated))) if repeated else _ROWS_AT_ONCE
-    return max(1, min(_ROWS_AT_ONCE, _VALUES_AT_ONCE // max(1, each), max(8, by_text)))
+    by_value = _VALUES_AT_ONCE // max(1, int(each))
+    return max(1, min(_ROWS_AT_ONCE, by_value, max(8, int(by_text))))
 
 
 def _repeats_texts(column: Any) -> bool:

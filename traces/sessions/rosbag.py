@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -281,7 +282,7 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
 def _named_errors(library: Any, out: Path) -> Iterator[None]:
     try:
         yield
-    except library.WriterError as error:
+    except (library.WriterError, sqlite3.Error) as error:
         raise SessionError(f"cannot write {out}: {error}") from error
 
 
