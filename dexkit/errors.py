@@ -39,6 +39,7 @@
     ├── ArchiveError                    not an archive as 'dexkit sign' writes it
     ├── SigningError                    the tool that signs is missing, or cannot use the key
     ├── OutputError (OSError)           a file or stream cannot be written: disk full, pipe closed
+    ├── ResourceError                   memory or threads do not suffice
     └── UsageError (ValueError)         arguments or configuration that make no sense
 
 Errors that are also a built-in (in brackets) are caught by an ordinary ``except`` of that
@@ -77,6 +78,7 @@ __all__ = [
     "ModelBroken",
     "OutputError",
     "OversizeError",
+    "ResourceError",
     "SessionError",
     "SigningError",
     "TopicConflict",
@@ -281,6 +283,12 @@ class SigningError(DexkitError):
 
 class OutputError(DexkitError, OSError):
     """A file or a stream cannot be written."""
+
+    exit_code = 2
+
+
+class ResourceError(DexkitError):
+    """Memory or threads do not suffice, or a limit of them is reached."""
 
     exit_code = 2
 

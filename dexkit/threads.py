@@ -66,7 +66,7 @@ class Worker(threading.Thread):
             del _dead[:-_KEPT]
             _dead.append(self)
             listeners = list(_listeners)
-        if isinstance(error, DexkitError | OSError):  # foreseen: a full disk, a lost device
+        if isinstance(error, DexkitError | OSError | MemoryError):  # foreseen: a full disk, ...
             _log.error("the %s thread ended: %s", self.what, error)
         else:
             _log.error("the %s thread died", self.what, exc_info=error)

@@ -700,7 +700,7 @@ class Container:
             else:
                 self.report_damage(f"{where} is compressed with {segment.compression!r}; left out")
                 return b""
-        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError) as error:
             if not segment.cut:
                 self.report_damage(f"{where} is damaged and left out ({error})")
             return b""

@@ -8,6 +8,7 @@ only the last moments. How the file is checked is in
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -567,7 +568,8 @@ def open_trace(path: str | os.PathLike[str], open_file: OpenFile | None = None) 
 @cache
 def _keep_memory() -> None:
     """Let glibc keep freed memory; called once in a process."""
-    bytearray(_MALLOC_KEEP)
+    with contextlib.suppress(MemoryError):  # it only saves time
+        bytearray(_MALLOC_KEEP)
 
 
 def _remainder_after(parts: Sequence[str], prefix: str) -> str:

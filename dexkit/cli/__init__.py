@@ -16,7 +16,7 @@ import sys
 import click
 
 from dexkit import __version__, threads
-from dexkit.errors import DexkitError, OutputError
+from dexkit.errors import DexkitError, OutputError, ResourceError
 from dexkit.escaping import REMARK, guarded, one_line
 
 __all__ = ["cli", "main"]
@@ -61,9 +61,13 @@ _COMMANDS: dict[str, tuple[str, str]] = {
 
 
 _NO_READER = 141
+# What the dynamic linker says when a library does not fit into memory.
+_NO_ROOM = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
 _HINTS = {
     errno.EMFILE: "too many open files: raise the limit (ulimit -n)",
     errno.ENFILE: "too many open files on this machine",
+    errno.ENOMEM: "there is not enough memory: end other programs, or raise the limit (ulimit -v)",
+    errno.EAGAIN: "too many processes or threads: end some, or raise the limit (ulimit -u)",
     errno.EADDRINUSE: "another program has that address; choose another one, or end it",
 }
 
@@ -114,8 +118,9 @@ def cli() -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns (through ``sys.exit``) the exit code.
 
-    0 success, 1 a negative result or a failed operation, 2 wrong usage or an unusable file or
-    device, 130 interrupted, 141 the reader of the output has closed the pipe.
+    0 success, 1 a negative result or a failed operation, 2 wrong usage, an unusable file or
+    device, too little memory or too few threads, 130 interrupted, 141 the reader of the output
+    has closed the pipe.
     """
     # a service has small matrices only: BLAS's threads would take a sixth of each start, and stay
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -131,6 +136,37 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str] | None) -> int:
+    try:
+        return _run_command(argv)
+    except (MemoryError, RuntimeError, ImportError) as error:
+        lack = lack_of(error)
+        if lack is None:
+            raise
+    # here, where the frames of what failed have freed their memory
+    _print_error(lack)
+    return lack.exit_code
+
+
+def lack_of(error: BaseException) -> ResourceError | None:
+    """The error to print for one that says that memory or threads are short; None for others."""
+    if isinstance(error, MemoryError) or (
+        isinstance(error, ImportError) and any(text in str(error) for text in _NO_ROOM)
+    ):
+        return ResourceError(
+            "there is not enough memory",
+            hint="end other programs, raise the limit (ulimit -v, or MemoryMax= of the service), "
+            "or take a smaller part of the data",
+        )
+    if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+        return ResourceError(
+            "no thread can be started",
+            hint="raise the limit of processes and threads (ulimit -u, or TasksMax= of the service)"
+            " or of memory (ulimit -v)",
+        )
+    return None
+
+
+def _run_command(argv: list[str] | None) -> int:
     try:
         result = cli.main(args=argv, prog_name="dexkit", standalone_mode=False)
         return result if isinstance(result, int) else 0

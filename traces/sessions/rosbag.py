@@ -87,7 +87,7 @@ def import_bag(
                 if wanted:
                     _copy(wanted, reader.messages(wanted), channels, unpack, writer, problems)
                 _write_metadata(writer, reader, source, problems, corrections)
-        except DexkitError:
+        except (DexkitError, MemoryError):
             raise
         except Exception as error:  # the library raises many kinds for damaged files
             raise SessionError(f"{source} cannot be read as a ROS 2 bag: {error}") from error
@@ -261,6 +261,8 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
                     continue
                 try:
                     digest = _type_hash(ros_name, text)
+                except MemoryError:
+                    raise
                 # raised by the library for a definition that it cannot read
                 except Exception as error:
                     lost.append(f"{key[0]}: its definition cannot be read: {error}")
