@@ -61,6 +61,13 @@ class Worker(threading.Thread):
             self.failure = error
             self._notify(error)
 
+    def join(self, timeout: float | None = None) -> None:
+        """Wait for its end. One that could not be started has none to wait for: an owner that
+        cleans up must not hide the error that says so.
+        """
+        if self.ident is not None:
+            super().join(timeout)
+
     def _notify(self, error: Exception) -> None:
         with _lock:
             del _dead[:-_KEPT]
