@@ -32,6 +32,7 @@ __all__ = [
     "LARGEST",
     "LOCK_PATIENCE",
     "check_output_paths",
+    "limit_depth",
     "open_ordinary",
     "parse_json",
     "parse_toml",
@@ -156,7 +157,7 @@ def parse_json(
             parse_int=_whole,
             object_pairs_hook=_without_duplicates,
         )
-        _limit_depth(document)
+        limit_depth(document)
     except RecursionError:
         raise error(f"{origin} is not valid JSON: {_TOO_DEEP}", hint=hint) from None
     except ValueError as why:
@@ -175,7 +176,7 @@ def parse_toml(
     """
     try:
         document = tomli.loads(text, parse_float=_finite)
-        _limit_depth(document)
+        limit_depth(document)
     except RecursionError:
         raise error(f"{origin} is not valid TOML: {_TOO_DEEP}", hint=hint) from None
     except ValueError as why:
@@ -212,7 +213,7 @@ def _without_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _limit_depth(document: Any) -> None:
+def limit_depth(document: Any) -> None:
     """Refuse a document that is nested too deeply, or has huge numbers (TOML's parser leaves them).
 
     :raises ValueError: it is.

@@ -1,0 +1,57 @@
+"""Read untrusted documents into typed records, before anything else uses them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from dexkit.documents import parse_json
+from dexkit.errors import SessionError
+from dexkit.escaping import one_line
+
+__all__ = ["Count", "Rate", "Vector", "parse_record", "to_record", "typed"]
+
+T = TypeVar("T")
+
+# UnicodeError: JSON can hold half a surrogate pair, where msgspec expects another type than a text
+_WRONG = (msgspec.ValidationError, RecursionError, UnicodeError)
+
+MOST_JOINTS = 1024
+"""Elements of a vector; robots have less than a hundred."""
+Rate = Annotated[float, msgspec.Meta(ge=0.1, le=2000)]
+"""Plausible frames per second of a file, Hz."""
+Count = Annotated[int, msgspec.Meta(ge=0, lt=10**9)]
+"""Number of an episode, frame or file."""
+Vector = Annotated[list[float], msgspec.Meta(max_length=MOST_JOINTS)]
+"""Values of a frame, some of which may be NaN."""
+
+
+def parse_record(text: str, kind: type[T], origin: object) -> T:
+    """The record in a JSON text.
+
+    :param origin: what to call it.
+    :raises SessionError: it is no JSON, or of another form; with the place in the document.
+    """
+    return to_record(parse_json(text, origin, error=SessionError, finite=False), kind, origin)
+
+
+def to_record(value: Any, kind: type[T], origin: object, *, texts: bool = False) -> T:
+    """A value of the JSON types as a record.
+
+    :param origin: what to call it.
+    :param texts: numbers may stand in texts.
+    :raises SessionError: it is of another form; with the place in the document.
+    """
+    try:
+        return msgspec.convert(value, kind, strict=not texts)
+    except _WRONG as error:
+        raise SessionError(f"{origin}: {one_line(error)}") from error
+
+
+def typed(value: Any, kind: type[T]) -> T | None:
+    """The value as a record, number or list of that type; None if it is of another form."""
+    try:
+        return msgspec.convert(value, kind)
+    except _WRONG:
+        return None
