@@ -27,6 +27,8 @@ __all__ = [
     "matching_layout",
 ]
 
+# Values of a message that need no byte, and structures around a number.
+_NODES, _DEEPEST = 1000, 20
 _FORMS = {
     "bool": "?",
     "u8": "B",
@@ -112,12 +114,18 @@ class _Reader:
         self._data = data
         self._order = order
         self._at = 0
+        # every number has a byte and at most so many structures around it; an array of structures
+        # without members has none, and would have no end
+        self._nodes = _NODES + _DEEPEST * len(data)
 
     @property
     def left(self) -> int:
         return len(self._data) - self._at
 
     def node(self, node: schemas.Node) -> Any:
+        self._nodes -= 1
+        if self._nodes < 0:
+            raise WireError(f"more than {_DEEPEST} members for each byte")
         if isinstance(node, schemas.Struct):
             return {f.name: self.node(f.type) for f in node.fields}
         if isinstance(node, schemas.Array):
@@ -146,8 +154,13 @@ class _Reader:
         return struct.unpack(self._order + form, self._take(size))[0]
 
 
-def _message(layout: OwnStruct, cls: type[Any], values: dict[str, Any]) -> Any:
-    """A message of the present layout; missing members get their default."""
+def _message(layout: OwnStruct, cls: type[Any], values: Any) -> Any:
+    """A message of the present layout; missing members get their default.
+
+    :raises WireError: the earlier layout has something else there than a structure.
+    """
+    if not isinstance(values, dict):
+        raise WireError(f"{layout.ros_name}: it is no structure in this layout")
     given: dict[str, Any] = {}
     for member in layout.fields:
         if member.name not in values:
