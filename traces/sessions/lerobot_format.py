@@ -46,14 +46,17 @@ def parquet_library() -> tuple[ModuleType, Any]:
     """(pyarrow, pyarrow.parquet)
 
     :raises ExtraMissing: it is not installed.
+    :raises SessionError: it cannot be loaded: too little memory, for example.
     """
     try:
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ExtraMissing(
             "Parquet files need the library pyarrow", hint="pip install 'dexkit[lerobot]'"
         ) from error
+    except ImportError as error:
+        raise SessionError(f"the library pyarrow cannot be loaded: {error}") from error
     return pyarrow, pyarrow.parquet
 
 
@@ -83,7 +86,7 @@ def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -
             hint="is it damaged? If not, write its rows to several files",
         )
         try:
-            with parquet.ParquetFile(source) as file:
+            with parquet.ParquetFile(source, pre_buffer=False) as file:
                 names = [name for name in file.schema_arrow.names if wanted(name)]
                 if len(set(names)) < len(names):
                     raise SessionError(f"{path} has two columns of one name")
@@ -92,7 +95,11 @@ def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -
                 yield file.schema_arrow.empty_table().select(names)
                 for group in range(file.metadata.num_row_groups):
                     for batch in file.iter_batches(
-                        _rows_at_once(file.metadata.row_group(group)), [group], columns=names
+                        _rows_at_once(file.metadata.row_group(group)),
+                        [group],
+                        columns=names,
+                        # Arrow ends the process where it cannot start threads (ulimit -v)
+                        use_threads=False,
                     ):
                         left -= max(batch.nbytes, batch.num_rows * _LEAST_ROW)
                         if left < 0:
