@@ -21,6 +21,8 @@ __all__ = ["SideEvidence", "swap_states", "swapped_sides"]
 
 # Largest delay of a hand behind its command, seconds.
 _LATEST = 0.6
+# Frames per second of which all delays are tried: the effort is frames times delays.
+_FASTEST = 2000.0
 # Smallest correlation with the other side, and its smallest margin over the own side.
 _LEAST = 0.7
 _LEAD = 0.3
@@ -63,7 +65,7 @@ def swapped_sides(parts: Sequence[Part], rate: float) -> SideEvidence | None:
         return None
     if len(left.joints) != len(right.joints):
         return None
-    steps = max(1, round(_LATEST * rate))
+    steps = max(1, round(_LATEST * min(rate, _FASTEST)))
 
     def follows(state: Part, command: Part) -> float:
         return _correlation(state.values[STATE]["q"], command.values[COMMAND]["q"], steps)
