@@ -178,7 +178,8 @@ def test_pictures_are_taken_over_as_they_are(tmp_path: Path, cameras: int) -> No
         recording = tmp_path / f"r{len(options)}.mcap"
         assert dexkit("import", source, recording, *options)[0] == 0
         out = tmp_path / f"d{len(options)}"
-        code, output = dexkit("export", recording, "--to", "lerobot", "--out", out)
+        to = ["export", recording, "--to", "lerobot", "--out", out]
+        code, output = dexkit(*to, *(() if options else ("--pictures", source)))
         assert code == 0, output
         info, table = read(out)
         assert info["fps"] == 30
@@ -200,12 +201,14 @@ def test_pictures_are_taken_over_as_they_are(tmp_path: Path, cameras: int) -> No
             ]
     (source / "colors" / "5_0.png").write_bytes(png(4, 4))
     code, output = dexkit(
-        "export", tmp_path / "r0.mcap", "--to", "lerobot", "--out", tmp_path / "x"
+        *("export", tmp_path / "r0.mcap", "--to", "lerobot", "--out", tmp_path / "x"),
+        *("--pictures", source),
     )
     assert (code, "another size" in output) == (2, True)
     (source / "colors" / "5_0.png").unlink()
     code, output = dexkit(
-        "export", tmp_path / "r0.mcap", "--to", "lerobot", "--out", tmp_path / "x"
+        *("export", tmp_path / "r0.mcap", "--to", "lerobot", "--out", tmp_path / "x"),
+        *("--pictures", source),
     )
     assert (code, "is missing" in output) == (2, True)
     assert not list(tmp_path.glob("x*"))
@@ -262,12 +265,15 @@ def test_an_episode_comes_back_as_it_was(tmp_path: Path, version: str) -> None:
     text = streamed(found) if version == "v1.4" else whole(found)
     source = episode(tmp_path / "e", text, 2, 12)
     assert dexkit("import", source, tmp_path / "a.mcap")[0] == 0
-    code, output = dexkit(
-        "export", tmp_path / "a.mcap", "--to", "episodes", "--out", tmp_path / "t"
-    )
+    to = ["export", tmp_path / "a.mcap", "--to", "episodes", "--out"]
+    code, output = dexkit(*to, tmp_path / "n")
+    assert (code, "--pictures DIR" in output) == (1, True)
+    code, output = dexkit(*to, tmp_path / "t", "--pictures", tmp_path / "e")
     assert code == 0, output
-    back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())
-    assert back == found
+    back, bare = (
+        json.loads((tmp_path / name / "episode_0000" / "data.json").read_text()) for name in "tn"
+    )
+    assert back == bare == found
     pictures = sorted(p.name for p in (tmp_path / "t" / "episode_0000" / "colors").iterdir())
     assert len(pictures) == 22
     for name in pictures:

@@ -31,7 +31,7 @@ from dexkit.traces.sessions import old_layouts, ros_types
 from dexkit.traces.sessions.episodes import parse_document
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.model import REST_TOPIC, picture_topic, reference_topic
-from dexkit.traces.sessions.pictures import parse_picture, safe_path
+from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 from tests.each import each
 from tests.session_helpers import document, episode, jpeg, png, streamed, whole
@@ -275,7 +275,7 @@ def test_pictures_are_referenced_or_embedded(tmp_path: Path) -> None:
     trace = open_trace(tmp_path / "a.mcap")
     first = next(trace.messages([reference_topic("color_1")]))
     assert json.loads(ros_types.decode_string(first.data)) == {"path": "colors/000000_color_1.jpg"}
-    assert trace.metadata[RECORD]["pictures_folder"] == str(source)
+    assert trace.metadata[RECORD]["pictures_folder"] == "."
     code, output = dexkit("import", source, tmp_path / "b.mcap", "--embed-pictures")
     assert (code, "neither JPEG nor PNG" in output) == (1, True)
     trace = open_trace(tmp_path / "b.mcap")
@@ -297,12 +297,11 @@ def test_pictures_elsewhere_are_not_read(tmp_path: Path) -> None:
     (source / "link.jpg").symlink_to(tmp_path / "secret.jpg")
     code, output = dexkit("import", source, tmp_path / "e.mcap", "--embed-pictures")
     assert code == 1
-    assert output.count("outside the session's folder") == 3
+    assert (output.count("leads out of it"), output.count("through a link")) == (3, 1)
     assert not [t for t in open_trace(tmp_path / "e.mcap").topics if "color" in t]
 
 
 def test_picture_formats_and_sizes_are_read() -> None:
-    assert safe_path(Path("/tmp"), "a\x00b") is None
     for data, expected in ((jpeg(640, 480), ("jpeg", 640, 480, 3)), (png(4, 2), ("png", 4, 2, 3))):
         found = parse_picture(data)
         assert found is not None
@@ -480,7 +479,7 @@ def test_lerobot_columns_of_other_kinds_are_reported(tmp_path: Path) -> None:
     [
         ("meta/info.json", b"{", "not valid JSON"),
         ("meta/info.json", b'{"codebase_version": "v1.6", "fps": 30}', "version v1.6"),
-        ("meta/info.json", b'{"codebase_version": "v2.1", "fps": "30"}', "no rate"),
+        ("meta/info.json", b'{"codebase_version": "v2.1", "fps": "30", "features": {}}', "no rate"),
         ("meta/episodes.jsonl", b"", "no list of its episodes"),
         ("data/chunk-000/episode_000000.parquet", b"PAR1", "cannot be read as Parquet"),
     ],
@@ -502,7 +501,7 @@ def test_no_path_of_a_dataset_fills_the_memory(tmp_path: Path, pattern: str) -> 
     info = json.loads((source / "meta" / "info.json").read_text())
     (source / "meta" / "info.json").write_text(json.dumps({**info, "data_path": pattern}))
     code, output = dexkit("import", source, tmp_path / "out.mcap")
-    assert (code, "a path that cannot be used" in output) == (2, True), output
+    assert (code, "no path that can be used" in output) == (2, True), output
 
 
 def test_frame_numbers_beyond_all_times_are_counted(tmp_path: Path) -> None:
@@ -518,7 +517,7 @@ def test_a_dataset_does_not_lead_elsewhere(tmp_path: Path) -> None:
     info["data_path"] = "../../{episode_index}.parquet"
     (source / "meta" / "info.json").write_text(json.dumps(info))
     code, output = dexkit("import", source, tmp_path / "out.mcap")
-    assert (code, "points outside the dataset" in output) == (2, True)
+    assert (code, "leads out of it" in output) == (2, True)
 
 
 # -- ROS 2 bags ----------------------------------------------------------------------------------

@@ -38,6 +38,13 @@ __all__ = ["command"]
     help="Frames per second, for lerobot and episodes.  [default: measured]",
 )
 @click.option("--task", metavar="TEXT", help="Task of all episodes.  [default: the recording's]")
+@click.option(
+    "--pictures",
+    type=FILE,
+    metavar="DIR",
+    help="The folder that was imported, for lerobot and episodes: pictures that are not in the "
+    "recordings are read below it, and nowhere else.",
+)
 def command(
     sessions: tuple[Path, ...],
     form: str,
@@ -45,24 +52,28 @@ def command(
     storage: str,
     fps: int | None,
     task: str | None,
+    pictures: Path | None,
 ) -> int:
     """Write the recordings SESSION... to the folder DIR in another format.
 
     lerobot writes one dataset (v3.0), and episodes one task folder, for all recordings. The other
     formats write one folder for each recording.
 
-    Exit code: 0 everything is exported, 1 a recording is damaged or was refused (the others are
-    exported), 2 wrong usage, or nothing could be exported.
+    Exit code: 0 everything is exported, 1 a recording is damaged or was refused, or something in
+    it is left out (it is listed, and all else is exported), 2 wrong usage, or nothing could be
+    exported.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions import rosbag, topic_tables
 
+    if pictures is not None and not pictures.is_dir():
+        raise UsageError(f"--pictures {pictures} is not a folder")
     if form in ("lerobot", "episodes"):
         # bytes of the command line that are no UTF-8 are escaped, as those of recordings are
         text = None if task is None else task.encode("utf-8", "backslashreplace").decode()
-        return _frames(sessions, form, out, fps, text)
-    if fps is not None or task is not None:
-        raise UsageError(f"--fps and --task are for lerobot and episodes, not for {form}")
+        return _frames(sessions, form, out, fps, text, pictures)
+    if fps is not None or task is not None or pictures is not None:
+        raise UsageError(f"--fps, --task and --pictures are for lerobot and episodes, not {form}")
     several = len(sessions) > 1
     if several and len({p.stem for p in sessions}) < len(sessions):
         raise UsageError("two of the recordings have the same name", hint="export them one by one")
@@ -93,7 +104,12 @@ def command(
 
 
 def _frames(
-    sessions: tuple[Path, ...], form: str, out: Path, fps: int | None, task: str | None
+    sessions: tuple[Path, ...],
+    form: str,
+    out: Path,
+    fps: int | None,
+    task: str | None,
+    pictures: Path | None,
 ) -> int:
     from dexkit.traces import open_trace
     from dexkit.traces.sessions import episodes_out, lerobot_out
@@ -108,10 +124,8 @@ def _frames(
             refused.append(f"{path}: refused: {error}")
     if not traces:
         raise SessionError("none of the recordings could be exported")
-    if form == "lerobot":
-        result = lerobot_out.export_dataset(traces, out, fps=fps, task=task)
-    else:
-        result = episodes_out.export_episodes(traces, out, fps=fps, task=task)
+    export = lerobot_out.export_dataset if form == "lerobot" else episodes_out.export_episodes
+    result = export(traces, out, fps=fps, task=task, pictures=pictures)
     for trace in traces:
         remarks("warning", trace.warnings, trace.path)
     remarks("warning", (*refused, *result.problems))

@@ -51,10 +51,12 @@ def command(
     an mcap file for one session, and a folder for several.
 
     Exit code: 0 everything is imported, 1 something is left out (it is listed, also in the
-    recording), 2 wrong usage, or nothing can be imported.
+    recording) or a session is refused (it is named, and the others are imported), 2 wrong usage, or
+    nothing can be imported.
     """
     from dexkit.models import model
     from dexkit.traces.sessions.episodes import Options
+    from dexkit.traces.sessions.paths import file_name
     from dexkit.traces.sessions.sources import choose, find
 
     if hand not in (None, "none"):
@@ -71,16 +73,20 @@ def command(
             hint=f"name a folder (OUT without .mcap), or one of them: --episode {entries[0].name}",
         )
     done, trouble = 0, False
+    written: dict[Path, str] = {}
     for entry in entries:
-        target = out if one else out / f"{entry.name}.mcap"
+        *folders, name = (file_name(part, 200) for part in entry.name.split("/"))
+        target = out if one else out.joinpath(*folders, f"{name}.mcap")
         try:
+            if (other := written.setdefault(target, entry.name)) != entry.name:
+                raise SessionError(f"its recording would have the name of {other}'s")
             target.parent.mkdir(parents=True, exist_ok=True)
             report = entry.convert(target, embed_pictures, force)
-        except (DexkitError, OSError) as error:
+        except (DexkitError, OSError, MemoryError) as error:
             if len(entries) == 1:
                 raise
             trouble = True
-            remark("warning", f"refused: {error}", entry.name)
+            remark("warning", f"refused: {str(error) or 'out of memory'}", entry.name)
             continue
         done += 1
         trouble |= bool(report.problems)
@@ -103,6 +109,6 @@ def _beside(source: Path, entries: list[Entry], wire: Path, options: Options) ->
         raise UsageError("--wire is for episodes of xr_teleoperate")
     trace = open_trace(wire)
     return [
-        replace(beside(folder, trace, options), name=entry.name)
+        replace(beside(folder, trace, options, source=source), name=entry.name)
         for folder, entry in zip(folders, entries, strict=True)
     ]

@@ -144,6 +144,7 @@ def _merge_episodes(
 ) -> bool:
     """Merge the episodes that are new or changed; whether there are some and all are merged."""
     from dexkit.traces import open_trace
+    from dexkit.traces.sessions.paths import file_name
     from dexkit.traces.sessions.sources import beside
 
     new = [e for e, status in _episodes(folder).items() if before.get(e) != status]
@@ -152,10 +153,10 @@ def _merge_episodes(
         return False
     trace, whole = open_trace(out), True
     for episode in new:
-        name = "_".join(episode.relative_to(folder).parts) or episode.name
+        name = file_name("_".join(episode.relative_to(folder).parts) or episode.name)
         target = out.with_name(f"{out.stem}_{name}.mcap")
         try:
-            report = beside(episode, trace).convert(target, False, force)
+            report = beside(episode, trace, source=folder).convert(target, False, force)
         except DexkitError as error:
             whole = False
             remark("warning", f"not merged: {error}", episode)

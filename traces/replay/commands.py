@@ -19,7 +19,7 @@ from dexkit.topics import Role, roles
 from dexkit.traces.names import SESSION
 from dexkit.traces.reader import SampleArray, Trace, open_trace
 from dexkit.traces.sessions.episodes import DATA, DEFAULT, Options
-from dexkit.traces.sessions.imported import NOMINAL, RECORD
+from dexkit.traces.sessions.imported import NOMINAL, import_record
 from dexkit.traces.sessions.sources import choose, find
 from dexkit.traces.sessions.streams import COMMAND, HAND, Stream, streams_of
 
@@ -165,16 +165,16 @@ def read_trace(trace: Trace, name: str) -> RecordedCommands:
     dialect = next(iter(spoken.values()), None)
     mine = [s for s in hands if (r := _role(s)) and r.dialect == dialect]
     first_ns = min((int(s.times_ns[0]) for s in commanded), default=0)
-    record = trace.metadata.get(RECORD, {})
-    nominal = record.get("clock") == NOMINAL
+    imported = import_record(trace)
+    nominal = imported.clock == NOMINAL
     return RecordedCommands(
         name=name,
-        form=record.get("format", "recording"),
+        form=imported.format,
         dialect=dialect,
         commands={_side(s): _commands(s, first_ns) for s in mine if s.kind == COMMAND},
         states={_side(s): ((s.times_ns - first_ns) / 1e9, s.q) for s in mine if s.kind != COMMAND},
-        nominal_rate=_number(record.get("rate_hz", "")) if nominal else 0.0,
-        first_ns=0 if nominal and "first_ns" not in record else first_ns,
+        nominal_rate=imported.rate_hz if nominal else 0.0,
+        first_ns=0 if nominal and imported.first_ns is None else first_ns,
         others=_others(trace, streams, mine),
         damage=tuple(trace.damage),
     )
@@ -192,13 +192,6 @@ def _role(stream: Stream) -> Role | None:
 
 def _side(stream: Stream) -> Side:
     return Side(stream.part.removesuffix(HAND))
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return 0.0
 
 
 def _others(trace: Trace, streams: Sequence[Stream], mine: Sequence[Stream]) -> tuple[str, ...]:

@@ -17,12 +17,13 @@ from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.documents import read_bytes
+from dexkit.documents import limit_depth, read_bytes
 from dexkit.errors import SessionError
 from dexkit.hand import Floats, Side
 from dexkit.models import HandModel, model
@@ -35,10 +36,11 @@ from dexkit.traces.sessions.model import (
     Session,
     models_by_joints,
 )
-from dexkit.traces.sessions.pictures import safe_path
+from dexkit.traces.sessions.paths import below
 from dexkit.traces.sessions.ros_types import LAST_NS
 from dexkit.traces.sessions.sides import swap_states, swapped_sides
 from dexkit.traces.sessions.streams import COMMAND, HAND, STATE
+from dexkit.traces.sessions.typed import MOST_JOINTS, Count, Rate, Vector, to_record, typed
 
 __all__ = [
     "DATA",
@@ -50,6 +52,7 @@ __all__ = [
     "read_document",
     "read_episode",
     "session_of",
+    "whole_number",
 ]
 
 DATA = "data.json"
@@ -59,10 +62,9 @@ _COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
 _PICTURES = ("colors", "depths")
 _STAMPS = ("timestamp_ns", "timestamp", "time", "t")  # the first in ns, the others in seconds
 _HANDS = {f"{side}_{end}": f"{side}{HAND}" for side in Side for end in ("ee", "hand")}
+_HAND_PARTS = frozenset(_HANDS.values())
 _NS = 10**9
 _DAY = 86_400 * _NS
-# Plausible frame rates of a file, Hz.
-_RATES = (0.1, 2000.0)
 # Share of samples that must lie within a model's limits, and how far beyond they may lie, rad.
 _WITHIN, _BEYOND = 0.99, 0.35
 _VERSIONS = {
@@ -70,6 +72,14 @@ _VERSIONS = {
     "whole": "xr_teleoperate v1.0 to v1.2 (written at the end)",
     "streamed": "xr_teleoperate v1.3 or later (written item by item)",
 }
+
+
+_Nanoseconds = Annotated[int, msgspec.Meta(ge=0, lt=LAST_NS)]
+_Seconds = Annotated[float, msgspec.Meta(ge=0, lt=LAST_NS / _NS)]
+
+
+class _Image(msgspec.Struct):
+    fps: Rate
 
 
 @dataclass(frozen=True)
@@ -117,7 +127,7 @@ def read_document(path: Path) -> Document:
 
     :raises SessionError: it cannot be read, or no item in it is whole.
     """
-    data = read_bytes(path, _LARGEST, error=SessionError)
+    data = read_bytes(below(path.parent, path.name), _LARGEST, error=SessionError)
     # an interrupted file may end inside a character
     return parse_document(data.decode("utf-8-sig", "replace"), str(path))
 
@@ -129,7 +139,7 @@ def parse_document(text: str, origin: str) -> Document:
     :raises SessionError: there is no whole item in it.
     """
     try:
-        found = json.loads(text)
+        found = json.loads(text, parse_int=whole_number)
         whole = True
     except ValueError:
         found, whole = _salvage(text), False
@@ -141,21 +151,32 @@ def parse_document(text: str, origin: str) -> Document:
         )
     if not found["data"]:
         raise SessionError(f"{origin} has no whole item")
-    info, words = found.get("info"), found.get("text")
+    head = {k: v for k, v in found.items() if k != "data"}
+    try:
+        limit_depth(head)
+    except ValueError as error:
+        raise SessionError(f"{origin}: {error}") from error
+    for key in ("info", "text"):
+        head[key] = to_record(head.get(key, {}), dict[str, Any], f"{origin}: {key}")
     return Document(
-        info=info if isinstance(info, dict) else {},
-        text=words if isinstance(words, dict) else {},
+        info=head.pop("info"),
+        text=head.pop("text"),
         items=found["data"],
         # whole documents are indented below the brace, streamed ones are not
         streamed=re.match(r'\s*\{\s*\n"', text) is not None,
         whole=whole,
-        rest={k: v for k, v in found.items() if k not in ("info", "text", "data")},
+        rest=head,
     )
+
+
+def whole_number(text: str) -> int | float:
+    """A whole number of a JSON text; one of more than 64 bits as a float, infinity if need be."""
+    return int(text) if len(text) <= 20 else float(text)
 
 
 def _salvage(text: str) -> dict[str, Any]:
     """Recover the complete members and ``data`` items at the beginning of a document."""
-    decoder = json.JSONDecoder()
+    decoder = json.JSONDecoder(parse_int=whole_number)
     space = re.compile(r"[\s,]*")
     found: dict[str, Any] = {}
 
@@ -203,8 +224,12 @@ def episode_folders(source: Path) -> list[Path]:
     try:
         if (source / DATA).exists():
             return [source]
-        found = []
-        for folder, names, files in os.walk(source):
+        found: list[Path] = []
+
+        def unreadable(error: OSError) -> None:
+            found.append(Path(os.fsdecode(error.filename)))  # told when it is read
+
+        for folder, names, files in os.walk(source, onerror=unreadable):
             names.sort()
             if DATA in files:
                 found.append(Path(folder))
@@ -250,10 +275,10 @@ def session_of(
         problems.add("the file is cut or damaged; it is read up to its last whole item")
     items = []
     for i, item in enumerate(document.items):
-        if isinstance(item, dict):
-            items.append(item)
-        else:
+        if not isinstance(item, dict):
             problems.add("items that are no objects are left out", f"item {i}")
+        else:
+            items.append(item)
     if not items:
         raise SessionError(f"{source} has no frame that can be used")
     rate = _rate(document, options, problems)
@@ -276,12 +301,13 @@ def session_of(
         problems=problems,
         first_ns=first,
     )
-    session.rest = _rest(items, carried, {c.name for c in session.cameras}, first is not None)
+    cameras = {c.name for c in session.cameras}
+    session.rest = _rest(items, carried, cameras, first is not None, problems)
     session.about = {
         "info": json.dumps(document.info, ensure_ascii=False),
         "text": json.dumps(document.text, ensure_ascii=False),
         "rest": json.dumps(document.rest, ensure_ascii=False),
-        "task": str(document.text.get("goal", "")),
+        "task": typed(document.text.get("goal"), str) or "",
         "names": json.dumps(_names(items)),
     }
     correct_sides(session, form, options)
@@ -291,11 +317,8 @@ def session_of(
 def _rate(document: Document, options: Options, problems: Problems) -> float:
     if options.rate is not None:
         return options.rate
-    image = document.info.get("image")
-    value: Any = image.get("fps") if isinstance(image, dict) else None
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if is_number and _RATES[0] <= value <= _RATES[1]:
-        return float(value)
+    if (image := typed(document.info.get("image"), _Image)) is not None:
+        return image.fps
     problems.add("the file states no rate (info.image.fps); 30 Hz are assumed")
     return 30.0
 
@@ -331,23 +354,16 @@ def _times(
 
 def _index(item: Mapping[str, Any]) -> int | None:
     """The number of a frame, where the source has one."""
-    n = item.get("idx")
-    return n if isinstance(n, int) and not isinstance(n, bool) and 0 <= n < 10**9 else None
+    return typed(item.get("idx"), Count)
 
 
 def _stamp(item: Mapping[str, Any]) -> int | None:
     """The time of a frame, ns since the epoch, where the source has one."""
-    value = item.get(_STAMPS[0])
-    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < LAST_NS:
+    if (value := typed(item.get(_STAMPS[0]), _Nanoseconds)) is not None:
         return value
     for key in _STAMPS[1:]:
-        value = item.get(key)
-        if (
-            isinstance(value, (int, float))
-            and not isinstance(value, bool)
-            and 0 <= value < LAST_NS / _NS
-        ):
-            return round(value * _NS)
+        if (seconds := typed(item.get(key), _Seconds)) is not None:
+            return round(seconds * _NS)
     return None
 
 
@@ -359,19 +375,6 @@ def _day(date: object) -> int:
         return day if EPOCH_NS <= day < LAST_NS - _DAY else EPOCH_NS
     except (ValueError, OverflowError):
         return EPOCH_NS
-
-
-def _numbers(value: object) -> tuple[float, ...] | None:
-    """A list of numbers; None if it is anything else."""
-    if not isinstance(value, list):
-        return None
-    for v in value:
-        if isinstance(v, bool) or not isinstance(v, (int, float)):
-            return None
-    try:
-        return tuple(float(v) for v in value)
-    except OverflowError:
-        return None
 
 
 Carried = dict[tuple[str, str, str], set[int]]
@@ -387,8 +390,12 @@ def _parts(items: Sequence[dict[str, Any]], problems: Problems) -> tuple[list[Pa
                 names.update(dict.fromkeys(n for n in group if _is_name(n, problems)))
             elif group is not None:
                 problems.add(f"'{key}' is no object", _place(item))
-    parts, carried = [], Carried()
+    parts: list[Part] = []
+    carried = Carried()
     for name in names:
+        if (part := _HANDS.get(name, name)) in {p.name for p in parts}:
+            problems.add(f"{name} is kept as JSON only: there is a {part}")
+            continue
         values: dict[str, dict[str, Floats]] = {}
         count = 0
         for key, kind in _DIRECTIONS.items():
@@ -407,7 +414,7 @@ def _parts(items: Sequence[dict[str, Any]], problems: Problems) -> tuple[list[Pa
                 width = columns["q"].shape[1]
                 parts.append(Part(f"{name}_{kind}", _joint_names(name, width), {kind: columns}))
         elif values:
-            parts.append(Part(_HANDS.get(name, name), _joint_names(name, count), values))
+            parts.append(Part(part, _joint_names(name, count), values))
     return parts, carried
 
 
@@ -429,15 +436,18 @@ def _table(
     items: Sequence[dict[str, Any]], key: str, name: str, problems: Problems
 ) -> tuple[dict[str, Floats], Carried, int]:
     """The columns of a part in one direction, the frames that have them, and their width."""
-    rows: dict[str, list[tuple[float, ...] | None]] = {f: [] for f in _COLUMNS}
+    rows: dict[str, list[list[float] | None]] = {f: [] for f in _COLUMNS}
     for item in items:
         group = item.get(key)
         entry = group.get(name) if isinstance(group, dict) else None
         for field_, column in _COLUMNS.items():
             value = entry.get(column) if isinstance(entry, dict) else None
-            numbers = _numbers(value)
+            numbers = typed(value, Vector)
             if numbers is None and value is not None:
-                problems.add(f"{key}.{name}.{column} is no list of numbers", _place(item))
+                problems.add(
+                    f"{key}.{name}.{column} is no list of numbers, {MOST_JOINTS} at most",
+                    _place(item),
+                )
             if numbers and not np.isfinite(numbers).all():
                 problems.add(f"{key}.{name}.{column} has values that are not finite", _place(item))
                 numbers = None
@@ -480,7 +490,7 @@ def _place(item: Mapping[str, Any]) -> str:
 
 def _as_hand(part: Part, options: Options, problems: Problems) -> Part:
     """The part as a hand of a model, if it is one."""
-    if not part.name.endswith(HAND) or options.hand == "none":
+    if part.name not in _HAND_PARTS or options.hand == "none":
         return part
     count = len(part.joints)
     if options.hand is not None:
@@ -505,12 +515,12 @@ def _as_hand(part: Part, options: Options, problems: Problems) -> Part:
 
 
 def _named(part: Part, hand: HandModel) -> Part:
-    joints = hand.joints[Side(part.name.removesuffix(HAND))]
+    joints = hand.joints[part.side]
     return Part(part.name, tuple(j.name for j in joints), part.values, hand)
 
 
 def _within_limits(part: Part, hand: HandModel) -> bool:
-    joints = hand.joints[Side(part.name.removesuffix(HAND))]
+    joints = hand.joints[part.side]
     low = np.array([j.q_min for j in joints]) - _BEYOND
     high = np.array([j.q_max for j in joints]) + _BEYOND
     for columns in part.values.values():
@@ -536,11 +546,10 @@ def _cameras(items: Sequence[dict[str, Any]], folder: Path, problems: Problems) 
                 problems.add(f"{key}.{name}: frames without a picture", _place(item))
                 paths.append("")
                 continue
-            file = safe_path(folder, path)
-            if file is None:
-                problems.add(
-                    f"{key}.{name}: pictures outside the session's folder are left out", path
-                )
+            try:
+                file = below(folder, path)
+            except SessionError as error:
+                problems.add(f"{key}.{name}: pictures are left out: {error.message}")
                 paths.append("")
                 continue
             if not file.exists():
@@ -551,7 +560,11 @@ def _cameras(items: Sequence[dict[str, Any]], folder: Path, problems: Problems) 
 
 
 def _rest(
-    items: Sequence[dict[str, Any]], carried: Carried, cameras: Iterable[str], numbered: bool
+    items: Sequence[dict[str, Any]],
+    carried: Carried,
+    cameras: Iterable[str],
+    numbered: bool,
+    problems: Problems,
 ) -> list[str]:
     """Data of each frame outside of parts and cameras, as JSON; empty where they do not change.
 
@@ -576,6 +589,11 @@ def _rest(
                 rest[key] = {
                     n: v for n, v in rest[key].items() if n not in cameras or not isinstance(v, str)
                 }
+        try:
+            limit_depth(rest)
+        except ValueError as error:
+            problems.add(f"what an item has beside joints is left out: {error}", _place(item))
+            rest = {}
         text = json.dumps(rest, ensure_ascii=False, sort_keys=False)
         found.append("" if text == before else text)
         before = text
@@ -598,7 +616,7 @@ def correct_sides(session: Session, form: str, options: Options) -> None:
     evidence = swapped_sides(session.parts, session.rate)
     if evidence is None or not evidence.swapped:
         return
-    hands = [p for p in session.parts if p.name.endswith(HAND)]
+    hands = [p for p in session.parts if p.name in _HAND_PARTS]
     six = all(len(p.joints) == 6 for p in hands)
     why = (
         "xr_teleoperate v1.0 and v1.1 record the states of Inspire hands so"

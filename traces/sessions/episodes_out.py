@@ -13,61 +13,73 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit import __version__
-from dexkit.errors import SessionError
+from dexkit.errors import DexkitError, SessionError, WireError
 from dexkit.hand import Floats
 from dexkit.staging import whole_folder
 from dexkit.traces.reader import Trace
 from dexkit.traces.sessions import ros_types
+from dexkit.traces.sessions.episodes import DATA
 from dexkit.traces.sessions.frames import RULE, Source, open_source, sample
+from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.lerobot_out import Result
 from dexkit.traces.sessions.model import REST_TOPIC
-from dexkit.traces.sessions.pictures import parse_picture, safe_path
+from dexkit.traces.sessions.paths import below
+from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.resample import hold, interpolate
 from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Pressure, Stream
+from dexkit.traces.sessions.typed import parse_record
 
 __all__ = ["export_episodes"]
 
 _KEYS = {STATE: "states", COMMAND: "actions"}
 _COLUMNS = {"q": "qpos", "dq": "qvel", "tau": "torque"}
 _EXTENSION = "dexkit"
-_ALIGNED = "aligned"
-"""In the record of an episode whose times were taken from the wire."""
 
 
 def export_episodes(
-    traces: Sequence[Trace], out: Path, *, fps: int | None = None, task: str | None = None
+    traces: Sequence[Trace],
+    out: Path,
+    *,
+    fps: int | None = None,
+    task: str | None = None,
+    pictures: Path | None = None,
 ) -> Result:
     """Write recordings as the episodes of a task folder.
 
     :param fps: frames a second of recordings that are sampled; None for their own rate.
     :param task: of all episodes; None for what each recording says.
+    :param pictures: the folder that was imported, with the pictures that are not in the recordings.
     :raises SessionError: ``out`` exists, cannot be written, or no recording can be used.
     """
     result = Result()
     with whole_folder(out, error=SessionError) as root:
         for trace in traces:
             try:
-                for info, text, items, pictures in _episodes(trace, fps, task, result):
+                for info, text, items, files in _episodes(trace, fps, task, pictures, result):
                     folder = root / f"episode_{result.episodes:04d}"
-                    for kind in ("colors", "depths", "audios"):
-                        (folder / kind).mkdir(parents=True, exist_ok=True)
-                    for name, data in pictures:
-                        target = safe_path(folder, name)
-                        if target is not None:
-                            target.parent.mkdir(parents=True, exist_ok=True)
-                            target.write_bytes(data)
-                    (folder / "data.json").write_bytes(_text(info, text, items))
+                    _write(folder, files, _text(info, text, items))
                     result.episodes += 1
                     result.frames += len(items)
-            except SessionError as error:
+            except DexkitError as error:
                 if len(traces) == 1:
                     raise
                 result.problems.append(f"{trace.path.name}: refused: {error.message}")
         if not result.episodes:
             raise SessionError("none of the recordings can be exported")
     return result
+
+
+def _write(folder: Path, files: Sequence[tuple[str, bytes]], text: bytes) -> None:
+    for kind in ("colors", "depths", "audios"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    for name, data in files:
+        target = below(folder, name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+    (folder / DATA).write_bytes(text)
 
 
 def _text(info: Any, text: Any, items: Sequence[Any]) -> bytes:
@@ -81,11 +93,12 @@ def _text(info: Any, text: Any, items: Sequence[Any]) -> bytes:
 Episode = tuple[Any, Any, "list[dict[str, Any]]", "list[tuple[str, bytes]]"]
 
 
-def _episodes(trace: Trace, fps: int | None, task: str | None, result: Result) -> Iterator[Episode]:
-    source = open_source(trace)
-    names = _object(source.record.get("names"))
-    if names is not None and fps is None:
-        yield _as_it_was(source, names, task, result)
+def _episodes(
+    trace: Trace, fps: int | None, task: str | None, folder: Path | None, result: Result
+) -> Iterator[Episode]:
+    source = open_source(trace, folder)
+    if source.imported.names is not None and fps is None:
+        yield _as_it_was(source, source.imported.names, task, result)
         return
     rate = fps or max(1, round(source.rate))
     result.fps = rate
@@ -122,7 +135,7 @@ def _episodes(trace: Trace, fps: int | None, task: str | None, result: Result) -
             }
             item |= {"tactiles": pressed or None, "audios": None, "sim_state": None}
             items.append(item)
-        goal = task or source.task
+        goal = task or source.imported.task
         info = _info(source, rate, result, int(frames.times_ns[0]))
         yield info, {"goal": goal, "desc": "", "steps": ""}, items, pictures
 
@@ -159,32 +172,24 @@ def _entry(row: Mapping[str, Floats]) -> dict[str, list[float]]:
     return {c: row[f].tolist() if f in row else [] for f, c in _COLUMNS.items()}
 
 
-def _object(text: str | None) -> dict[str, Any] | None:
-    try:
-        found = json.loads(text or "")
-    except ValueError:
-        return None
-    return found if isinstance(found, dict) else None
-
-
 def _as_it_was(
-    source: Source, names: Mapping[str, Any], task: str | None, result: Result
+    source: Source, names: Mapping[str, str], task: str | None, result: Result
 ) -> Episode:
-    """The original frames of an imported episode."""
-    record, trace = source.record, source.trace
-    rest = {
-        m.log_time_ns: _object(ros_types.decode_string(m.data)) or {}
-        for m in (trace.messages([REST_TOPIC]) if REST_TOPIC in trace.topics else ())
-    }
-    if _ALIGNED in record:  # every frame has its number, and the hands come from the DDS recording
+    """The original frames of an imported episode.
+
+    :raises SessionError: the recording is not as its import wrote it.
+    """
+    imported, trace = source.imported, source.trace
+    result.problems += [f"{trace.path.name}: {text}" for text in source.problems]
+    rest = _rest(trace)
+    pictured = [*source.pictures, *source.absent]
+    if imported.aligned:  # every frame has its number, and the hands come from the DDS recording
         times = set(rest)
     else:
         times = {t for s in source.streams for t in s.times_ns.tolist()} | rest.keys()
-        times |= {t for p in source.pictures for t in p.times_ns.tolist()}
+        times |= {t for p in pictured for t in p.times_ns.tolist()}
     ordered = sorted(times)
-    groups = _object(record.get("cameras")) or {}
-    first = int(record["first_ns"]) if record.get("first_ns", "").isdigit() else None
-    rate = float(record.get("rate_hz", "30"))
+    first, rate = imported.first_ns, imported.rate_hz
     items: dict[int, dict[str, Any]] = {}
     current: dict[str, Any] = {}
     for i, t in enumerate(ordered):
@@ -195,8 +200,8 @@ def _as_it_was(
             item = {"idx": number, **item}
         items[t] = item
     for s in source.streams:
-        name = str(names.get(s.part, s.part))
-        if _ALIGNED in record and s.samples is not None and s.model:
+        name = names.get(s.part, s.part)
+        if imported.aligned and s.samples is not None and s.model:
             found = _at_frames(s, ordered)
             _fill(found, items, name)
             if len(found) < len(ordered):
@@ -205,20 +210,24 @@ def _as_it_was(
                     f"frames lie in gaps of the recording and have no {_KEYS[s.kind]}"
                 )
         else:
+            _at_items(trace, s.topic, s.times_ns, items)
             _fill(s, items, name)
-    if _ALIGNED in record:
+    if imported.aligned:
         for tactile in source.pressures:
-            _add_tactile(tactile, items, str(names.get(tactile.part, tactile.part)))
+            _add_tactile(tactile, items, names.get(tactile.part, tactile.part))
         for t, item in items.items():
             item["timestamp_ns"] = t
     pictures: list[tuple[str, bytes]] = []
-    for p in source.pictures:
-        group = str(groups.get(p.camera, "colors"))
+    for p in pictured:
+        _at_items(trace, p.camera, p.times_ns, items)
+        group = imported.cameras[p.camera]
         for i, t in enumerate(p.times_ns.tolist()):
             path = p.paths[i] if p.paths else f"{group}/{i:06d}_{p.camera}.jpg"
             entry = items[t].setdefault(group, {})
             if isinstance(entry, dict):
                 entry[p.camera] = path
+            if p in source.absent:
+                continue
             data = p.load(i)
             if data is not None:
                 pictures.append((path, data))
@@ -226,14 +235,46 @@ def _as_it_was(
                 result.problems
             ):
                 result.problems.append(text)
+    record = trace.metadata.get(RECORD, {})
     for key in record:
         if key.startswith(("rounded ", "correction ")):
             result.lost.append(f"{trace.path.name}: {key}: {record[key]}")
     result.fps = result.fps or round(rate)
-    words = _object(record.get("text")) or {}
+    words = dict(imported.text)
     if task is not None:
         words["goal"] = task
-    return _object(record.get("info")) or {}, words, [items[t] for t in ordered], pictures
+    return imported.info, words, [items[t] for t in ordered], pictures
+
+
+def _rest(trace: Trace) -> dict[int, dict[str, Any]]:
+    """By time, what an imported episode has beside joints and pictures.
+
+    :raises SessionError: a message has another form.
+    """
+    found = {}
+    for m in trace.messages([REST_TOPIC]) if REST_TOPIC in trace.topics else ():
+        origin = f"{trace.path}: {REST_TOPIC} at {m.log_time_ns} ns"
+        try:
+            text = ros_types.decode_string(m.data)
+        except WireError as error:
+            raise SessionError(f"{origin}: {error}") from error
+        found[m.log_time_ns] = parse_record(text, dict[str, Any], origin)
+    return found
+
+
+def _at_items(
+    trace: Trace, what: str, times: NDArray[np.int64], items: Mapping[int, dict[str, Any]]
+) -> None:
+    """Check that all of a stream's times are those of frames.
+
+    :raises SessionError: they are not.
+    """
+    for t in times.tolist():
+        if t not in items:
+            raise SessionError(
+                f"{trace.path}: {what}: {t} ns is not the time of a frame of the imported episode",
+                hint="--fps N samples the recording instead",
+            )
 
 
 def _at_frames(stream: Stream, times: Sequence[int]) -> Stream:

@@ -6,21 +6,22 @@ is no frame, and a new run of frames begins after it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.errors import SessionError
+from dexkit.errors import SessionError, WireError
 from dexkit.hand import Floats
 from dexkit.traces.names import SESSION
-from dexkit.traces.reader import Trace
+from dexkit.traces.reader import Trace, TraceMessage
 from dexkit.traces.sessions import ros_types
-from dexkit.traces.sessions.imported import RECORD
+from dexkit.traces.sessions.imported import RECORD, ImportRecord, import_record
 from dexkit.traces.sessions.model import REST_TOPIC
+from dexkit.traces.sessions.paths import below
 from dexkit.traces.sessions.pictures import read_picture
 from dexkit.traces.sessions.resample import gap_of, hold, interpolate, period_of
 from dexkit.traces.sessions.streams import (
@@ -31,6 +32,7 @@ from dexkit.traces.sessions.streams import (
     pressures_of,
     streams_of,
 )
+from dexkit.traces.sessions.typed import parse_record
 
 __all__ = ["RULE", "Frames", "Pictures", "Source", "open_source", "sample"]
 
@@ -62,6 +64,9 @@ class Source:
 
     :param streams: those with at least two samples.
     :param pressures: what the hands feel, likewise.
+    :param pictures: those that can be read.
+    :param absent: those of which only the paths are known.
+    :param imported: how it was imported.
     :param lost: data that frames cannot represent.
     :param problems: data that cannot be read.
     """
@@ -70,13 +75,10 @@ class Source:
     streams: list[Stream]
     pressures: list[Pressure]
     pictures: list[Pictures]
+    absent: list[Pictures]
+    imported: ImportRecord
     lost: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-
-    @property
-    def record(self) -> dict[str, str]:
-        """The record of its import, if it was imported."""
-        return self.trace.metadata.get(RECORD, {})
 
     @property
     def measured(self) -> dict[str, float]:
@@ -98,11 +100,6 @@ class Source:
             if rates:
                 return min(rates)
         return 0.0
-
-    @property
-    def task(self) -> str:
-        """The task stated in the recording."""
-        return self.record.get("task", "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,11 +126,14 @@ def _rate(times: NDArray[np.int64]) -> float:
     return 1.0 / period if period > 0 else 0.0
 
 
-def open_source(trace: Trace) -> Source:
+def open_source(trace: Trace, pictures: Path | None = None) -> Source:
     """The streams and pictures of a recording.
 
-    :raises SessionError: it has no joints.
+    :param pictures: the folder that was imported, in which pictures are looked for that are not in
+        the recording; None not to read them. A recording cannot choose it.
+    :raises SessionError: it has no joints, or the record of its import is not valid.
     """
+    imported = import_record(trace)
     lost = []
     streams = []
     for stream in streams_of(trace):
@@ -162,58 +162,99 @@ def open_source(trace: Trace) -> Source:
             lost.append(f"{channel.topic}: no joints in it")
     if REST_TOPIC in trace.topics:
         lost.append(f"{REST_TOPIC}: what an imported session has beside joints and pictures")
-    pictures = _pictures(trace, lost)
+    readable, absent = _pictures(trace, imported, pictures, lost, problems)
     commands = [s for s in streams if s.kind == COMMAND]
     if there := [f for f in FIELDS[COMMAND][1:] if any(f in s.values for s in commands)]:
         lost.append(f"{', '.join(there)} of the commands")
-    return Source(trace, streams, pressures, pictures, lost, problems)
+    return Source(trace, streams, pressures, readable, absent, imported, lost, problems)
 
 
 def _session_topics(trace: Trace) -> set[str]:
     return {t for t in trace.topics if t.startswith(SESSION)}
 
 
-def _pictures(trace: Trace, lost: list[str]) -> list[Pictures]:
-    record = trace.metadata.get(RECORD, {})
-    try:
-        cameras = json.loads(record.get("cameras", "{}"))
-        names = [c for c in cameras if isinstance(c, str)]
-    except (ValueError, TypeError):
-        names = []
-    folder = Path(record.get("pictures_folder", "."))
-    found = []
+class _Reference(msgspec.Struct):
+    """Where a picture is: its file, and the time in it if it is a video."""
+
+    path: str
+    seconds: float | None = None
+
+
+def _pictures(
+    trace: Trace,
+    imported: ImportRecord,
+    folder: Path | None,
+    lost: list[str],
+    problems: list[str],
+) -> tuple[list[Pictures], list[Pictures]]:
+    """The cameras whose pictures can be read, and those of which only the paths are known."""
+    found, absent = [], []
     filled = {c.topic for c in trace.channels if c.message_count}
-    for name in names:
+    for name in imported.cameras:
         embedded = ros_types.group_topic(name, "compressed")
         referenced = ros_types.group_topic(name, "reference")
         if embedded in filled:
             messages = list(trace.messages([embedded]))
-            data = [ros_types.decode_compressed_image(m.data).data for m in messages]
-            times = np.array([m.log_time_ns for m in messages], dtype=np.int64)
-            found.append(Pictures(name, times, lambda i, data=data: data[i]))  # type: ignore[misc]
+            found.append(Pictures(name, _times(messages), _embedded(messages)))
         elif referenced in filled:
             messages = list(trace.messages([referenced]))
-            entries = [_reference(ros_types.decode_string(m.data)) for m in messages]
-            if any("seconds" in e for e in entries):
-                lost.append(f"{name}: its video stays where it is ({folder})")
+            entries = [_reference(trace, m) for m in messages]
+            if any(e.seconds is not None for e in entries):
+                lost.append(f"{name}: its video stays where it is")
                 continue
-            paths = tuple(str(e.get("path", "")) for e in entries)
-            times = np.array([m.log_time_ns for m in messages], dtype=np.int64)
+            paths = tuple(e.path for e in entries)
+            if folder is None:
+                absent.append(Pictures(name, _times(messages), lambda i: None, paths))
+                problems.append(
+                    f"{name}: its pictures are left out, which are not in the recording; name the "
+                    "folder that was imported: --pictures DIR"
+                )
+                continue
+            load = _referenced(_session_folder(trace, imported, folder), paths)
+            found.append(Pictures(name, _times(messages), load, paths))
+    return found, absent
 
-            def load(i: int, paths: Sequence[str] = paths) -> bytes | None:
-                picture, _ = read_picture(folder, paths[i])
-                return picture.data if picture is not None else None
 
-            found.append(Pictures(name, times, load, paths))
-    return found
-
-
-def _reference(text: str) -> dict[str, object]:
+def _session_folder(trace: Trace, imported: ImportRecord, folder: Path) -> Path:
+    """The session's folder in what was imported, or that itself."""
+    place = imported.pictures_folder
+    if PurePosixPath(place).is_absolute():  # so wrote dexkit 0.1; nothing is looked for there
+        return folder
     try:
-        found = json.loads(text)
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
+        found = below(folder, place)
+    except SessionError as error:
+        raise SessionError(f"{trace.path}: pictures_folder of {RECORD}: {error.message}") from error
+    return found if found.is_dir() else folder
+
+
+def _times(messages: Sequence[TraceMessage]) -> NDArray[np.int64]:
+    return np.array([m.log_time_ns for m in messages], dtype=np.int64)
+
+
+def _embedded(messages: Sequence[TraceMessage]) -> Callable[[int], bytes | None]:
+    def load(i: int) -> bytes | None:
+        try:
+            return ros_types.decode_compressed_image(messages[i].data).data
+        except WireError:
+            return None
+
+    return load
+
+
+def _referenced(folder: Path, paths: Sequence[str]) -> Callable[[int], bytes | None]:
+    def load(i: int) -> bytes | None:
+        picture, _ = read_picture(folder, paths[i])
+        return picture.data if picture is not None else None
+
+    return load
+
+
+def _reference(trace: Trace, message: TraceMessage) -> _Reference:
+    origin = f"{trace.path}: {message.topic} at {message.log_time_ns} ns"
+    try:
+        return parse_record(ros_types.decode_string(message.data), _Reference, origin)
+    except WireError as error:
+        raise SessionError(f"{origin}: {error}") from error
 
 
 def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:

@@ -3,18 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
+import msgspec
+
+from dexkit.documents import parse_json
+from dexkit.errors import SessionError
 from dexkit.traces.names import dds_topic
+from dexkit.traces.reader import Trace
+from dexkit.traces.sessions.paths import file_name
+from dexkit.traces.sessions.typed import to_record
 
-__all__ = ["EPOCH_NS", "NOMINAL", "RECORD", "absent_fields", "absent_key"]
+__all__ = [
+    "EPOCH_NS",
+    "MEASURED",
+    "NOMINAL",
+    "RECORD",
+    "ImportRecord",
+    "absent_fields",
+    "absent_key",
+    "import_record",
+]
 
 RECORD = "dexkit_import"
 """Name of the metadata record."""
 NOMINAL = "nominal"
 """Value of its ``clock``: the source has no times, only a rate that was asked for."""
+MEASURED = "measured"
+"""Value of ``clock``: the source has times."""
 EPOCH_NS = 86_400 * 10**9
 """Begin of nominal times in a session without a date: 1970-01-02, because 0 means "unknown"."""
 _ABSENT = "absent "
+# Values of the record that are JSON.
+_JSON = ("cameras", "info", "names", "text")
+
+
+class ImportRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """The record of an import, as far as other commands use it.
+
+    :param pictures_folder: of the session, relative to the source that was imported.
+    :param cameras: by name, the group of its pictures.
+    :param names: by part, its name in the episode; None if it was no episode.
+    :param aligned: how the times were found in a recording of the wire; empty if they were not.
+    """
+
+    format: str = "recording"
+    clock: Literal["nominal", "measured"] = "measured"
+    rate_hz: Annotated[float, msgspec.Meta(gt=0, le=1e9)] = 30.0
+    first_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] | None = None
+    task: str = ""
+    aligned: str = ""
+    pictures_folder: str = "."
+    cameras: dict[str, Literal["colors", "depths"]] = {}
+    names: dict[str, str] | None = None
+    info: dict[str, Any] = {}
+    text: dict[str, Any] = {}
+
+    def __post_init__(self) -> None:
+        for name in self.cameras:
+            if file_name(name) != name:
+                raise ValueError("cameras: a name that no file can have")
+
+
+def import_record(trace: Trace) -> ImportRecord:
+    """The record of a recording's import; the defaults if it was not imported.
+
+    :raises SessionError: it is not what ``dexkit import`` writes; with its place.
+    """
+    origin = f"{trace.path}: metadata {RECORD}"
+    found: dict[str, Any] = {}
+    for key, text in trace.metadata.get(RECORD, {}).items():
+        if key in _JSON:
+            found[key] = parse_json(text, f"{origin}, {key},", error=SessionError, finite=False)
+        elif key in ImportRecord.__struct_fields__:
+            found[key] = text
+    return to_record(found, ImportRecord, origin, texts=True)
 
 
 def absent_key(topic: str) -> str:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from dexkit.documents import read_bytes
+from dexkit.documents import limit_depth, read_bytes
 from dexkit.errors import SessionError
-from dexkit.traces.sessions.episodes import DEFAULT, Document, Options, session_of
+from dexkit.traces.sessions.episodes import DEFAULT, Document, Options, session_of, whole_number
 from dexkit.traces.sessions.model import Session
 
 __all__ = ["parse_lines", "read_lines"]
@@ -27,7 +27,9 @@ def parse_lines(data: bytes) -> tuple[Document, list[str]]:
         if not line.strip():
             continue
         try:
-            found = json.loads(line.decode("utf-8-sig" if number == 1 else "utf-8"))
+            text = line.decode("utf-8-sig" if number == 1 else "utf-8")
+            found = json.loads(text, parse_int=whole_number)
+            limit_depth(found)
         except (ValueError, RecursionError):
             bad.append(f"line {number}")
             continue

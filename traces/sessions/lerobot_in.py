@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.documents import read_bytes
 from dexkit.errors import SessionError
+from dexkit.escaping import one_line
 from dexkit.hand import Floats, Side
 from dexkit.models import DIALECTS, HandModel, model
 from dexkit.traces.sessions.episodes import DEFAULT, Options, correct_sides
@@ -32,9 +34,10 @@ from dexkit.traces.sessions.lerobot_format import (
     read_parquet,
 )
 from dexkit.traces.sessions.model import Camera, Part, Problems, Session
-from dexkit.traces.sessions.pictures import safe_path
+from dexkit.traces.sessions.paths import below, file_name
 from dexkit.traces.sessions.ros_types import LAST_NS
 from dexkit.traces.sessions.streams import HAND
+from dexkit.traces.sessions.typed import MOST_JOINTS, Count, Rate, parse_record, to_record, typed
 
 __all__ = ["Dataset", "is_dataset"]
 
@@ -43,11 +46,80 @@ _INDEXES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 MOST_FRAMES = 1_000_000
 """Frames of an episode: 9 hours at 30 a second."""
 _MAX_JSON = 256 * 2**20
+# A field of a path: {video_key}, {chunk_index:03d}
+_FIELD = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}", re.ASCII)
 
 
 def is_dataset(source: Path) -> bool:
     """Whether it looks like a LeRobot dataset."""
     return (source / "meta" / "info.json").is_file()
+
+
+T = TypeVar("T")
+
+_Seconds = Annotated[float, msgspec.Meta(ge=0, lt=10**9)]
+_Name = Annotated[str, msgspec.Meta(pattern=r"^\w{1,64}\Z")]
+
+
+class _Feature(msgspec.Struct):
+    dtype: str = ""
+    names: Any = None
+
+
+class _Stated(msgspec.Struct):
+    """A part as dexkit's export states it: its joints, and the elements that they are."""
+
+    part: _Name
+    joints: list[str]
+    features: list[str]
+    model: str = ""
+
+
+class _Origin(msgspec.Struct):
+    """Where an episode of dexkit's export comes from; the time is a number in a text."""
+
+    start_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}\Z")]
+    clock: Literal["nominal", "measured"] = "nominal"
+
+    def __post_init__(self) -> None:
+        if int(self.start_ns) >= LAST_NS:
+            raise ValueError("a time after January 2038")
+
+
+class _Extension(msgspec.Struct):
+    parts: list[_Stated] | None = None
+    sessions: dict[str, _Origin] = {}
+
+
+class _Info(msgspec.Struct):
+    """``meta/info.json``"""
+
+    features: dict[str, _Feature]
+    codebase_version: str = ""
+    fps: Any = None
+    robot_type: str | None = None
+    chunks_size: Annotated[int, msgspec.Meta(ge=1, lt=10**9)] = 1000
+    data_path: str = ""
+    video_path: str | None = None
+    dexkit: _Extension = msgspec.field(default_factory=_Extension, name=EXTENSION)
+
+
+class _Version(msgspec.Struct):
+    codebase_version: str = "unknown"
+
+
+class _Task(msgspec.Struct):
+    task_index: int
+    task: str | None = None
+
+
+class _Episode(msgspec.Struct):
+    """A row of the list of episodes; ``videos`` are read as they are needed."""
+
+    episode_index: Count
+    tasks: list[str] | None = None
+    chunk: Count = msgspec.field(default=0, name="data/chunk_index")
+    file: Count = msgspec.field(default=0, name="data/file_index")
 
 
 @dataclass(frozen=True)
@@ -65,33 +137,30 @@ class Dataset:
 
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: it cannot be read, or is of another version.
+
+    ``refused`` has the errors of episodes that cannot be listed, by their place in the dataset.
     """
 
     def __init__(self, root: Path, options: Options = DEFAULT) -> None:
         parquet_library()  # told before anything is read
         self.root = root
         self.options = options
-        info = _read_json(root / "meta" / "info.json")
-        if not isinstance(info, dict):
-            raise SessionError(f"{root}/meta/info.json is no object")
-        self.info: dict[str, Any] = info
-        self.version = str(info.get("codebase_version", ""))
+        path = below(root, "meta/info.json")
+        text = _read_text(path)
+        self.version = parse_record(text, _Version, path).codebase_version
         if self.version not in _VERSIONS:
             raise SessionError(
-                f"{root} is a LeRobot dataset of version {self.version or 'unknown'}",
+                f"{root} is a LeRobot dataset of version {self.version}",
                 hint=f"readable: {', '.join(_VERSIONS)}",
             )
-        fps = options.rate if options.rate is not None else info.get("fps")
-        if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0.1 <= fps <= 2000:
-            raise SessionError(f"{root}/meta/info.json has no rate (fps)", hint="state it: --rate")
-        self.fps = float(fps)
-        features = info.get("features")
-        if not isinstance(features, dict):
-            raise SessionError(f"{root}/meta/info.json has no features")
-        self.features: dict[str, Any] = features
-        extension = info.get(EXTENSION)
-        self._extension = extension if isinstance(extension, dict) else {}
+        self.info = parse_record(text, _Info, path)
+        fps = options.rate if options.rate is not None else typed(self.info.fps, Rate)
+        if fps is None:
+            raise SessionError(f"{path} has no rate (fps)", hint="state it: --rate")
+        self.fps = fps
+        self.refused: dict[str, SessionError] = {}
         self._tables: dict[Path, Any] = {}
+        self._problems: list[str] = []
         self._tasks = self._read_tasks()
         self._rows = self._read_episodes()
 
@@ -106,12 +175,16 @@ class Dataset:
         :raises SessionError: its data are missing or of another form than the features declare.
         """
         problems = Problems()
-        row = self._rows[episode]
+        for text in self._problems:
+            problems.add(text)
+        row, _ = self._rows[episode]
         path, table = self._table(episode, row)
         missing = [c for c in ("timestamp", "frame_index") if c not in table.column_names]
         if missing:
             raise SessionError(f"{path} has no column {', '.join(missing)}")
-        times = self._times(table, problems)
+        if not table.num_rows:
+            raise SessionError(f"{path} has no frame")
+        times = self._times(path, table, problems)
         corrections: list[str] = []
         parts = list(self._parts(path, table, problems, corrections))
         if not parts:
@@ -127,22 +200,19 @@ class Dataset:
             rate=self.fps,
             parts=parts,
             folder=self.root,
-            cameras=list(self._cameras(episode, row, table, problems)),
+            cameras=list(self._cameras(episode, path, table, problems)),
             problems=problems,
             corrections=list(dict.fromkeys(corrections)),
             name=f"episode_{episode:06d}",
         )
-        session.rest = self._rest(table, len(times))
-        kept = self._extension.get("sessions")
-        origin = kept.get(str(episode), {}) if isinstance(kept, dict) else {}
-        start = str(origin.get("start_ns", "")) if isinstance(origin, dict) else ""
-        if start.isdigit() and len(start) < 20 and int(start) < 2**62:
-            session.times_ns = session.times_ns - times[0] + int(start)
-            session.clock = str(origin.get("clock", NOMINAL))
-        tasks = self._task_texts(row, table)
+        session.rest = self._rest(path, table)
+        if (origin := self.info.dexkit.sessions.get(str(episode))) is not None:
+            session.times_ns = session.times_ns - times[0] + int(origin.start_ns)
+            session.clock = origin.clock
+        tasks = self._task_texts(row, path, table)
         session.about = {
             "episode": str(episode),
-            "robot_type": str(self.info.get("robot_type")),
+            "robot_type": str(self.info.robot_type),
             "task": tasks[0] if tasks else "",
             "tasks": json.dumps(tasks, ensure_ascii=False),
         }
@@ -154,39 +224,65 @@ class Dataset:
     # -- files ---------------------------------------------------------------------------------
 
     def _read_tasks(self) -> dict[int, str]:
-        lines = self.root / "meta" / "tasks.jsonl"
-        if lines.is_file():
-            return {
-                row["task_index"]: str(row.get("task", ""))
-                for row in _read_lines(lines)
-                if isinstance(row.get("task_index"), int)
-            }
-        path = self.root / "meta" / "tasks.parquet"
-        if not path.is_file():
-            return {}
         found = {}
-        for row in _table_rows(path, read_parquet(path)):
-            texts = [v for v in row.values() if isinstance(v, str)]
-            if isinstance(row.get("task_index"), int) and texts:
-                found[row["task_index"]] = texts[0]
+        for _, task, row in self._listed("tasks", _Task):
+            if isinstance(task, SessionError):
+                self._problems.append(task.message)
+                continue
+            # pandas' index may have another name
+            others = (v for v in row.values() if isinstance(v, str))
+            found[task.task_index] = next(others, "") if task.task is None else task.task
         return found
 
-    def _read_episodes(self) -> dict[int, dict[str, Any]]:
-        lines = self.root / "meta" / "episodes.jsonl"
-        rows: Iterable[dict[str, Any]]
-        if lines.is_file():
-            rows = _read_lines(lines)
-        else:
-            rows = []
-            for path in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
-                table = read_parquet(path, lambda name: not name.startswith("stats/"))
-                rows += _table_rows(path, table)
-        found = {
-            row["episode_index"]: row for row in rows if isinstance(row.get("episode_index"), int)
-        }
-        if not found:
+    def _read_episodes(self) -> dict[int, tuple[_Episode, dict[str, Any]]]:
+        """By number, the row of each episode, as it is used and as a whole."""
+        found: dict[int, tuple[_Episode, dict[str, Any]]] = {}
+        for place, episode, row in self._listed("episodes", _Episode):
+            if isinstance(episode, SessionError):
+                self.refused[place] = episode
+            elif episode.episode_index in found:
+                self.refused[place] = SessionError(
+                    f"{self.root}/{place}: episode {episode.episode_index} occurs twice"
+                )
+            else:
+                found[episode.episode_index] = episode, row
+        if not found and not self.refused:
             raise SessionError(f"{self.root} has no list of its episodes in meta/")
         return found
+
+    def _listed(
+        self, what: str, kind: type[T]
+    ) -> Iterator[tuple[str, T | SessionError, dict[str, Any]]]:
+        """The rows of a list in ``meta/``, JSON lines or Parquet: place in the dataset, record or
+        the error of reading it, and the whole row.
+        """
+        name = f"meta/{what}.jsonl"
+        if (self.root / name).is_file():
+            for number, line in enumerate(_read_text(below(self.root, name)).split("\n"), 1):
+                if line.strip():
+                    place = f"{name}, line {number}"
+                    try:
+                        row = parse_record(line, dict[str, Any], self.root / place)
+                        yield place, to_record(row, kind, self.root / place), row
+                    except SessionError as error:
+                        yield place, error, {}
+            return
+        single = self.root / "meta" / f"{what}.parquet"
+        several = sorted((self.root / "meta" / what).glob("*/*.parquet"))
+        for file in [single] if single.is_file() else several:
+            name = file.relative_to(self.root).as_posix()
+            try:
+                table = read_parquet(below(self.root, name), lambda c: not c.startswith("stats/"))
+                columns = {c: _values(file, table, c) for c in table.column_names}
+            except SessionError as error:
+                yield name, error, {}
+                continue
+            for i, values in enumerate(zip(*columns.values(), strict=True)):
+                row = dict(zip(columns, values, strict=True))
+                try:
+                    yield f"{name}, row {i}", to_record(row, kind, f"{file}, row {i}"), row
+                except SessionError as error:
+                    yield f"{name}, row {i}", error, {}
 
     def _open(self, path: Path) -> Any:
         if path not in self._tables:
@@ -194,21 +290,20 @@ class Dataset:
             self._tables[path] = read_parquet(path, lambda name: name != "index")
         return self._tables[path]
 
-    def _table(self, episode: int, row: Mapping[str, Any]) -> tuple[Path, Any]:
-        pattern = str(self.info.get("data_path") or "")
-        chunks = self.info.get("chunks_size")
+    def _table(self, episode: int, row: _Episode) -> tuple[Path, Any]:
         values = {
-            "episode_chunk": episode
-            // (chunks if isinstance(chunks, int) and chunks > 0 else 1000),
+            "episode_chunk": episode // self.info.chunks_size,
             "episode_index": episode,
-            "chunk_index": row.get("data/chunk_index", 0),
-            "file_index": row.get("data/file_index", 0),
+            "chunk_index": row.chunk,
+            "file_index": row.file,
         }
-        path = self._path(pattern, values)
+        path = self._path("data_path", self.info.data_path, values)
         table = self._open(path)
         if "episode_index" in table.column_names:
-            column = np.asarray(table["episode_index"].to_numpy(zero_copy_only=False))
-            where = np.flatnonzero(column == episode)
+            column = table["episode_index"]
+            if str(column.type) not in ("int64", "int32"):
+                raise SessionError(f"{path}: episode_index holds {column.type}, not numbers")
+            where = np.flatnonzero(column.to_numpy(zero_copy_only=False) == episode)
             if not len(where):
                 raise SessionError(f"{path} has no frame of episode {episode}")
             if len(where) <= MOST_FRAMES:
@@ -217,24 +312,31 @@ class Dataset:
             raise SessionError(f"{path} has more than {MOST_FRAMES} frames of episode {episode}")
         return path, table
 
-    def _path(self, pattern: str, values: Mapping[str, Any]) -> Path:
-        try:
-            # a field may be a few digits wide, as LeRobot has them, and not a gigabyte
-            if re.search(r":[^}]{5}", pattern):
-                raise ValueError(pattern)
-            name = pattern.format(**values)
-        except (KeyError, IndexError, ValueError, AttributeError) as error:
+    def _path(self, key: str, pattern: str, values: Mapping[str, int | str]) -> Path:
+        """The file that a pattern of ``meta/info.json`` names.
+
+        Only what LeRobot writes is understood, a name in braces with a width, and not all that
+        Python's format could reach.
+        """
+
+        def insert(match: re.Match[str]) -> str:
+            value, width = values.get(match[1]), int(match[2] or 0)
+            if value is None or (match[2] and isinstance(value, str)):
+                return match[0]  # refused below, with its braces
+            return str(value).rjust(width, "0")
+
+        name = _FIELD.sub(insert, pattern)
+        if re.search(r"[{}]", name):
             raise SessionError(
-                f"{self.root}/meta/info.json has a path that cannot be used: {pattern!r}"
-            ) from error
-        found = safe_path(self.root, name)
-        if found is None:
-            raise SessionError(f"{self.root}/meta/info.json points outside the dataset: {name!r}")
-        return found
+                f"{self.root}/meta/info.json: $.{key} is no path that can be used: "
+                f"{one_line(pattern, 100)!r}",
+                hint=f"its fields are {', '.join(values)}, as in {{episode_index:06d}}",
+            )
+        return below(self.root, name)
 
     # -- columns -------------------------------------------------------------------------------
 
-    def _times(self, table: Any, problems: Problems) -> NDArray[np.int64]:
+    def _times(self, path: Path, table: Any, problems: Problems) -> NDArray[np.int64]:
         numbers = _column(table, "frame_index")
         period = 1e9 / self.fps
         if (
@@ -257,8 +359,8 @@ class Dataset:
     ) -> Iterator[Part]:
         found: dict[str, tuple[_Group, dict[str, dict[str, Floats]]]] = {}
         for (kind, field), column in COLUMNS.items():
-            feature = self.features.get(column)
-            if column not in table.column_names or not isinstance(feature, dict):
+            feature = self.info.features.get(column)
+            if column not in table.column_names or feature is None:
                 continue
             matrix = _matrix(table, column)
             if matrix is None:
@@ -304,23 +406,30 @@ class Dataset:
         return groups
 
     def _stated_groups(self, names: Sequence[str]) -> list[_Group] | None:
-        """The assignment stored by dexkit's export."""
-        stated = self._extension.get("parts")
-        if not isinstance(stated, list):
+        """The assignment stored by dexkit's export; None if it is of other elements.
+
+        :raises SessionError: it contradicts itself.
+        """
+        if self.info.dexkit.parts is None:
             return None
-        groups, at = [], 0
+        groups: list[_Group] = []
         by_name = {name: i for i, name in enumerate(names)}
-        for entry in stated:
-            try:
-                part, joints, features = entry["part"], entry["joints"], entry["features"]
-                hand = model(entry["model"]) if entry.get("model") else None
-                columns = [by_name[n] for n in features if n in by_name]
-            except (TypeError, KeyError, SessionError):
-                return None
-            if columns and len(columns) == len(joints):
-                groups.append(_Group(part, tuple(joints), tuple(columns), hand))
-                at += len(columns)
-        return groups if at == len(names) else None
+        for i, stated in enumerate(self.info.dexkit.parts):
+            hand = model(stated.model) if stated.model else None
+            columns = [by_name[n] for n in stated.features if n in by_name]
+            if not columns or len(columns) != len(stated.joints):
+                continue
+            known = {f"{side}{HAND}": side for side in Side}
+            if hand is not None and (
+                stated.part not in known or len(hand.joints[known[stated.part]]) != len(columns)
+            ):
+                raise SessionError(
+                    f"{self.root}/meta/info.json: {stated.part} with {len(columns)} joints is no "
+                    f"{hand.name} - at `$.{EXTENSION}.parts[{i}]`"
+                )
+            groups.append(_Group(stated.part, tuple(stated.joints), tuple(columns), hand))
+        taken = sorted(c for g in groups for c in g.columns)
+        return groups if taken == list(range(len(names))) else None
 
     def _hand(self, side: Side, names: Mapping[int, str], corrections: list[str]) -> _Group | None:
         """The hand of a side: the columns whose names are those of a model's joints."""
@@ -352,93 +461,88 @@ class Dataset:
     # -----------------------------------------------------------------
 
     def _cameras(
-        self, episode: int, row: Mapping[str, Any], table: Any, problems: Problems
+        self, episode: int, path: Path, table: Any, problems: Problems
     ) -> Iterator[Camera]:
-        for key, feature in self.features.items():
-            kind = feature.get("dtype") if isinstance(feature, dict) else None
-            if kind not in ("video", "image"):
+        names: dict[str, str] = {}
+        for key, feature in self.info.features.items():
+            if feature.dtype not in ("video", "image"):
                 continue
-            name = key.removeprefix(PICTURES)
-            if kind == "image":
-                if (camera := _embedded(name, key, table)) is None:
-                    problems.add(f"{name}: its pictures are not in the Parquet file")
-                else:
-                    yield camera
-                continue
-            chunks = self.info.get("chunks_size")
-            size = chunks if isinstance(chunks, int) and chunks > 0 else 1000
-            values = {
-                "video_key": key,
-                "episode_chunk": episode // size,
-                "episode_index": episode,
-                "chunk_index": row.get(f"videos/{key}/chunk_index", 0),
-                "file_index": row.get(f"videos/{key}/file_index", 0),
-            }
-            try:
-                path = self._path(str(self.info.get("video_path") or ""), values)
-            except SessionError as error:
-                problems.add(f"{name}: {error.message}")
-                continue
-            if not path.is_file():
-                problems.add(f"{name}: its video is missing", path.name)
-            start = row.get(f"videos/{key}/from_timestamp", 0.0)
-            first = float(start) if isinstance(start, (int, float)) else 0.0
-            stamps = _column(table, "timestamp")
-            if stamps is None:
-                stamps = np.arange(table.num_rows) / self.fps
-            relative = path.relative_to(Path(self.root).resolve()).as_posix()
-            yield Camera(
-                name,
-                (relative,) * table.num_rows,
-                seconds=tuple((first + stamps).tolist()),
-            )
+            name = file_name(key.removeprefix(PICTURES), 64)
+            if names.setdefault(name, key) != key:
+                problems.add(f"{key} is left out: its camera is called {name}, as {names[name]}'s")
+            elif feature.dtype == "video":
+                yield from self._video(name, key, episode, path, table, problems)
+            elif (camera := _embedded(name, key, path, table)) is None:
+                problems.add(f"{name}: its pictures are not in the Parquet file")
+            else:
+                yield camera
 
-    def _rest(self, table: Any, count: int) -> list[str]:
+    def _video(
+        self, name: str, key: str, episode: int, path: Path, table: Any, problems: Problems
+    ) -> Iterator[Camera]:
+        """The camera of a video, if its place is known."""
+        _, row = self._rows[episode]
+        values: dict[str, int | str] = {
+            "video_key": key,
+            "episode_chunk": episode // self.info.chunks_size,
+            "episode_index": episode,
+            "chunk_index": typed(row.get(f"videos/{key}/chunk_index"), Count) or 0,
+            "file_index": typed(row.get(f"videos/{key}/file_index"), Count) or 0,
+        }
+        try:
+            file = self._path("video_path", self.info.video_path or "", values)
+        except SessionError as error:
+            problems.add(f"{name}: {error.message}")
+            return
+        if not file.is_file():
+            problems.add(f"{name}: its video is missing", file.name)
+        first = typed(row.get(f"videos/{key}/from_timestamp"), _Seconds) or 0.0
+        stamps = _column(table, "timestamp")
+        if stamps is None:
+            stamps = np.arange(table.num_rows) / self.fps
+        relative = file.relative_to(self.root.resolve()).as_posix()
+        yield Camera(name, (relative,) * table.num_rows, seconds=tuple((first + stamps).tolist()))
+
+    def _rest(self, path: Path, table: Any) -> list[str]:
         """The other columns, as JSON; empty where they do not change."""
-        known = {*COLUMNS.values(), *_INDEXES[:4]}
-        others = [
-            c
-            for c in table.column_names
-            if c not in known
-            and (self.features.get(c) or {}).get("dtype") not in ("image", "video")
-        ]
-        if others == ["task_index"] and len(set(table["task_index"].to_pylist())) == 1:
+        pictures = {k for k, f in self.info.features.items() if f.dtype in ("image", "video")}
+        known = {*COLUMNS.values(), *_INDEXES[:4], *pictures}
+        columns = {c: _values(path, table, c) for c in table.column_names if c not in known}
+        if list(columns) == ["task_index"] and len(set(map(repr, columns["task_index"]))) == 1:
             return []
-        rows = table.select(others).to_pylist() if others else []
         found, before = [], None
-        for row in rows:
-            text = json.dumps(row, ensure_ascii=False, default=str)
+        for row in zip(*columns.values(), strict=True):
+            text = json.dumps(dict(zip(columns, row, strict=True)), ensure_ascii=False, default=str)
             found.append("" if text == before else text)
             before = text
-        return found if len(found) == count else []
+        return found
 
-    def _task_texts(self, row: Mapping[str, Any], table: Any) -> list[str]:
-        given = row.get("tasks")
-        if isinstance(given, list) and all(isinstance(t, str) for t in given) and given:
-            return list(given)
+    def _task_texts(self, row: _Episode, path: Path, table: Any) -> list[str]:
+        if row.tasks:
+            return row.tasks
         if "task_index" not in table.column_names:
             return []
-        numbers = dict.fromkeys(table["task_index"].to_pylist())
-        return [self._tasks[n] for n in numbers if n in self._tasks]
+        numbers = typed(_values(path, table, "task_index"), list[int]) or []
+        return [self._tasks[n] for n in dict.fromkeys(numbers) if n in self._tasks]
 
 
-def _table_rows(path: Path, table: Any) -> list[dict[str, Any]]:
-    """The rows of a table.
+def _values(path: Path, table: Any, name: str) -> list[Any]:
+    """The values of a column.
 
-    :raises SessionError: a text in it is not UTF-8.
+    :raises SessionError: one is nothing that Python has: a text that is not UTF-8, a late date.
     """
     try:
-        found: list[dict[str, Any]] = table.to_pylist()
-    except ValueError as error:
-        raise SessionError(f"{path} cannot be read: {error}") from error
+        found: list[Any] = table[name].to_pylist()
+    except (ValueError, OverflowError) as error:
+        raise SessionError(f"{path}: {one_line(name)} cannot be read: {one_line(error)}") from error
     return found
 
 
-def _embedded(name: str, key: str, table: Any) -> Camera | None:
+def _embedded(name: str, key: str, path: Path, table: Any) -> Camera | None:
     """A camera whose pictures are in the table; None if they are not."""
     if key not in table.column_names:
         return None
-    rows = table[key].to_pylist()
+    rows = _values(path, table, key)
     data = [r.get("bytes") if isinstance(r, dict) else None for r in rows]
     if not any(isinstance(d, bytes) for d in data):
         return None
@@ -446,26 +550,11 @@ def _embedded(name: str, key: str, table: Any) -> Camera | None:
     return Camera(name, paths, load=lambda i: data[i] if isinstance(data[i], bytes) else None)
 
 
-def _read_json(path: Path) -> Any:
-    data = read_bytes(path, _MAX_JSON, error=SessionError)
+def _read_text(path: Path) -> str:
     try:
-        return json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise SessionError(f"{path} is not valid JSON: {error}") from error
-
-
-def _read_lines(path: Path) -> list[dict[str, Any]]:
-    found = []
-    data = read_bytes(path, _MAX_JSON, error=SessionError)
-    try:
-        for line in data.decode("utf-8").splitlines():
-            if line.strip():
-                row = json.loads(line)
-                if isinstance(row, dict):
-                    found.append(row)
-    except (ValueError, RecursionError) as error:
-        raise SessionError(f"{path} is not valid JSON lines: {error}") from error
-    return found
+        return read_bytes(path, _MAX_JSON, error=SessionError).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SessionError(f"{path} is not UTF-8 text (at byte {error.start})") from error
 
 
 def _column(table: Any, name: str) -> Floats | None:
@@ -483,7 +572,7 @@ def _matrix(table: Any, name: str) -> Floats | None:
         return None
     if values.ndim == 1:
         values = values[:, None]
-    return values if values.ndim == 2 and values.shape[1] else None
+    return values if values.ndim == 2 and 0 < values.shape[1] <= MOST_JOINTS else None
 
 
 def _as_numbers(column: Any) -> Floats | None:
@@ -512,16 +601,17 @@ def _as_numbers(column: Any) -> Floats | None:
     return found
 
 
-def _names(feature: Mapping[str, Any], count: int) -> tuple[str, ...] | None:
+def _names(feature: _Feature, count: int) -> tuple[str, ...] | None:
     """The names of a vector's elements; datasets have them in several forms."""
-    names = feature.get("names")
+    names = feature.names
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
     if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
         names = names[0]
-    if not isinstance(names, list) or len(names) != count or len(set(map(str, names))) != count:
+    found = typed(names, list[str])
+    if found is None or len(found) != count or len(set(found)) != count:
         return None
-    return tuple(str(n) for n in names)
+    return tuple(found)
 
 
 def _words(name: str) -> list[str]:

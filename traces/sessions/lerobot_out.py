@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dexkit import __version__
 from dexkit.digests import sha256_of_file
-from dexkit.errors import ExtraMissing, SessionError
+from dexkit.errors import DexkitError, ExtraMissing, SessionError
 from dexkit.hand import Floats
 from dexkit.robots import ROBOTS
 from dexkit.staging import whole_folder
@@ -33,7 +33,6 @@ from dexkit.traces.sessions.lerobot_format import (
     STATE_COLUMN,
     parquet_library,
 )
-from dexkit.traces.sessions.model import MEASURED
 from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE
 
@@ -92,23 +91,29 @@ class _Scheme:
 
 
 def export_dataset(
-    traces: Sequence[Trace], out: Path, *, fps: int | None = None, task: str | None = None
+    traces: Sequence[Trace],
+    out: Path,
+    *,
+    fps: int | None = None,
+    task: str | None = None,
+    pictures: Path | None = None,
 ) -> Result:
     """Write recordings as one dataset, a folder.
 
     :param fps: frames a second; None for the rate of the first recording's pictures, commands or
         states.
     :param task: of all episodes; None for what each recording says.
+    :param pictures: the folder that was imported, with the pictures that are not in the recordings.
     :raises ExtraMissing: pyarrow or Pillow is not installed.
     :raises SessionError: ``out`` exists, cannot be written, or no recording can be used.
     """
     parquet_library()
     with whole_folder(out, error=SessionError) as root:
-        writer = _Writer(root, fps, task)
+        writer = _Writer(root, fps, task, pictures)
         for trace in traces:
             try:
                 writer.add(trace)
-            except SessionError as error:
+            except DexkitError as error:
                 if isinstance(error, ExtraMissing) or len(traces) == 1:
                     raise
                 writer.result.problems.append(f"{trace.path.name}: refused: {error.message}")
@@ -117,11 +122,14 @@ def export_dataset(
 
 
 class _Writer:
-    def __init__(self, root: Path, fps: int | None, task: str | None) -> None:
+    def __init__(
+        self, root: Path, fps: int | None, task: str | None, pictures: Path | None
+    ) -> None:
         self._arrow, self._parquet = parquet_library()
         self.root = root
         self.result = Result(fps=fps or 0)
         self._task = task
+        self._folder = pictures
         self._scheme: _Scheme | None = None
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
@@ -138,7 +146,7 @@ class _Writer:
 
         :raises SessionError: it cannot be used, or has other joints than the first one.
         """
-        source = open_source(trace)
+        source = open_source(trace, self._folder)
         name = trace.path.name
         scheme = _scheme(source)
         if self._scheme is None:
@@ -151,18 +159,24 @@ class _Writer:
                 raise SessionError(f"{name}: {feature.name} has values that no float32 can hold")
         # before anything is written: a picture that cannot be read refuses the whole recording
         pictures = [_load(source, frames, scheme) for frames in runs]
+        seen = [{c: _picture_statistics(c, data) for c, data in p.items()} for p in pictures]
         self._scheme = scheme
         self._measured[name] = {k: round(v, 4) for k, v in source.measured.items()}
         self.result.problems += [f"{name}: {text}" for text in (*source.problems, *told)]
         self._lost.update(dict.fromkeys(f"{name}: {text}" for text in source.lost))
-        for frames, loaded in zip(runs, pictures, strict=True):
-            self._add(source, frames, loaded, scheme)
+        for frames, loaded, found in zip(runs, pictures, seen, strict=True):
+            self._add(source, frames, loaded, found, scheme)
 
     def _add(
-        self, source: Source, frames: Frames, pictures: dict[str, list[bytes]], scheme: _Scheme
+        self,
+        source: Source,
+        frames: Frames,
+        pictures: dict[str, list[bytes]],
+        seen: dict[str, dict[str, list[Any]]],
+        scheme: _Scheme,
     ) -> None:
         episode, n = len(self._episodes), len(frames)
-        task = self._task or source.task or _UNNAMED
+        task = self._task or source.imported.task or _UNNAMED
         number = self._tasks.setdefault(task, len(self._tasks))
         first = self.result.frames
         vectors: dict[str, NDArray[Any]] = {f.name: f.matrix(frames) for f in scheme.features}
@@ -174,8 +188,8 @@ class _Writer:
             "task_index": np.full(n, number),
         }
         stats = {k: statistics(v) for k, v in (vectors | plain).items()}
-        for camera, data in pictures.items():
-            stats[PICTURES + camera] = found = _picture_statistics(camera, data)
+        for camera, found in seen.items():
+            stats[PICTURES + camera] = found
             self._picture_stats.setdefault(PICTURES + camera, []).append(found)
         for k, v in (vectors | plain).items():
             self._all.setdefault(k, []).append(v)
@@ -198,7 +212,7 @@ class _Writer:
             "file": source.trace.path.name,
             "sha256": sha256_of_file(source.trace.path),
             "start_ns": str(int(frames.times_ns[0])),
-            "clock": source.record.get("clock", MEASURED),
+            "clock": source.imported.clock,
         }
         self.result.episodes += 1
         self.result.frames += n

@@ -29,7 +29,7 @@ from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS, Dialect, HandModel, ModeByte, model
 from dexkit.traces.sessions import ros_types
-from dexkit.traces.sessions.imported import NOMINAL, RECORD, absent_key
+from dexkit.traces.sessions.imported import MEASURED, NOMINAL, RECORD, absent_key
 from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, STATE
 from dexkit.traces.writer import RecordingWriter, definition
 
@@ -48,8 +48,6 @@ __all__ = [
     "write",
 ]
 
-MEASURED = "measured"
-"""Value of ``clock``: the source has times."""
 REST_TOPIC = ros_types.group_topic("frame", "rest")
 _REFERENCE, _PICTURE = "reference", "compressed"
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
@@ -136,6 +134,7 @@ class Session:
     :param clock: :data:`~dexkit.traces.sessions.imported.NOMINAL` or :data:`MEASURED`.
     :param rate: frames a second, nominal or measured.
     :param folder: to which the paths of pictures are relative.
+    :param below: that folder, relative to the source that was named.
     :param first_ns: of a nominal clock, the time of frame 0; None where times are measured.
     :param rest: per frame, what neither a part nor a camera holds, as JSON; empty texts where it is
         the same as in the frame before.
@@ -158,6 +157,7 @@ class Session:
     corrections: list[str] = field(default_factory=list)
     problems: Problems = field(default_factory=Problems)
     name: str = ""
+    below: str = "."
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -241,7 +241,7 @@ def record_of(session: Session, *, embed: bool = False) -> dict[str, str]:
         "rate_hz": f"{session.rate:g}",
         "frames": str(len(session)),
         "pictures": "embedded" if embed else "referenced",
-        "pictures_folder": str(session.folder.absolute()),
+        "pictures_folder": session.below,
         "cameras": json.dumps({c.name: c.group for c in session.cameras}),
         **({} if session.first_ns is None else {"first_ns": str(session.first_ns)}),
         **session.about,

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from dexkit.documents import read_bytes
-from dexkit.errors import UsageError
+from dexkit.errors import SessionError, UsageError
+from dexkit.traces.sessions.paths import below
 
-__all__ = ["Picture", "parse_picture", "read_picture", "safe_path"]
+__all__ = ["Picture", "parse_picture", "read_picture"]
 
 _LARGEST = 32 * 2**20
 _JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xDA)})
@@ -31,23 +31,11 @@ class Picture:
     data: bytes
 
 
-def safe_path(folder: Path, name: str) -> Path | None:
-    """The file of a session's path; None if it is outside of the session's folder."""
-    pure = PurePosixPath(name.replace("\\", "/"))
-    if not name or "\x00" in name or pure.is_absolute() or ".." in pure.parts:
-        return None
-    try:
-        root = os.path.realpath(folder)
-        found = os.path.realpath(os.path.join(root, *pure.parts))
-    except ValueError:  # not a valid file name
-        return None
-    return Path(found) if os.path.commonpath([root, found]) == root else None
-
-
 def read_picture(folder: Path, name: str) -> tuple[Picture | None, str]:
     """(the picture, or None; the reason, as the end of "pictures that ...")."""
-    path = safe_path(folder, name)
-    if path is None:
+    try:
+        path = below(folder, name)
+    except SessionError:
         return None, "are not below the session's folder"
     try:
         if not path.is_file():

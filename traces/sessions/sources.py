@@ -46,11 +46,15 @@ class Entry:
     convert: Callable[[Path, bool, bool], Report]
 
 
-def beside(folder: Path, wire: Trace, options: Options = DEFAULT) -> Entry:
-    """An episode with times from a DDS recording of the same session."""
+def beside(folder: Path, wire: Trace, options: Options = DEFAULT, *, source: Path) -> Entry:
+    """An episode with times from a DDS recording of the same session.
+
+    :param source: the folder of episodes that was named.
+    """
 
     def convert(out: Path, embed: bool, overwrite: bool) -> Report:
         session = episodes.read_episode(folder, options)
+        session.below = _below(folder, source)
         if session.clock != NOMINAL:
             raise SessionError(f"{folder} has times of its own")
         written, times = write_beside(session, wire, out, embed=embed, overwrite=overwrite)
@@ -82,7 +86,7 @@ def find(source: Path, form: str | None = None, options: Options = DEFAULT) -> l
         return [
             _entry(f"episode_{n:06d}", lambda n=n: dataset.read(n))  # type: ignore[misc]
             for n in dataset.episodes
-        ]
+        ] + [_refused(Path(place).name, error) for place, error in dataset.refused.items()]
     folders = episodes.episode_folders(source)
     if not folders:
         raise SessionError(
@@ -90,14 +94,14 @@ def find(source: Path, form: str | None = None, options: Options = DEFAULT) -> l
             hint="an episode has a data.json, a LeRobot dataset meta/info.json, a bag "
             "metadata.yaml",
         )
+    found = {f: _below(f, source) for f in folders}
     return [
         _entry(
-            folder.name
-            if folder == source or not folder.is_relative_to(source)
-            else folder.relative_to(source).as_posix(),
+            folder.name if place == "." else place,
             lambda folder=folder: episodes.read_episode(folder, options),  # type: ignore[misc]
+            place,
         )
-        for folder in folders
+        for folder, place in found.items()
     ]
 
 
@@ -139,11 +143,26 @@ def _format(source: Path) -> str:
     return "episodes"
 
 
-def _entry(name: str, read: Callable[[], Session]) -> Entry:
+def _below(folder: Path, source: Path) -> str:
+    """An episode's folder, relative to the source that was named."""
+    return folder.relative_to(source).as_posix() if folder.is_relative_to(source) else "."
+
+
+def _entry(name: str, read: Callable[[], Session], place: str = ".") -> Entry:
     def convert(out: Path, embed: bool, overwrite: bool) -> Report:
         session = read()
+        session.below = place
         written = write(session, out, embed=embed, overwrite=overwrite)
         return Report(session.form, written, session.corrections, session.problems.sentences())
+
+    return Entry(name, convert)
+
+
+def _refused(name: str, error: SessionError) -> Entry:
+    """A session that cannot be read."""
+
+    def convert(out: Path, embed: bool, overwrite: bool) -> Report:
+        raise error
 
     return Entry(name, convert)
 

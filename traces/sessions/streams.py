@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.errors import SessionError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import MODELS, model
@@ -182,13 +183,18 @@ def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream
 
     :param topics: only these, in any spelling, patterns allowed.
     :raises UsageError: a topic is not in the recording.
+    :raises SessionError: a group of joints of an import has a message that is none.
     """
     known = [c.topic for c in trace.channels if c.message_count]
     wanted = known if topics is None else list(trace.load(topics, payloads=False))
     found: list[Stream] = []
     absent = absent_fields(trace.metadata.get(RECORD, {}))
     for topic, samples in trace.load(sorted(set(wanted) & set(known)), decode=True).items():
-        for stream in _streams(topic, samples):
+        try:
+            streams = list(_streams(topic, samples))
+        except WireError as error:
+            raise SessionError(f"{trace.path}: {topic}: {error}") from error
+        for stream in streams:
             lacking = absent.get(topic, frozenset())
             values = {f: v for f, v in stream.values.items() if f not in lacking}
             if len(stream) and "q" in values:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +30,8 @@ from dexkit.staging import whole_folder
 from dexkit.traces.reader import ChannelInfo, Definition, Trace
 from dexkit.traces.sessions.lerobot_format import parquet_library, parquet_pieces
 from dexkit.traces.sessions.model import Problems
+from dexkit.traces.sessions.paths import below, file_name
+from dexkit.traces.sessions.typed import parse_record, to_record
 from dexkit.traces.writer import RecordingWriter, definition
 
 __all__ = ["export_tables", "import_tables", "is_tables"]
@@ -108,7 +111,7 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
         root.mkdir()
         topics = []
         for number, ((topic, type_name), d) in enumerate(sorted(trace.definitions.items())):
-            name = f"{number:03d}_{_file_name(topic)}.{form}"
+            name = f"{number:03d}_{file_name(topic)}.{form}"
             entry = {
                 "topic": d.topic,
                 "type": type_name,
@@ -126,10 +129,6 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
         text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
         (root / _ABOUT).write_bytes(text.encode("utf-8", "backslashreplace"))
     return lost
-
-
-def _file_name(topic: str) -> str:
-    return "".join(c if c.isalnum() and c.isascii() else "_" for c in topic)[:100]
 
 
 def _export_topic(
@@ -235,37 +234,27 @@ def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: they cannot be read, or nothing in them can be used.
     """
-    data = read_bytes(source / _ABOUT, _LARGEST_ABOUT, error=SessionError)
-    try:
-        about = json.loads(data)
-        topics = [e for e in about["topics"] if isinstance(e, dict)]
-        metadata = {
-            str(name): {str(k): str(v) for k, v in values.items()}
-            for name, values in about.get("metadata", {}).items()
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise SessionError(
-            f"{source / _ABOUT} is not what dexkit export writes: {error}"
-        ) from error
+    path = below(source, _ABOUT)
+    data = read_bytes(path, _LARGEST_ABOUT, error=SessionError)
+    about = parse_record(data.decode("utf-8-sig", "replace"), _About, path)
     problems = Problems()
     rows: list[tuple[int, int, int, int, bytes]] = []
     with RecordingWriter(out, overwrite=overwrite) as writer:
-        for name, values in metadata.items():
+        for name, values in about.metadata.items():
             writer.add_metadata(name, values)
-        for entry in topics:
+        for number, entry in enumerate(about.topics):
             try:
-                channel, found = _import_topic(source, entry, problems)
+                topic = to_record(entry, _Topic, f"{path}, topics[{number}]")
+                channel, found = _import_topic(source, topic, problems)
             except DexkitError as error:
                 if isinstance(error, ExtraMissing):
                     raise
                 problems.add(error.message)
                 continue
-            number = writer.add_channel(channel)
-            rows += [
-                (log, len(rows) + i, sent, number, d) for i, (log, sent, d) in enumerate(found)
-            ]
-        for log, _, sent, number, data in sorted(rows, key=lambda r: r[:2]):
-            writer.put(number, data, log, sent)
+            place = writer.add_channel(channel)
+            rows += [(log, len(rows) + i, sent, place, d) for i, (log, sent, d) in enumerate(found)]
+        for log, _, sent, place, data in sorted(rows, key=lambda r: r[:2]):
+            writer.put(place, data, log, sent)
         if not writer.written:
             raise SessionError(
                 f"{source} has no message that can be used",
@@ -274,16 +263,30 @@ def import_tables(source: Path, out: Path, *, overwrite: bool = False) -> tuple[
         return writer.written, problems
 
 
+class _Topic(msgspec.Struct):
+    """A topic in ``session.json``; its schema's text is base64."""
+
+    topic: str
+    file: str
+    type: str = ""
+    message_encoding: str = "cdr"
+    metadata: dict[str, str] = {}
+    schema: tuple[str, str, str] | None = None
+    columns: str = "members"
+
+
+class _About(msgspec.Struct):
+    """``session.json``; each topic is checked when it is read."""
+
+    topics: list[Any]
+    metadata: dict[str, dict[str, str]] = {}
+
+
 def _import_topic(
-    source: Path, entry: Mapping[str, Any], problems: Problems
+    source: Path, entry: _Topic, problems: Problems
 ) -> tuple[Definition, list[tuple[int, int, bytes]]]:
-    name = str(entry.get("file", ""))
-    if Path(name).name != name or not name:
-        raise SessionError(f"{source / _ABOUT} points outside its folder: {name!r}")
-    path = source / name
-    topic = str(entry.get("topic", ""))
-    given = entry.get("metadata")
-    metadata = {str(k): str(v) for k, v in given.items()} if isinstance(given, dict) else {}
+    name = entry.file
+    path = below(source, name)
     found: list[tuple[int, int, bytes]] = []
 
     def report(lines: list[int]) -> None:
@@ -291,19 +294,14 @@ def _import_topic(
             problems.add(f"{name}: rows that cannot be read are left out", f"row {line}")
 
     pieces = _pieces(path)
-    if entry.get("columns") == "payload":
-        schema = entry.get("schema")
-        try:
-            channel = Definition(
-                topic,
-                str(entry.get("message_encoding", "cdr")),
-                metadata,
-                None
-                if schema is None
-                else (str(schema[0]), str(schema[1]), base64.b64decode(schema[2])),
-            )
-        except (ValueError, TypeError, LookupError) as error:
-            raise SessionError(f"{name}: its schema cannot be read: {error}") from error
+    if entry.columns == _PAYLOAD:
+        schema = None
+        if entry.schema is not None:
+            try:
+                schema = (*entry.schema[:2], base64.b64decode(entry.schema[2]))
+            except ValueError as error:
+                raise SessionError(f"{name}: its schema cannot be read: {error}") from error
+        channel = Definition(entry.topic, entry.message_encoding, entry.metadata, schema)
         for piece in pieces:
             bad = list(piece.short)
             for line, row in zip(piece.lines, zip(*piece.columns, strict=True), strict=True):
@@ -314,8 +312,8 @@ def _import_topic(
                     bad.append(line)
             report(bad)
         return channel, found
-    mt = message_type(str(entry.get("type", "")))
-    channel = definition(topic, mt, metadata)
+    mt = message_type(entry.type)
+    channel = definition(entry.topic, mt, entry.metadata)
     for piece in pieces:
         encoded, numbers = _encode(mt, piece.header, piece.columns, name)
         found += encoded
