@@ -122,11 +122,12 @@ def test_an_episode_is_merged_with_the_wire(tmp_path: Path) -> None:
     wire = tmp_path / "wire.mcap"
     whole = open_trace(sample_path("dex3_pinch"))
     cut(whole, wire, spans=[Span(int(at[0]) - 10**9, int(at[-1]) + 10**9)])
-    code, output = dexkit("import", folder, tmp_path / "m.mcap", "--wire", wire)
+    code, output = dexkit("import", folder.parent, tmp_path / "m.mcap", "--wire", wire)
     assert (code, "confidence 1.00" in output) == (1, True), output  # its pictures are missing
     trace = open_trace(tmp_path / "m.mcap")
     record = trace.metadata[RECORD]
     assert (record["clock"], record["wire"]) == ("measured", "wire.mcap")
+    assert record["pictures_folder"] == folder.name
     assert float(record["alignment_confidence"]) > 0.9
     got, source = streams(trace), streams(open_trace(wire))
     hand = got["left_hand", STATE]
