@@ -32,6 +32,7 @@ _WRITERS: dict[tuple[str, ...], list[str]] = {
 }
 """Commands that write files by options, with what they need for it."""
 _INPUTS = {
+    "--pictures",
     "--capabilities",
     "--recording",
     "--eeprom",
