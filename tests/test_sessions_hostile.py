@@ -13,7 +13,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dexkit import cli
 from dexkit.errors import SessionError, WireError
 from dexkit.traces import open_trace, schemas
 from dexkit.traces.sessions import old_layouts, ros_types, sources
@@ -382,20 +381,6 @@ def test_an_episode_for_which_the_memory_is_too_small_is_one_of_several(
     code, output = dexkit("import", tmp_path / "task", tmp_path / "out")
     assert (code, "b: refused: out of memory" in output) == (1, True)
     assert len(list((tmp_path / "out").iterdir())) == 2
-
-
-@each("error", [MemoryError(), RuntimeError("can't start new thread")], ids=str)
-def test_a_limit_of_the_machine_is_an_error_and_no_traceback(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    def limited(**_: object) -> None:
-        raise error
-
-    monkeypatch.setattr(cli.cli, "main", limited)
-    with pytest.raises(SystemExit) as caught:
-        cli.main(["backends"])
-    assert caught.value.code == 2
-    assert capsys.readouterr().err.startswith(f"error: {str(error) or 'out of memory'}\n")
 
 
 @each("names", [("a" * 251, "b"), ("a\n", "a_"), ("\udc80", "b")], ids=repr)
