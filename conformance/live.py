@@ -46,6 +46,7 @@ from dexkit.conformance.stimuli import (
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
 from dexkit.conformance.stimulus_record import RECORD, Planned, Stimulus
+from dexkit.conformance.suspension import sleep_awake
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject
@@ -366,7 +367,7 @@ class _LivePlayer:
         if not self._watch.measure_pause():
             for topic, payload in action.payloads:
                 sender.send(topic, payload, stamp)
-        self._clock.sleep_until((action.until_ns - self._offset) / 1e9)
+        sleep_awake(self._clock, (action.until_ns - self._offset) / 1e9)
 
     def _new_client(self, type_name: str | None = None) -> _Client:
         claim = self.sole.announce()

@@ -49,6 +49,7 @@ from dexkit.errors import HandTimeout
 __all__ = [
     "DRIFT",
     "FORGET",
+    "LONG_PAUSE",
     "PAUSE",
     "QUIET",
     "SETTLE",
@@ -59,6 +60,9 @@ __all__ = [
 
 PAUSE = 0.25
 """Seconds: a loop that did not run for longer had a pause, and an older command is stale."""
+LONG_PAUSE = 1.0
+"""Seconds: the command time-out of the family. After a longer pause the hands have long stopped by
+themselves, and a program with a schedule of its own moves them on only when it is asked to."""
 SETTLE = 0.2
 """Seconds by which a baseline is confirmed, and that a command must have been sent after the end
 of a pause. Covers a least latency of 0.14 s with the drift of a minute of silence."""

@@ -23,6 +23,7 @@ from dexkit.conformance.stimuli.usb import (
     UsbScript,
     Wait,
 )
+from dexkit.conformance.suspension import sleep_awake
 from dexkit.conformance.usb.access import UsbHost, bulk_pair, open_device
 from dexkit.conformance.usb.record import (
     RECORD,
@@ -161,7 +162,7 @@ class _Player:
                 status, data = self._host.read(self._in, length, timeout)
                 self._put(Transfer(begin, self._now_ns(), self._in, status, length, data))
             case Wait(until_ns=until):
-                self._clock.sleep_until((until - self._offset_ns) / 1e9)
+                sleep_awake(self._clock, (until - self._offset_ns) / 1e9)
             case Alone(alone=True):
                 self._turn.acquire()
                 self._has_turn = True

@@ -26,7 +26,7 @@ from dexkit.cli.options import (
     usb_option,
 )
 from dexkit.cli.remarks import remark
-from dexkit.clock import Rate
+from dexkit.clock import Rate, RealClock
 from dexkit.errors import HandTimeout, UsageError
 from dexkit.escaping import one_line
 from dexkit.hand import Side
@@ -196,7 +196,8 @@ class _Run:
 
     def _act(self) -> None:
         """Everything until the next question."""
-        session, rate = self._session, Rate(_RATE)
+        session, clock = self._session, RealClock()
+        rate = Rate(_RATE, clock)
         said, moving = "", False
         with self._keys() as held:
             while session.question is None and not session.done:
@@ -208,7 +209,7 @@ class _Run:
                         how = "hold SPACE: " if session.moves and self._terminal else ""
                         click.echo(f"{how}{said}")
                 now = time.monotonic()
-                key = held(now)
+                key = held(clock.since_boot())  # a key from before a sleep of the machine is old
                 # an old state is none to drive by: after a lost answer all is locked until the next
                 drive = session.step(now, self._snapshot, key) if not self._lost else None
                 if moving and drive is None and session.moves and session.doing == said:

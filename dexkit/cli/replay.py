@@ -30,6 +30,7 @@ from dexkit.escaping import REMARK, one_line
 from dexkit.redaction import redact
 
 if TYPE_CHECKING:
+    from dexkit.cli.consent import Consent
     from dexkit.conformance.virtual.rehearsal import Rehearsal
     from dexkit.traces.replay.commands import RecordedCommands
     from dexkit.traces.replay.live import LiveReplay
@@ -202,8 +203,12 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
 
     The default domain is 1, the simulation's: --domain 0 with a robot's interface moves real hands.
 
+    If this program was suspended for more than a second, it asks before it moves the hands on;
+    without a terminal it ends.
+
     Exit code: 0 played (or a loop was stopped, or nothing is refused with --check and --rehearse),
-    1 refused, stopped by the supervision, damaged, or not free, 2 it cannot be read, 130 stopped.
+    1 refused, stopped by the supervision, suspended without a terminal, damaged, or not free, 2 it
+    cannot be read, 130 stopped.
     """
     if given["as_recorded"] or given["no_wait"] or given["topics"]:
         return _as_recorded(ctx, source, given)
@@ -413,7 +418,8 @@ def _print_rehearsal(rehearsal: Rehearsal) -> None:
 
 
 def _play(prepared: Prepared, guards: Guards, given: dict[str, Any]) -> int:
-    from dexkit.cli.stop_keys import stop_keys
+    from dexkit.cli.consent import Consent
+    from dexkit.cli.stop_keys import is_stop, keys
     from dexkit.dds import DdsNode
     from dexkit.interpreter import timely_threads
     from dexkit.stop_signals import stop_on_signals
@@ -423,24 +429,29 @@ def _play(prepared: Prepared, guards: Guards, given: dict[str, Any]) -> int:
     assert prepared.plan is not None
     machine = ReplayMachine(prepared.plan, guards)
     domain, interface = given["domain"], given["interface"]
-    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        live = LiveReplay(node, machine, force=given["force"])
+    with (
+        stop_on_signals() as stop,
+        DdsNode(domain=domain, interface=interface) as node,
+        keys() as pressed,
+    ):
+        consent = Consent(pressed, stop)
+        live = LiveReplay(node, machine, force=given["force"], resume=consent)
         waiting = _Waiting(live, given["wait"])
         if not live.wait_ready(stop.event, waiting):
-            return 130
+            return consent.explain() or 130
         click.echo(f"ready: playing on domain {domain}, {interface}; space, q or Ctrl-C stops")
-        with timely_threads(), _status() as show, stop_keys() as pressed:
+        with timely_threads(), _status() as show:
 
             def turn(machine: ReplayMachine) -> None:
                 show(machine)
-                if stop or pressed():
+                if stop or is_stop(pressed()):
                     machine.stop(End.ASKED, "stopped")
 
             live.play(turn)
-    return _print_end(machine)
+    return _print_end(machine, consent)
 
 
-def _print_end(machine: ReplayMachine) -> int:
+def _print_end(machine: ReplayMachine, consent: Consent) -> int:
     from dexkit.traces.replay.machine import End
 
     done = machine.progress
@@ -460,6 +471,8 @@ def _print_end(machine: ReplayMachine) -> int:
         return 0
     if machine.end is End.ASKED:
         return 0 if machine.guards.loop else 130
+    if machine.end is End.SUSPENDED:
+        return consent.explain()
     click.echo(one_line(f"stopped: {machine.reason}", REMARK), err=True)
     return 1
 

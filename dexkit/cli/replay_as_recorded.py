@@ -12,6 +12,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.consent import Consent
+from dexkit.cli.stop_keys import keys
+from dexkit.clock import RealClock
+from dexkit.command_age import PauseWatch
 from dexkit.errors import DdsError, TraceUnsupported
 from dexkit.escaping import REMARK, one_line
 from dexkit.interpreter import timely_threads
@@ -64,7 +68,12 @@ def play_as_recorded(
         f"{file}: {len(player)} messages of {', '.join(map(one_line, player.topics))}, "
         f"{player.duration:.1f} s" + (", looped" if loop else "")
     )
-    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
+    with (
+        stop_on_signals() as stop,
+        DdsNode(domain=domain, interface=interface) as node,
+        keys() as pressed,
+    ):
+        consent = Consent(pressed, stop)
         # a hand must have one source of commands: a recording gives way to any other
         sole = SolePublisher(
             [NodeTopics(node, player.topics)],
@@ -80,10 +89,10 @@ def play_as_recorded(
         }
         sole.settle()
         if not no_wait:
-            _wait_for_readers(node, writers, wait, stop)
+            _wait_for_readers(node, writers, wait, stop, consent)
             stop.wait(_SETTLE)
         if stop:
-            return 130
+            return consent.explain() or 130
         click.echo(f"ready: playing on domain {domain}, {interface}")
         with timely_threads(), _status(player):
 
@@ -94,6 +103,9 @@ def play_as_recorded(
                 return writers[message.topic].write_raw(message.data, now_ns)
 
             def paused(seconds: float) -> None:
+                if not consent(seconds):
+                    stop.set()
+                    return
                 click.echo(
                     f"this program was paused for {seconds:.2f} s; the recording goes on where it "
                     "was left",
@@ -110,6 +122,8 @@ def play_as_recorded(
         f"{stats.error_max * 1e3:.3f} ms (max)"
         + (f"; paused {stats.pauses} times" if stats.pauses else "")
     )
+    if consent.missing:
+        return consent.explain()
     # for a loop, being stopped is the ordinary end
     if stats.stopped and not loop:
         return 130
@@ -127,18 +141,27 @@ def _check_types(trace: Trace, player: Player) -> None:
 
 
 def _wait_for_readers(
-    node: DdsNode, writers: dict[str, Writer], patience: float, stop: StopRequest
+    node: DdsNode,
+    writers: dict[str, Writer],
+    patience: float,
+    stop: StopRequest,
+    consent: Consent,
 ) -> None:
     """Return when each topic is subscribed, or the user gives up.
 
     :raises DdsError: a topic is still not subscribed after ``patience`` seconds.
     """
     end = time.monotonic() + patience
+    watch = PauseWatch(RealClock())
     missing = [t for t, w in writers.items() if not w.matched]
     if missing:
         names = ", ".join(map(one_line, missing))
         click.echo(f"waiting for a subscriber of {names} ...", err=True)
     while missing and not stop and time.monotonic() < end:
+        if (away := watch.measure_pause()) and not consent(away):
+            stop.set()
+            return
+        watch.restart()
         writers[missing[0]].wait_matched(timeout=0.1)
         missing = [t for t, w in writers.items() if not w.matched]
     if missing and not stop:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.consent import Consent
 from dexkit.cli.options import (
     FILE,
     Number,
@@ -27,6 +28,7 @@ from dexkit.cli.options import (
     wait_option,
 )
 from dexkit.cli.status_line import StatusLine
+from dexkit.cli.stop_keys import Keys, is_enter, is_stop, keys
 from dexkit.errors import DdsError, UsageError
 from dexkit.escaping import REMARK, one_line
 from dexkit.hand import Hand, Side
@@ -95,12 +97,13 @@ def command(backend_name: str | None, **given: Any) -> int:
 
     BACKEND is a name from 'dexkit backends' or package.module:Class; the hand is driven directly.
     Every joint MOVES over its whole range, slowly at first: keep the hand free. Space, q or Ctrl-C
-    stops and leaves the hand at rest.
+    stops and leaves the hand at rest. If this program was suspended for more than a second, it asks
+    before it goes on; without a terminal it ends.
 
     Writes a page and a JSON file. With --baseline it reports what has become worse since.
 
-    Exit code: 0 no fault found, 1 a fault, a change for the worse, or a failed measurement, 2 the
-    test cannot begin, 130 stopped.
+    Exit code: 0 no fault found, 1 a fault, a change for the worse, a failed measurement, or
+    suspended without a terminal, 2 the test cannot begin, 130 stopped.
     """
     if (backend_name is None) == (not given["external"]):
         raise UsageError(
@@ -159,8 +162,12 @@ def command(backend_name: str | None, **given: Any) -> int:
                 f"{model_by_name(spec.model).title}; space, q or Ctrl-C stops",
                 err=True,
             )
-        with _turn(stop, given["quiet"]) as turn:
-            run(hand, test, turn=turn)
+        pressed = stack.enter_context(keys())
+        consent = Consent(pressed, stop)
+        with _turn(stop, pressed, given["quiet"]) as turn:
+            run(hand, test, turn=turn, resume=consent)
+    if consent.missing:
+        return consent.explain()
     if test.end is End.STOPPED:
         click.echo("stopped; the hand is at rest, and nothing was written", err=True)
         return 130
@@ -233,39 +240,37 @@ def _outputs(given: dict[str, Any], model: str) -> tuple[Path, Path]:
 
 
 @contextmanager
-def _turn(stop: StopRequest, quiet: bool) -> Iterator[Callable[[SelfTest], None]]:
+def _turn(stop: StopRequest, pressed: Keys, quiet: bool) -> Iterator[Callable[[SelfTest], None]]:
     """Shows progress and questions, and takes keys, in each turn of a test."""
-    from dexkit.cli.stop_keys import is_stop, keys
     from dexkit.conformance.selftest.supervision import End
 
     status = StatusLine(quiet)
     said = ""
-    with keys() as pressed:
 
-        def turn(test: SelfTest) -> None:
-            nonlocal said
-            procedure = test.procedure
-            keyed = pressed()
-            if stop or is_stop(keyed):
-                test.stop(End.STOPPED, "stopped")
-            elif procedure.question and any(key in b"\r\n" for key in keyed):
-                procedure.skip()
-            now = procedure.question or procedure.doing
-            if now == said:
-                return
-            said = now
-            text = f"{procedure.part:4.0%}  {now}"
-            if procedure.question:
-                text = f"touch: {now}; Enter goes on without"
-            if status:
-                status.show(one_line(text, REMARK))
-            elif not quiet:
-                click.echo(one_line(text, REMARK), err=True)
+    def turn(test: SelfTest) -> None:
+        nonlocal said
+        procedure = test.procedure
+        keyed = pressed()
+        if stop or is_stop(keyed):
+            test.stop(End.STOPPED, "stopped")
+        elif procedure.question and is_enter(keyed):
+            procedure.skip()
+        now = procedure.question or procedure.doing
+        if now == said:
+            return
+        said = now
+        text = f"{procedure.part:4.0%}  {now}"
+        if procedure.question:
+            text = f"touch: {now}; Enter goes on without"
+        if status:
+            status.show(one_line(text, REMARK))
+        elif not quiet:
+            click.echo(one_line(text, REMARK), err=True)
 
-        try:
-            yield turn
-        finally:
-            status.clear()
+    try:
+        yield turn
+    finally:
+        status.clear()
 
 
 def _finish(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.consent import Consent
 from dexkit.cli.options import (
     LocalPath,
     dds_options,
@@ -23,6 +24,7 @@ from dexkit.cli.options import (
     side_option,
     wait_option,
 )
+from dexkit.cli.stop_keys import keys
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
@@ -115,10 +117,11 @@ def command(
     does. The default domain is 1, the simulation's:
     --domain 0 with a robot's interface moves real hands.
 
-    At the end, on Ctrl-C too, the hands are commanded to hold their position.
+    At the end, on Ctrl-C too, the hands are commanded to hold their position. If this program was
+    suspended for more than a second, it asks before it moves them on; without a terminal it ends.
 
     Exit codes: 0 done, 1 the hand gave no state, fell silent, or is commanded by another program,
-    2 wrong usage, 130 interrupted.
+    or this program was suspended without a terminal, 2 wrong usage, 130 interrupted.
     """
     if list_only:
         _list()
@@ -143,10 +146,11 @@ def command(
         if record_path is not None:
             _record(stack, record_path, spoken, domain, interface)
         node = stack.enter_context(DdsNode(domain=domain, interface=interface))
-        live = LiveClient(node, client, force=force)
+        consent = Consent(stack.enter_context(keys()), stop)
+        live = LiveClient(node, client, force=force, resume=consent)
         waiting = _WaitReport(node, spoken, wait)
         if not live.wait_ready(stop.event, waiting):
-            return 130
+            return consent.explain() or 130
         _print_to_stderr(
             f"ready: {chosen.name} on {spoken.name}, domain {domain}, {interface}, {seconds:g} s"
         )
@@ -163,6 +167,8 @@ def command(
             "figures of then are not the hand's"
         )
     _report(session, operator, 1 / client.period, as_json=as_json)
+    if code := consent.explain():
+        return code
     silent = [] if stopped else _silent_sides(session, seconds)
     for side in silent:
         _print_to_stderr(

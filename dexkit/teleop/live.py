@@ -8,7 +8,8 @@ it leaves the hand at rest (:meth:`LiveClient.leave`).
 It differs after a pause of its own, too (stopped, suspended, starved; more than
 :data:`~dexkit.command_age.PAUSE`). The genuine client would go on by what it last read, or by where
 the operator is by now. This one sends nothing until each hand has published its position *now*,
-forgets what it smoothed, and lets the operator go on where he was.
+forgets what it smoothed, and lets the operator go on where he was. After a pause of more than
+:data:`~dexkit.command_age.LONG_PAUSE` it does so only with leave.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.clock import RealClock
-from dexkit.command_age import PAUSE, SETTLE, PauseWatch
+from dexkit.command_age import LONG_PAUSE, PAUSE, SETTLE, PauseWatch
 from dexkit.dds import DdsNode, Qos
 from dexkit.errors import WireError
 from dexkit.hand import Floats, Side
@@ -101,12 +102,25 @@ class LiveClient:
     :param client: fresh, for the sides that it is to drive.
     :param force: command beside others. Two clients on one hand would alternate, and a real one may
         carry something: this one gives way to other clients.
+    :param resume: called after a pause of this program that was longer than
+        :data:`~dexkit.command_age.LONG_PAUSE`, with its seconds; returns whether to move the hands
+        on. By default they are not.
     :raises TopicConflict: another program commands one of these hands. So do :meth:`wait_ready` and
         :meth:`perform`, when one starts to.
     """
 
-    def __init__(self, node: DdsNode, client: TeleopClient, *, force: bool = False) -> None:
+    def __init__(
+        self,
+        node: DdsNode,
+        client: TeleopClient,
+        *,
+        force: bool = False,
+        resume: Callable[[float], bool] = lambda seconds: False,
+    ) -> None:
         self._node = node
+        self._resume = resume
+        self._stale = False
+        """The states are from before a pause."""
         self._client = client
         self._wire = ClientCodec(client.dialect)
         self._arrived = threading.Event()
@@ -141,11 +155,15 @@ class LiveClient:
         """Wait until the client has the states that it wants, and the hands listen.
 
         :param report: called once a second with what is missing by side, and for how long.
-        :returns: False when it was stopped.
+        :returns: False when it was stopped, or paused for long without leave to go on.
         """
         begin = time.monotonic()
         reported = 0.0
         while not stop.is_set():
+            if away := self._watch.measure_pause():
+                if not self._may_go_on(away):
+                    return False
+                self._restart_after_pause(stop)
             now = time.monotonic()
             self._sole.poll()
             self._read(now)
@@ -174,18 +192,19 @@ class LiveClient:
     ) -> TeleopSession:
         """Run the operator's motion for some seconds, or until stopped.
 
-        After a pause of this program it continues where it was.
+        After a pause of this program it continues where it was, or ends without leave to go on.
 
         :param progress: called about twice a second.
         """
         session = TeleopSession(self._client.sides)
         period = self._client.period
         start = reported = seen = time.monotonic()
-        self._watch.restart()
         while not stop.is_set():
             away = self._watch.measure_pause()
             if away:
                 session.pauses.append((seen - start, away))
+                if not self._may_go_on(away):
+                    break
                 self._restart_after_pause(stop)
                 start += time.monotonic() - seen
                 seen = time.monotonic()
@@ -211,6 +230,11 @@ class LiveClient:
             self._sleep(now + period, start, session)
         return session
 
+    def _may_go_on(self, away: float) -> bool:
+        """Whether to move the hands on after a pause."""
+        self._stale = not (away <= LONG_PAUSE or self._resume(away))
+        return not self._stale
+
     def _restart_after_pause(self, stop: threading.Event) -> None:
         """After a pause: drop queued states, then wait for a state of each hand."""
         stop.wait(SETTLE)  # for queued states, and for other clients that started meanwhile
@@ -233,7 +257,7 @@ class LiveClient:
         second to stay where it is, with its motors locked where the dialect has a mode byte (status
         0).
         """
-        if self._watch.away() > PAUSE:  # ended in a pause: the hands may be elsewhere by now
+        if self._stale or self._watch.away() > PAUSE:  # the hands may be elsewhere by now
             time.sleep(SETTLE)
             for reader in self._readers.values():
                 reader.take()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from dexkit.clock import RealClock, wait_until
-from dexkit.command_age import PAUSE, PauseWatch
+from dexkit.command_age import LONG_PAUSE, PAUSE, PauseWatch
 from dexkit.errors import TopicConflict, WireError
 from dexkit.models import DIALECTS
 from dexkit.single_publisher import NodeTopics, SolePublisher
@@ -27,20 +27,35 @@ __all__ = ["LiveReplay"]
 _NAP = 0.05
 
 
+def _refuse(seconds: float) -> bool:
+    return False
+
+
 class LiveReplay:
     """A machine's endpoints on a node, and its loop.
 
     :param force: command although other clients do. By default the replay stops if another client
         commands the hands.
+    :param resume: called after a pause of this program that was longer than
+        :data:`~dexkit.command_age.LONG_PAUSE`, with its seconds; returns whether to move the hands
+        on. By default they are not.
     :raises TopicConflict: another program commands one of the hands. So does :meth:`play`, when one
         starts to.
     """
 
-    def __init__(self, node: DdsNode, machine: ReplayMachine, *, force: bool = False) -> None:
+    def __init__(
+        self,
+        node: DdsNode,
+        machine: ReplayMachine,
+        *,
+        force: bool = False,
+        resume: Callable[[float], bool] = _refuse,
+    ) -> None:
         from dexkit.dds import Qos
 
         self.node, self.machine = node, machine
         plan = machine.plan
+        self._resume = resume
         self._encode = ClientCodec(plan.dialect)
         self._states = HandStateCodec(plan.dialect)
         self.command_topics = tuple(
@@ -99,10 +114,12 @@ class LiveReplay:
         """Wait until the hands have a command reader and have published their state.
 
         :param waiting: called every 50 ms with the seconds so far; may raise.
-        :returns: False when it was stopped.
+        :returns: False when it was stopped, or paused for long without leave to go on.
         """
         begin = time.monotonic()
         while not stop.is_set():
+            if (away := self._watch.measure_pause()) and not self._may_go_on(away):
+                return False
             self._sole.poll()
             self._read()
             if not self.unsubscribed and not self.machine.missing:
@@ -117,24 +134,32 @@ class LiveReplay:
         :param turn: called in every cycle; it may stop the machine, and must not block. If it
             raises, the hands are brought to rest first.
         """
-        self._watch.restart()
         try:
             self._run(turn)
         except TopicConflict as conflict:
             self.machine.abandon(End.ASKED, conflict.message)
             raise
         except BaseException:
+            self._resume = _refuse
             self.machine.stop(End.ASKED, "this program failed")
             self._run(lambda machine: None)
             raise
 
+    def _may_go_on(self, away: float) -> bool:
+        """Start over after a pause: no state from before counts. Whether to move the hands on."""
+        allowed = away <= LONG_PAUSE or self.machine.end is not None or self._resume(away)
+        self._watch.restart()
+        for reader in self._readers.values():
+            reader.take()
+        self.machine.pause(time.monotonic())
+        return allowed
+
     def _run(self, turn: Callable[[ReplayMachine], object]) -> None:
         machine, clock = self.machine, RealClock()
         while machine.phase is not Phase.END:
-            if self._watch.measure_pause():
-                for reader in self._readers.values():
-                    reader.take()
-                machine.pause(clock.now())
+            if (away := self._watch.measure_pause()) and not self._may_go_on(away):
+                turn(machine)  # a stop that was asked for comes first
+                machine.stop(End.SUSPENDED, f"this program was suspended for {away:.1f} s")
             turn(machine)
             self._sole.poll()
             self._read()

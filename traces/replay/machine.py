@@ -16,7 +16,8 @@ after a delay of the caller the session continues where it was, and nothing is s
   as the modelled teleoperation client does at its end.
 
 After a pause of the caller (:data:`~dexkit.command_age.PAUSE`) the machine starts over with WAIT:
-the hand may have moved, and is led from there back to the session.
+the hand may have moved, and is led from there back to the session. When it is stopped before that,
+LEAVE begins with the wait for fresh states, and a hand without one is not commanded any more.
 """
 
 from __future__ import annotations
@@ -86,6 +87,7 @@ class End(str, Enum):
     FAULT = "fault"
     SILENT = "silent"
     DISTANCE = "distance"
+    SUSPENDED = "suspended"
 
     def __str__(self) -> str:
         return self.value
@@ -162,6 +164,8 @@ class ReplayMachine:
         self._sent: dict[Side, tuple[float, Sequence[JointCommand]]] = {}
         self._far_since: dict[tuple[Side, int], float] = {}
         self._not_before = -math.inf
+        self._stale = False
+        """Whether nothing has been sent since a pause: what was sent last is old."""
         self._last: float | None = None
         self._since = 0.0
         """Seconds of the phase so far."""
@@ -208,6 +212,7 @@ class ReplayMachine:
         self._not_before = now + SETTLE
         self._seen.clear()
         self._far_since.clear()
+        self._stale = True
         self.progress.pauses += 1
         self._last = now
         if self.phase in (Phase.RAMP, Phase.PLAY):
@@ -338,6 +343,12 @@ class ReplayMachine:
         return self._note(now, found)
 
     def _leave(self) -> Commands:
+        if self._stale and any(s not in self._seen for s in self._sent):
+            if self.end is End.SILENT or self._since >= _PATIENCE:
+                self._enter(Phase.END)
+            return {}
+        if self._stale:
+            self._stale, self._since = False, 0.0
         if self._since >= _LEAVING:
             self._enter(Phase.END)
             return {}
@@ -356,6 +367,7 @@ class ReplayMachine:
             commands = {**{s: motors for s, (_, motors) in self._sent.items()}, **commands}
         for side, motors in commands.items():
             self._sent[side] = (now, motors)
+            self._stale = False
         self.progress.sent += len(commands)
         return commands
 
