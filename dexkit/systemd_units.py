@@ -13,7 +13,10 @@ from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
 
-__all__ = ["device_link", "serial_rule", "unit", "unit_name", "usb_rules"]
+__all__ = ["GROUPS", "device_link", "serial_rule", "unit", "unit_name", "usb_rules"]
+
+GROUPS = ("dialout", "plugdev")
+"""Who may use serial ports and USB devices, on Debian and its relatives."""
 
 _PLAIN = re.compile(r"[A-Za-z0-9@%+=:,./_-]+")
 _WATCHDOG = 5  # seconds without a state after which systemd restarts the service
@@ -29,33 +32,78 @@ def device_link(side: Side) -> str:
     return f"/dev/dexkit-{side}"
 
 
-def _quoted(word: str) -> str:
-    """A word of ExecStart (systemd.service(5), "Command lines").
+def _plain(text: str) -> str:
+    """A text of one line, in which nothing is a specifier (systemd.unit(5), "Specifiers").
 
-    :raises UsageError: it holds a control character.
+    :raises UsageError: it holds a control character, or is not Unicode.
     """
-    if any(ord(c) < 32 for c in word):
-        raise UsageError(f"{word!r} cannot be written into a systemd unit")
-    word = word.replace("%", "%%").replace("$", "$$")
+    if any(ord(c) < 32 or "\ud800" <= c <= "\udfff" for c in text):
+        raise UsageError(f"{text!r} cannot be written into a systemd unit")
+    return text.replace("%", "%%")
+
+
+def _quoted(word: str) -> str:
+    """A word of a list (systemd.syntax(7), "Quoting").
+
+    :raises UsageError: as for :func:`_plain`.
+    """
+    word = _plain(word)
     if _PLAIN.fullmatch(word):
         return word
     return '"' + word.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def unit(side: Side, command: Sequence[str], *, user: str, what: str) -> str:
+def _command(words: Sequence[str]) -> str:
+    """A command line (systemd.service(5), "Command lines"): variables are not in the program."""
+    program, *arguments = words
+    return " ".join([_quoted(program), *(_quoted(word.replace("$", "$$")) for word in arguments)])
+
+
+def _folder(folder: Path) -> str:
+    """A folder, which systemd reads to the end of its line, without quotes.
+
+    :raises UsageError: it would read another one.
+    """
+    text = str(folder)
+    if not text.startswith("/") or text != text.strip() or text.endswith("\\"):
+        raise UsageError(
+            f"the folder {text!r} cannot be written into a systemd unit", hint="rename it"
+        )
+    return _plain(text)
+
+
+def unit(
+    side: Side,
+    command: Sequence[str],
+    *,
+    user: str,
+    what: str,
+    groups: Sequence[str] = GROUPS,
+    folder: Path | None = None,
+    python_path: str = "",
+) -> str:
     """The unit of one hand's service.
 
     :param command: the command line, program first.
     :param user: who runs it.
     :param what: the hand, for its description.
-    :raises UsageError: a word or name cannot be written into a unit.
+    :param groups: that the service is in beside the user's own. Each has to exist.
+    :param folder: working folder, where a plug-in is loaded from; None for systemd's, "/".
+    :param python_path: value of PYTHONPATH, or empty.
+    :raises UsageError: a word, name or folder cannot be written into a unit.
     """
-    if not re.fullmatch(r"[a-z_][a-z0-9_-]*\$?", user):
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]*\$?", user):
         raise UsageError(f"{user!r} is not a user name")
+    place = "" if folder is None else f"WorkingDirectory={_folder(folder)}\n"
+    if python_path:
+        place += f"Environment={_quoted('PYTHONPATH=' + python_path)}\n"
+    devices = f"SupplementaryGroups={' '.join(groups)}\n" if groups else ""
+    if devices:
+        devices = "# serial ports and USB devices of hands\n" + devices
     return f"""\
 # Written by dexkit install-service (docs/install-service.md).
 [Unit]
-Description=dexkit: {side} hand ({what})
+Description=dexkit: {side} hand ({_plain(what)})
 # the interface may come later still: --wait-for-interface
 Wants=network-online.target
 After=network-online.target
@@ -65,11 +113,9 @@ StartLimitIntervalSec=0
 [Service]
 Type=notify
 NotifyAccess=main
-ExecStart={" ".join(map(_quoted, command))}
-User={user}
-# serial ports and USB devices of hands
-SupplementaryGroups=dialout plugdev
-# ready when the topics are up, which may take until device and network are there
+ExecStart={_command(command)}
+{place}User={user}
+{devices}# ready when the topics are up, which may take until device and network are there
 TimeoutStartSec=infinity
 # the state loop reports; without a report for {_WATCHDOG} s the service is killed and started again
 WatchdogSec={_WATCHDOG}

@@ -201,6 +201,8 @@ def _run_block(block: Sequence[Shown], host: Host, folder: Path, device: str) ->
             if words[0] not in SERVICES or "--dry-run" in words:
                 if words[0] == "install-service" and "--dry-run" not in words:
                     continue
+                if words[0] == "install-service" and os.geteuid() == 0:
+                    words = [*words, "--user", "root"]
                 wrong = _run(command, folder, words)
             else:
                 kind = _kind(words)

@@ -39,7 +39,7 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("emulate", "revo2"): ["--link", "<link>"],
     ("emulate", "rh56"): ["--link", "<link>"],
     ("info",): [_SAMPLE],
-    ("install-service",): ["sim-dex1", "--side", "left", "--dry-run"],
+    ("install-service",): ["sim-dex1", "--side", "left", "--user", "root", "--dry-run"],
     ("record",): ["<new>"],
     ("replay",): [_SAMPLE],
     ("report",): ["<result>"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import shlex
 import shutil
 import signal
@@ -12,11 +13,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
 from dexkit import sd_notify, systemd_units
+from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.errors import OutputError, UsageError
 from dexkit.hand import Side
@@ -89,6 +92,104 @@ def test_systemd_accepts_the_units(tmp_path: Path) -> None:
 def test_words_are_quoted_as_systemd_reads_them() -> None:
     text = unit(Side.LEFT, ["a b", "50%", "$x", 'q"\\'], user="me", what="x")
     assert 'ExecStart="a b" 50%% "$$x" "q\\"\\\\"' in text
+    text = unit(
+        *(Side.LEFT, ["/opt/$5", ";", "$x"]),
+        user="Jo.Doe",
+        what="50%n",
+        groups=(),
+        folder=Path("/home/a b/50%"),
+        python_path='/x "y:/z$%',
+    )
+    lines = text.splitlines()
+    assert 'ExecStart="/opt/$5" ";" "$$x"' in lines
+    assert "WorkingDirectory=/home/a b/50%%" in lines
+    assert 'Environment="PYTHONPATH=/x \\"y:/z$%%"' in lines
+    assert "User=Jo.Doe" in lines
+    assert "Description=dexkit: left hand (50%%n)" in lines
+    assert "SupplementaryGroups" not in text
+
+
+@each(
+    "given",
+    [
+        {"what": "x\nExecStartPre=/bin/evil"},
+        {"python_path": "/a\n"},
+        {"python_path": "/a\udc80"},
+        {"folder": Path("/a\nb")},
+        {"folder": Path("/a ")},
+        {"folder": Path("/a\\")},
+        {"folder": Path("a")},
+        {"user": "root\nUser=x"},
+        {"user": "0"},
+    ],
+)
+def test_what_would_be_read_as_something_else_is_not_written(given: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        unit(Side.LEFT, ["/x"], **{"user": "me", "what": "x", **given})
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="is about root")
+def test_root_has_to_be_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ("sim-dex1", "--side", "left", "--dry-run")
+    for caller in (None, "root"):
+        if caller is None:
+            monkeypatch.delenv("SUDO_USER", raising=False)
+        else:
+            monkeypatch.setenv("SUDO_USER", caller)
+        with pytest.raises(UsageError, match="would run as root") as raised:
+            _install(*words)
+        assert "--user NAME" in raised.value.hint
+        assert "User=root\n" in _install(*words, "--user", "root")
+    monkeypatch.setenv("SUDO_USER", "nobody")
+    monkeypatch.setattr("dexkit.cli.install_service._load_problem", lambda *given: "")
+    assert "User=nobody\n" in _install(*words)
+
+
+_PLUGIN = """\
+from dexkit.emulators.sim_dex1 import SimHand as Hand
+"""
+
+
+def test_unit_of_a_plugin_path_names_the_folder_that_it_is_loaded_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    me = pwd.getpwuid(os.geteuid()).pw_name
+    module = f"hand_{tmp_path.name.replace('-', '_')}"
+    words = (f"{module}:Hand", "--side", "left", "--user", me, "--dry-run")
+    folder = tmp_path / "a b%"
+    folder.mkdir()
+    (folder / f"{module}.py").write_text(_PLUGIN)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    text = _install(*words)
+    assert f"WorkingDirectory={tmp_path}/a b%%\n" in text
+    assert _command(text)[:2] == command_line()  # not -m: the folder would be in front
+    assert "PYTHONPATH" not in text
+    # as from another folder with PYTHONPATH
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", "a b%")
+    assert f'Environment="PYTHONPATH={tmp_path}/a b%%"\n' in _install(*words)
+    # it is loaded here, and would not be by the unit
+    monkeypatch.delenv("PYTHONPATH")
+    with pytest.raises(UsageError, match=f"cannot load {module}:Hand: .*{module}"):
+        _install(*words)
+    # anyone may put code there
+    folder.chmod(0o777)
+    monkeypatch.chdir(folder)
+    with pytest.raises(UsageError, match="others than"):
+        _install(*words)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become another user")
+def test_interpreter_that_the_services_user_cannot_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hidden = tmp_path / "hidden"
+    hidden.mkdir(mode=0o700)
+    (hidden / "python").symlink_to(sys.executable)
+    monkeypatch.setattr(sys, "executable", str(hidden / "python"))
+    with pytest.raises(UsageError, match=r"as the user nobody, .* cannot load sim-dex1"):
+        _install("sim-dex1", "--side", "left", "--user", "nobody", "--dry-run")
 
 
 @each(
@@ -97,7 +198,10 @@ def test_words_are_quoted_as_systemd_reads_them() -> None:
         (("no-such-hand", "--side", "left"), "no-such-hand"),
         (("sim-dex1", "--side", "left", "--user", "no such user"), "there is no user"),
         (("ezgripper", "--side", "both", "--device", "/dev/ttyUSB0"), "names no side"),
-        (("ezgripper", "--side", "left", "--device", "/dev/null"), "no serial adapter"),
+        (
+            ("ezgripper", "--side", "left", "--device", "/dev/null", "--user", "root"),
+            "no serial adapter",
+        ),
         (
             ("sim-dex1", "--side", "left", "--set", "a=\n", "--user", "root"),
             "cannot be written into a systemd unit",

@@ -59,7 +59,7 @@ _BASE: dict[tuple[str, ...], tuple[str, ...]] = {
     ("emulate", "h1"): ("--duration", "0.3", "--domain", "{domain}"),
     ("emulate", "mx64"): ("--link", "{scratch}/link"),
     ("info",): ("{sample}",),
-    ("install-service",): ("sim-dex1", "--side", "left", "--dry-run"),
+    ("install-service",): ("sim-dex1", "--side", "left", "--user", "root", "--dry-run"),
     ("models",): (),
     ("record",): ("{scratch}/out.mcap", "--duration", "0.3", "--domain", "{domain}"),
     ("replay",): ("{sample}", "--no-wait", "--speed", "500", "--domain", "{domain}"),
