@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace, sample_path
 from dexkit.traces import recorder as recorder_module
+from dexkit.traces.heap import release_freed_memory
 from dexkit.traces.recorder import FLUSH_INTERVAL, MAX_CHANNELS
 from tests.each import each
 from tests.patience import PATIENCE
@@ -154,6 +155,67 @@ def test_the_queue_is_bounded_in_bytes_too(tmp_path: Path) -> None:
     gate.open.set()
     recorder.close()
     assert (recorder.written, recorder.dropped) == (3, 1)
+
+
+class Alive(bytes):
+    """Payloads whose bytes in memory are counted."""
+
+    total = 0
+
+    def __init__(self, *_: object) -> None:
+        Alive.total += len(self)
+
+    def __del__(self) -> None:
+        Alive.total -= len(self)
+
+
+def test_a_backlog_that_is_written_stays_within_the_bound_and_is_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bound, size = 16 * 2**20, 64 * 2**10
+    given_back: list[int] = []
+    monkeypatch.setattr(
+        "dexkit.traces.recorder.release_freed_memory", lambda: given_back.append(Alive.total)
+    )
+    recorder = Recorder(tmp_path / "a.mcap", max_bytes=bound, compression="none")
+    recorder.open()
+    offered = most = 0
+
+    def fill() -> None:
+        nonlocal offered
+        while recorder.put(STATE, STATE_TYPE, Alive(size), T0):
+            offered += 1
+        offered += 1
+
+    assert recorder.put(STATE, STATE_TYPE, Alive(size), T0)
+    wait_until(lambda: recorder.written == 1)
+    assert not given_back  # no backlog
+    for stall in (1, 2, 3):
+        gate = Gate(recorder)
+        fill()
+        assert gate.reached.wait(60)
+        add, writes = gate._add, 0
+
+        def add_and_fill(*args: object) -> None:
+            nonlocal most, writes
+            add(*args)  # type: ignore[arg-type]  # noqa: B023
+            writes += 1
+            if writes < 600:  # samples come as fast as they are written
+                fill()
+            most = max(most, Alive.total)
+
+        gate._add = add_and_fill  # type: ignore[assignment]
+        gate.open.set()
+        wait_until(lambda: len(given_back) == stall)  # noqa: B023
+        recorder._writer.add_message = add  # type: ignore[method-assign]
+    recorder.close()
+    assert most <= bound + size  # and one that is refused
+    assert max(given_back) <= size
+    assert recorder.written + recorder.dropped == offered + 1
+
+
+def test_freed_memory_is_released_where_the_library_can() -> None:
+    release_freed_memory()
 
 
 def test_drops_show_as_gaps_in_the_sequence_numbers(tmp_path: Path) -> None:

@@ -9,6 +9,9 @@ with the queue. A power cut may cost more, since nothing is forced onto the disk
 counts as written is in the file: :mod:`~dexkit.traces.recording_file` commits whole chunks or
 nothing.
 
+The bounds hold for all samples that are not written yet, those that the writer works on included.
+After a stall the memory of the backlog is given back to the system.
+
 Schemas are ``ros2msg`` and the profile is ``ros2``, because that is what PlotJuggler, Foxglove
 and the readers of ROS 2 bags open; topics keep their DDS names (``rt/...``).
 """
@@ -18,7 +21,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, cast
 
@@ -28,6 +31,7 @@ from dexkit import __version__
 from dexkit.errors import TraceError, UsageError
 from dexkit.messages import MessageType, message_type
 from dexkit.threads import Worker
+from dexkit.traces.heap import release_freed_memory
 from dexkit.traces.recording_file import ChunkIndexes, RecordingFile
 
 __all__ = ["FLUSH_INTERVAL", "MAX_CHANNELS", "Recorder"]
@@ -37,8 +41,12 @@ FLUSH_INTERVAL = 0.2
 # Longest sleep of the writer, seconds, and queued messages that wake it.
 _POLL = 0.05
 _WAKE_AT = 512
-# Messages written between two readings of the clock.
+# Messages taken from the queue at a time, and bytes of them, between two readings of the clock.
 _SLICE = 4096
+_SLICE_BYTES = 2**20
+# A backlog whose memory is given back, bytes; and those of a queued message beside its payload.
+_BACKLOG = 8 * 2**20
+_OVERHEAD = 256
 # Bytes after which a chunk is written before its time.
 _COMMIT_AT = 4 * 2**20
 #: Channels, each a topic with a type, in one file: their ids are 16-bit numbers from 1 on.
@@ -130,9 +138,11 @@ class Recorder:
         self._compression = _COMPRESSION[compression]
         self._about = {"version": __version__, **_check_metadata("metadata", metadata or {})}
         self._lock = threading.Lock()
-        self._queue: list[_Item | _Metadata] = []
+        self._queue: deque[_Item | _Metadata] = deque()
+        # of messages not written yet, those that the writer holds included
         self._queued = 0
         self._queued_bytes = 0
+        self._backlog = 0  # most of them, bytes with overhead, since memory was given back
         self._channels: dict[tuple[str, str], _Channel] = {}
         self._wake = threading.Event()
         self._closing = False
@@ -329,7 +339,7 @@ class Recorder:
         """Keep an error of the disk or mount for close(). Messages not in the file are lost."""
         with self._lock:
             self._error = error
-            self._queue = []
+            self._queue.clear()
             for channel in self._channels.values():
                 channel.dropped = channel.offered - channel.written
 
@@ -344,13 +354,15 @@ class Recorder:
             self._wake.clear()
             with self._lock:
                 closing = self._closing
-                batch, self._queue = self._queue, []
-            for start in range(0, len(batch), _SLICE):
-                self._write(batch[start : start + _SLICE])
+            while batch := self._take():
+                self._write(batch)
                 flushed = self._commit_after(flushed)
             if closing:
                 break
             flushed = self._commit_after(flushed)
+            if self._backlog >= _BACKLOG:
+                self._backlog = 0
+                release_freed_memory()
         with self._lock:
             silent = [c for c in self._channels.values() if not c.id]
             dropped: Counter[str] = Counter()
@@ -372,10 +384,25 @@ class Recorder:
         writer.finish()  # type: ignore[no-untyped-call]
         self._commit()
 
-    def _write(self, items: list[_Item | _Metadata]) -> None:
+    def _take(self) -> deque[_Item | _Metadata]:
+        """The next of the queue; they count as queued until they are written."""
+        items: deque[_Item | _Metadata] = deque()
+        size = 0
+        with self._lock:
+            held = self._queued_bytes + self._queued * _OVERHEAD
+            self._backlog = max(self._backlog, held)
+            while self._queue and len(items) < _SLICE and size < _SLICE_BYTES:
+                item = self._queue.popleft()
+                size += len(item.data) if isinstance(item, _Item) else 0
+                items.append(item)
+        return items
+
+    def _write(self, items: deque[_Item | _Metadata]) -> None:
+        """Write messages to the chunk, and let go of them."""
         writer = self._writer
         messages = size = 0
-        for item in items:
+        while items:
+            item = items.popleft()
             if isinstance(item, _Metadata):
                 writer.add_metadata(item.name, item.values)
                 continue
@@ -387,6 +414,7 @@ class Recorder:
             item.channel.pending += 1
             messages += 1
             size += len(item.data)
+            del item
         with self._lock:
             self._queued -= messages
             self._queued_bytes -= size
