@@ -22,8 +22,10 @@ __all__ = [
     "READY_TIMEOUT",
     "STOP_TIMEOUT",
     "Tool",
+    "code_line",
     "command_line",
     "end_with_parent",
+    "module_line",
     "process_id",
 ]
 
@@ -42,6 +44,32 @@ def command_line(*arguments: str) -> list[str]:
     the working folder, as ``python -P`` does where there is one.
     """
     return [sys.executable, str(_START), *arguments]
+
+
+def code_line(
+    code: str,
+    *arguments: str,
+    python: str = "",
+    front: Sequence[str] = (),
+    back: Sequence[str] = (),
+) -> list[str]:
+    """The command that runs Python code, and imports nothing from the working folder.
+
+    ``python -c`` and ``python -m`` have that folder in front of the path; installed programs have
+    it nowhere.
+
+    :param python: interpreter; by default this one.
+    :param front: folders in front of the interpreter's path; ``back``: behind it.
+    """
+    path = f"[*{list(front)!r}, *filter(None, sys.path), *{list(back)!r}]"
+    start = f"import sys; sys.path[:] = {path}; {code}"
+    return [python or sys.executable, "-c", start, *arguments]
+
+
+def module_line(module: str, *arguments: str, python: str = "") -> list[str]:
+    """The command ``python -m module``, as :func:`code_line` runs it."""
+    code = f"import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
+    return code_line(code, *arguments, python=python)
 
 
 _PID_MAX = 1 << 22  # PID_MAX_LIMIT of Linux

@@ -124,8 +124,10 @@ def main(argv: list[str] | None = None) -> int:
     """
     # a service has small matrices only: BLAS's threads would take a sixth of each start, and stay
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # click writes completions as bytes; a shell reads them, and nothing in them is of a file
+    completing = "_DEXKIT_COMPLETE" in os.environ
     try:
-        with guarded():
+        with contextlib.nullcontext() if completing else guarded():
             code = _run(argv)
     except OutputError as error:
         if error.exit_code != _NO_READER:

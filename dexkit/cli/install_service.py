@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 
 from dexkit.backends import backend
-from dexkit.child_processes import command_line
+from dexkit.child_processes import code_line, command_line
 from dexkit.cli.options import (
     LocalPath,
     devices_by_side,
@@ -234,10 +234,7 @@ def _place(backend_name: str, user: pwd.struct_passwd) -> _Place:
 
 def _load_problem(backend_name: str, place: _Place, user: pwd.struct_passwd) -> str:
     """Why a process of the unit would not load the backend, or empty."""
-    code = (
-        f"import sys; sys.path[:] = [*filter(None, sys.path), {_ROOT!r}]; "
-        "from dexkit.backends import backend; backend(sys.argv[1])"
-    )
+    code = "from dexkit.backends import backend; backend(sys.argv[1])"
     environment = {
         "PATH": os.defpath,
         "HOME": user.pw_dir,
@@ -251,7 +248,7 @@ def _load_problem(backend_name: str, place: _Place, user: pwd.struct_passwd) -> 
         identity = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code, backend_name],
+            code_line(code, backend_name, back=[_ROOT]),
             cwd=place.folder or "/",
             env=environment,
             stdin=subprocess.DEVNULL,

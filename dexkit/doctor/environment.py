@@ -6,7 +6,6 @@ import os
 import platform
 import re
 import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -14,6 +13,7 @@ from xml.etree.ElementTree import ParseError
 
 from defusedxml.ElementTree import fromstring
 
+from dexkit.child_processes import code_line
 from dexkit.doctor.observations import Environment
 from dexkit.documents import read_text
 from dexkit.errors import UsageError
@@ -52,11 +52,9 @@ def _version(name: str) -> str:
 def _import_problem(module: str) -> str:
     """Why a module does not import, or empty. A crash of it is not ours."""
     code = f"import {module}"
-    # -c has the working folder in front of the path; installed programs have not
-    start = f"import sys; sys.path[:] = [p for p in sys.path if p]; {code}"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", start],
+            code_line(code),
             capture_output=True,
             text=True,
             timeout=_PATIENCE,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
 
+from dexkit.child_processes import module_line
 from dexkit.documents import write_file
 from dexkit.errors import DdsBuildFailed, OutputError
 from dexkit.setup_dds import pinned_wheel, probe
@@ -173,24 +174,25 @@ class _Task:
     def _with_pip(self) -> list[str]:
         """A command that is pip: the environment's, or that of one made for this."""
         if self._interpreter.pip:
-            return [self._interpreter.executable, "-m", "pip"]
+            return module_line("pip", python=self._interpreter.executable)
         if not self._pip:
             home = self.folder / "pip"
             command = (
-                [self._interpreter.executable, "-m", "venv", str(home)]
+                module_line("venv", str(home), python=self._interpreter.executable)
                 if self._interpreter.ensurepip
                 else [self._interpreter.uv, "venv", "--quiet", "--seed", "--python",
                       self._interpreter.executable, str(home)]
             )  # fmt: skip
             self._run(command, os.environ, "no pip can be made for the build")
-            self._pip = [str(home / "bin" / "python"), "-m", "pip"]
+            self._pip = module_line("pip", python=str(home / "bin" / "python"))
         return self._pip
 
     def install(self, wheel: Path) -> None:
         """Install the wheel as the last step, after its dependencies."""
         python = self._interpreter.executable
         if self._interpreter.pip:
-            begin, again = [python, "-m", "pip", "install", *_PIP], ["--force-reinstall"]
+            begin = module_line("pip", "install", *_PIP, python=python)
+            again = ["--force-reinstall"]
         elif self._interpreter.uv:
             begin = [self._interpreter.uv, "pip", "install", "--python", python]
             again = ["--reinstall-package", "cyclonedds"]

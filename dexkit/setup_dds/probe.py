@@ -16,6 +16,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
+from dexkit.child_processes import code_line
 from dexkit.dds_library import loaded_here
 from dexkit.setup_dds.facts import Installed
 
@@ -39,13 +40,9 @@ def command(python: str, folder: str = "", *, send: bool) -> list[str]:
 
 
 def _start(python: str, folder: str, call: str) -> list[str]:
-    # -c has the working folder in front of the path; installed programs have not
-    code = (
-        "import sys; "
-        f"sys.path[:] = [*{[folder] if folder else []!r}, *filter(None, sys.path), {_ROOT!r}]; "
-        f"from dexkit.setup_dds import probe; probe.{call}"
-    )
-    return [python, "-c", code]
+    code = f"from dexkit.setup_dds import probe; probe.{call}"
+    front = [folder] if folder else []
+    return code_line(code, python=python, front=front, back=[_ROOT])
 
 
 def result_of(code: int, output: str) -> Installed:
