@@ -25,7 +25,7 @@ import tomli
 
 from dexkit.errors import DexkitError, UsageError
 from dexkit.escaping import one_line, output_error
-from dexkit.staging import whole_file
+from dexkit.staging import followed, whole_file
 
 __all__ = [
     "DEEPEST",
@@ -313,7 +313,7 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
     owner.
     """
     try:
-        target = path.resolve()
+        target = followed(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         with _locked(target):
             before = read_text(target) if target.exists() else None
@@ -321,10 +321,10 @@ def update_file(path: Path, change: Callable[[str | None], str]) -> None:
             if after != before:
                 with whole_file(target) as place:
                     _write_pieces(place, [after.encode()])
-    except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links (Python 3.10)
-        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+    except OSError as error:
         raise UsageError(
-            f"cannot write {path}: {why}", hint="its folder must be writable and its disk not full"
+            f"cannot write {path}: {error.strerror or error}",
+            hint="its folder must be writable and its disk not full",
         ) from error
 
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from dexkit import __version__
 from dexkit.errors import DexkitError, OutputError
 
-__all__ = ["NOTE", "PREFIX", "Staged", "whole_file", "whole_folder"]
+__all__ = ["NOTE", "PREFIX", "Staged", "followed", "whole_file", "whole_folder"]
 
 PREFIX = ".dexkit-"
 """Begin of the names of the folders; a digest of the output's name and a random number follow."""
@@ -143,6 +143,24 @@ def _check_new(out: Path, error: type[DexkitError]) -> None:
         raise error(f"{out} {what}", hint="choose another name, or delete it")
 
 
+def followed(path: Path) -> Path:
+    """The file that a path leads to, for writing.
+
+    :raises PermissionError: it is a link that another user has put into a folder where anyone may,
+        such as ``/tmp``. The kernel follows none there (``fs.protected_symlinks``), and the path
+        that this returns would pass by that.
+    """
+    try:
+        link, folder = path.lstat(), path.absolute().parent.stat()
+    except OSError:
+        return Path(os.path.realpath(path))
+    shared = folder.st_mode & stat.S_ISVTX and folder.st_mode & stat.S_IWOTH
+    theirs = link.st_uid not in (os.geteuid(), folder.st_uid)
+    if stat.S_ISLNK(link.st_mode) and shared and theirs:
+        raise PermissionError(errno.EACCES, "it is a link that another user has put there")
+    return Path(os.path.realpath(path))
+
+
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Write a file in one step; yields where, which does not exist yet. An exception inside leaves
@@ -153,7 +171,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     :raises OSError: it cannot be written.
     """
-    target = Path(os.path.realpath(path))
+    target = followed(path)
     if not target.name:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     known = target.stat() if target.exists() else None

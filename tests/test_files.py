@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import stat
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,9 @@ import pytest
 from dexkit import documents
 from dexkit.documents import update_file
 from dexkit.drivers.ezgripper.calibration_file import GripperRecord, Store
-from dexkit.errors import UsageError
+from dexkit.errors import DexkitError, UsageError
+from dexkit.traces.recording_file import RecordingFile
+from tests.each import each
 
 
 def _store_many(path: str, name: str, count: int, begin: object) -> None:
@@ -160,3 +163,31 @@ def test_invalid_file_is_not_overwritten(tmp_path: Path) -> None:
     path.write_text('{"of somebody else": 1}')
     Store(path).write("a", GripperRecord(zero=1))
     assert json.loads(path.read_text()) == {"of somebody else": 1, "calibration": {"a": 1}}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to make a link of another user")
+@each(
+    "write",
+    [
+        lambda path: documents.write_file(path, "new"),
+        lambda path: documents.update_file(path, lambda before: "new"),
+        lambda path: RecordingFile(path, overwrite=True).open(),
+    ],
+)
+def test_link_that_another_user_put_into_a_shared_folder_is_not_followed(
+    write: Callable[[Path], object], tmp_path: Path
+) -> None:
+    shared, victim = tmp_path / "shared", tmp_path / "victim"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    victim.write_text("old")
+    link = shared / "result.json"
+    link.symlink_to(victim)
+    os.lchown(link, 65534, 65534)
+    with pytest.raises(DexkitError, match="a link that another user has put there"):
+        write(link)
+    assert victim.read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["shared", "victim"]
+    os.lchown(link, 0, 0)  # an own one is
+    documents.write_file(link, "new")
+    assert victim.read_text() == "new"

@@ -34,7 +34,7 @@ from pathlib import Path
 from mcap.records import ChunkIndex
 
 from dexkit.errors import TraceError, UsageError
-from dexkit.staging import Staged
+from dexkit.staging import Staged, followed
 from dexkit.traces import mcap_records
 from dexkit.traces.mcap_records import HEAD, MAGIC, Opcode, walk
 
@@ -56,6 +56,7 @@ class RecordingFile:
     :param path: its final name. A link is followed.
     :param overwrite: replace what is there.
     :param whole: it gets its name when it is closed, not before.
+    :raises TraceError: another user has put a link there (:func:`~dexkit.staging.followed`).
 
     :ivar displaced: what happened to the file's name while it was written, or empty.
     """
@@ -63,7 +64,10 @@ class RecordingFile:
     def __init__(self, path: Path, *, overwrite: bool, whole: bool = False) -> None:
         self.path = path
         self.displaced = ""
-        self._target = Path(os.path.realpath(path))
+        try:
+            self._target = followed(path)
+        except PermissionError as error:
+            raise TraceError(f"cannot create {path}: {error.strerror}") from error
         if not self._target.name:  # "/", or no name in the folder "/"
             raise UsageError(f"cannot record to {str(path)!r}: it is a folder")
         self._part = self._target.with_name(self._target.name + _PART)
