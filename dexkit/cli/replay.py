@@ -465,7 +465,7 @@ def _print_end(machine: ReplayMachine, consent: Consent) -> int:
     if done.held > 0.1:
         text += f"; held for {done.held:.1f} s by this machine"
     if done.pauses:
-        text += f"; paused {done.pauses} times, and ramped again"
+        text += f"; paused {done.pauses} times"
     click.echo(one_line(text, REMARK))
     if machine.end is End.DONE:
         return 0
