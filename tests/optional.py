@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import os
 import shutil
 import subprocess
 import sys
@@ -100,6 +101,7 @@ OPTIONAL = (
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
+    Optional("root", lambda: os.geteuid() == 0, ("files", "install_service")),
     Optional("pyzmq", _package("zmq"), ("lerobot_ports",)),
     Optional("pyte", _package("pyte"), ("monitor_terminal",)),
     Optional("viser", _package("viser"), ("view", "view_browser", "view_soak", "web_pages")),
