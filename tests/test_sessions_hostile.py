@@ -483,7 +483,7 @@ ROW = {"episode_index": 1, "tasks": ["b"]}
         ("episodes", json.dumps(ROW | {"tasks": 5}), "$.tasks"),
         ("episodes", json.dumps(ROW | {"data/chunk_index": "x"}), "data/chunk_index"),
         ("episodes", json.dumps(ROW | {"episode_index": 0}), "episode 0 occurs twice"),
-        ("episodes", json.dumps(ROW), "episode_000001.parquet is missing"),
+        ("episodes", json.dumps(ROW), "episode_000001.parquet: No such file"),
         ("tasks", "{", "tasks.jsonl, line 2"),
         ("tasks", '{"task_index": [], "task": "a"}', "$.task_index"),
         ("tasks", '{"task_index": 1, "task": []}', "$.task"),
