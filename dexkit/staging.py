@@ -149,6 +149,7 @@ def followed(path: Path) -> Path:
     :raises PermissionError: it is a link that another user has put into a folder where anyone may,
         such as ``/tmp``. The kernel follows none there (``fs.protected_symlinks``), and the path
         that this returns would pass by that.
+    :raises OSError: it is a loop of links.
     """
     try:
         link, folder = path.lstat(), path.absolute().parent.stat()
@@ -158,7 +159,10 @@ def followed(path: Path) -> Path:
     theirs = link.st_uid not in (os.geteuid(), folder.st_uid)
     if stat.S_ISLNK(link.st_mode) and shared and theirs:
         raise PermissionError(errno.EACCES, "it is a link that another user has put there")
-    return Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+    return target
 
 
 @contextlib.contextmanager
