@@ -7,8 +7,9 @@ layer to layer is data, in :mod:`dexkit.conformance.layers`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime, timezone
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
-__all__ = ["judge", "judge_layer"]
+__all__ = ["deciding", "judge", "judge_layer", "results_of"]
 
 _ANY_TIME = 0.0, 1e6
 """Begin and end, seconds, of a recording whose layer does not say how long it is."""
@@ -49,17 +50,7 @@ def judge(
     """
     claims = claims or Claims()
     wanted = None if requirements is None else {r.id for r in requirements}
-
-    def results_of(name: str, part: Any, client: Sequence[Result] = ()) -> list[Result]:
-        every = claims.apply(catalogue(recording.model.name, name))
-        return judge_layer(layer(name), part, every, claims, client)
-
-    # in a run of the kit the kit is the client, and sends wrong commands on purpose
-    client = results_of("client", recording) if recording.stimulus is None else []
-    results = results_of(recording.layer, recording, client)
-    if recording.usb is not None:
-        judged = {str(side) for side in recording.judged}
-        results += [r for r in results_of("usb", recording.usb) if r.side in judged]
+    client, results = results_of(recording, claims)
     chosen = [r for r in results if wanted is None or r.requirement.id in wanted]
     if wanted is not None:  # what blocks another requirement is reported with it
         wanted |= {r.blocked_by for r in chosen}
@@ -92,6 +83,47 @@ def judge(
     )
 
 
+def results_of(
+    recording: Recording, claims: Claims | None = None, only: Collection[str] | None = None
+) -> tuple[list[Result], list[Result]]:
+    """The results of the requirements about the client, and of all others.
+
+    :param only: ids of those to judge; what decides about them is judged as well. None for all.
+    """
+    claims = claims or Claims()
+    model = recording.model.name
+    chosen = None if only is None else {r.id for name in only for r in deciding(model, name)}
+
+    def judged(name: str, part: Any, client: Sequence[Result] = ()) -> list[Result]:
+        every = claims.apply(catalogue(model, name))
+        some = [r for r in every if chosen is None or r.id in chosen]
+        return judge_layer(layer(name), part, some, claims, client)
+
+    # in a run of the kit the kit is the client, and sends wrong commands on purpose
+    client = judged("client", recording) if recording.stimulus is None else []
+    results = judged(recording.layer, recording, client)
+    if recording.usb is not None:
+        sides = {str(side) for side in recording.judged}
+        results += [r for r in judged("usb", recording.usb) if r.side in sides]
+    return client, results
+
+
+@cache
+def deciding(model: str, name: str) -> tuple[Requirement, ...]:
+    """A requirement, and all those whose verdicts decide whether it is judged at all."""
+    every = {r.id: r for r in catalogue(model, None)}
+    found: dict[str, Requirement] = {}
+    todo = [name]
+    while todo:
+        one = todo.pop()
+        if one in found:
+            continue
+        found[one] = every[one]
+        todo += every[one].after
+        todo += [r.id for r in every.values() if r.spoils and one.startswith(r.spoils)]
+    return tuple(found.values())
+
+
 def judge_layer(
     layer: Layer[RecordingT, ViewT, ContextT],
     recording: RecordingT,
@@ -101,8 +133,8 @@ def judge_layer(
 ) -> list[Result]:
     """Judge every requirement of one layer for every subject; results in the requirements' order.
 
-    :param requirements: all those of the layer that are about the model, at the levels that
-        ``claims`` gives them: some are judged by what came before them.
+    :param requirements: those of the layer that are about the model, at the levels that ``claims``
+        gives them, with those that :func:`deciding` names: some are judged by what came before.
     :param claims: what the vendor claims of the hand.
     :param client: results of the requirements about the client, of every subject.
     """

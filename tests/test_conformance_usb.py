@@ -21,7 +21,7 @@ from dexkit.conformance.judge import judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
 from dexkit.conformance.mutants import mutants
 from dexkit.conformance.mutants.matrix import WrongHandResult, try_one
-from dexkit.conformance.mutants.trials import run_usb_mutant
+from dexkit.conformance.mutants.runs import judge_usb, play_usb
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Load, Verdict
 from dexkit.conformance.run_queue import Watched
@@ -189,7 +189,7 @@ def test_wrong_device_fails_only_its_requirements(name: str) -> None:
 
 
 def test_script_ends_early_without_answers() -> None:
-    results = run_usb_mutant(BY_NAME["NoAnswers"].made, usb())
+    results = judge_usb(play_usb(BY_NAME["NoAnswers"].made, Side.LEFT), Side.LEFT, None)
     assert {r.verdict for r in results if r.requirement.needs != "nothing"} == {
         Verdict.FAIL,  # no answer
         Verdict.PASS,  # and no frame without a command
@@ -198,7 +198,7 @@ def test_script_ends_early_without_answers() -> None:
 
 
 def test_failure_has_evidence_in_the_recording() -> None:
-    results = run_usb_mutant(BY_NAME["SlowTrip"].made, usb())
+    results = judge_usb(play_usb(BY_NAME["SlowTrip"].made, Side.LEFT), Side.LEFT, None)
     (failed,) = [r for r in results if r.verdict is Verdict.FAIL]
     assert failed.requirement.id == "DEX3USB-PROT-02"
     assert 1.3 < failed.values["driven_s"] < 1.5

@@ -9,22 +9,35 @@ from __future__ import annotations
 import json
 import multiprocessing
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from rich.markup import escape
 from rich.table import Table
 
-from dexkit.conformance.layers import layer
 from dexkit.conformance.mutants import Mutant, mutants
-from dexkit.conformance.mutants.trials import Trial
+from dexkit.conformance.mutants.trials import blamed, trial_of
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.console import Console
 from dexkit.documents import write_file
 
-__all__ = ["Score", "WrongHandResult", "chosen", "cost", "essential", "print_list", "try_one"]
+__all__ = [
+    "Score",
+    "WrongHandResult",
+    "chosen",
+    "cost",
+    "essential",
+    "in_processes",
+    "print_list",
+    "try_one",
+    "with_key",
+]
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -81,13 +94,9 @@ def print_list(console: Console, given: Sequence[Mutant]) -> None:
     console.print(f"{len(given)} wrong hands", highlight=False)
 
 
-def _trial_of(mutant: Mutant) -> Trial:
-    return layer(mutant.layer).trial.load()()
-
-
 def cost(mutant: Mutant) -> float:
     """Roughly how long a trial takes, in units of the shortest on DDS."""
-    return _trial_of(mutant).cost(mutant)
+    return trial_of(mutant).cost(mutant)
 
 
 def essential(given: Sequence[Mutant]) -> tuple[Mutant, ...]:
@@ -105,18 +114,42 @@ def try_one(mutant: Mutant, *, short: bool = False) -> WrongHandResult:
 
     :param short: apply only the phases that show the fault, where that is fair.
     """
-    return WrongHandResult.from_blame(mutant, _trial_of(mutant).blamed(mutant, short=short))
+    return WrongHandResult.from_blame(mutant, blamed(mutant, short=short))
+
+
+def with_key(key: tuple[str, str, str]) -> Mutant:
+    """The wrong hand with that :attr:`~.Mutant.key`."""
+    return next(m for m in mutants() if m.key == key)
 
 
 def _blamed(key: tuple[str, str, str]) -> set[str]:
     """Run a trial in a worker process, which gets the key: mixed classes cannot be pickled."""
-    mutant = next(m for m in mutants() if m.key == key)
-    return _trial_of(mutant).blamed(mutant, short=False)
+    return blamed(with_key(key))
 
 
 def ignore_interrupts() -> None:
     """Ignore Ctrl-C, which goes to every process of the terminal; the first ends the others."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def in_processes(
+    work: Callable[[T], R], given: Iterable[T], stop: object = None, jobs: int | None = None
+) -> Iterator[tuple[T, R]]:
+    """Call a function in worker processes; yield each argument with its result when it is done.
+
+    :param given: the arguments; the first ones are begun first.
+    :param stop: ends it early when it becomes true.
+    :param jobs: processes; one per processor by default.
+    """
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), ignore_interrupts)
+    try:
+        waiting = {pool.submit(work, one): one for one in given}
+        while waiting and not stop:
+            for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                yield waiting.pop(future), future.result()
+    finally:
+        # not as a context manager, which would run what is waiting
+        pool.shutdown(cancel_futures=True)
 
 
 @dataclass
@@ -134,20 +167,10 @@ class Score:
         :param stop: ends it early when it becomes true.
         :param jobs: processes; one per processor by default.
         """
-        context = multiprocessing.get_context("spawn")
-        ordered = sorted(given, key=lambda m: -cost(m))
-        pool = ProcessPoolExecutor(jobs, context, ignore_interrupts)
-        try:
-            waiting = {pool.submit(_blamed, mutant.key): mutant for mutant in ordered}
-            while waiting and not stop:
-                for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
-                    self.outcomes.append(
-                        WrongHandResult.from_blame(waiting.pop(future), future.result())
-                    )
-                    yield self.outcomes[-1]
-        finally:
-            # not as a context manager, which would run the waiting trials
-            pool.shutdown(cancel_futures=True)
+        by_key = {mutant.key: mutant for mutant in sorted(given, key=lambda m: -cost(m))}
+        for key, found in in_processes(_blamed, by_key, stop, jobs):
+            self.outcomes.append(WrongHandResult.from_blame(by_key[key], found))
+            yield self.outcomes[-1]
 
     def killers(self, requirement: Requirement) -> list[WrongHandResult]:
         """The trials that prove a requirement."""

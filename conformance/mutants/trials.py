@@ -13,27 +13,35 @@ from dataclasses import replace
 from functools import cache
 from typing import Protocol
 
-from dexkit.conformance.judge import judge, judge_layer
+from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import layer, recording_of
 from dexkit.conformance.mutants.registry import Mutant
+from dexkit.conformance.mutants.runs import (
+    Run,
+    judge_client,
+    judge_topics,
+    judge_usb,
+    play_client,
+    play_topics,
+    play_usb,
+)
 from dexkit.conformance.requirements import Requirement, catalogue, select
-from dexkit.conformance.results import Result, RunResult, Verdict
+from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import CommandSession, Plan, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.virtual import TopicDevice, run_virtual
-from dexkit.conformance.virtual.client import run_client
-from dexkit.conformance.virtual.usb import ReferenceDevice, run_virtual_usb
 from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import DEX1_1, dialect, model
 from dexkit.robots import ROBOTS
 
-__all__ = ["Trial", "plan_for", "run_mutant", "run_usb_mutant"]
+__all__ = ["BLAMES", "Trial", "blamed", "plan_for", "run_mutant", "trial_of"]
 
 SESSION_SECONDS = 4.0
-_BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
+BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
+"""The verdicts that blame a hand."""
 
 
 class Trial(Protocol):
@@ -42,11 +50,24 @@ class Trial(Protocol):
     def cost(self, mutant: Mutant) -> float:
         """Roughly how long a run takes, in units of the shortest on DDS."""
 
-    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
-        """The requirements that fail or warn.
+    def run(self, mutant: Mutant, *, short: bool = False) -> Run:
+        """Its run.
 
         :param short: apply only the phases that show the fault, where that is fair.
         """
+
+
+def trial_of(mutant: Mutant) -> Trial:
+    """How a wrong hand is tried."""
+    trial: Trial = layer(mutant.layer).trial.load()()
+    return trial
+
+
+def blamed(mutant: Mutant, *, short: bool = False) -> set[str]:
+    """Try a wrong hand: the requirements that fail or warn."""
+    run = trial_of(mutant).run(mutant, short=short)
+    results = run.judge(run.play(run.made, run.about), run.about, None)
+    return {r.requirement.id for r in results if r.verdict in BLAMES}
 
 
 @cache
@@ -99,19 +120,6 @@ def run_mutant(
     return judge(recording, requirements=requirements, subject=subject)
 
 
-def run_usb_mutant(
-    device: type[ReferenceDevice], requirements: Sequence[Requirement], side: Side = Side.LEFT
-) -> list[Result]:
-    """Judge a USB device on the virtual clock."""
-    usb = layer("usb")
-    recording = usb.decode(run_virtual_usb(device(side)), None, ())
-    return judge_layer(usb, recording, requirements)
-
-
-def _blamed(results: Sequence[Result]) -> set[str]:
-    return {r.requirement.id for r in results if r.verdict in _BLAMES}
-
-
 class TopicTrial(ABC):
     """Trial of a wrong hand on DDS topics."""
 
@@ -119,9 +127,9 @@ class TopicTrial(ABC):
     def cost(self, mutant: Mutant) -> float:
         """Roughly how long a run takes, in units of the shortest on DDS."""
 
-    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
-        """The requirements that fail or warn."""
-        return _blamed(run_mutant(mutant.made, self.plan(mutant, short=short)).results)
+    def run(self, mutant: Mutant, *, short: bool = False) -> Run:
+        """Its run, going through its plan."""
+        return Run(mutant.made, self.plan(mutant, short=short), play_topics, judge_topics)
 
     def plan(self, mutant: Mutant, *, short: bool = False) -> Plan[Subject]:
         """The phases that show the fault: all, or those that its requirements need."""
@@ -184,12 +192,10 @@ class UsbTrial:
         """Roughly how long a run takes, in units of the shortest on DDS."""
         return 0.5
 
-    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
-        """The requirements that fail or warn; the script has no short form."""
-        every = catalogue(mutant.model, mutant.layer)
+    def run(self, mutant: Mutant, *, short: bool = False) -> Run:
+        """Its run; the script has no short form."""
         (side,) = mutant.sides
-        assert isinstance(side, Side), "a robot has no USB device"
-        return _blamed(run_usb_mutant(mutant.made, every, side))
+        return Run(mutant.made, side, play_usb, judge_usb)
 
 
 class ClientTrial:
@@ -199,11 +205,7 @@ class ClientTrial:
         """Roughly how long a run takes, in units of the shortest on DDS."""
         return 1.0 if len(model(mutant.model).joints[Side.LEFT]) == 1 else 4.0
 
-    def blamed(self, mutant: Mutant, *, short: bool) -> set[str]:
-        """The requirements that fail or warn, the hands' included; there is no short form."""
+    def run(self, mutant: Mutant, *, short: bool = False) -> Run:
+        """Its session; there is no short form."""
         spoken = dialect(mutant.dialect) if mutant.dialect else model(mutant.model).dialects[0]
-        trace = run_client(mutant.made, spoken)
-        recording = layer(mutant.layer).decode(trace, spoken.name, ())
-        assert recording is not None, "only USB may be missing from a recording"
-        result = judge(recording)
-        return _blamed([*result.results, *result.client])
+        return Run(mutant.made, spoken, play_client, judge_client)
