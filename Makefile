@@ -50,7 +50,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
+.PHONY: help setup demo test soak pins platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -71,6 +71,9 @@ test: $(STAMP) $(COLLECTED) ## the tests, six workers for two cores (ARGS="-k na
 
 soak: $(STAMP) ## the long tests
 	$(RUN) pytest -m soak $(ARGS)
+
+pins: $(STAMP) ## whether each wrong hand and sample is judged as pinned (ARGS="--only dds-dex3-1", ARGS=--update; docs/mutants.md)
+	$(RUN) python -m tools.pins $(ARGS)
 
 campaign: $(STAMP) ## fuzz and fault campaign: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record FRESH=1 (docs/campaign.md)
 	$(RUN) python -m tools.campaign $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED)) \
