@@ -349,6 +349,7 @@ def watch(layer_name: str, model: str) -> None:
         assert not left, (requirement.id, left)
 
 
+@pytest.mark.soak
 def test_a_real_run_stays_in_the_code_of_its_keys() -> None:
     # in one process of its own, which reads the sources once
     runs = ["dds/dex3-1", "dds/inspire-ftp", "client/dex1-1", "robot/h1", "usb/dex3-1"]
