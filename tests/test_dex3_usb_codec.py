@@ -105,9 +105,12 @@ def test_gains_are_never_negative() -> None:
 
 
 def test_missing_pressure_has_its_own_code() -> None:
-    assert d.NO_VALUE == 30000
-    assert units.encode_pressure(math.nan) == 30000
-    assert units.encode_pressure(240_000.0) == 30001, "a reading that looks like none"
+    # 30000 Pa, where the air is 12500 counts (docs/sources/unitree-dex.md#b4)
+    assert units.PRESSURE.decode(d.NO_VALUE) == 30000.0
+    assert units.PRESSURE.decode(12_500) == 100_000.0
+    assert units.encode_pressure(math.nan) == 3750
+    assert units.encode_pressure(30_000.0) == 3751, "a reading that looks like none"
+    assert units.encode_pressure(240_000.0) == 30001, "the same, in counts"
     assert units.encode_pressure(240_008.0) == 30001
     assert units.encode_pressure(-5.0) == 0
     assert units.encode_pressure(1e9) == 65535
@@ -529,3 +532,35 @@ def test_bus_map_of_another_hand_is_refused() -> None:
         d.HandCodec(JOINTS[:6])
     assert len(d.DEFAULT_BUS_MAP.motors) == 7
     assert len(d.DEFAULT_BUS_MAP.sensors) == len(DEX3_1.sensors)
+
+
+@each("code", [d.NO_VALUE, units.NO_VALUE_COUNTS])
+def test_either_code_is_no_element_and_a_firm_press_is_none_of_them(code: int) -> None:
+    """30000 Pa, or 30000 counts: the manual does not say which (docs/dex3-usb.md)."""
+
+    def answer(first: int) -> HandState:
+        frame = d.parse_state(codec.encode_state(a_state()))
+        counts = [12_700 if slot in DEX3_1.sensors[0].slots else code for slot in range(12)]
+        counts[0] = first
+        buses = [
+            [
+                dataclasses.replace(packet, pressure=tuple(counts))
+                if isinstance(packet, d.SensorState)
+                else packet
+                for packet in bus
+            ]
+            for bus in frame.buses
+        ]
+        return codec.decode(d.pack_state(dataclasses.replace(frame, buses=buses)), 0.0)
+
+    codec = d.HandCodec(JOINTS)
+    for count, pascal in ((12_700, 101_600.0), (30_000, 240_000.0), (30_001, 240_008.0)):
+        state = answer(count)
+        assert state.pressure is not None
+        assert state.pressure[0, 0] == pascal
+        assert np.isnan(state.pressure[0]).tolist() == [
+            slot not in DEX3_1.sensors[0].slots for slot in range(12)
+        ]
+    pressed = answer(units.NO_VALUE)  # no reading: the air alone is 12500
+    assert pressed.pressure is not None
+    assert math.isnan(pressed.pressure[0, 0])

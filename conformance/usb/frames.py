@@ -26,7 +26,7 @@ from dexkit.hand import JointSpec
 __all__ = [
     "BUSES",
     "COMMAND_SIZES",
-    "NO_VALUE",
+    "NO_VALUES",
     "STATE_SIZE",
     "Motor",
     "MotorReading",
@@ -45,8 +45,9 @@ COMMAND_SIZES = {1234: 240, 734: 140}
 """Bytes of a command frame, and of each bus buffer in it: the manual's two versions."""
 STATE_SIZE = 1270
 STATE_BUS = 240
-NO_VALUE = 30000
-"""Pressure of a slot without sensor element (the Dex3-1 manual "30000 represents no value")."""
+NO_VALUES = (3750, 30000)
+"""Pressure counts of a slot without sensor element (the Dex3-1 manual "30000 represents no value",
+which may be Pa, 3750 counts of 8, or counts)."""
 
 _MOTOR_CMD = struct.Struct("<2sBBhhihh")
 _MOTOR_STATE = struct.Struct("<2sBbBBhhiIHH")

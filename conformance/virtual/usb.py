@@ -30,7 +30,7 @@ from dexkit.conformance.stimuli.usb import (
 from dexkit.conformance.usb.frames import (
     BUSES,
     COMMAND_SIZES,
-    NO_VALUE,
+    NO_VALUES,
     STATE_BUS,
     STATE_SIZE,
     Motor,
@@ -313,7 +313,8 @@ def _short(counts: float) -> int:
 
 @cache
 def _sensor_packet(number: int, elements: int) -> bytes:
-    values = [12] * elements + [NO_VALUE] * (12 - elements)
+    # the air's pressure, in counts of 8 Pa
+    values = [12_700] * elements + [NO_VALUES[0]] * (12 - elements)
     body = struct.pack("<2sBB12H12b", b"\x7e\xe7", number, 0, *values, *([25] * 12))
     return body + crc(body).to_bytes(4, "little")
 

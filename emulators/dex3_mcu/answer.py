@@ -34,10 +34,18 @@ class AnswerWriter:
 
     :param wiring: bus and id of each joint and sensor, and how the motors are mounted.
     :param model: ``mode[0]`` of the frames.
+    :param no_value: counts in a slot without an element.
     """
 
-    def __init__(self, mechanics: Dex3Mechanics, wiring: Wiring, model: int) -> None:
+    def __init__(
+        self,
+        mechanics: Dex3Mechanics,
+        wiring: Wiring,
+        model: int,
+        no_value: int = units.NO_VALUE,
+    ) -> None:
         self._mechanics = mechanics
+        self._no_value = no_value
         self._map = bus_map = wiring.bus_map
         mounting = wiring.mounting
         self._model = model
@@ -144,8 +152,9 @@ class AnswerWriter:
         with np.errstate(invalid="ignore"):
             counts = np.clip(pressure * (scale.factor() * NUDGE), scale.low, scale.high)
             counts = np.floor(counts)
-        counts[counts == units.NO_VALUE] += 1.0  # a real reading is never "no value"
-        counts[np.isnan(pressure)] = units.NO_VALUE
+        # a real reading is never "no value"
+        counts[np.isin(counts, (units.NO_VALUE, units.NO_VALUE_COUNTS))] += 1.0
+        counts[np.isnan(pressure)] = self._no_value
         rows = counts.astype("<u2")
         heat = np.nan_to_num(self._mechanics.sensor_temperature).astype("i1")
         for i, (_, number) in enumerate(self._map.sensors):

@@ -108,7 +108,9 @@ class Dex3Mcu:
             DEX3_1.joints[side], self.wiring.bus_map, mounting=self.wiring.mounting
         )
         self._reader = CommandReader(self.wiring)
-        self._writer = AnswerWriter(self.mechanics, self.wiring, self.firmware.model_code)
+        self._writer = AnswerWriter(
+            self.mechanics, self.wiring, self.firmware.model_code, self.firmware.no_value
+        )
         self._clock: Clock = clock or RealClock()
         self._random = random.Random(seed)
         self._motors = [_Motor() for _ in DEX3_1.joints[side]]

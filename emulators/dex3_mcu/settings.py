@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from dexkit.errors import UsageError
 from dexkit.models import DEX3_1
+from dexkit.wire.dex3_usb import units
 
 __all__ = ["Firmware"]
 
@@ -42,6 +43,8 @@ class Firmware:
         are frames with a wrong CRC.
     :param answer_time: seconds from a command to its answer. Unknown, below 1 ms at the 1000 Hz of
         the manual; with 0 a measurement shows the cost of the host's side.
+    :param no_value: counts of a pressure slot without an element: 3750, which are 30000 Pa, or
+        30000 ("30000 represents no value", which may be either; docs/dex3-usb.md).
     """
 
     answer_bad_frame: bool = True
@@ -55,6 +58,7 @@ class Firmware:
     frame: int | None = None
     head: bytes | None = None
     answer_time: float = 0.0
+    no_value: int = units.NO_VALUE
 
     def __post_init__(self) -> None:
         if self.queue < 1:
@@ -63,3 +67,5 @@ class Firmware:
             raise UsageError("a time must not be negative, nor a time-out 0")
         if not 0 <= self.model_code <= 0xFF:
             raise UsageError("the model code is one byte")
+        if self.no_value not in (units.NO_VALUE, units.NO_VALUE_COUNTS):
+            raise UsageError(f"no value is 3750 or 30000 counts, not {self.no_value}")

@@ -165,6 +165,7 @@ class HandCodec:
         self.frames = 0
         self.damaged = 0
         self.sensor_lost = np.zeros(len(bus_map.sensors), np.uint32)
+        self._elements = _Elements(len(bus_map.sensors))
         # a broadcast reaches every motor of its bus
         self._joints_at: dict[tuple[int, int], list[int]] = {}
         for joint, (bus, number) in enumerate(bus_map.motors):
@@ -223,7 +224,7 @@ class HandCodec:
         self.missing_sensors = plan.missing_sensors
         if plan.missing_sensors:
             self.sensor_lost[list(plan.missing_sensors)] += 1
-        return plan.state(data, stamp, self.sensor_lost.copy())
+        return plan.state(data, stamp, self.sensor_lost.copy(), self._elements)
 
     def _frame_intact(self, data: Bytes) -> bool:
         start, end = STATE.covered
@@ -540,7 +541,30 @@ _JOINT_SCALES = (
 )
 # Pa of every count: one look-up instead of a multiplication and a comparison
 _PASCAL = np.arange(0x10000) / units.PRESSURE.factor()
-_PASCAL[units.NO_VALUE] = math.nan
+_PASCAL[[units.NO_VALUE, units.NO_VALUE_COUNTS]] = math.nan
+_PASCAL_OF_CODE = units.NO_VALUE_COUNTS / units.PRESSURE.factor()
+
+
+class _Elements:
+    """Which slots have an element: those that have held a reading.
+
+    So a reading of :data:`~dexkit.wire.dex3_usb.units.NO_VALUE_COUNTS` is kept apart from the
+    code, whatever the layout of the sensors is.
+    """
+
+    def __init__(self, n_sensors: int) -> None:
+        self._empty: NDArray[np.bool_] = np.ones((n_sensors, _N_VALUES), np.bool_)
+        self._empty_bytes = self._empty.tobytes()
+
+    def correct(self, pressure: NDArray[np.float64], counts: NDArray[Any]) -> None:
+        """Put the readings that look like the code in; ``pressure`` has NaN for those."""
+        unknown = np.isnan(pressure)
+        if unknown.tobytes() == self._empty_bytes:
+            return  # as nearly always
+        self._empty &= unknown
+        self._empty_bytes = self._empty.tobytes()
+        coded = unknown & ~self._empty & (counts == units.NO_VALUE_COUNTS)
+        pressure[coded] = _PASCAL_OF_CODE
 
 
 @dataclass
@@ -666,7 +690,13 @@ class _StatePlan:
         self._known_modes = modes
         return True
 
-    def state(self, data: Bytes, stamp: float, sensor_lost: NDArray[np.uint32]) -> HandState:
+    def state(
+        self,
+        data: Bytes,
+        stamp: float,
+        sensor_lost: NDArray[np.uint32],
+        elements: _Elements,
+    ) -> HandState:
         """The frame that was loaded."""
         joints = np.zeros(self._units.shape)
         joints[0] = self._pos
@@ -690,6 +720,10 @@ class _StatePlan:
             gone = list(self.missing_sensors)
             pressure[gone] = math.nan
             heat[gone] = math.nan
+            elements.correct(pressure, self._pressure)
+            pressure[gone] = math.nan
+        else:
+            elements.correct(pressure, self._pressure)
         pin_v, vin_v, vm_v, pin_a, ax, ay, az, gx, gy, gz, error = _TAIL.unpack_from(data, _TAIL_AT)
         q, dq, tau, temperature, winding, voltage, ddq = joints
         imu = {

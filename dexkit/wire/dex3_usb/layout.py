@@ -108,7 +108,7 @@ SENSOR_STATE = Structure(
         Field("head", "u8", 2, "7E E7"),
         Field("mode", "u8", 1, "bits 0-3 id, bits 4-7 status"),
         Field("reverse", "u8", 1, "reserved"),
-        Field("pressure", "u16", 12, "pressure; 30000 where there is no element", "8 Pa"),
+        Field("pressure", "u16", 12, "pressure; 3750 where there is no element", "8 Pa"),
         Field("temperature", "i8", 12, "temperature", "1 °C"),
         Field("CRC32", "u32", 1, "checksum"),
     ),

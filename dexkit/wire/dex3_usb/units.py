@@ -25,6 +25,7 @@ __all__ = [
     "DAMPING",
     "MOTOR_VOLTAGE",
     "NO_VALUE",
+    "NO_VALUE_COUNTS",
     "POSITION",
     "PRESSURE",
     "ROTATION",
@@ -38,9 +39,13 @@ __all__ = [
     "Scale",
 ]
 
-NO_VALUE = 30000
-"""Pressure count where a packet has no sensor element (the Dex3-1 manual "30000 represents no
-value")."""
+NO_VALUE = 3750
+"""Pressure count that dexkit sends where a packet has no sensor element: 30000 Pa (the Dex3-1
+manual "30000 represents no value"; a count is 8 Pa). No element reads that: the air is 12500
+counts (docs/dex3-usb.md)."""
+NO_VALUE_COUNTS = 30000
+"""The same, where a hand's processor means counts. These are 240 kPa, which a pressed element may
+read, so they say that there is none only in a slot that never holds anything else."""
 
 _INT16 = (-0x8000, 0x7FFF)
 _UINT16 = (0, 0xFFFF)
@@ -83,8 +88,10 @@ SCALES = (
 
 
 def encode_pressure(pascal: float) -> int:
-    """Counts of a pressure; NaN becomes :data:`NO_VALUE`, and a real reading never does."""
+    """Counts of a pressure; NaN becomes :data:`NO_VALUE`, and a real reading neither that nor
+    :data:`NO_VALUE_COUNTS`.
+    """
     if math.isnan(pascal):
         return NO_VALUE
     count = PRESSURE.encode(pascal)
-    return NO_VALUE + 1 if count == NO_VALUE else count
+    return count + 1 if count in (NO_VALUE, NO_VALUE_COUNTS) else count
