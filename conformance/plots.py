@@ -46,7 +46,7 @@ class PlotKind(str, Enum):
     TORQUE_BY_POSITION = "torque-by-position"
     """``tau_est`` over q, all states and those at the place."""
     PRESSURE = "pressure"
-    """Pressure, summed over each sensor packet, about the place."""
+    """Change of pressure since rest, summed over each sensor packet, about the place."""
     MEMBER = "member"
     """A member of the state message about the place; :attr:`Plot.member` names it."""
     DESCRIPTORS = "descriptors"

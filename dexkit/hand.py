@@ -309,9 +309,10 @@ class HandState:
     :param temperature: of the motor's case, °C, shape (n_joints,).
     :param winding_temperature: likewise of its winding, or None where it is not measured apart.
     :param fault: :class:`MotorError` bits per joint.
-    :param pressure: Pa, shape (n_sensors, 12), NaN where there is no sensor element; or None
-        without sensors. Of tactile areas: the device's own counts, shape (n_sensors, elements of
-        the largest area), row after row.
+    :param pressure: Pa, absolute (about 100,000 with nothing on an element, see
+        :mod:`dexkit.pressure`), shape (n_sensors, 12), NaN where there is no sensor element; or
+        None without sensors. Of tactile areas: the device's own counts, shape (n_sensors, elements
+        of the largest area), row after row.
     :param sensor_temperature: °C, shape (n_sensors, 12), or None.
     :param sensor_lost: packets that each sensor has missed, shape (n_sensors,), or None.
     :param error: the hand's own error word, apart from its motors'.

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.emulators.barometers import untouched
 from dexkit.emulators.finger_mechanics import AMBIENT, FingerMechanics, MotorModel
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, ImuState, Side, SupplyState
@@ -72,9 +73,10 @@ _PALM_SHARES = (1.0 / 12.0,) * 4
 _PALM_FROM = 6.0  # N of the fingers' pads from which the object is pressed into the palm
 _GRAVITY = 9.81
 _FORCE_MIN, _FORCE_MAX = 0.010 * _GRAVITY, 2.5 * _GRAVITY  # the Dex3-1 manual "Range of Perception"
-# m² of one element. A square centimetre, and a little more so that a full reading stays below
-# the code for "no value" on the wire (30000 counts of 8 Pa).
-_ELEMENT_AREA = 1.05e-4
+# m² of one element. About a square centimetre: then the least force that an element feels is 1090
+# Pa, above the 1000 from which a program of real hands sees a contact
+# (docs/sources/real-hands.md#touch-sign).
+_ELEMENT_AREA = 0.9e-4
 
 # per place of a finger: (joint that presses it, lever arm, share of each element)
 _INDEX = {spec.name: i for i, spec in enumerate(DEX3_1.joints[Side.LEFT])}
@@ -92,8 +94,7 @@ _ON_PALM = [_PLACES.index("middle pad"), _PLACES.index("index pad")]
 _SHARES = np.full((len(_PLACES), 12), math.nan)
 for _row, _sensor in zip(_SHARES, DEX3_1.sensors, strict=True):
     _row[list(_sensor.slots)] = _PRESSES.get(_sensor.place, (None, None, _PALM_SHARES))[2]
-_NO_PRESSURE = 0.0 * _SHARES
-_SENSOR_TEMPERATURE = AMBIENT + _NO_PRESSURE
+_SENSOR_TEMPERATURE = AMBIENT + 0.0 * _SHARES
 
 
 class Dex3Mechanics(FingerMechanics):
@@ -120,8 +121,10 @@ class Dex3Mechanics(FingerMechanics):
         self.supply_v = supply_v
         self.fans = False
         self._presses = [0.0] * len(DEX3_1.sensors)
+        self._time = 0.0
+        self._rest: Floats = untouched(side, 0.0)
         self._touched: list[float] = []
-        self._felt = _NO_PRESSURE
+        self._felt: Floats = self._rest
 
     def press(self, sensor: int, force: float) -> None:
         """Press a sensor from outside, as a person does; the joints do not yield.
@@ -132,6 +135,7 @@ class Dex3Mechanics(FingerMechanics):
 
     def _step_slowly(self, dt: float) -> None:
         super()._step_slowly(dt)
+        self._time += dt
         hottest = max(motor.case for motor in self._motors)
         if hottest > _FANS_ON:
             self.fans = True
@@ -169,16 +173,22 @@ class Dex3Mechanics(FingerMechanics):
         return _IMU
 
     @property
+    def untouched(self) -> Floats:
+        """The pressure at this time if nothing touched the hand, read-only."""
+        return untouched(self.side, self._time)
+
+    @property
     def pressure(self) -> Floats:
-        """Pa, shape (9, 12), NaN where there is no element, 0 where nothing is touched.
+        """Pa, absolute, shape (9, 12), NaN where there is no element.
 
         The first joint of a finger (thumb_1 for the thumb) presses its pad against the object,
-        the second its tip. An element measures 10 g to 2500 g: less reads as 0, more as the
-        maximum.
+        the second its tip, which raises it above :attr:`untouched`. An element measures 10 g to
+        2500 g: less changes nothing, more reads as the maximum.
         """
         torques = [motor.contact() for motor in self._motors]
         key = torques + self._presses
-        if key == self._touched:
+        rest = self.untouched
+        if key == self._touched and rest is self._rest:
             return self._felt.copy()
         forces = [torques[joint] / lever for joint, lever in _TOUCH]
         palm = sum(forces[i] for i in _ON_PALM) - _PALM_FROM
@@ -188,7 +198,8 @@ class Dex3Mechanics(FingerMechanics):
         np.minimum(felt, _FORCE_MAX, out=felt)
         felt[felt < _FORCE_MIN] = 0.0
         felt /= _ELEMENT_AREA
-        self._touched, self._felt = key, felt
+        felt += rest
+        self._touched, self._rest, self._felt = key, rest, felt
         return felt.copy()
 
     @property

@@ -116,6 +116,7 @@ class Worn:
         self._half = np.array([wear.joints.get(i, JointWear()).play / 2 for i in range(n_joints)])
         self._elements = sorted(wear.elements)
         self._q: Floats | None = None
+        self._dead: Floats | None = None
 
     def __call__(self, state: HandState) -> HandState:
         """The state as the worn hand reports it."""
@@ -124,7 +125,9 @@ class Worn:
         self._q = np.clip(self._q, state.q - self._half, state.q + self._half)
         pressure = state.pressure
         if pressure is not None and self._elements:
+            if self._dead is None:
+                self._dead = pressure.copy()  # what they read first, they read for ever
             pressure = pressure.copy()
             for packet, slot in self._elements:
-                pressure[packet, slot] = 0.0
+                pressure[packet, slot] = self._dead[packet, slot]
         return replace(state, q=self._q, pressure=pressure)

@@ -1,5 +1,9 @@
 """Check the fingers' pressure readings in contact: sensors in the state, or tactile areas on their
 own topic.
+
+What counts is the change of an element from what it read before the contact: a hand's values are
+absolute, and a touch may lower them (docs/sources/real-hands.md#touch-sign). Before the contact is
+known here, from the phases of the run; tools that do not know it use :mod:`dexkit.pressure`.
 """
 
 from __future__ import annotations
@@ -13,11 +17,12 @@ from dexkit.conformance.checks.motion import steps_of
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, Subject
 from dexkit.models import HandModel
+from dexkit.pressure import NO_VALUE, known
 
 __all__: list[str] = []
 
 _BEFORE_S = 0.1  # s before a phase or at its end in which a pressure is taken
-
+_REST_S = 0.5  # s before a contact in which the noise is taken
 
 _STANDS = 0.02  # of the stroke: motion at the end of a phase that still counts as standing
 
@@ -33,6 +38,27 @@ def _pressures(
     if ctx.recording.dialect.touch_topic:
         touch = ctx.recording.touch.get(ctx.side if side is None else side)
         return None if touch is None else touch.median(begin, end)
+    found = _readings(ctx, begin, end, side)
+    return None if found is None else np.asarray(np.median(found, axis=0))
+
+
+def _noise(ctx: Context, end: float) -> float:
+    """The most that an element varies in the time before ``end``, in which nothing touches it."""
+    if ctx.recording.dialect.touch_topic:
+        return 0.0  # counts, which are 0 at rest
+    found = _readings(ctx, end - _REST_S, end)
+    return 0.0 if found is None else float(np.nanmax(np.ptp(found, axis=0), initial=0.0))
+
+
+def _changes(after: Floats, before: Floats) -> Floats:
+    """The size of the change of each element; 0 for those without a value."""
+    return np.asarray(np.nan_to_num(np.abs(after - before)))
+
+
+def _readings(ctx: Context, begin: float, end: float, side: Subject | None = None) -> Floats | None:
+    """The pressures of every state, shape (n, n_packets, 12), NaN for no value; None if there are
+    none.
+    """
     hand = ctx.hand if side is None else ctx.recording.sides[side]
     states, columns = hand.states, hand.states.columns
     rows = states.between(begin, end)
@@ -46,13 +72,7 @@ def _pressures(
     for i in range(least):
         if i not in packets:
             packets[i] = columns[f"press_sensor_state[{i}].pressure"]
-    found = np.median(np.stack([packets[i][rows] for i in range(least)], axis=1), axis=0)
-    found[found == _NO_VALUE] = np.nan
-    return np.asarray(found)
-
-
-_NO_VALUE = 30000.0
-"""What a slot without a sensor holds (docs/sources/unitree-dex.md#b4)."""
+    return known(np.stack([packets[i][rows] for i in range(least)], axis=1))
 
 
 def _finger_packets(ctx: Context, finger: str) -> list[int]:
@@ -98,36 +118,38 @@ def _presses(ctx: Context, phase: Phase) -> bool:
 
 @check("DEX3-SENS-04")
 def touch(ctx: Context) -> Outcome:
-    """The rise of the pressure in a finger's own packets while it alone presses."""
+    """The change of the pressure in a finger's own packets while it alone presses."""
     if ctx.object_at is None:
         return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = list(_touches(ctx))
     if not found:
         return ctx.absent("the states hold no sensor packets")
+    rest, noise = found[0][2], _noise(ctx, ctx.span(found[0][0])[0])
     judged = 0
     for phase, finger, free, held in found:
         mine = [i for i in _finger_packets(ctx, finger) if i < len(held)]
         if not mine or not _presses(ctx, phase):
             continue
         judged += 1
-        rises = held - free
-        own = float(np.nanmax(rises[mine], initial=0.0))
+        # the finger before may be let go of in this phase, and go back to what it was
+        changes = _changes(held, rest) - _changes(free, rest)
+        own = float(changes[mine].max(initial=0.0))
         foreign = max(
             (
-                float(np.nanmax(rises[i], initial=0.0))
+                float(changes[i].max(initial=0.0))
                 for name in _fingers(ctx)
                 if name != finger
                 for i in _finger_packets(ctx, name)
-                if i < len(rises)
+                if i < len(changes)
             ),
             default=0.0,
         )
-        if own > max(foreign, 0.0) or np.isnan(rises[mine]).all():
+        if own > max(foreign, noise) or np.isnan((held - free)[mine]).all():
             continue
-        others = [i for i in range(len(rises)) if np.nanmax(rises[i], initial=0.0) > 0]
+        others = [i for i in range(len(changes)) if changes[i].max(initial=0.0) > noise]
         outcome = ctx.failed(
             "other packets" if others else "no touch",
-            f"the {finger} presses on the object, and the pressure rises in "
+            f"the {finger} presses on the object, and the pressure changes in "
             + (f"packets {others}, and not most in its own ({mine})" if others else "no packet"),
             ctx.at(ctx.states.topic, *ctx.span(phase)),
         )
@@ -148,14 +170,14 @@ def saturates(ctx: Context) -> Outcome:
     count = columns.count("press_sensor_state")
     full = count == count.max(initial=0)
     for packet in range(int(count.max(initial=0))):
-        marked = columns[f"press_sensor_state[{packet}].pressure"][full] == _NO_VALUE
+        marked = columns[f"press_sensor_state[{packet}].pressure"][full] == NO_VALUE
         changes = (marked != marked[:1]).any(axis=1)
         if changes.any():
             at = float(ctx.states.t[full][int(np.argmax(changes))])
             return ctx.failed(
                 "changes",
                 f"at {at:.2f} s an element of packet {packet} begins or ends to hold "
-                f"{_NO_VALUE:g}, which means that there is no sensor",
+                f"{NO_VALUE:g}, which means that there is no sensor",
                 ctx.at(ctx.states.topic, at),
             )
     return ctx.passed("constant", "the same slots hold a value throughout")
@@ -177,17 +199,17 @@ def releases(ctx: Context) -> Outcome:
     later = _pressures(ctx, at, at + _BEFORE_S)
     if free is None or most is None or later is None:
         return ctx.absent("the states hold no sensor packets")
-    rise, left = most - free, later - free
-    rise, left = np.nan_to_num(rise), np.nan_to_num(left)
+    change, left = _changes(most, free), _changes(later, free)
     # noise of an element with hardly any contact does not count
-    touched = rise > ctx.tolerance("min_rise_part") * rise.max(initial=0.0)
+    least = ctx.tolerance("min_rise_part") * change.max(initial=0.0)
+    touched = change > max(least, _noise(ctx, rest[0]))
     if not touched.any():
-        return ctx.skipped("no pressure rose at the object")
-    part = np.where(touched, left / np.where(touched, rise, 1.0), 0.0)
+        return ctx.skipped("no pressure changed at the object")
+    part = np.where(touched, left / np.where(touched, change, 1.0), 0.0)
     packet, slot = (int(i) for i in np.unravel_index(int(np.argmax(part)), part.shape))
     worst = float(part[packet, slot])
     text = (
-        f"{worst:.0%} of the pressure in slot {slot} of packet {packet} is left "
+        f"{worst:.0%} of the change of pressure in slot {slot} of packet {packet} is left "
         f"{ctx.tolerance('release_s'):g} s after the release"
     )
     if worst <= ctx.tolerance("max_part"):
@@ -217,21 +239,22 @@ def pressure_lasts(ctx: Context) -> Outcome:
         last = _pressures(ctx, end - _BEFORE_S, end)
         if free is None or first is None or last is None:
             continue
-        rise, later = np.nan_to_num(first - free), np.nan_to_num(last - free)
-        most = float(rise.max(initial=0.0))
-        if most <= 0.0:
+        change = _changes(first, free)
+        later = np.nan_to_num(last - free) * np.sign(np.nan_to_num(first - free))
+        most = float(change.max(initial=0.0))
+        if most <= _noise(ctx, rest):
             continue
-        part = np.where(rise >= 0.3 * most, later / np.where(rise > 0, rise, 1.0), np.inf)
+        part = np.where(change >= 0.3 * most, later / np.where(change > 0, change, 1.0), np.inf)
         packet, slot = (int(k) for k in np.unravel_index(int(np.argmin(part)), part.shape))
         found = (float(part[packet, slot]), packet, slot, begin, end)
         worst = found if worst is None or found < worst else worst
     if worst is None:
-        return ctx.absent("no pressure rose at the object")
+        return ctx.absent("no pressure changed at the object")
     part_left, packet, slot, begin, end = worst
     part_left = max(part_left, 0.0)
     text = (
-        f"at the end of a grip of {end - begin:.1f} s, {part_left:.0%} of its pressure is left in "
-        f"slot {slot} of packet {packet}"
+        f"at the end of a grip of {end - begin:.1f} s, {part_left:.0%} of the change of pressure "
+        f"is left in slot {slot} of packet {packet}"
     )
     if part_left >= ctx.tolerance("min_part"):
         return ctx.passed(f"{part_left:.0%}", text, part=part_left)
@@ -252,7 +275,7 @@ def follows_the_force(ctx: Context) -> Outcome:
     if not phases:
         return ctx.skipped("the fingers did not press in turn")
     rest = _untouched(ctx, ctx.span(phases[0])[0])
-    free = _pressures(ctx, rest - 2 * _BEFORE_S, rest)
+    free, noise = _pressures(ctx, rest - 2 * _BEFORE_S, rest), _noise(ctx, rest)
     worst: tuple[float, str, str, float, float] | None = None
     for phase, after in zip(phases, [*phases[1:], None], strict=True):
         finger = phase.params.get("finger", "")
@@ -263,7 +286,7 @@ def follows_the_force(ctx: Context) -> Outcome:
         for word, a, b in (("rises", begin, end), ("falls", end, later)):
             if word == "falls" and not _gives_way(ctx, finger, begin, end, later):
                 continue
-            found = _share(ctx, finger, free, a, b)
+            found = _share(ctx, finger, free, noise, a, b)
             if found is not None and (worst is None or found < worst[0]):
                 worst = found, finger, word, a, b
     if worst is None:
@@ -278,7 +301,7 @@ def follows_the_force(ctx: Context) -> Outcome:
 
 
 def _share(
-    ctx: Context, finger: str, free: Floats | None, begin: float, end: float
+    ctx: Context, finger: str, free: Floats | None, noise: float, begin: float, end: float
 ) -> float | None:
     """The change of a finger's pressure from before ``begin`` to ``end``, relative to the change
     that its torque predicts; None where the torque hardly changes.
@@ -303,10 +326,10 @@ def _share(
         part = min(part, float((has / _most_torque(ctx, joints, begin)).max()) - 1.0)
         if part < ctx.tolerance("min_change_part"):
             return None
-    felt, feels = np.nan_to_num(was - free)[mine], np.nan_to_num(now - free)[mine]
+    felt, feels = _changes(was, free)[mine], _changes(now, free)[mine]
     most = float(max(felt.max(initial=0.0), feels.max(initial=0.0)))
     touched = np.maximum(felt, feels) >= ctx.tolerance("min_rise_part") * most
-    if most <= 0.0:
+    if most <= noise:
         return 0.0
     changed = (feels[touched] - felt[touched]) / np.maximum(felt[touched], 1e-3 * most)
     return float((changed / part).max())
@@ -339,7 +362,7 @@ def _gives_way(ctx: Context, finger: str, begin: float, end: float, later: float
 
 @check("DEX3-SENS-11")
 def feels_nothing(ctx: Context) -> Outcome:
-    """The rise of pressures in a standing hand without contact, while the other hand squeezes an
+    """The change of pressures in a standing hand without contact, while the other hand squeezes an
     object.
     """
     if ctx.object_at is not None:
@@ -356,16 +379,17 @@ def feels_nothing(ctx: Context) -> Outcome:
     theirs = [_pressures(ctx, *span, side=side) for span in spans]
     if mine[0] is None or mine[1] is None or theirs[0] is None or theirs[1] is None:
         return ctx.absent("the states hold no sensor packets")
-    rise = np.nan_to_num(mine[1] - mine[0])
-    pressed = float(np.nan_to_num(theirs[1] - theirs[0]).max(initial=0.0))
-    if pressed <= 0.0:
+    change = _changes(mine[1], mine[0])
+    pressed = float(_changes(theirs[1], theirs[0]).max(initial=0.0))
+    noise = _noise(ctx, rest)
+    if pressed <= noise:
         return ctx.skipped(f"the {side} hand felt no object")
-    packet, slot = (int(k) for k in np.unravel_index(int(np.argmax(rise)), rise.shape))
-    part = float(rise[packet, slot]) / pressed
+    packet, slot = (int(k) for k in np.unravel_index(int(np.argmax(change)), change.shape))
+    part = max(float(change[packet, slot]) - noise, 0.0) / pressed
     text = (
         f"while the {side} hand squeezes an object, the pressure in slot {slot} of packet {packet} "
-        f"of this one rises by {max(part, 0.0):.0%} of the most there"
+        f"of this one changes by {part:.0%} of the most there"
     )
     if part <= ctx.tolerance("max_part"):
-        return ctx.passed(f"{max(part, 0.0):.0%}", text, part=part)
+        return ctx.passed(f"{part:.0%}", text, part=part)
     return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *spans[1]), part=part)

@@ -407,11 +407,10 @@ class SevenPackets(FingerService):
 
 @wrong_hand("DEX3-SENS-04", sides=BOTH)
 class Numb(FingerService):
-    """Publishes a pressure of 0 at every contact."""
+    """Publishes the pressure of an untouched hand at every contact."""
 
     def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        return np.where(pressure == 30000.0, pressure, 0.0)
+        return hand.untouched()
 
 
 @wrong_hand("DEX3-SENS-04", sides=BOTH)
@@ -428,7 +427,7 @@ class SaturatesToNothing(FingerService):
 
     def pressures(self, hand: FingerHand) -> Floats:
         pressure = super().pressures(hand)
-        return np.where(pressure > 5000.0, 30000.0, pressure)
+        return np.where(pressure > hand.untouched() + 25_000.0, 30000.0, pressure)
 
 
 @wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
@@ -440,12 +439,12 @@ class SlowFoam(FingerService):
         self.pressure: dict[Side, tuple[float, Floats]] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        at, before = self.pressure.get(hand.side, (self.now, pressure))
-        left = before * math.exp((at - self.now) / 2.0)
-        pressure = np.where(pressure == 30000.0, pressure, np.maximum(pressure, left))
-        self.pressure[hand.side] = self.now, pressure
-        return pressure
+        rest = hand.untouched()
+        change = super().pressures(hand) - rest
+        at, before = self.pressure.get(hand.side, (self.now, change))
+        change = np.maximum(change, before * math.exp((at - self.now) / 2.0))
+        self.pressure[hand.side] = self.now, change
+        return rest + change
 
     def live(self, dt: float) -> None:
         super().live(dt)
@@ -478,7 +477,7 @@ class KeepsTheMost(Dex3Service):
     def pressures(self, hand: FingerHand) -> Floats:
         pressure = np.array(super().pressures(hand))
         kept = np.maximum(self.pressure.get(hand.side, pressure), pressure)
-        self.pressure[hand.side] = np.where(pressure > 0.0, kept, pressure)
+        self.pressure[hand.side] = np.where(pressure > hand.untouched(), kept, pressure)
         return self.pressure[hand.side]
 
 
@@ -501,13 +500,12 @@ class TaresInAGrip(FingerService):
         self.drift: dict[Side, tuple[float, Floats]] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        empty = pressure == 30000.0
-        rest = np.where(empty, 0.0, pressure)
-        at, drift = self.drift.get(hand.side, (self.now, np.zeros_like(rest)))
-        drift = rest + (drift - rest) * math.exp((at - self.now) / 0.7)
+        rest = hand.untouched()
+        change = super().pressures(hand) - rest
+        at, drift = self.drift.get(hand.side, (self.now, np.zeros_like(change)))
+        drift = change + (drift - change) * math.exp((at - self.now) / 0.7)
         self.drift[hand.side] = self.now, drift
-        return np.asarray(np.where(empty, pressure, np.maximum(rest - drift, 0.0)))
+        return np.asarray(rest + np.maximum(change - drift, 0.0))
 
     def live(self, dt: float) -> None:
         super().live(dt)

@@ -15,12 +15,12 @@ from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.conformance.stimulus_record import Phase
-from dexkit.conformance.usb.frames import NO_VALUE
 from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.errors import UsageError
 from dexkit.escaping import html as escape
 from dexkit.hand import Floats, JointSpec, Side, Subject
+from dexkit.pressure import known, resting_pressure
 
 __all__ = ["PHASES", "command_and_state", "operated", "phase_bands", "plots_of"]
 
@@ -551,7 +551,7 @@ def _member(scene: _Scene, member: str) -> str:
 
 
 def _pressure(scene: _Scene) -> str:
-    """Pressure of each sensor packet: the sum over its elements."""
+    """Change of pressure of each sensor packet since rest: the sum over its elements."""
     hand, span = scene.hand, scene.window()
     if hand.states.columns is None:
         return ""
@@ -559,12 +559,14 @@ def _pressure(scene: _Scene) -> str:
     lines = []
     for i in range(count):
         values = hand.states.columns[f"press_sensor_state[{i}].pressure"]
-        there = np.where(np.isfinite(values) & (values < NO_VALUE), values, 0.0)
-        lines.append(Line("each packet", "force", hand.states.t, there.sum(axis=1)))
+        change = known(values) - resting_pressure(hand.states.t, values)
+        change = np.where(np.isfinite(change), change, 0.0)
+        lines.append(Line("each packet", "force", hand.states.t, change.sum(axis=1)))
     if not lines:
         return ""
     return chart(
-        f"{whose(hand.side)}: pressure, summed over each of {count} sensor packets",
+        f"{whose(hand.side)}: change of pressure since rest, summed over each of {count} sensor "
+        "packets",
         lines,
         y_unit="",
         span=span,

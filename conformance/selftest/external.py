@@ -20,10 +20,10 @@ from dexkit.errors import DdsError, HandTimeout, UsageError, WireError
 from dexkit.hand import Floats, HandCommand, HandSpec, HandState, JointMode, Side
 from dexkit.messages import message_type
 from dexkit.models import Dialect, ModeByte, model
+from dexkit.pressure import NO_VALUE
 from dexkit.single_publisher import NodeTopics, SolePublisher
 from dexkit.teleop.client import JointCommand
 from dexkit.teleop.client_codec import ClientCodec
-from dexkit.watch.fields import NO_VALUE
 
 if TYPE_CHECKING:
     import threading

@@ -44,7 +44,7 @@ _OVERSHOT = 0.05  # part of the stroke beyond a goal
 _WATCHED = 0.3  # seconds after a step
 _GAP = 2.5  # periods between two samples at most, where a figure depends on them
 _PRESSED = 500.0  # Pa, or ...
-_SIGMAS = 8.0  # ... times the noise, above rest: an element that is pressed
+_SIGMAS = 8.0  # ... times the noise, from rest: an element that is pressed
 _TOUCH_PATIENCE = 60.0  # seconds without a new element
 
 
@@ -73,7 +73,7 @@ class ElementFound:
     """Findings about a tactile element.
 
     :ivar rest: Pa while nothing was touched; ``noise`` its standard deviation; NaN: no value.
-    :ivar peak: most while it was pressed; NaN if it was not tested.
+    :ivar peak: furthest from rest while it was pressed; NaN if it was not tested.
     """
 
     packet: int
@@ -422,7 +422,7 @@ class Procedure:
         assert bench.state is not None
         last, self._skipped = bench.state.stamp, False
         for element in elements:
-            element.answered, element.peak = False, -math.inf
+            element.answered, element.peak = False, math.nan
         while not self._skipped and bench.state.stamp - last < _TOUCH_PATIENCE:
             missing = [str(e.slot) for e in elements if not e.answered]
             if not missing:
@@ -434,10 +434,12 @@ class Procedure:
                 break
             for i, element in enumerate(elements):
                 value = float(state.pressure[packet, element.slot])
-                limit = element.rest + max(_PRESSED, _SIGMAS * element.noise)
-                if value > element.peak:
+                # of either sign: docs/sources/real-hands.md#touch-sign
+                change = abs(value - element.rest)
+                if not abs(element.peak - element.rest) >= change:
                     element.peak = value
-                above[i] = above[i] + 1 if value > limit else 0
+                pressed = change > max(_PRESSED, _SIGMAS * element.noise)
+                above[i] = above[i] + 1 if pressed else 0
                 if above[i] >= 2 and not element.answered:
                     element.answered, last = True, state.stamp
 

@@ -15,12 +15,12 @@ from dexkit.conformance.virtual.service import Sample, Service, TopicDevice
 from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
+from dexkit.pressure import NO_VALUE
 
 __all__ = ["GO_MOTOR", "Dex3Service", "FingerHand", "FingerService", "Flags", "Ints"]
 
 Flags: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]
-NO_VALUE = 30000.0  # the Dex3-1 manual
 # the joint that presses each sensor packet, in the order of the model's sensors
 _PRESSED_BY = {"thumb": (2, 1), "middle": (4, 3), "index": (6, 5)}
 
@@ -206,6 +206,10 @@ class FingerHand:
 
     def pressures(self) -> Floats:
         """Shape (n_sensors, 12): the values of the sensor packets."""
+        return self.untouched()
+
+    def untouched(self) -> Floats:
+        """The same at this time, if nothing touched the hand."""
         return np.zeros((0, 12))
 
 
@@ -218,6 +222,7 @@ class Dex3Hand(FingerHand):
     coulomb = 0.005
     brake = 0.2
     stiffness = 60.0
+    noise = 0
 
     def understood(self, mode: Ints) -> tuple[Ints, Flags]:
         """Status in bits 4 to 6, protection in bit 7."""
@@ -234,24 +239,45 @@ class Dex3Hand(FingerHand):
 
     def pressures(self) -> Floats:
         """Values of the sensor packets, shape (9, 12)."""
+        rest = self.untouched()
         if not self.touches or not any(self.contact):
-            return _UNTOUCHED
-        pressure = np.array(_UNTOUCHED)
-        pressure[_PRESSED] = 1e4 * np.abs(self.contact)[_PRESSING]
+            return rest
+        pressure = np.array(rest)
+        pressure[_PRESSED] += _PER_TORQUE * np.abs(self.contact)[_PRESSING]
         return pressure
 
+    def untouched(self) -> Floats:
+        """The air's pressure, with the offset and the noise of each element."""
+        return _UNTOUCHED[self.side][self.noise % len(_UNTOUCHED[self.side])]
 
-def _untouched() -> Floats:
-    pressure = np.full((len(DEX3_1.sensors), 12), NO_VALUE)
-    for row, sensor in zip(pressure, DEX3_1.sensors, strict=True):
-        row[list(sensor.slots)] = 0.0
-    return pressure
+    def step(self, dt: float) -> None:
+        """Advance by one step, also with the noise of the sensors."""
+        super().step(dt)
+        noise = int(self.now / _NOISE_S)
+        if noise != self.noise:
+            self.noise = noise
+            self.version += 1
+
+
+def _untouched(side: Side) -> list[Floats]:
+    """Readings of an untouched hand, one after the other: about 100,000, as on real ones
+    (docs/sources/real-hands.md#touch-rest). Offsets and noise of the elements are made up.
+    """
+    places = 12 * np.arange(len(DEX3_1.sensors))[:, np.newaxis] + np.arange(12)
+    offsets = 101_000.0 + (577.0 * places + (311.0 if side is Side.RIGHT else 0.0)) % 2300.0
+    rows = []
+    for k in range(_NOISE_ROWS):
+        row = np.full(offsets.shape, NO_VALUE)
+        for i, sensor in enumerate(DEX3_1.sensors):
+            slots = list(sensor.slots)
+            row[i, slots] = (offsets + (37.0 * (k + 1) * (places + 3)) % 61.0)[i, slots]
+        row.setflags(write=False)  # so that equal ones are known by identity
+        rows.append(row)
+    return rows
 
 
 def _pressed() -> tuple[tuple[Ints, Ints], Ints]:
-    """Rows and columns of the values that a joint presses, in :data:`_UNTOUCHED`, and the joint of
-    each.
-    """
+    """Rows and columns of the values that a joint presses, and the joint of each."""
     found = []
     for row, sensor in enumerate(DEX3_1.sensors):
         finger, _, part = sensor.place.partition(" ")
@@ -262,8 +288,9 @@ def _pressed() -> tuple[tuple[Ints, Ints], Ints]:
     return (rows, columns), joints
 
 
-_UNTOUCHED = _untouched()
-_UNTOUCHED.setflags(write=False)
+_PER_TORQUE = 5e4  # Pa per N m; made up, so that a grip is above 150,000
+_NOISE_S, _NOISE_ROWS = 0.05, 16
+_UNTOUCHED = {side: _untouched(side) for side in Side}
 _PRESSED, _PRESSING = _pressed()
 
 
@@ -276,7 +303,7 @@ class _Message:
 
     def set_pressures(self, pressure: Floats) -> None:
         """Fill in the values of the packets, shape (n_sensors, 12)."""
-        # those of a hand that touches nothing are one array that cannot change
+        # those of a hand that touches nothing are arrays that cannot change
         if pressure is not self._pressure or pressure.flags.writeable:
             self.packets["pressure"] = pressure[: len(self.packets)]
             self._pressure = pressure

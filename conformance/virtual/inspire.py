@@ -56,7 +56,7 @@ class FtpHand(InspireHand):
 
     def pressures(self) -> Floats:
         """Shape (n_areas, elements of the largest): counts of the tactile areas."""
-        pressure = np.zeros((len(_AREAS), _MOST))
+        pressure = self.untouched()
         if not self.touches:
             return pressure
         # the object is on the way to closed, which is toward 0
@@ -67,6 +67,10 @@ class FtpHand(InspireHand):
                 mine = [p for p, name in zip(pressed, _JOINTS, strict=True) if name == finger]
                 row[: area.elements] = _COUNTS * max(mine)
         return pressure
+
+    def untouched(self) -> Floats:
+        """The same of a hand that nothing touches: its areas were set to zero."""
+        return np.zeros((len(_AREAS), _MOST))
 
 
 class FtpService(ServoService):

@@ -46,11 +46,11 @@ class Snapshot:
     """One answer of the hand.
 
     :param motors: by address; those that are silent are left out.
-    :param pressure: highest value of each sensor, Pa, by address.
+    :param pressure: values of each sensor, Pa, by address. Slots without an element never change.
     """
 
     motors: Mapping[str, Reading]
-    pressure: Mapping[str, float] = field(default_factory=dict)
+    pressure: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -153,11 +153,11 @@ class BringupSession:
 
 
 class _TouchWatch:
-    """Finds the one sensor whose pressure rises and stays."""
+    """Finds the one sensor whose pressure changes and stays so."""
 
     def __init__(self, action: PressRequest) -> None:
         self.action = action
-        self._rest: dict[str, float] = {}
+        self._rest: dict[str, tuple[float, ...]] = {}
         self._begin = math.nan
         self._since: tuple[str, float] | None = None
 
@@ -169,17 +169,19 @@ class _TouchWatch:
         """The address of the sensor that is pressed, once that is sure."""
         if math.isnan(self._begin):
             self._begin = now
-        risen = []
+        changed = []
         for address, pressure in snapshot.pressure.items():
             rest = self._rest.setdefault(address, pressure)
-            if address not in self.action.known and pressure - rest > _PRESSED:
-                risen.append((pressure - rest, address))
-        risen.sort(reverse=True)
-        clear = len(risen) == 1 or (len(risen) > 1 and risen[0][0] > 2 * risen[1][0])
+            # either sign: docs/sources/real-hands.md#touch-sign
+            change = max((abs(a - b) for a, b in zip(pressure, rest, strict=True)), default=0.0)
+            if address not in self.action.known and change > _PRESSED:
+                changed.append((change, address))
+        changed.sort(reverse=True)
+        clear = len(changed) == 1 or (len(changed) > 1 and changed[0][0] > 2 * changed[1][0])
         if not clear:
             self._since = None
             return None
-        address = risen[0][1]
+        address = changed[0][1]
         if self._since is None or self._since[0] != address:
             self._since = (address, now)
         return address if now - self._since[1] >= _PRESS_TIME else None

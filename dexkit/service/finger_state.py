@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats, HandSpec, HandState, ImuState, MotorError, SupplyState
 from dexkit.messages import message_type, unitree_hg
+from dexkit.pressure import NO_VALUE
 
-__all__ = ["NO_VALUE", "FingerStateEncoder"]
-
-NO_VALUE = 30000.0  #: the pressure of a slot without a sensor element (the Dex3-1 manual)
+__all__ = ["FingerStateEncoder"]
 
 _TYPE = message_type("unitree_hg::msg::dds_::HandState_")
 _BESIDE_NO_VALUE = np.nextafter(np.float32(NO_VALUE), np.float32(np.inf))

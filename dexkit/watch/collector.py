@@ -32,9 +32,10 @@ from dexkit.hand import Floats, JointSpec, MotorError, Subject
 from dexkit.messages import Columns, message_type
 from dexkit.messages.columns import RowReader
 from dexkit.models import HandModel, ModeByte
+from dexkit.pressure import RestingPressure, known
 from dexkit.robots import RobotModel
 from dexkit.watch.cycles import Cycles
-from dexkit.watch.fields import NO_VALUE, Field, Part, parts_of
+from dexkit.watch.fields import Field, Part, parts_of
 from dexkit.watch.history import History
 
 __all__ = [
@@ -103,6 +104,7 @@ class SubjectView:
     :param near: which joints are near a limit: -1 the lower, 1 the upper one, 0 neither.
     :param pressure: of the sensor elements in the order of the model's sensors and their slots, in
         the message's unit; empty without sensors.
+    :param pressure_at_rest: what each of them reads at rest, by :mod:`dexkit.pressure`.
     :param touch: of a hand with a touch topic: the most that an element of each of the model's
         areas counts; NaN where it is not known or old, empty without a topic.
     :param commanders: processes that publish the command topic, as far as they say so.
@@ -123,6 +125,7 @@ class SubjectView:
     target: Floats
     near: NDArray[np.int8]
     pressure: Floats
+    pressure_at_rest: Floats
     touch: Floats
     commanders: tuple[str, ...]
     command_timeout: float
@@ -139,14 +142,34 @@ class SubjectView:
         return np.asarray(np.clip(np.abs(np.nan_to_num(self.tau)) / most, 0.0, 1.0))
 
     @property
+    def pressure_change(self) -> Floats:
+        """Change of :attr:`pressure` from what each element reads at rest; a touch may lower it."""
+        return self.pressure - self.pressure_at_rest
+
+    @property
     def touched(self) -> dict[str, float]:
-        """The largest of :attr:`touch` by finger, in the areas' order; empty without areas."""
+        """By finger and for the palm, in the message's order: of a hand with a touch topic the
+        largest of :attr:`touch`, of one with sensors the largest :attr:`pressure_change` of either
+        sign. Empty without either.
+        """
         fingers: dict[str, float] = {}
-        areas = self.model.areas if isinstance(self.model, HandModel) and len(self.touch) else ()
-        for area, count in zip(areas, self.touch.tolist(), strict=True):
-            finger = area.place.partition(" ")[0]
-            fingers[finger] = float(np.fmax(fingers.get(finger, math.nan), count))
+        for place, value in self._felt():
+            finger = place.partition(" ")[0]
+            before = fingers.get(finger, math.nan)
+            if math.isnan(before) or abs(value) > abs(before):
+                fingers[finger] = value
         return fingers
+
+    def _felt(self) -> Iterable[tuple[str, float]]:
+        if not isinstance(self.model, HandModel):
+            return ()
+        if len(self.touch):
+            places = [area.place for area in self.model.areas]
+            return zip(places, self.touch.tolist(), strict=True)
+        places = (
+            [s.place for s in self.model.sensors for _ in s.slots] if len(self.pressure) else []
+        )
+        return zip(places, self.pressure_change.tolist(), strict=True)
 
     @property
     def fraction(self) -> Floats:
@@ -214,6 +237,8 @@ class _Topic:
         # the writer of each of the last samples, by time
         self._writers = History(1, most, seconds)
         self._numbers: dict[int, int] = {}
+        self._pressures = [i for i, f in enumerate(self.fields) if f.quantity == "pressure"]
+        self._resting = RestingPressure(len(self._pressures))
 
     def take(
         self,
@@ -234,6 +259,8 @@ class _Topic:
             bad = np.flatnonzero(~good)
         order = np.argsort(t, kind="stable")
         self.history.append(t[order], rows[order])
+        if self._pressures:
+            self._resting.take(t[order], rows[order][:, self._pressures])
         numbers = [self._numbers.setdefault(w, len(self._numbers)) for w in writers.tolist()]
         self._writers.append(t[order], np.array(numbers, dtype=np.float64)[order, None])
         if len(bad):
@@ -282,6 +309,13 @@ class _Topic:
     def row(self, at: float) -> Floats | None:
         end = self.history.until(at)
         return self.history.rows[end - 1] if end else None
+
+    @property
+    def at_rest(self) -> Floats:
+        """A row with what the pressures read at rest, shape (n_fields,); NaN elsewhere."""
+        row: Floats = np.full(len(self.fields), np.nan)
+        row[self._pressures] = self._resting.level
+        return row
 
     def writing(self, at: float) -> int:
         some = self._writers.between(at - _RATE_WINDOW, at)
@@ -463,6 +497,7 @@ class Collector:
         q = dq = tau = temperature = nothing
         fault: NDArray[np.uint32] = np.zeros(len(part.joints), dtype=np.uint32)
         pressure: Floats = np.empty(0)
+        at_rest: Floats = np.empty(0)
         age = math.nan
         if state is not None and (row := state[0].row(at)) is not None:
             age = state[0].age(at)
@@ -471,8 +506,8 @@ class Collector:
             )
             if len(bits := _values(row, state, "fault")) == len(fault):
                 fault = np.nan_to_num(bits).astype(np.uint32)
-            pressure = _values(row, state, "pressure")
-            pressure = np.where(pressure == NO_VALUE, np.nan, pressure)
+            pressure = known(_values(row, state, "pressure"))
+            at_rest = _values(state[0].at_rest, state, "pressure")
         touch: Floats = np.empty(0)
         felt = found.get("touch")
         if felt is not None:
@@ -505,6 +540,7 @@ class Collector:
             target=target,
             near=near,
             pressure=pressure,
+            pressure_at_rest=at_rest,
             touch=touch,
             commanders=self._processes(command[0].name, "writer") if command else (),
             command_timeout=part.timeout,

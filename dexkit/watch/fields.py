@@ -13,9 +13,6 @@ from dexkit.topics import roles
 
 __all__ = ["Field", "Part", "parts_of"]
 
-NO_VALUE = 30000.0
-"""Pressure of a slot without a sensor element (docs/sources/unitree-dex.md#b4)."""
-
 _STATE = {
     "q": ("q",),
     "dq": ("dq",),

@@ -203,10 +203,7 @@ class Dex3Bench:
                 for bus, motor in state.motors
             },
             {
-                f"{bus}.{sensor.id}": max(
-                    (units.PRESSURE.decode(p) for p in sensor.pressure if p != units.NO_VALUE),
-                    default=0.0,
-                )
+                f"{bus}.{sensor.id}": tuple(map(units.PRESSURE.decode, sensor.pressure))
                 for bus, sensor in state.sensors
             },
         )
