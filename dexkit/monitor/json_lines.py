@@ -81,6 +81,7 @@ def _subject(view: SubjectView) -> dict[str, object]:
         "near_limit": near,
         "faults": view.faults,
         "pressure": _numbers(view.pressure),
+        "pressure_change": _numbers(view.pressure_change),
         "touch": _numbers(view.touch),
         "commanders": list(view.commanders),
     }

@@ -171,7 +171,13 @@ def hand_lines(view: SubjectView, signs: Signs, width: int) -> list[Text]:
 
 
 def _touch(view: SubjectView) -> list[Text]:
-    """The largest pressure of each finger, three fingers a line."""
+    """What touches each finger: counts, three a line, or the change of pressure since rest."""
+    if not len(view.touch):
+        changes = [
+            f"{one_line(name)} {'+' if v >= 0 else ''}{number(v, 0)}"
+            for name, v in view.touched.items()
+        ]
+        return [Text(f"touch {'  '.join(changes)}  from rest", "dim")] if changes else []
     told = [f"{one_line(name)} {number(count, 0)}" for name, count in view.touched.items()]
     return [
         Text(f"{'' if i else 'touch':6}{'  '.join(told[i : i + 3])}", "dim")

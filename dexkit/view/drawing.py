@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dexkit.hand import Floats, Side
 from dexkit.kinematics import Skeleton, rotation
 from dexkit.models.skeletons import skeleton_of
+from dexkit.pressure import STILL
 from dexkit.robots import RobotModel
 from dexkit.watch import SubjectView
 
@@ -26,8 +27,10 @@ _WARM = np.array([247, 103, 7])
 CALM = np.array([73, 80, 87])
 GHOST = (51, 154, 240)
 _COLD = np.array([233, 236, 239])
-# from no pressure to the most that was seen
+# from no change of pressure to the most that was seen
 _PRESSURE = np.array([[208, 235, 255], [81, 207, 102], [252, 196, 25], [240, 62, 62]])
+
+_LEAST_SCALE = 20 * STILL  # so that a light touch is not drawn as the most
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class Drawing:
         side = view.subject if isinstance(view.subject, Side) else None
         self.skeleton = skeleton or skeleton_of(view.model, side)
         self._pin_joints = np.array([p.joint for p in self.skeleton.pins], dtype=int)
-        self._most_pressure = 1.0
+        self._most_pressure = _LEAST_SCALE
 
     @property
     def pin_sizes(self) -> Floats:
@@ -111,7 +114,7 @@ class Drawing:
         return out.astype(np.uint8)
 
     def _pressure_colors(self, view: SubjectView) -> Colors:
-        values = np.nan_to_num(view.pressure)
+        values = np.abs(np.nan_to_num(view.pressure_change))
         count = len(self.skeleton.elements)
         if len(values) != count:
             return np.tile(_COLD, (count, 1)).astype(np.uint8)
@@ -120,7 +123,7 @@ class Drawing:
         low = np.minimum(part.astype(int), len(_PRESSURE) - 2)
         mix = (part - low)[:, None]
         colors = _PRESSURE[low] * (1 - mix) + _PRESSURE[low + 1] * mix
-        return np.where(values[:, None] > 0, colors, _COLD).astype(np.uint8)
+        return np.where(values[:, None] > STILL, colors, _COLD).astype(np.uint8)
 
 
 def _drawn_q(view: SubjectView, q: Floats) -> Floats:

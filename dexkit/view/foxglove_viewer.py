@@ -121,6 +121,7 @@ def _numbers(moment: Moment) -> dict[str, Any]:
     return {
         **moment.numbers(),
         "pressure": [float(p) if math.isfinite(p) else None for p in view.pressure],
+        "pressure_change": [float(p) if math.isfinite(p) else None for p in view.pressure_change],
         "faults": view.faults,
         "state_age": view.age if math.isfinite(view.age) else None,
         "command_age": view.command_age if math.isfinite(view.command_age) else None,

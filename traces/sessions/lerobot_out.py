@@ -135,6 +135,7 @@ class _Writer:
         self._episodes: list[dict[str, Any]] = []
         self._origins: dict[str, dict[str, str]] = {}
         self._measured: dict[str, dict[str, float]] = {}
+        self._at_rest: dict[str, dict[str, list[float | None]]] = {}
         self._all: dict[str, list[NDArray[Any]]] = {}
         self._picture_stats: dict[str, list[dict[str, Any]]] = {}
         self._file: Any = None
@@ -162,6 +163,7 @@ class _Writer:
         seen = [{c: _picture_statistics(c, data) for c, data in p.items()} for p in pictures]
         self._scheme = scheme
         self._measured[name] = {k: round(v, 4) for k, v in source.measured.items()}
+        self._at_rest[name] = {p.part: p.at_rest for p in source.pressures}
         self.result.problems += [f"{name}: {text}" for text in (*source.problems, *told)]
         self._lost.update(dict.fromkeys(f"{name}: {text}" for text in source.lost))
         for frames, loaded, found in zip(runs, pictures, seen, strict=True):
@@ -320,6 +322,7 @@ class _Writer:
                 "version": __version__,
                 "resampling": RULE,
                 "measured_hz": self._measured,
+                "pressure_at_rest": self._at_rest,
                 "parts": list(self._scheme.parts),
                 "sessions": self._origins,
                 "lost": self.result.lost,

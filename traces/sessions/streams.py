@@ -7,6 +7,7 @@ joints: :mod:`dexkit.models` and :mod:`dexkit.robots`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,6 +19,7 @@ from dexkit.errors import SessionError, WireError
 from dexkit.hand import Floats, Side
 from dexkit.messages import Columns, message_type
 from dexkit.models import MODELS, model
+from dexkit.pressure import resting_pressure
 from dexkit.robots import ROBOTS
 from dexkit.topics import Role, roles
 from dexkit.traces.names import SESSION
@@ -133,6 +135,13 @@ class Pressure:
     def names(self) -> tuple[str, ...]:
         """Names of the elements that are unique in the recording."""
         return tuple(f"{self.part}_{e}" for e in self.elements)
+
+    @property
+    def at_rest(self) -> list[float | None]:
+        """What each element reads at rest, by :mod:`dexkit.pressure`; None without a value."""
+        seconds = (self.times_ns - self.times_ns[:1]) / 1e9
+        found = resting_pressure(np.maximum.accumulate(seconds), self.values)
+        return [round(v, 3) if math.isfinite(v) else None for v in found.tolist()]
 
     def at(self, times_ns: Times) -> Floats:
         """Interpolated, shape (len(times_ns), n_elements); NaN outside of the data and in gaps."""
