@@ -5,10 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.requirements import catalogue, select
+from dexkit.conformance.results import Verdict
+from dexkit.conformance.stimuli import phases_for, script_class
+from dexkit.conformance.virtual.fingers import Dex3Service, FingerHand
 from dexkit.dds import DdsNode
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import parse_server
@@ -188,3 +194,42 @@ def test_view_and_monitor_show_the_change_from_rest(rest: float, push: float) ->
         + "  from rest"
     )
     assert len(text) <= 80
+
+
+# -- legal hands -----------------------------------------------------------------------------
+
+
+class ThumbFalls(Dex3Service):
+    """A touch lowers the pressures of the thumb (docs/sources/real-hands.md#touch-sign)."""
+
+    def pressures(self, hand: FingerHand) -> Any:
+        pressure, rest = super().pressures(hand), hand.untouched()
+        thumb = [i for i, s in enumerate(DEX3_1.sensors) if s.place.startswith("thumb")]
+        pressure = pressure.copy()
+        pressure[thumb] = np.maximum(2 * rest - pressure, 0.0)[thumb]
+        return pressure
+
+
+class RestsAtZero(Dex3Service):
+    """Its sensors were set to zero, as those of older emulators."""
+
+    def pressures(self, hand: FingerHand) -> Any:
+        pressure = super().pressures(hand)
+        return np.where(pressure == NO_VALUE, pressure, pressure - hand.untouched())
+
+
+@each("service", [ThumbFalls, RestsAtZero])
+def test_the_sign_of_a_touch_and_the_level_of_rest_fail_no_hand(
+    service: type[Dex3Service],
+) -> None:
+    wanted = select(catalogue("dex3-1"), prefixes=["DEX3-SENS"])
+    plan = plan_for("dex3", sides=tuple(Side))
+    # what comes after the grip shows that the pressure ends
+    beside = {script_class("dex3-1").motion, "limp", "silence"}
+    plan = replace(plan, phases=phases_for(wanted) | beside)
+    found = run_mutant(service, plan, wanted).results
+    assert {r.verdict for r in found} <= {Verdict.PASS, Verdict.NOT_APPLICABLE}, [
+        r.explain() for r in found
+    ]
+    passed = {r.requirement.id for r in found if r.verdict is Verdict.PASS}
+    assert passed >= {f"DEX3-SENS-{n:02}" for n in (2, 3, 4, 7, 8, 9, 10, 11)}
