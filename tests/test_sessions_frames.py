@@ -95,6 +95,11 @@ def test_every_value_of_a_dataset_is_that_of_the_recording(tmp_path: Path, part:
         assert np.allclose(stats["q90"], np.quantile(made, 0.9, axis=0))
         assert stats["count"] == [table.num_rows]
     assert vectors(table, "observation.pressure").shape == (table.num_rows, 66)
+    rest = info["dexkit"]["pressure_at_rest"][part.name]
+    assert {part: set(values) for part, values in rest.items()} == {
+        "left_hand": {0.0},  # of an older emulator
+        "right_hand": {0.0},
+    }
     assert table["timestamp"].to_pylist()[3] == pytest.approx(0.1)
     row = pq.read_table(tmp_path / "d/meta/episodes/chunk-000/file-000.parquet").to_pylist()[0]
     assert (row["length"], row["tasks"]) == (table.num_rows, ["pinch"])
@@ -425,6 +430,9 @@ def test_touch_is_in_datasets_and_episodes(tmp_path: Path) -> None:
     assert made[:, column : column + 96].max() > 100  # it presses on the object
     back = json.loads((tmp_path / "episodes" / "episode_0000" / "data.json").read_text())
     assert back["info"]["tactile_names"]["right_ee"][column - 1062] == "index_top_0"
+    # counts from a rest that the hand knows itself
+    assert info["dexkit"]["pressure_at_rest"] == {"a.mcap": {}}
+    assert back["info"]["dexkit"]["tactile_at_rest"] == {}
     right = np.array([item["tactiles"]["right_ee"] for item in back["data"]])
     assert np.abs(right - made[:, 1062:]).max() < 0.01
 

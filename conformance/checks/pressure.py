@@ -131,16 +131,17 @@ def touch(ctx: Context) -> Outcome:
         if not mine or not _presses(ctx, phase):
             continue
         judged += 1
-        # the finger before may be let go of in this phase, and go back to what it was
-        changes = _changes(held, rest) - _changes(free, rest)
+        changes = _changes(held, free)
         own = float(changes[mine].max(initial=0.0))
+        # the finger before is let go of in this phase, and its pressure goes back to rest
+        grown = _changes(held, rest) - _changes(free, rest)
         foreign = max(
             (
-                float(changes[i].max(initial=0.0))
+                float(grown[i].max(initial=0.0))
                 for name in _fingers(ctx)
                 if name != finger
                 for i in _finger_packets(ctx, name)
-                if i < len(changes)
+                if i < len(grown)
             ),
             default=0.0,
         )

@@ -158,7 +158,7 @@ def _info(source: Source, rate: int, result: Result, start_ns: int) -> dict[str,
             "start_ns": start_ns,
             "resampling": RULE,
             "measured_hz": {k: round(v, 4) for k, v in source.measured.items()},
-            "tactile_at_rest": {_name(p.part): p.at_rest for p in source.pressures},
+            "tactile_at_rest": {_name(p.part): p.at_rest for p in source.pressures if not p.zeroed},
             "lost": list(result.lost),
         },
     }

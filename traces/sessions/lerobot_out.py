@@ -163,7 +163,7 @@ class _Writer:
         seen = [{c: _picture_statistics(c, data) for c, data in p.items()} for p in pictures]
         self._scheme = scheme
         self._measured[name] = {k: round(v, 4) for k, v in source.measured.items()}
-        self._at_rest[name] = {p.part: p.at_rest for p in source.pressures}
+        self._at_rest[name] = {p.part: p.at_rest for p in source.pressures if not p.zeroed}
         self.result.problems += [f"{name}: {text}" for text in (*source.problems, *told)]
         self._lost.update(dict.fromkeys(f"{name}: {text}" for text in source.lost))
         for frames, loaded, found in zip(runs, pictures, seen, strict=True):

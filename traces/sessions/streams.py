@@ -119,6 +119,7 @@ class Pressure:
     :param values: as in the messages, shape (n, n_elements).
     :param unusable: messages of a touch topic that are left out, as a list is not as long as its
         area.
+    :param zeroed: the hand itself counts from its rest.
     """
 
     part: str
@@ -127,6 +128,7 @@ class Pressure:
     values: Floats
     topic: str
     unusable: int = 0
+    zeroed: bool = False
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -184,6 +186,7 @@ def _touch(topic: str, samples: SampleArray, role: Role, side: Side) -> Pressure
         values=table[whole],
         topic=topic,
         unusable=int(np.count_nonzero(~whole)),
+        zeroed=True,
     )
 
 
