@@ -164,6 +164,20 @@ def test_hand_at_rest_reports_its_initial_state() -> None:
     assert np.count_nonzero(counts == 3750) == 75  # docs/sources/unitree-dex.md#b4: 30000 Pa
 
 
+@each("code", [3750, 30000])
+def test_a_hand_may_mark_slots_without_an_element_in_pa_or_in_counts(code: int) -> None:
+    bench = Bench(firmware=Firmware(no_value=code), object_at=40.0)
+    raw = bench.mcu.exchange(bench.frame(bench.rest.tolist()))
+    assert raw is not None
+    counts = np.array([s.pressure for _, s in parse_state(raw).sensors])
+    assert np.count_nonzero(counts == code) == 75
+    state = bench.codec.decode(raw, 0.0)
+    assert state.pressure is not None
+    assert np.isfinite(state.pressure).sum() == 33
+    with pytest.raises(UsageError, match="3750 or 30000"):
+        Firmware(no_value=0)
+
+
 def test_sensors_measure_an_object() -> None:
     bench = Bench(object_at=40.0)
     closed = [j.q_max if j.closing > 0 else j.q_min for j in DEX3_1.joints[Side.LEFT]]
