@@ -16,8 +16,9 @@ which this one has::
     [manual_test]
     q_is_measured = "2026-11-20: index finger held at half travel; q stayed within 0.01 rad"
 
-What is claimed must pass: its SHOULDs count as MUSTs. What is not, false or left out, is reported
-as not claimed. Without a file every unit is judged at the catalogue's level.
+What is claimed must pass: its SHOULDs count as MUSTs, unless they are inferred, for then no source
+says that the unit is broken without them. What is not, false or left out, is reported as not
+claimed. Without a file every unit is judged at the catalogue's level.
 """
 
 from __future__ import annotations
@@ -114,9 +115,11 @@ class Claims:
         return self.units[requirement.capability]
 
     def apply(self, requirements: Iterable[Requirement]) -> tuple[Requirement, ...]:
-        """Raise every SHOULD about a claimed unit to a MUST."""
+        """Raise every SHOULD about a claimed unit to a MUST, unless it is inferred."""
         return tuple(
-            replace(r, level=Level.MUST) if self.claimed(r) and r.level is Level.SHOULD else r
+            replace(r, level=Level.MUST)
+            if self.claimed(r) and r.level is Level.SHOULD and r.confidence != "inferred"
+            else r
             for r in requirements
         )
 

@@ -50,6 +50,11 @@ def sequence_of(type_name: str) -> str:
     return _SEQUENCE[type_name][0]
 
 
+def state_member(state_type: str, name: str) -> str:
+    """The name by which a state of that type has a quantity that others have in each motor."""
+    return _LISTS.get(state_type, {}).get(name, (name, 1))[0]
+
+
 @dataclass(frozen=True)
 class Motor:
     """One motor's command in the dialect's own units; the defaults are xr_teleoperate's gains."""

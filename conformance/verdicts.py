@@ -408,7 +408,7 @@ class Judgement:
         busy = excuse(outcome)
         if busy.text:
             outcome = replace(outcome, reason=busy.text)
-        must = self.requirement.level is Level.MUST
+        must = self.requirement.level is Level.MUST and not outcome.tolerable
         failed = Verdict.FAIL if must else Verdict.WARN
         verdict = Verdict.BLOCKED if busy.excused else failed
         measure = weigh(outcome)

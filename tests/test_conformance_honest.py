@@ -157,7 +157,7 @@ def blamed(result: RunResult) -> set[str]:
     ("service", "warned"),
     [
         (JustFastEnough, {"DEX1-RATE-02"}),
-        (Plain, {"DEX1-QOS-02", "DEX1-FIELD-22"}),
+        (Plain, {"DEX1-QOS-02"}),
         (Quick, set()),
         # slow, which gives warnings; but it arrives, opens, closes and obeys
         (Unhurried, {"DEX1-MOVE-04", "DEX1-MOVE-07"}),

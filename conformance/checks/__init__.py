@@ -102,8 +102,10 @@ class Outcome:
     :param cause: the likely cause, where the check can determine it; else the requirement's.
     :param late: the delay of a conforming hand that would cause this failure, where the check can
         determine it; else the duration of the failure.
-    :param absent: the hand lacks this unit: a failure if the vendor claims the unit, whatever
-        ``met`` is otherwise.
+    :param absent: nothing in the recording fills this unit: a failure if the vendor claims the
+        unit, whatever ``met`` is otherwise. What merely cannot be judged of a hand is not absent.
+    :param tolerable: not met, but no more than a warning, whatever the level: real hands do it, or
+        the part that is not met rests on less than the rest of the requirement.
     :param joints: indices of the joints concerned, the most important first; empty if none in
         particular.
     :param plots: the plots that show it, if they differ from the requirement's.
@@ -120,6 +122,7 @@ class Outcome:
     cause: str = ""
     late: Late | None = None
     absent: bool = False
+    tolerable: bool = False
     joints: tuple[int, ...] = ()
     plots: tuple[Plot, ...] = ()
     retry: bool = False
@@ -133,6 +136,10 @@ class Outcome:
         """Return a copy with these plots instead of the requirement's."""
         chosen = tuple(Plot(p) if isinstance(p, PlotKind) else p for p in plots)
         return replace(self, plots=chosen)
+
+    def tolerated(self) -> Outcome:
+        """Return a copy that is at most a warning."""
+        return replace(self, tolerable=True)
 
     def because(self, cause: str) -> Outcome:
         """Return a copy with a cause determined by the check."""
@@ -230,8 +237,8 @@ class BaseContext(Generic[RecordingT, ViewT]):
         return outcome
 
     def absent(self, reason: str) -> Outcome:
-        """Return the outcome of a hand without this unit: not judged, or failed if the vendor
-        claims the unit.
+        """Return the outcome of a hand of which nothing fills this unit: not judged, or failed if
+        the vendor claims the unit.
         """
         return Outcome(None, reason=reason, absent=True)
 
@@ -335,6 +342,15 @@ class Context(BaseContext[Recording, SideView]):
     def object_at(self) -> float | None:
         """The q at which this side touches its object, or None if unknown."""
         return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
+
+    @property
+    def contact_unknown(self) -> Outcome | None:
+        """Why a judgement that needs to know what the hand touches cannot be made: only a run of
+        the kit says that. None if it can be made.
+        """
+        if self.recording.stimulus is not None:
+            return None
+        return self.skipped("the recording does not say what the hand touched")
 
     def at(self, topic: str, seconds: float, end: float | None = None) -> Evidence:
         """A place in the recording."""

@@ -155,7 +155,7 @@ def _other_stiffness(ctx: Context) -> Outcome | None:
     parts = ctx.tolerance("min_way_part"), ctx.tolerance("max_way_part")
     noise = displacement_noise(ctx, pulses)
     for nudge in later:
-        if not is_alike(first.way, nudge.way, parts, noise):
+        if not is_alike(first, nudge, parts, noise):
             text = (
                 f"a torque displaced it by {nudge.way:.3f} {ctx.unit} at {nudge.begin:.1f} s, and "
                 f"by {first.way:.3f} {ctx.unit} before any bad command"
@@ -222,6 +222,7 @@ def in_force(ctx: Context) -> Outcome:
         place, spec = median(states.q[spans[1], 0]), ctx.joints[0]
         near = _AT_A_STOP * spec.stroke
         free = spec.q_min + near < place < spec.q_max - near
+        free = free and not _arrives(ctx, last, abs(before) * ctx.tolerance("until_s"))
         if free and not found and abs(before) >= ctx.tolerance("min_speed_stroke"):
             unit = f"{ctx.unit}/s"
             found.append((after / before, f"moves at {after:.2f} {unit}, {before:.2f} {unit}"))
@@ -235,6 +236,15 @@ def in_force(ctx: Context) -> Outcome:
     if part >= ctx.tolerance("min_part"):
         return ctx.passed(f"{part:.0%}", text, part=part)
     return ctx.failed(f"{part:.0%}", text, ctx.at(states.topic, at, at + window), part=part)
+
+
+def _arrives(ctx: Context, at: float, way: float) -> bool:
+    """Whether the last command before a time has a position that is nearer than so far, rad."""
+    row = int(np.searchsorted(ctx.commands.t, at, "right")) - 1
+    here = ctx.states.q[ctx.states.between(at - 0.05, at), 0]
+    if not ctx.commands.kp[row, 0] > 0 or not len(here):
+        return False
+    return abs(float(ctx.commands.q[row, 0]) - median(here)) < way
 
 
 def _speed(t: Floats, q: Floats) -> float:

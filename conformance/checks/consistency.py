@@ -618,8 +618,8 @@ def no_force_at_any_rest(ctx: Context) -> Outcome:
     explains.
     """
     states, spec = ctx.states, ctx.joints[0]
-    if ctx.recording.stimulus is None:
-        return ctx.skipped("the recording does not say what was between the fingers")
+    if (unknown := ctx.contact_unknown) is not None:
+        return unknown
     if not len(states) or not len(ctx.commands):
         return ctx.skipped("no states, or no commands to this hand")
     ends = ctx.tolerance("clear_stroke")

@@ -354,7 +354,7 @@ def torque_drives(ctx: Context) -> Outcome:
         return ctx.skipped("no state shows the begin and the end of a torque command")
     for phase in ctx.phases("pull"):
         for joint, moved in _pushed(ctx, phase, after=_LATE):
-            most = 0.5 * ctx.tolerance("min_motion_stroke", joint) + _noise(ctx, joint)
+            most = ctx.tolerance("max_against_stroke", joint) + _noise(ctx, joint)
             if moved < -most:
                 text = ctx.named(
                     f"moved by {-moved:.2f} {ctx.unit} against a torque that was commanded", joint
@@ -467,7 +467,7 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
             if worst is None or slower / faster < worst[0]:
                 worst = slower / faster, step.joint, slower, faster, text
     if worst is None and limited:
-        return ctx.absent(
+        return ctx.skipped(
             "its own speed or start limits every joint's steps, whatever their gains are"
         )
     if worst is None:

@@ -19,7 +19,7 @@ from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 
-__all__ = ["Nudge", "nudges"]
+__all__ = ["Nudge", "has_own_force", "nudges"]
 
 STIFFNESS = "stiffness"
 """The phase of the pushes that are repeated throughout a run."""
@@ -28,6 +28,8 @@ _RESTS_PART = 0.005
 _MEDIAN_OFF = 0.7
 """Part of the noise of q by which its median in 0.1 s may be off, if 15 of the states are measured
 and the others predicted from them: once in some hundred."""
+_MOST_OFF_PART = 0.5
+"""Part of a displacement that dry friction may take from it."""
 _PEAKS_S, _FEW_PEAKS = 1.05, 3
 """Window of contact in which peaks are counted, seconds, and the fewest peaks of a failure."""
 
@@ -38,6 +40,8 @@ class Nudge:
 
     :param way: displacement by the torque, rad; ``asked`` is torque / kp.
     :param at_rest: whether the gripper stood still before it.
+    :param off: how far from its goal it was then, in the direction of the torque, rad: with dry
+        friction it rests anywhere near the goal, and the torque displaces it by as much less.
     """
 
     begin: float
@@ -45,6 +49,7 @@ class Nudge:
     way: float
     asked: float
     at_rest: bool
+    off: float = 0.0
 
 
 def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
@@ -59,9 +64,11 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
             continue
         kp, tau = median(ctx.commands.kp[given, 0]), median(ctx.commands.tau[given, 0])
         if kp > 0 and tau != 0:  # a damaged recording may hold another command here
-            way = (median(after) - median(before)) * (1 if tau > 0 else -1)
+            sign = 1 if tau > 0 else -1
+            way = (median(after) - median(before)) * sign
+            off = (median(before) - median(ctx.commands.q[given, 0])) * sign
             rests = float(np.ptp(before)) <= _RESTS_PART * ctx.joints[0].stroke
-            found.append(Nudge(begin, end, way, abs(tau) / kp, rests))
+            found.append(Nudge(begin, end, way, abs(tau) / kp, rests, off))
     return found
 
 
@@ -70,14 +77,23 @@ def displacement_noise(ctx: Context, phases: Sequence[Phase]) -> float:
     return _MEDIAN_OFF * noise_at_rest(ctx, 0, phases)
 
 
-def is_alike(first: float, last: float, parts: tuple[float, float], noise: float) -> bool:
-    """Whether a displacement is like an earlier one, give or take the noise of both.
+def is_alike(first: Nudge, last: Nudge, parts: tuple[float, float], noise: float) -> bool:
+    """Whether a displacement is like an earlier one, give or take the noise of both, and that they
+    began at other distances from the goal.
 
-    :param first: the earlier one, rad; ``last`` and ``noise`` likewise.
     :param parts: least and most of ``last``, as parts of ``first``.
+    :param noise: of a displacement, rad.
     """
-    low, high = parts[0] * (first - noise), parts[1] * (first + noise)
-    return low - noise <= last <= high + noise
+    low, high = parts[0] * (first.way - noise), parts[1] * (first.way + noise)
+    slack = noise + min(abs(first.off - last.off), _MOST_OFF_PART * first.asked)
+    return low - slack <= last.way <= high + slack
+
+
+def has_own_force(ctx: Context) -> bool:
+    """Whether no torque displaced the held gripper: a position servo, which uses q alone."""
+    found = nudges(ctx, [*ctx.phases(STIFFNESS), *ctx.phases("nudge")])
+    least = ctx.tolerance("min_motion_stroke")
+    return bool(found) and not any(n.way >= least for n in found)
 
 
 @check("DEX1-HOLD-01")
@@ -89,7 +105,9 @@ def held(ctx: Context) -> Outcome:
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not shown:
-        return ctx.absent("a torque does not displace this hand: it does not show whether it holds")
+        return ctx.skipped(
+            "a torque does not displace this hand: it does not show whether it holds"
+        )
     noise = displacement_noise(ctx, ctx.phases())
     pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
     for first, last in pairs:
@@ -98,11 +116,11 @@ def held(ctx: Context) -> Outcome:
             f"{last.begin - first.end:.1f} "
             f"s of equal commands by {last.way:.3f} {ctx.unit}"
         )
-        if not is_alike(first.way, last.way, (least, most), noise):
+        if not is_alike(first, last, (least, most), noise):
             place = ctx.at(ctx.states.topic, last.begin, last.end)
             return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
     if not pairs:
-        return ctx.absent("the first push displaced it too little to compare the last with it")
+        return ctx.skipped("the first push displaced it too little to compare the last with it")
     return ctx.passed(f"{last.way:.3f} {ctx.unit}", text, motion_rad=last.way)
 
 
@@ -169,7 +187,7 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
     if not found:
         return ctx.skipped("no state while it was pushed")
     if len(shown) < len(found):
-        return ctx.absent("a torque does not displace this hand: it has a force of its own")
+        return ctx.skipped("a torque does not displace this hand: it has a force of its own")
     # relative to kp; a stiffer hand may press more, and a softer one less
     stiffest = max(1.0, *(n.asked / n.way for n in shown))
     softest = min(1.0, *(n.asked / n.way for n in shown))

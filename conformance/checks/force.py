@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
+from dexkit.conformance.checks.firmness import has_own_force
 from dexkit.conformance.checks.motion import obeyed_before
 from dexkit.conformance.median import median, medians
 from dexkit.hand import Floats
@@ -217,6 +218,9 @@ def _softer(ctx: Context) -> list[tuple[float, float, float, float, float, float
     return [grip for grip in _soft(ctx) if grip[3] < hand.client_gains[0]]
 
 
+_OWN = "this gripper has a force of its own"
+
+
 def _usual(ctx: Context) -> float | None:
     """The force of a grip with the client's stiffness, relative to the commanded one."""
     stiff = []
@@ -242,8 +246,8 @@ def in_proportion(ctx: Context) -> Outcome:
     usual, part = _usual(ctx), ctx.tolerance("max_change_part")
     if usual is None:
         return ctx.skipped("no grip with the client's stiffness")
-    if abs(usual - 1.0) > part:
-        return ctx.absent("this gripper has a force of its own")
+    if abs(usual - 1.0) > part or has_own_force(ctx):
+        return ctx.skipped(_OWN)
     worst = max(soft, key=lambda f: abs(f[0] - 1.0))
     ratio, tau, torque, kp, begin, end = worst
     text = (
@@ -261,8 +265,8 @@ def no_more_than_asked(ctx: Context) -> Outcome:
     soft, usual = _softer(ctx), _usual(ctx)
     if not soft or usual is None:
         return ctx.skipped("no grips to compare, one of them with the client's stiffness")
-    if abs(usual - 1.0) > ctx.tolerance("max_own_part"):
-        return ctx.absent("this gripper has a force of its own")
+    if abs(usual - 1.0) > ctx.tolerance("max_own_part") or has_own_force(ctx):
+        return ctx.skipped(_OWN)
     ratio, tau, torque, kp, begin, end = max(soft)
     text = f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, which asks for {torque:.2f} N m"
     limit = ctx.tolerance("max_part") * torque
@@ -302,8 +306,8 @@ def releases_with_zero_gains(ctx: Context) -> Outcome:
 @check("DEX1-FORCE-13")
 def zero(ctx: Context) -> Outcome:
     """The median of tau_est without contact, before the first command."""
-    if ctx.recording.stimulus is None:
-        return ctx.skipped("the recording does not say what was between the fingers")
+    if (unknown := ctx.contact_unknown) is not None:
+        return unknown
     states, asked = ctx.states, ctx.commands.t
     q, tau = states.q[:, 0], states.tau[:, 0]
     ends = ctx.tolerance("clear_stroke")
@@ -354,10 +358,11 @@ def _still(ctx: Context) -> Floats:
 def at_rest(ctx: Context) -> Outcome:
     """tau_est while the gripper rests at its target without contact."""
     states, commands = ctx.states, ctx.commands
+    if (unknown := ctx.contact_unknown) is not None:
+        return unknown
     if len(commands) < 2:
         return ctx.skipped("no commands to this hand")
     window = ctx.tolerance("min_rest_s")
-    known = ctx.recording.stimulus is not None
     begins = _still(ctx)
     rows = _ranges(states.t, begins, begins + window, "right")
     asked = _ranges(commands.t, begins, begins + window, "left")
@@ -368,7 +373,7 @@ def at_rest(ctx: Context) -> Outcome:
         rests &= high - low <= ctx.tolerance("max_ripple_stroke")
         rests &= goal_high - goal_low <= ctx.tolerance("max_ripple_stroke")
     rests &= _bounds(commands.kp[:, 0], asked)[0] > 0
-    if known and ctx.object_at is not None:
+    if ctx.object_at is not None:
         rests &= low > ctx.object_at + 0.1
     rows, asked, begins = rows[rests], asked[rests], begins[rests]
     errors = medians(states.q[:, 0], rows) - medians(commands.q[:, 0], asked)

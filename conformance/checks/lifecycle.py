@@ -155,7 +155,7 @@ def last_state(ctx: Context) -> Outcome:
     modes = modes[np.isfinite(modes).all(axis=1)]
     status = MotorCodec(ctx.recording.dialect).status(modes.astype(np.intp))
     if len(status) < 2 or not (status[0] == JointMode.FOC).all():
-        return ctx.absent("the mode of this hand does not show whether it is driven")
+        return ctx.skipped("the mode of this hand does not show whether it is driven")
     went = _went_on(ctx, begin, end)
     if went is not None and went[0] > went[1]:
         rad, limit, joint = went
@@ -170,7 +170,7 @@ def last_state(ctx: Context) -> Outcome:
     if went is not None:
         text = f"it was moving, and was found {went[0]:.2f} {ctx.unit} further on"
         return ctx.passed("stops", text, motion_rad=went[0]).placed(went[0], went[1])
-    return ctx.absent(
+    return ctx.skipped(
         "its last state shows it driven, but may have been measured before it braked; it was not "
         "moving then"
     )
@@ -212,7 +212,8 @@ def no_new_goal(ctx: Context) -> Outcome:
     worst: tuple[float, float, float, int, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before = ctx.states.between(begin - 0.2, begin + 0.2)
+        latency = ctx.tolerance("latency_s")
+        before = ctx.states.between(begin - max(0.2, latency), begin + 0.2)
         later = ctx.states.between(end - 0.1, end + 1.0)
         t, q = ctx.states.t[before], ctx.states.q[before]
         after = ctx.states.q[later][ctx.states.t[later] > begin + 0.25]
@@ -222,8 +223,9 @@ def no_new_goal(ctx: Context) -> Outcome:
             place, found = q[:, joint], float(after[0, joint])
             if not np.isfinite(place).all() or not math.isfinite(found):
                 continue
-            speed = float(place[-1] - place[0]) / max(float(t[-1] - t[0]), 1e-3)
-            recent = place[t >= t[-1] - ctx.tolerance("latency_s")]
+            first = int(np.argmax(t >= begin - 0.2))
+            speed = float(place[-1] - place[first]) / max(float(t[-1] - t[first]), 1e-3)
+            recent = place[t >= t[-1] - latency]
             away = max(float(recent.min()) - found, found - float(recent.max()), 0.0)
             moved = abs(speed) >= ctx.tolerance("min_speed_stroke", joint)
             against = 0.0 if moved and (found - float(place[-1])) * speed > 0.0 else away

@@ -250,7 +250,7 @@ def pressure_lasts(ctx: Context) -> Outcome:
         found = (float(part[packet, slot]), packet, slot, begin, end)
         worst = found if worst is None or found < worst else worst
     if worst is None:
-        return ctx.absent("no pressure changed at the object")
+        return ctx.skipped("no pressure changed at the object")
     part_left, packet, slot, begin, end = worst
     part_left = max(part_left, 0.0)
     text = (
@@ -291,7 +291,7 @@ def follows_the_force(ctx: Context) -> Outcome:
             if found is not None and (worst is None or found < worst[0]):
                 worst = found, finger, word, a, b
     if worst is None:
-        return ctx.absent("no finger's torque changed while it held the object")
+        return ctx.skipped("no finger's torque changed while it held the object")
     share, finger, word, begin, end = worst
     text = f"where the torque of the {finger} {word} on the object, its pressure shows {share:.0%}"
     limit = ctx.tolerance("min_part" if word == "rises" else "min_fall_part")

@@ -22,6 +22,7 @@ from dexkit.conformance.checks.timing import (
     least_rate,
     longest_gap,
     slow,
+    survived,
     too_slow,
 )
 from dexkit.conformance.measurement_error import Measure, Quantity
@@ -447,6 +448,7 @@ def state_in_silence(ctx: Context) -> Outcome:
                 ctx.at(ctx.states.topic, a, b),
                 max_gap_s=b - a,
             )
+            outcome = survived(ctx, outcome, max(b - a for a, b in found))
             return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
         clock = ctx.states.clock
         inside = clock[(clock >= begin) & (clock <= end)]

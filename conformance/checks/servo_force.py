@@ -7,12 +7,13 @@ grip is recognised by position, and its force is compared with that of other gri
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.motor_messages import state_member
 from dexkit.hand import Floats
 from dexkit.models import model
 
@@ -106,6 +107,11 @@ def _stands(ctx: Context, settle: float, held: float) -> list[Stand]:
     return found
 
 
+def _member(ctx: Context) -> str:
+    """The state's own name of tau_est."""
+    return state_member(ctx.recording.dialect.state_type, "tau_est")
+
+
 def _unit(ctx: Context) -> str:
     return model(ctx.recording.dialect.model).torque_unit
 
@@ -113,7 +119,7 @@ def _unit(ctx: Context) -> str:
 def _reported(ctx: Context) -> Outcome | None:
     """Why the force of a hand cannot be judged."""
     if not np.nan_to_num(ctx.states.tau).any():
-        return ctx.absent("tau_est is not filled (0 throughout)")
+        return ctx.absent(f"{_member(ctx)} is not filled (0 throughout)")
     return None
 
 
@@ -151,10 +157,10 @@ def reported(ctx: Context) -> Outcome:
     if (skipped := _without_object(ctx)) is not None:
         return skipped
     most = max(float(np.abs(s.force[:, s.presses]).max()) for s in stands(ctx) if s.presses.any())
-    text = f"tau_est is {most:.2f} {_unit(ctx)} at most in a grip"
+    text = f"{_member(ctx)} is {most:.2f} {_unit(ctx)} at most in a grip"
     if np.nan_to_num(ctx.states.tau).any():
         return ctx.passed(f"{most:.2f}", text, tau_nm=most)
-    return ctx.failed("0", "tau_est is 0 throughout the run, in each grip as well")
+    return ctx.failed("0", f"{_member(ctx)} is 0 throughout the run, in each grip as well")
 
 
 @check("BRAINCO-FORCE-01")
@@ -168,7 +174,7 @@ def force_in_grip(ctx: Context) -> Outcome:
         return ctx.skipped("the object held no joint back for long enough")
     part, joint, one = worst
     tau = part * ctx.joints[joint].tau_max
-    text = ctx.named(f"tau_est of {tau:.2f} {unit} towards closing in a grip", joint)
+    text = ctx.named(f"{_member(ctx)} of {tau:.2f} {unit} towards closing in a grip", joint)
     limit = ctx.tolerance("min_part")
     if part >= limit:
         return ctx.passed(f"{tau:.2f} {unit}", text, tau_nm=tau)
@@ -188,7 +194,7 @@ def unit(ctx: Context) -> Outcome:
         return ctx.skipped("no state")
     row, joint = (int(i) for i in np.unravel_index(int(np.argmax(tau / limits)), tau.shape))
     most, name = float(tau[row, joint]), _unit(ctx)
-    text = ctx.named(f"tau_est of {most:.3g} {name} at most", joint)
+    text = ctx.named(f"{_member(ctx)} of {most:.3g} {name} at most", joint)
     if most <= ctx.tolerance("max_part") * limits[joint]:
         return ctx.passed(f"{most:.3g} {name}", text, tau_nm=most)
     place = ctx.at(ctx.states.topic, float(ctx.states.t[row]))
@@ -206,11 +212,33 @@ def none_without_contact(ctx: Context) -> Outcome:
         return ctx.skipped("no joint stood at its goal for long enough")
     part, joint, one = -worst[0], *worst[1:]
     tau = part * ctx.joints[joint].tau_max
-    text = ctx.named(f"tau_est of {tau:.2f} {unit} at its goal, where it touches nothing", joint)
+    if (unknown := ctx.contact_unknown) is not None:
+        shows = ctx.named(f"{tau:.2f} {unit} at its goal", joint)
+        if part <= ctx.tolerance("max_part"):
+            return unknown
+        advice = ctx.requirement.advice
+        return replace(unknown, reason=f"{unknown.reason}; {shows}: {_IF_NOTHING}. {advice}")
+    text = ctx.named(
+        f"{_member(ctx)} of {tau:.2f} {unit} at its goal, where it touches nothing", joint
+    )
     if part <= ctx.tolerance("max_part"):
         return ctx.passed(f"{tau:.2f} {unit}", text, tau_nm=tau)
     place = ctx.at(ctx.states.topic, one.begin, one.end)
-    return ctx.failed(f"{tau:.2f} {unit}", text, place, tau_nm=tau).about(joint)
+    outcome = ctx.failed(f"{tau:.2f} {unit}", text, place, tau_nm=tau).about(joint)
+    return outcome.because(_OFFSET) if _has_offset(ctx, joint) else outcome
+
+
+_IF_NOTHING = "if nothing touched it there, that is an offset"
+_OFFSET = "It is there before the joint has pressed on anything: an offset."
+
+
+def _has_offset(ctx: Context, joint: int) -> bool:
+    """Whether a joint shows too much force even before its first grip."""
+    limit = ctx.tolerance("max_part") * ctx.joints[joint].tau_max
+    gripped = min((s.begin for s in stands(ctx) if s.presses[joint]), default=np.inf)
+    before = [s for s in stands(ctx) if s.free[joint] and s.end < gripped]
+    over = [s for s in before if abs(float(s.force[-1, joint])) > limit]
+    return len(over) >= FEW_STANDS
 
 
 @check("BRAINCO-FORCE-05")
@@ -235,7 +263,8 @@ def grips_alike(ctx: Context) -> Outcome:
         return ctx.skipped("no joint pressed with enough force to compare")
     part, joint, strongest, weakest, one = worst
     text = ctx.named(
-        f"tau_est of {weakest:.2f} {unit} in a grip, where it was {strongest:.2f} {unit} at most",
+        f"{_member(ctx)} of {weakest:.2f} {unit} in a grip, where it was {strongest:.2f} {unit} "
+        "at most",
         joint,
     )
     if part >= ctx.tolerance("min_part"):
@@ -264,8 +293,8 @@ def squeezes_alike(ctx: Context) -> Outcome:
         return ctx.skipped("no joint squeezed the object twice with enough force to compare")
     part, joint, strongest, weakest, when = worst
     text = ctx.named(
-        f"force_act of {weakest:.2f} {unit} in a squeeze, where it was {strongest:.2f} {unit} in "
-        "another one",
+        f"{_member(ctx)} of {weakest:.2f} {unit} in a squeeze, where it was {strongest:.2f} "
+        f"{unit} in another one",
         joint,
     )
     if part >= ctx.tolerance("min_part"):

@@ -133,7 +133,7 @@ def keeps_grip(ctx: Context) -> Outcome:
     if opened <= limit:
         return ctx.passed(f"{opened:.3f} {ctx.unit}", text, motion_rad=opened).placed(opened, limit)
     place = ctx.at(ctx.states.topic, at)
-    outcome = ctx.failed(f"{opened:.2f} {ctx.unit}", text, place, motion_rad=opened)
+    outcome = ctx.failed(f"{opened:.2f} {ctx.unit}", text, place, motion_rad=opened).tolerated()
     return outcome.about(joint).placed(opened, limit).if_late(STROKE_S * opened)
 
 

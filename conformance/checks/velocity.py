@@ -6,8 +6,9 @@ dq that alternates between twice the speed and 0, and one that is stuck while th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import FOUGHT_OVER, filled
 from dexkit.conformance.row_selection import Rows, Selected, Times
 from dexkit.hand import Floats
+from dexkit.unseen import UNSEEN_S
 
 __all__: list[str] = []
 
@@ -68,19 +70,36 @@ def _rows_from(t: Floats, times: Floats) -> Rows:
 
 @check("DEX1-FIELD-22", "DEX3-FIELD-21")
 def velocity_filled(ctx: Context) -> Outcome:
-    """Whether dq of each joint that moves is ever other than 0."""
+    """Whether dq of a joint stays 0 while q moves, in a hand that fills it elsewhere."""
+    if not filled(ctx):
+        return ctx.absent("dq is not filled (0 throughout)")
     moved = 0
     for joint in range(len(ctx.joints)):
-        _, q, dq = _series(ctx, joint)
-        if len(q) < _FEW or float(np.ptp(q)) < ctx.tolerance("min_way_stroke", joint):
+        t, q, dq = _series(ctx, joint)
+        least = ctx.tolerance("min_way_stroke", joint)
+        if len(q) < _FEW or float(np.ptp(q)) < least:
             continue
         moved += 1
-        if not dq.any():
-            text = ctx.named("dq is 0 throughout, although q moves", joint)
-            return ctx.failed("0", text).about(joint)
+        for first, last in _zeros(t, dq):
+            if float(np.ptp(q[first:last])) >= least:
+                begin, end = float(t[first]), float(t[last - 1])
+                text = ctx.named(
+                    f"dq is 0 from {begin:.1f} to {end:.1f} s, although q moves", joint
+                )
+                return ctx.failed("0", text, ctx.at(ctx.states.topic, begin, end)).about(joint)
     if not moved:
         return ctx.skipped("no joint moves in this recording")
     return ctx.passed("filled", "dq is not 0 throughout in any joint that moves")
+
+
+def _zeros(t: Floats, dq: Floats) -> Iterator[tuple[int, int]]:
+    """First row, and the one after the last, of each stretch in which dq is 0, without a pause of
+    the state.
+    """
+    zero = dq == 0.0
+    ends = np.flatnonzero(np.diff(zero) | (np.diff(t) > UNSEEN_S)) + 1
+    edges = [0, *ends.tolist(), len(t)]
+    return ((a, b) for a, b in pairwise(edges) if zero[a])
 
 
 @check("DEX1-FIELD-19", "DEX3-FIELD-18")

@@ -218,7 +218,7 @@ class RepeatsOldStates(Service):
 
 @wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
 @wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
-@wrong_hand("DFX-FRESH-01", also=("DFX-SIDE-01",), whole=True)
+@wrong_hand("DFX-FRESH-01", whole=True)
 @wrong_hand("FTP-FRESH-01", whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
@@ -1369,12 +1369,14 @@ class WaitsForRest(Service):
 class Delayed(Service):
     """Obeys each command 0.15 s late."""
 
+    delay = 0.15
+
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
         self.queue: list[tuple[float, Side, tuple[Motor, ...]]] = []
 
     def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.queue.append((self.now + 0.15, side, motors))
+        self.queue.append((self.now + self.delay, side, motors))
 
     def live(self, dt: float) -> None:
         while self.queue and self.queue[0][0] <= self.now:

@@ -58,7 +58,7 @@ class LowRateIsSlow(Dex3Service):
 
 @wrong_hand("DEX3-TOPIC-04", brief=True)
 class OldLowRate(Dex3Service):
-    """Copies states to the low-rate topic that are 0.3 s old."""
+    """Copies states to the low-rate topic that are 0.45 s old."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -67,7 +67,7 @@ class OldLowRate(Dex3Service):
     def low_rate(self, samples: list[Sample]) -> list[Sample]:
         new = super().low_rate(samples)
         self.queue.append(new)
-        old = self.queue.popleft() if len(self.queue) > 6 else self.queue[0]
+        old = self.queue.popleft() if len(self.queue) > 9 else self.queue[0]
         return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
@@ -162,7 +162,7 @@ class _Timed(FingerService):
             hand.changed()
 
 
-@wrong_hand("DEX3-FIELD-15", also=("DEX3-FIELD-21", "DEX3-PATH-01", "DEX3-STILL-01"))
+@wrong_hand("DEX3-FIELD-15", also=("DEX3-PATH-01", "DEX3-STILL-01"))
 class JumpsOnce(_Timed):
     """Has no dq, and publishes one pose that is half of each joint's range off."""
 
@@ -742,7 +742,7 @@ class _GainsOfNeighbour(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01", "DEX3-SAFE-06"))
+@wrong_hand("DEX3-GAIN-02", also=("DEX3-SAFE-06",))
 class GainsOfTheMotorBefore(FingerService):
     """Uses the gains of the motor before in each."""
 
@@ -770,8 +770,7 @@ class _StuckWhenSoft(FingerHand):
         super().take(own, mode)
 
 
-# two joints of the silence are on their way with soft gains
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-HOLD-01",))
+@wrong_hand("DEX3-GAIN-02")
 class StuckWhenSoft(FingerService):
     """Does not move with less than half of the client's stiffness."""
 
@@ -1073,14 +1072,13 @@ class GearOfTheThumb(Dex3Service):
     hand_fault = _GearSquared
 
 
-@wrong_hand("DEX3-FIELD-21")
-class FingersWithoutVelocity(Dex3Service):
-    """Publishes no dq and no ddq."""
+@wrong_hand("DEX3-FIELD-21", also=("DEX3-FIELD-17", "DEX3-FORCE-09"))
+class ThumbWithoutVelocity(Dex3Service):
+    """Publishes no dq of the thumb."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
-        motors["dq"] = 0.0
-        motors["ddq"] = 0.0
+        motors["dq"][:3] = 0.0
 
 
 class _Tires(FingerHand):

@@ -179,18 +179,18 @@ class TurnedVelocity(_Fields):
         return {**fields, "dq": -fields["dq"]}
 
 
-@wrong_hand("DEX1-FIELD-22")
-class NoVelocity(_Fields):
-    """Publishes no dq."""
+@wrong_hand("DEX1-FIELD-22", also=("DEX1-FIELD-04", "DEX1-FIELD-17"))
+class VelocityWhileOpening(_Fields):
+    """Fills dq only while it opens."""
 
     def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "dq": 0.0}
+        return {**fields, "dq": max(fields["dq"], 0.0)}
 
 
 # --------------------------------------------------------------------- consistency of the state
 
 
-@wrong_hand("DEX1-FIELD-15", also=("DEX1-FIELD-22", "DEX1-PATH-01", "DEX1-STILL-01"))
+@wrong_hand("DEX1-FIELD-15", also=("DEX1-PATH-01", "DEX1-STILL-01"))
 class JumpsOnce(_Fields):
     """Has no dq, and publishes one q that is 30 % of the stroke off."""
 

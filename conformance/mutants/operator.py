@@ -11,7 +11,7 @@ from typing import Any
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.any_model import Delayed
-from dexkit.conformance.mutants.registry import obeys_gains, wrong_hand
+from dexkit.conformance.mutants.registry import has_speeds, obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
@@ -244,6 +244,13 @@ class Springs(_OpenEnd, FingerService):
 
 
 @wrong_hand("DEX3-OPER-05", also=("DEX3-CMD-01", "DEX3-GAIN-04", "DEX3-MODE-02", "DEX3-TRACK-02"))
-@wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",))
+@wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",), where=has_speeds)
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
+
+
+@wrong_hand("DFX-OPER-05", also=("DFX-OPER-02",))
+class LaterFingers(Delayed, FingerService):
+    """Obeys each command 0.45 s late."""
+
+    delay = 0.45

@@ -20,7 +20,17 @@ from dexkit.hand import Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import HandModel, model
 
-__all__ = ["BOTH", "LEFT", "Mutant", "expand", "mix", "obeys_gains", "takes_floats", "wrong_hand"]
+__all__ = [
+    "BOTH",
+    "LEFT",
+    "Mutant",
+    "expand",
+    "has_speeds",
+    "mix",
+    "obeys_gains",
+    "takes_floats",
+    "wrong_hand",
+]
 
 LEFT = (Side.LEFT,)
 BOTH = (Side.LEFT, Side.RIGHT)
@@ -124,6 +134,11 @@ def wrong_hand(
 def obeys_gains(hand: HandModel) -> bool:
     """Whether a hand's commands have gains: a place for ``where``."""
     return hand.dialects[0].gains_are_used
+
+
+def has_speeds(hand: HandModel) -> bool:
+    """Whether the dq of a hand's commands limits its speed: a place for ``where``."""
+    return bool(hand.dialects[0].speed_units)
 
 
 def takes_floats(hand: HandModel) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.mutants.any_model import ChokesOnThousands
-from dexkit.conformance.mutants.registry import BOTH, takes_floats, wrong_hand
+from dexkit.conformance.mutants.registry import BOTH, has_speeds, takes_floats, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
 from dexkit.conformance.virtual.inspire import FtpService
@@ -332,6 +332,7 @@ class GoesOnForEver(ServoService):
 
 
 class _Smooths(ServoHand):
+    seconds = 0.15
     wanted: Floats | None = None
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -349,15 +350,26 @@ class _Smooths(ServoHand):
 
     def step(self, dt: float) -> None:
         if self.wanted is not None:
-            self.goal = self.goal + (self.wanted - self.goal) * dt / 0.15
+            self.goal = self.goal + (self.wanted - self.goal) * dt / self.seconds
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-OPER-02")
+@wrong_hand("BRAINCO-OPER-02", where=has_speeds)
 class SmoothsGoals(ServoService):
     """Smooths its goals over 0.15 s."""
 
     hand_fault = _Smooths
+
+
+class _SmoothsLonger(_Smooths):
+    seconds = 0.6
+
+
+@wrong_hand("DFX-OPER-02")
+class SmoothsGoalsLonger(ServoService):
+    """Smooths its goals over 0.6 s: the hands of a real G1 follow 0.37 s late."""
+
+    hand_fault = _SmoothsLonger
 
 
 # ----------------------------------------------------------------------- bad commands
