@@ -138,6 +138,36 @@ def test_invalid_options_and_devices_are_refused(
         opened(acme, address)
 
 
+@pytest.mark.parametrize(
+    "quick", [True, pytest.param(False, marks=pytest.mark.soak)], ids=["quick", "full"]
+)
+def test_the_gripper_of_the_guide_meets_what_its_maker_claims(
+    acme: ModuleType, tmp_path: Path, quick: bool
+) -> None:
+    """The guide's own command, with the claims that the example ships."""
+    with emulated(acme) as left, emulated(acme, object_at=37.0) as right:
+        result = tmp_path / "result.json"
+        run = subprocess.run(
+            [
+                *(*SUITE, "-q", "--pyargs", "dexkit.conformance"),
+                *("--backend", "acme_gripper.hand:make", "--domain", str(free_domain())),
+                *("--device", f"left={left}", "--device", f"right={right}"),
+                *("--object", "right=37", "--capabilities", str(ACME / "capabilities.toml")),
+                *("--json", str(result), *(["--quick"] if quick else [])),
+            ],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            env={**os.environ, "NO_COLOR": "1", "PYTHONPATH": str(ACME)},
+        )
+    assert run.returncode in (0, 2), run.stdout + run.stderr  # 2: this machine was too busy to tell
+    rows = json.loads(result.read_text())["results"]
+    found = {(row["id"], row["side"]): row["verdict"] for row in rows}
+    assert not {k: v for k, v in found.items() if v in ("fail", "error")}, run.stdout
+    assert list(found.values()).count("pass") > 30
+
+
 def test_the_document_shows_the_hand_as_it_is() -> None:
     document = (EXAMPLES.parent / "docs" / "certify-your-gripper.md").read_text()
     source = (ACME / "acme_gripper" / "hand.py").read_text()

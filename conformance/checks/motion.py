@@ -711,8 +711,7 @@ def independent(ctx: Context) -> Outcome:
             goals = given[np.isfinite(given[:, joint]), joint]
             goal = float(np.clip(goals[-1], spec.q_min, spec.q_max)) if len(goals) else start
             # the later steps are shorter: the end of its own one may still be ahead
-            rests = name != first or "late_s" in ctx.requirement.tolerances
-            rest = ctx.tolerance("max_rest_stroke", joint) if rests else 0.0
+            rest = 0.0 if name == first else ctx.tolerance("max_rest_stroke", joint)
             end_q = float(np.clip(goal, start - rest, start + rest))
             low, high = min(start, end_q), max(start, end_q)
             most = float(np.maximum(low - means, means - high).max(initial=0.0))
@@ -895,18 +894,12 @@ def every_command(ctx: Context) -> Outcome:
         if not len(before) or not len(after):
             continue
         start, final = np.median(before, axis=0), np.median(after, axis=0)
-        # of a hand that answers late the farthest place counts: the next command leads back
-        seen_late = ctx.requirement.tolerances.get("late_s")
-        late = None
-        if seen_late is not None:
-            late = ctx.states.q[ctx.states.between(end - 0.03, end + seen_late)]
         judged += 1
         for joint, target in phase.targets.get(ctx.side, {}).items():
             size = target - float(start[joint])
             if abs(size) < ctx.tolerance("min_step_stroke", joint):
                 continue
-            course = (final[joint] if late is None else late[:, joint]) - float(start[joint])
-            progress = float(np.nanmax(course / size))
+            progress = (float(final[joint]) - float(start[joint])) / size
             if progress < ctx.tolerance("min_progress"):
                 missed.append((begin, end, joint, target, progress))
                 break

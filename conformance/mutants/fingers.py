@@ -405,7 +405,7 @@ class SevenPackets(FingerService):
     sensors = 7
 
 
-@wrong_hand("DEX3-SENS-04", sides=BOTH)
+@wrong_hand("DEX3-SENS-04", also=("DEX3-SENS-10",), sides=BOTH)
 class Numb(FingerService):
     """Publishes the pressure of an untouched hand at every contact."""
 
@@ -413,7 +413,7 @@ class Numb(FingerService):
         return hand.untouched()
 
 
-@wrong_hand("DEX3-SENS-04", sides=BOTH)
+@wrong_hand("DEX3-SENS-04", also=("DEX3-SENS-10",), sides=BOTH)
 class CrossedCables(Dex3Service):
     """Publishes the index finger's pressures as the middle finger's, and the other way round."""
 
@@ -927,7 +927,7 @@ class _ZeroIsNoChange(FingerHand):
         return np.where(status == 0, self.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-06"))
 class ZeroIsNoChange(FingerService):
     """Keeps a joint driven that is switched off: takes 0 for "as before"."""
 
@@ -941,7 +941,7 @@ class _OneStaysOn(FingerHand):
         return np.where(last & (status == 0), self.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",))
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-06"))
 class LastJointStaysOn(FingerService):
     """Keeps its last joint driven when it is switched off."""
 

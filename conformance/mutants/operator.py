@@ -249,8 +249,15 @@ class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
 
 
+@wrong_hand("DFX-OPER-02", also=("DFX-OPER-05",))
+class LaggingFingers(Delayed, FingerService):
+    """Obeys each command 0.38 s late, and shows it later still."""
+
+    delay = 0.38
+
+
 @wrong_hand("DFX-OPER-05", also=("DFX-OPER-02",))
 class LaterFingers(Delayed, FingerService):
-    """Obeys each command 0.45 s late."""
+    """Obeys each command 0.39 s late."""
 
-    delay = 0.45
+    delay = 0.39

@@ -361,17 +361,6 @@ class SmoothsGoals(ServoService):
     hand_fault = _Smooths
 
 
-class _SmoothsLonger(_Smooths):
-    seconds = 0.6
-
-
-@wrong_hand("DFX-OPER-02")
-class SmoothsGoalsLonger(ServoService):
-    """Smooths its goals over 0.6 s: the hands of a real G1 follow 0.37 s late."""
-
-    hand_fault = _SmoothsLonger
-
-
 # ----------------------------------------------------------------------- bad commands
 
 
@@ -697,7 +686,7 @@ class HalfSpeeds(ServoService):
 
 @wrong_hand("BRAINCO-WDOG-03")
 class LateAfterSilence(ServoService):
-    """Obeys commands 0.4 s late for half a second after a silence."""
+    """Obeys commands 0.55 s late for half a second after a silence."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -708,7 +697,7 @@ class LateAfterSilence(ServoService):
         if self.heard and self.now - self.heard > 1.0:
             self.slow_until = self.now + 0.5
         self.heard = self.now
-        late = 0.4 if self.now < self.slow_until else 0.0
+        late = 0.55 if self.now < self.slow_until else 0.0
         self.mail.append((self.now + late, side, motors))
 
     def live(self, dt: float) -> None:
@@ -817,6 +806,7 @@ class SwapsAfterRestart(_SwapsSome):
 
 
 @wrong_hand("BRAINCO-WDOG-03", whole=True)
+@wrong_hand("DFX-WDOG-03", also=("DFX-MOVE-09", "DFX-PATH-01"), whole=True)
 class SwapsAfterSilence(_SwapsSome):
     """Mixes two joints up in commands for three seconds after a silence."""
 

@@ -51,6 +51,8 @@ BETWEEN = 0.3
 """Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 SINGLES, SINGLE_SECONDS = 5, 0.25
 """Commands that are sent once, and how long none follows, s: less than any time-out."""
+LATE_SINGLE_SECONDS = 0.6
+"""The same for hands with a control of their own: those of a real G1 answer 0.37 s late."""
 
 
 class HandScript(Script[Side]):
@@ -456,6 +458,7 @@ class HandScript(Script[Side]):
         away = {s: self._aside(s, 0.4 * ASIDE) for s in home}
         decoy = {s: self._aside(s, -0.2 * ASIDE) for s in home}
         encode = self._codec.encode
+        seconds = SINGLE_SECONDS if self.plan.dialect.gains_are_used else LATE_SINGLE_SECONDS
         for i in range(SINGLES):
             goal = home if i % 2 else away
             if i % 3 == 2:  # a newer command replaces one that has just arrived
@@ -464,7 +467,7 @@ class HandScript(Script[Side]):
             targets = {s: dict(enumerate(pose)) for s, pose in goal.items()}
             phase = self._begin("single", self.plan.sides, targets=targets)
             yield from self._command()
-            yield from self._through(phase, SINGLE_SECONDS, lambda: self._wait(0.01))
+            yield from self._through(phase, seconds, lambda: self._wait(0.01))
 
     def _silence_alone(self, name: str, side: Side, rejected: Mapping[Side, Motors]) -> Steps:
         """No good command to one side, as a phase; the others make a step after the time-out.
