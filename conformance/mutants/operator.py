@@ -249,14 +249,16 @@ class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
 
 
-@wrong_hand("DFX-OPER-02", also=("DFX-OPER-05",))
+@wrong_hand("DFX-OPER-02", also=("DFX-MOVE-08", "DFX-OPER-05", "DFX-WDOG-03"))
+@wrong_hand("FTP-OPER-02", also=("FTP-OPER-05",))
 class LaggingFingers(Delayed, FingerService):
     """Obeys each command 0.38 s late, and shows it later still."""
 
     delay = 0.38
 
 
-@wrong_hand("DFX-OPER-05", also=("DFX-OPER-02",))
+@wrong_hand("DFX-OPER-05", also=("DFX-MOVE-08", "DFX-OPER-02", "DFX-WDOG-03"))
+@wrong_hand("FTP-OPER-05", also=("FTP-OPER-02",))
 class LaterFingers(Delayed, FingerService):
     """Obeys each command 0.39 s late."""
 

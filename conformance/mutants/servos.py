@@ -467,7 +467,7 @@ class FullSpeedInContact(ServoService):
             motors["dq"][np.abs(hand.contact[: len(motors)]) > 0.05] = 1.0
 
 
-@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
+@wrong_hand("BRAINCO-FORCE-01", also=("BRAINCO-FORCE-05",), sides=BOTH)
 @wrong_hand("FTP-FORCE-01", also=("FTP-FORCE-06",), sides=BOTH)
 class ForceZeroedInGrip(_FeelingService):
     """Sets its forces to zero half a second after it has touched."""
@@ -478,7 +478,8 @@ class ForceZeroedInGrip(_FeelingService):
             motors["tau_est"] = 0.0
 
 
-@wrong_hand("BRAINCO-FORCE-01", also=("BRAINCO-FORCE-04",), sides=BOTH)
+@wrong_hand("BRAINCO-FORCE-01", also=("BRAINCO-FORCE-04", "BRAINCO-FORCE-05"), sides=BOTH)
+@wrong_hand("FTP-FORCE-01", also=("FTP-FORCE-04",), sides=BOTH)
 class ForceOfNextJoint(ServoService):
     """Reports each force as its neighbour's."""
 
