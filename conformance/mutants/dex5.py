@@ -96,7 +96,7 @@ class _FadingGrip(FingerHand):
 
 @wrong_hand(
     "DEX5-FORCE-06",
-    also=("DEX5-FORCE-03", "DEX5-FORCE-05", "DEX5-FORCE-10"),
+    also=("DEX5-FORCE-03", "DEX5-FORCE-05", "DEX5-FORCE-08", "DEX5-FORCE-10"),
     sides=BOTH,
     whole=True,
 )

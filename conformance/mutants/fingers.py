@@ -908,7 +908,7 @@ class _IgnoresStatus(FingerHand):
         return np.ones_like(status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-07"))
+@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-06", "DEX3-MODE-07"))
 class IgnoresStatus(FingerService):
     """Drives its motors whatever the mode byte of the command is."""
 
