@@ -47,6 +47,11 @@ __all__ = [
     "joints_of",
 ]
 
+_IMPOSSIBLE = 20.0
+"""Part of a joint's torque that nobody takes for one: a drive has a few times what is rated."""
+_OFTEN = 0.75
+"""Quantile of the largest part in each state that must be beyond that: real hands were seen with an
+offset of thousands of counts at rest (docs/sources/real-hands.md#dex3-tau)."""
 _SOME = 50
 """Rows that are looked at first."""
 
@@ -100,6 +105,11 @@ class States:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @property
+    def say_nothing(self) -> bool:
+        """Whether every number in every state is 0."""
+        return self.columns is not None and self.columns.are_zero
 
     @cached_property
     def clock(self) -> Floats:
@@ -158,6 +168,16 @@ class SideView:
     commands: Commands
     joints: tuple[JointSpec, ...]
     known: dict[object, Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def has_raw_torque(self) -> bool:
+        """Whether tau_est is beyond what any such joint can do, in any unit of torque: raw counts.
+
+        Not only once, for that is a wrong value.
+        """
+        part = np.abs(self.states.tau) / np.array([j.tau_max for j in self.joints])
+        most = np.nan_to_num(part).max(axis=1, initial=0.0)
+        return bool(len(most)) and float(np.quantile(most, _OFTEN)) > _IMPOSSIBLE
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +244,10 @@ class Recording:
             for s in (Side.LEFT, Side.RIGHT)
             if s in judged or not found.present.isdisjoint(chosen.topics(s))
         }
-        if not sides and (blank := [s for s in judged if _is_blank(views[s])]) != list(judged):
-            judged = tuple(s for s in judged if s not in blank)
-        else:
-            blank = []
+        # a service of one hand fills the other's place in their message with zeros; a topic of its
+        # own has its zeros from a hand
+        left_out = () if sides else _left_out(chosen, {s: views[s] for s in judged})
+        judged = tuple(s for s in judged if s not in left_out)
         # the kit itself publishes another type in the phase 'foreign'
         phases = found.stimulus.phases if found.stimulus else []
         notes = found.notes({s for p in phases if p.name == "foreign" for s in p.sides})
@@ -240,7 +260,7 @@ class Recording:
         notes += [
             f"{views[s].states.topic} says nothing of the {s} hand (all 0), and nobody drives it: "
             f"taken for a service of one hand; --side {s} judges it all the same"
-            for s in blank
+            for s in left_out
         ]
         touch = {s: found.of_type(topic, chosen.touch_type) for s, topic in felt.items()}
         slow = {s: topic for s, topic in slow.items() if topic in found.present}
@@ -521,11 +541,20 @@ def _sent(samples: SampleArray, origin: int) -> Floats:
     return sent
 
 
-def _is_blank(view: SideView) -> bool:
+def _left_out(spoken: Dialect, views: Mapping[Side, SideView]) -> tuple[Side, ...]:
+    """The sides of which a service of one hand says nothing in the message of both hands."""
+    if spoken.topics(Side.LEFT) != spoken.topics(Side.RIGHT):
+        return ()
+    empty = tuple(s for s, view in views.items() if _is_unused(spoken, view))
+    return () if len(empty) == len(views) else empty
+
+
+def _is_unused(spoken: Dialect, view: SideView) -> bool:
     """Whether every state of a side is 0 and no command drives it."""
     states, commands = view.states, view.commands
     said = (states.q, states.dq, states.ddq, states.tau, states.mode)
-    drives = (commands.kp, commands.kd, commands.tau)
+    gains = (commands.kp, commands.kd, commands.tau)
+    drives = gains if spoken.gains_are_used else (commands.q,)
     # the first rows nearly always tell
     return len(states) > 0 and not any(
         np.nan_to_num(a[:_SOME]).any() or np.nan_to_num(a[_SOME:]).any() for a in (*said, *drives)

@@ -193,6 +193,8 @@ class Result:
     :param retry: whether another run may come to another finding.
     :param measure: the figure that it rests on, with its limit and the kit's error; None if it
         rests on none.
+    :param tolerated: not met without consequence, so that nothing else is spoiled; known only while
+        a recording is judged.
     """
 
     requirement: Requirement
@@ -210,6 +212,7 @@ class Result:
     plots: tuple[Plot, ...] = ()
     retry: bool = False
     measure: Measure | None = None
+    tolerated: bool = field(default=False, compare=False)
 
     @property
     def expected(self) -> str:

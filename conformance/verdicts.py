@@ -347,11 +347,16 @@ class Judgement:
             plots=outcome.plots or self.requirement.plots,
             retry=outcome.retry or disturbance.load is not Load.NONE,
             measure=measure,
+            tolerated=outcome.tolerable,
         )
 
     def not_applicable(self, reason: str) -> Result:
         """The result *not applicable*, with its reason."""
         return self.result(Verdict.NOT_APPLICABLE, Outcome(None, reason=reason))
+
+    def no_hand(self, reason: str) -> Result:
+        """The result *blocked* where nothing that was recorded shows a hand."""
+        return self.result(Verdict.BLOCKED, Outcome(None, reason=reason))
 
     def not_claimed(self) -> Result | None:
         """The result *not claimed*, if the requirement's unit is not claimed; else None."""
@@ -374,7 +379,9 @@ class Judgement:
         """The result *blocked*, if the client's commands do not allow to judge it; else None."""
         for result in self._client:
             need = result.requirement
-            if result.verdict in _NOT_MET and self.requirement.id.startswith(need.spoils):
+            if result.tolerated or result.verdict not in _NOT_MET:
+                continue
+            if self.requirement.id.startswith(need.spoils):
                 reason = f"blocked by {need.id}, a fault of the client: {result.observed}"
                 return self.result(Verdict.BLOCKED, Outcome(None, reason=reason), need.id)
         return None

@@ -470,3 +470,44 @@ def test_session_ends_at_rest_or_with_a_stop() -> None:
         states = replace(ctx.states, t=later, sent=later, q=at_end)
         outcome = judged(replace(ctx, hand=replace(ctx.hand, states=states)))
         assert outcome.met is met, outcome
+
+
+# ------------------------------------------------------------- mode bytes that a hand does not need
+
+
+MODES = {"dex3": ("DEX3", 1), "dex5": ("DEX5", 0)}
+"""A byte for all motors that is wrong by the documents, and that some real hands move by."""
+
+
+def with_mode(name: str, *, follows: bool, value: int) -> RunResult:
+    """A session of good hands whose client sends one mode byte to every motor."""
+    trace = run_client(ReferenceClient, dialect(name))
+    recording = recording_of(trace, None, ())
+    sides = {}
+    for side, view in recording.sides.items():
+        states, commands = view.states, view.commands
+        mode = np.full_like(commands.mode, value)
+        held = np.tile(states.q[:1], (len(states), 1))
+        states = states if follows else replace(states, q=held, dq=np.zeros_like(held))
+        sides[side] = replace(view, states=states, commands=replace(commands, mode=mode), known={})
+    return judge(replace(recording, sides=sides))
+
+
+@each("name", MODES)
+def test_wrong_mode_byte_that_a_hand_follows_is_a_warning_and_spoils_nothing(name: str) -> None:
+    prefix, value = MODES[name]
+    result = with_mode(name, follows=True, value=value)
+    (one, *_) = [r for r in result.client if r.requirement.id == f"{prefix}-CLIENT-10"]
+    assert one.verdict is Verdict.WARN
+    assert "the hand follows them all the same" in one.observed
+    assert result_of(result, f"{prefix}-TRACK-01").verdict is Verdict.PASS
+    assert not any("CLIENT-10" in r.blocked_by for r in result.results)
+
+
+@each("name", MODES)
+def test_wrong_mode_byte_that_a_hand_obeys_is_the_clients_failure(name: str) -> None:
+    prefix, value = MODES[name]
+    result = with_mode(name, follows=False, value=value)
+    (one, *_) = [r for r in result.client if r.requirement.id == f"{prefix}-CLIENT-10"]
+    assert one.verdict is Verdict.FAIL
+    assert result_of(result, f"{prefix}-TRACK-01").blocked_by == f"{prefix}-CLIENT-10"

@@ -104,8 +104,9 @@ class Outcome:
         determine it; else the duration of the failure.
     :param absent: nothing in the recording fills this unit: a failure if the vendor claims the
         unit, whatever ``met`` is otherwise. What merely cannot be judged of a hand is not absent.
-    :param tolerable: not met, but no more than a warning, whatever the level: real hands do it, or
-        the part that is not met rests on less than the rest of the requirement.
+    :param tolerable: not met, but no more than a warning, whatever the level, which spoils nothing
+        else: real hands do it, what depends on it works all the same, or the part that is not met
+        rests on less than the rest of the requirement.
     :param joints: indices of the joints concerned, the most important first; empty if none in
         particular.
     :param plots: the plots that show it, if they differ from the requirement's.

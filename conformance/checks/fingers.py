@@ -75,7 +75,9 @@ def rest_pose(ctx: Context) -> Outcome:
             "the first command, and in the last of them",
             ctx.at(ctx.states.topic, float(ctx.states.t[int(np.argmin(most))])),
         ).because(
-            "Positions are never read from the device, or the hand rests with all joints at 0."
+            "The hand has not started (every number in its states is 0): is it powered?"
+            if ctx.states.say_nothing
+            else "Positions are never read from the device, or the hand rests with all joints at 0."
         )
     return ctx.passed("not zero", f"a joint is {most[-1]:.3f} {ctx.unit} from 0")
 

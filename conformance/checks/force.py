@@ -11,6 +11,7 @@ from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
 from dexkit.conformance.checks.firmness import has_own_force
 from dexkit.conformance.checks.motion import obeyed_before
 from dexkit.conformance.median import median, medians
+from dexkit.conformance.results import Evidence
 from dexkit.hand import Floats
 from dexkit.models import HandModel
 
@@ -422,9 +423,22 @@ def unit(ctx: Context) -> Outcome:
     text = ctx.named(f"|tau_est| of at most {tau_nm:.2f} N m", joint)
     if part <= ctx.tolerance("max_part") * (1.0 + ROUNDING):
         return ctx.passed(f"{tau_nm:.2f} N m", text, tau_nm=tau_nm)
-    return ctx.failed(
-        f"{tau_nm:.3g} N m", text, ctx.at(ctx.states.topic, float(at)), tau_nm=tau_nm
-    ).about(joint)
+    place = ctx.at(ctx.states.topic, float(at))
+    if ctx.hand.has_raw_torque:
+        return raw_counts(ctx, joint, tau_nm, place)
+    return ctx.failed(f"{tau_nm:.3g} N m", text, place, tau_nm=tau_nm).about(joint)
+
+
+def raw_counts(
+    ctx: Context, joint: int, most: float, place: Evidence, unit: str = "N m"
+) -> Outcome:
+    """The outcome of a hand whose tau_est is in raw counts: no other requirement judges it."""
+    text = ctx.named(f"|tau_est| of at most {most:.0f}: not {unit}, looks like raw counts", joint)
+    outcome = ctx.failed(f"{most:.0f} counts", text, place).about(joint)
+    return outcome.because(
+        f"tau_est holds the raw register, as some real hands do. Its force in {unit} is not known, "
+        "and not judged."
+    )
 
 
 @check("DEX1-FORCE-05")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.force import raw_counts
 from dexkit.conformance.motor_messages import state_member
 from dexkit.hand import Floats
 from dexkit.models import model
@@ -198,6 +199,8 @@ def unit(ctx: Context) -> Outcome:
     if most <= ctx.tolerance("max_part") * limits[joint]:
         return ctx.passed(f"{most:.3g} {name}", text, tau_nm=most)
     place = ctx.at(ctx.states.topic, float(ctx.states.t[row]))
+    if ctx.hand.has_raw_torque:
+        return raw_counts(ctx, joint, most, place, name)
     return ctx.failed(f"{most:.3g} {name}", text, place, tau_nm=most).about(joint)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dexkit.conformance.layers import Layer, claimed, not_blocked, not_spoiled
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
@@ -59,6 +61,57 @@ def applies_to_dialect(judgement: Judgement, context: Context) -> Result | None:
     if dialect in judgement.requirement.dialects:
         return None
     return judgement.not_applicable(f"does not apply to the dialect {dialect}")
+
+
+_SAY_NOTHING = (
+    "every number in every state is 0, temperatures and all: nothing shows that there is a hand "
+    "(is it powered, and has it started?)"
+)
+_UNIT_OF_TORQUE = frozenset(("DEX1-FORCE-04", "DEX3-FORCE-02"))
+"""The requirements that say that tau_est is in raw counts, and what others are like."""
+_MOVED = 0.1
+"""Part of a joint's stroke by which commands move a goal."""
+_NOT_ALL_ZERO = "-START-02"
+"""How the ids end of what a hand that says nothing fails by itself."""
+
+
+def says_something(judgement: Judgement, context: Context) -> Result | None:
+    """A precondition: some number in some state is not 0.
+
+    A hand that failed to start may publish valid messages of zeros at full rate. They meet most of
+    what is asked of a hand at rest, and show nothing of it. One that is commanded to move fails by
+    what it does.
+    """
+    requirement = judgement.requirement
+    if requirement.needs in ("nothing", "endpoints") or requirement.id.endswith(_NOT_ALL_ZERO):
+        return None
+    if context.recording.stimulus is not None or not context.states.say_nothing:
+        return None
+    return None if _asked_to_move(context) else judgement.no_hand(_SAY_NOTHING)
+
+
+def _asked_to_move(context: Context) -> bool:
+    """Whether commands move the goal of a joint that they drive."""
+    commands = context.commands
+    for joint, spec in enumerate(context.joints):
+        driven = commands.kp[:, joint] > 0
+        if not context.recording.dialect.gains_are_used:
+            driven |= True
+        q = commands.q[driven, joint]
+        low, high = np.nanmin(q, initial=np.inf), np.nanmax(q, initial=-np.inf)
+        if high - low > _MOVED * spec.stroke:
+            return True
+    return False
+
+
+def has_torque(judgement: Judgement, context: Context) -> Result | None:
+    """A precondition: tau_est is a torque, where the requirement is about it."""
+    requirement = judgement.requirement
+    about_it = requirement.area == "Force" or requirement.capability == "force"
+    says_so = not _UNIT_OF_TORQUE.isdisjoint((requirement.id, *requirement.lineage))
+    if says_so or not about_it or not context.hand.has_raw_torque:
+        return None
+    return judgement.not_applicable("tau_est is in raw counts, and not in a unit of force")
 
 
 def recorded(judgement: Judgement, context: Context) -> Result | None:
@@ -120,7 +173,10 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     decode=_decode,
     subjects=subjects,
     context=Lazy("dexkit.conformance.checks:Context"),
-    preconditions=(applies_to_dialect, claimed, recorded, not_spoiled, not_blocked),
+    preconditions=(
+        *(applies_to_dialect, claimed, recorded, has_torque),
+        *(says_something, not_spoiled, not_blocked),
+    ),
     refine=with_silence,
     whole=whole,
     script=lambda name: model(name).script.load(),

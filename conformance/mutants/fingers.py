@@ -1210,7 +1210,7 @@ class TorqueInMillis(Dex3Service):
 
 
 @wrong_hand("DEX3-FORCE-02", brief=True)
-@wrong_hand("BRAINCO-FORCE-02", also=("BRAINCO-FORCE-04",), brief=True)
+@wrong_hand("BRAINCO-FORCE-02", brief=True)
 class MilliNewtonMetres(FingerService):
     """Publishes tau_est in mN m."""
 

@@ -209,6 +209,11 @@ class Columns:
         # numpy's, which pass NaN on
         return (float(np.min(low)), float(np.max(high))) if low else (np.nan, np.nan)
 
+    @property
+    def are_zero(self) -> bool:
+        """Whether there are samples, and every number in all of them is 0."""
+        return bool(self._groups) and all(g.is_zero for g in self._groups.values())
+
     def constant(self, path: str) -> NDArray[np.float64] | None:
         """The row that every sample has at ``path``, shape (1,) or (1, length); None if they
         differ, or if not all have it.
@@ -421,6 +426,11 @@ class _Group:
         self._fixed = np.array([0, *_count_words(kind, self.counts)])
         self._mask = np.full(len(self._fixed), 0xFFFFFFFF, dtype=np.uint32)
         self._mask[:1].view(np.uint8)[2:] = 0
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether every number in all samples is 0."""
+        return self.words.are_zero(self._fixed)
 
     def agrees(
         self, table: NDArray[np.uint32], changes: NDArray[np.uint32]

@@ -222,6 +222,12 @@ class Words:
         """The number at byte ``at`` of the first sample."""
         return self._row.view(np.uint8)[at : at + leaf.itemsize].view(leaf)[0]
 
+    def are_zero(self, but: NDArray[np.intp]) -> bool:
+        """Whether all words of all samples are 0, apart from these."""
+        row = self._row.copy()
+        row[but] = 0
+        return not len(self._changing) and not row.any()
+
     def extremes(self, leaf: np.dtype[Any], places: Sequence[int]) -> tuple[float, float]:
         """The lowest and highest of the numbers at some bytes, in all samples; NaN passes on."""
         low, high = [], []

@@ -24,7 +24,7 @@ _AREAS = "<!-- areas: made from conformance/requirements, do not edit -->"
 _END_AREAS = "<!-- end of areas -->"
 
 
-_CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z])([\d-]*))")
+_CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z][\w-]*))")
 
 PAGES = {
     "dds": "conformance.md",
@@ -107,8 +107,10 @@ def _linked(text: str) -> str:
     """``text`` with a link for each citation of docs/sources."""
 
     def link(match: re.Match[str]) -> str:
-        target, letter, number = match.groups()
-        return f"[{letter.upper()}{'.' if number else ''}{number}]({target})"
+        target, anchor = match.groups()
+        # a section (B.4), or a fact by name
+        section = re.sub(r"^([a-z])(?=\d)", lambda m: f"{m[1].upper()}.", anchor)
+        return f"[{section.upper() if len(anchor) == 1 else section}]({target})"
 
     return _CITED.sub(link, text)
 
