@@ -33,6 +33,7 @@ __all__ = [
     "ImuState",
     "JointMode",
     "JointSpec",
+    "ModeRule",
     "MotorError",
     "RobotSubject",
     "Side",
@@ -76,6 +77,26 @@ class JointMode(IntEnum):
 
     BRAKE = 0
     FOC = 1
+
+
+class ModeRule(str, Enum):
+    """What a hand's firmware takes for "drive" in a mode byte that holds RIS_Mode.
+
+    Which of them a genuine Dex3-1 has is disputed (docs/sources/real-hands.md#mode-status).
+    """
+
+    MANUAL = "manual"
+    """Status 1 in bits 4 to 6; any other one brakes."""
+    NONZERO = "nonzero"
+    """Any byte but 0; 0 brakes."""
+    IGNORED = "ignored"
+    """Every byte: the gains decide alone."""
+
+    def drives(self, mode: int) -> bool:
+        """Whether a mode byte drives its motor."""
+        if self is ModeRule.MANUAL:
+            return (mode >> 4) & 7 == JointMode.FOC
+        return self is ModeRule.IGNORED or mode != 0
 
 
 class MotorError(IntFlag):
@@ -164,6 +185,7 @@ class HandSpec:
     :param exchange_timeout: seconds after which ``exchange`` has returned or raised.
     :param n_sensors: pressure sensor packets in a state, or tactile areas of a touch topic.
     :param simulated: no real device moves when this hand is commanded.
+    :param mode_rule: which mode bytes drive a motor, where the byte holds RIS_Mode.
     """
 
     model: str
@@ -173,6 +195,7 @@ class HandSpec:
     exchange_timeout: float = 0.1
     n_sensors: int = 0
     simulated: bool = False
+    mode_rule: ModeRule = ModeRule.MANUAL
 
     def __post_init__(self) -> None:
         if not self.joints:

@@ -5,12 +5,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from dexkit.backends import Backend, BackendOptions
 from dexkit.clock import Clock
 from dexkit.emulators.dex3_mechanics import Dex3Mechanics
 from dexkit.emulators.finger_mechanics import SETTINGS, STEP
 from dexkit.emulators.simulated_hand import COMMON_SETTINGS, SimulatedHand, configured, number
-from dexkit.hand import Side
+from dexkit.errors import UsageError
+from dexkit.hand import ModeRule, Side
 from dexkit.models import DEX3_1
 
 __all__ = ["SimDex3", "sim_dex3"]
@@ -25,6 +28,8 @@ class SimDex3(SimulatedHand):
     :param start: how far they are closed at ``open``, percent; None for a relaxed pose, which
         is not all zero, because clients wait for a position that is not.
     :param supply_v: voltage of the supply, V.
+    :param mode_rule: which mode bytes drive a motor: that of the manual, or of another firmware
+        (docs/dex3.md#firmware).
     :param clock: real time unless given; with a manual clock the hand is deterministic.
     :raises UsageError: a parameter is out of range.
     """
@@ -36,10 +41,12 @@ class SimDex3(SimulatedHand):
         object_at: float | None = None,
         start: float | None = None,
         supply_v: float = 24.0,
+        mode_rule: ModeRule = ModeRule.MANUAL,
         clock: Clock | None = None,
     ) -> None:
         self.mechanics = Dex3Mechanics(side, object_at=object_at, start=start, supply_v=supply_v)
         spec = DEX3_1.spec(side, io_rate=DEX3_1.state_rate, simulated=True)
+        spec = replace(spec, mode_rule=mode_rule)
         super().__init__(spec, self.mechanics, STEP, clock)
 
 
@@ -50,8 +57,17 @@ def _make(options: BackendOptions) -> SimDex3:
         object_at=number(options, "object"),
         start=number(options, "start"),
         supply_v=24.0 if supply is None else supply,
+        mode_rule=_mode_rule(options.settings.get("mode_byte", ModeRule.MANUAL.value)),
     )
     return configured(hand, options)
+
+
+def _mode_rule(text: str) -> ModeRule:
+    try:
+        return ModeRule(text)
+    except ValueError:
+        known = ", ".join(rule.value for rule in ModeRule)
+        raise UsageError(f"no mode_byte {text!r}", hint=f"known: {known}") from None
 
 
 sim_dex3 = Backend(
@@ -61,6 +77,8 @@ sim_dex3 = Backend(
     settings={
         **SETTINGS,
         **COMMON_SETTINGS,
+        "mode_byte": "which mode bytes drive a motor: manual (status 1), nonzero (any but 0, as "
+        "some clients of real hands need) or ignored (the gains decide) (default: manual)",
         "supply": "volts of the supply, 24 to 58 (default: 24)",
     },
 )

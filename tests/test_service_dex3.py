@@ -15,8 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dexkit.backends import BackendOptions
 from dexkit.clock import ManualClock
-from dexkit.emulators.sim_dex3 import SimDex3
+from dexkit.emulators.sim_dex3 import SimDex3, sim_dex3
+from dexkit.errors import UsageError
 from dexkit.hand import (
     CommandGate,
     HandCommand,
@@ -24,6 +26,7 @@ from dexkit.hand import (
     HandState,
     ImuState,
     JointMode,
+    ModeRule,
     MotorError,
     Side,
     SupplyState,
@@ -90,6 +93,37 @@ class TestModeByte:
         assert "mode byte 0x01 of motor 0 has id 1, status 0" in remark.text
         assert "locks it" in remark.text
         assert "send 0x10 (0x10 | index) to drive motor 0" in remark.text
+
+    @each("rule", list(ModeRule))
+    def test_another_firmware_drives_by_other_bytes(self, rule: ModeRule) -> None:
+        """docs/dex3.md#firmware"""
+        hand = SimDex3(LEFT, mode_rule=rule)
+        m = dialect_map(DEX3, {LEFT: hand.spec}, Fill.KNOWN)
+        for byte, drives in {
+            0x00: (rule is ModeRule.IGNORED),
+            0x01: (rule is not ModeRule.MANUAL),
+            0x80: (rule is not ModeRule.MANUAL),
+            0x60: (rule is not ModeRule.MANUAL),
+            0x10: True,
+            0x90: True,
+        }.items():
+            command = m.command(message([byte] * N), LEFT)
+            assert command is not None
+            assert command.timeout is not None
+            assert command.mode.tolist() == [int(drives)] * N, hex(byte)
+            assert command.timeout.tolist() == [byte >= 0x80] * N
+            texts = [r.text for r in m.remarks(message([byte] * N), LEFT)]
+            assert not drives or not any("locks it" in t or "is locked" in t for t in texts)
+
+    def test_firmware_is_a_setting(self) -> None:
+        made = [
+            sim_dex3.make(BackendOptions(LEFT, settings={"mode_byte": rule.value}))
+            for rule in ModeRule
+        ]
+        assert [hand.spec.mode_rule for hand in made] == list(ModeRule)
+        assert sim_dex3.make(BackendOptions(LEFT)).spec.mode_rule is ModeRule.MANUAL
+        with pytest.raises(UsageError, match="no mode_byte 'other'"):
+            sim_dex3.make(BackendOptions(LEFT, settings={"mode_byte": "other"}))
 
     def test_calibration_is_not_passed_on(self) -> None:
         """Status 6 means calibration on a sibling motor (docs/sources/unitree-dex.md#b4)."""

@@ -65,6 +65,7 @@ from dexkit.hand import (
     ImuState,
     JointMode,
     JointSpec,
+    ModeRule,
     Side,
     SupplyState,
 )
@@ -386,7 +387,7 @@ class FingerMap(DialectMap):
 
 class RisModeMap(FingerMap):
     """Hands of several joints whose mode byte is RIS_Mode: id in bits 0 to 3, status in 4 to 6,
-    time-out in 7 (the Dex3-1 manual).
+    time-out in 7 (the Dex3-1 manual). The hand's specification says which bytes drive.
     """
 
     def command(self, message: Any, side: Side) -> HandCommand | None:
@@ -395,8 +396,9 @@ class RisModeMap(FingerMap):
         if command is None:
             return None
         modes = self._modes(message, side)
-        foc = [(mode >> 4) & 7 == JointMode.FOC for mode in modes]
-        # a status that is neither lock nor FOC brakes: nothing moves that was not understood
+        # by the manual a status that is neither lock nor FOC brakes: nothing moves that was not
+        # understood
+        foc = [self._specs[side].mode_rule.drives(mode) for mode in modes]
         return replace(
             command,
             mode=np.where(foc, JointMode.FOC, JointMode.BRAKE).astype(np.uint8),
@@ -406,6 +408,7 @@ class RisModeMap(FingerMap):
     def remarks(self, message: Any, side: Side) -> Sequence[Remark]:
         """Mode bytes that mean something else than their sender may think."""
         found: dict[str, Remark] = {}
+        by_manual = self._specs[side].mode_rule is ModeRule.MANUAL
         for i, mode in enumerate(self._modes(message, side)):
             if mode & 0x6F == i:  # its own id, and status 0 or 1
                 continue
@@ -413,10 +416,10 @@ class RisModeMap(FingerMap):
             decoded = f"mode byte {mode:#04x} of motor {i} has id {mode & 15}, status {status}"
             right = f"send {0x10 | i:#04x} (0x10 | index) to drive motor {i}, {i:#04x} to lock it"
             if mode & 15 != i:
-                does = "; status 0 locks it" if status == JointMode.BRAKE else ""
+                does = "; status 0 locks it" if status == JointMode.BRAKE and by_manual else ""
                 text = f"{decoded}: the id is not its index{does}. Motors go by index; {right}"
                 found.setdefault("wrong_ids", Remark("wrong_ids", text))
-            if status not in (JointMode.BRAKE, JointMode.FOC):
+            if by_manual and status not in (JointMode.BRAKE, JointMode.FOC):
                 text = f"{decoded}: neither 0 (lock) nor 1 (FOC), so it is locked; {right}"
                 found.setdefault("unknown_status", Remark("unknown_status", text))
         return tuple(found.values())
