@@ -22,6 +22,7 @@ from dexkit.doctor import (
     readiness,
     verdict,
 )
+from dexkit.doctor.dds import _Watch
 from dexkit.doctor.link import RoundTrips, link_to
 from dexkit.doctor.observations import (
     DdsSocket,
@@ -38,9 +39,11 @@ from dexkit.doctor.observations import (
     UsbDevice,
 )
 from dexkit.doctor.report import as_data, print_report
-from dexkit.doctor.rtps import Data, parse_message, parse_participant
+from dexkit.doctor.rtps import Data, EndpointData, parse_message, parse_participant
 from dexkit.doctor.topic_spelling import closest_topic, is_driven
 from dexkit.doctor.type_hashes import TYPE_HASHES
+from dexkit.messages import message_type
+from dexkit.messages import unitree_hg as hg
 from dexkit.messages.earlier import EARLIER
 from dexkit.models import DIALECTS
 from tests.doctor_packets import FAST_PARTICIPANT
@@ -193,6 +196,123 @@ def _moving(*courses: tuple[float, float]) -> DomainView:
     return dataclasses.replace(view, streams=tuple(flows))
 
 
+def _driven(
+    state: dict[str, object], command: dict[str, object], model: str = "dex3"
+) -> DomainView:
+    """A pair whose states and commands have these statistics."""
+    view = _pair(model=model)
+    commands = [e for e in view.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
+    states = tuple(dataclasses.replace(s, **{**_AT_REST[model], **state}) for s in view.streams)  # type: ignore[arg-type]
+    usual = {**_AT_REST[model], "drives": True, "asks": True}
+    flows = tuple(_flow(e, **{**usual, **command}) for e in commands)
+    return dataclasses.replace(view, streams=states + flows)
+
+
+FOC, LOCK, BACK = (tuple(bits | i for i in range(7)) for bits in (0x10, 0, 0x80))
+_AT_REST: dict[str, dict[str, object]] = {
+    "dex3": {"q": (0.1,) * 7, "modes": FOC},
+    "dex1": {"q": (2.0,), "modes": (0,)},
+}
+MOVES = {"q_span": 1.0, "asked_span": 1.0, "driven_span": 1.0}
+ONES = {"modes": (1,) * 7, "drives": False, "q_span": 1.0, "asked_span": 1.0}
+AWAY = {"q": (1.0,) * 7}
+STANDS: dict[str, tuple[dict[str, object], dict[str, object], str, str]] = {
+    # states, commands, the finding, and what its text or remedy has
+    "wrong mode byte": ({"modes": LOCK}, ONES, "DDS-MODE", "mode 0x01, which drives no motor"),
+    "tripped": ({"modes": BACK}, {"modes": tuple(m | 0x80 for m in FOC)}, "DDS-TRIPPED", "bit 7"),
+    "locked": ({"modes": LOCK}, {}, "DDS-NOT-FOLLOWING", "status 0 (locked)"),
+    "no force": ({"q_span": 0.001}, MOVES, "DDS-NOT-FOLLOWING", "too small"),
+    "only damped": (
+        {"q_span": 0.001},
+        {"q_span": 1.0, "asks": False, "drives": False},
+        "DDS-NOT-FOLLOWING",
+        "no position gain",
+    ),
+    "tripped and still": (
+        {"modes": BACK, "identical": True},
+        {**MOVES, "modes": tuple(m | 0x80 for m in FOC)},
+        "DDS-TRIPPED",
+        "7 of 7 motors",
+    ),
+    "far away": ({}, AWAY, "DDS-NOT-FOLLOWING", "without a torque"),
+    "limp": (
+        {},
+        {**AWAY, "asks": False, "drives": False, "limp": True},
+        "DDS-NO-GAINS",
+        "kp = kd = dq = tau = 0",
+    ),
+}
+
+
+@each("name", list(STANDS))
+def test_hand_that_cannot_move_is_not_healthy(name: str) -> None:
+    state, command, finding, text = STANDS[name]
+    seen = _seen(_driven(state, command))
+    found = diagnose(seen)
+    assert {f.id for f in found} == {finding}
+    assert text in found[0].seen + found[0].fix
+    assert not verdict(seen, found).healthy
+
+
+FINE: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+    "follows": ({"q_span": 0.8}, MOVES),
+    "stands at its goal": ({}, {}),
+    "presses on an object": ({"tau": 0.4}, AWAY),
+    "is stopped": (
+        {},
+        {"q": (0.0,) * 7, "asks": False, "drives": False, "limp": True, "nonzero": False},
+    ),
+    "is locked on purpose": (
+        {"modes": LOCK},
+        {"asks": False, "drives": False, "modes": LOCK},
+    ),
+    "says nothing by its mode bytes": ({"modes": (0,) * 7, "q_span": 0.8}, MOVES),
+}
+
+
+@each("name", list(FINE))
+def test_hand_that_moves_or_is_not_asked_to_is_healthy(name: str) -> None:
+    state, command = FINE[name]
+    assert diagnose(_seen(_driven(state, command))) == []
+
+
+@each(("model", "kp"), [("dex1", "kp 5,"), ("dex3", "kp 1.5,")])
+def test_advice_on_gains_is_of_the_hand(model: str, kp: str) -> None:
+    limp: dict[str, object] = {"q_span": 1.0, "limp_span": 1.0, "drives": False, "asks": False}
+    (found, _) = diagnose(_seen(_driven({}, limp, model)))
+    assert kp in found.fix
+    assert ("EZGripper" in found.fix) == (model == "dex1")
+
+
+def test_mode_byte_that_moves_a_hand_is_a_warning() -> None:
+    (one, _) = diagnose(_seen(_driven({"modes": LOCK, "q_span": 0.9}, ONES)))
+    assert (one.id, one.severity) == ("DDS-MODE", Severity.WARNING)
+    assert "this hand moves all the same" in one.seen
+
+
+@each(("model", "simulated"), [("dex1", "sim-dex1"), ("dex3", "sim-dex3")])
+def test_one_handed_set_up_is_healthy(model: str, simulated: str) -> None:
+    hand = _pair(("left",), model=model)
+    seen = _seen(hand)
+    (found,) = diagnose(seen)
+    assert (found.id, found.severity) == ("DDS-ONE-SIDE", Severity.NOTE)
+    assert f"'dexkit serve {simulated} --side right --domain 1'" in found.fix
+    assert verdict(seen, [found]).healthy
+    assert all(state.ready for state in readiness(seen))
+    alone = _seen(_without(hand, "client"))
+    assert not any(f.severity is Severity.ERROR for f in diagnose(alone))
+    (state,) = readiness(alone)
+    assert (state.ready, state.waiting) == (False, False)
+
+
+def _one_side() -> DomainView:
+    """One gripper, and a client of both."""
+    view = _pair()
+    gone = [e for e in view.endpoints if e.participant == "hand" and "right" in e.topic]
+    keep = tuple(e for e in view.endpoints if e not in gone)
+    return dataclasses.replace(view, endpoints=keep, streams=view.streams[:1])
+
+
 def _limp_client() -> DomainView:
     commands = [e for e in GOOD.endpoints if e.kind == "writer" and e.topic.endswith("cmd")]
     flows = tuple(_flow(e, q_span=1.0, limp_span=1.0) for e in commands)
@@ -253,10 +373,14 @@ CASES: dict[str, Observations] = {
     "DDS-TYPE": _seen(_renamed(GOOD, "hand", type_name=HAND_STATE)),
     "DDS-LAYOUT": _seen(_pair(state_hash=("aa", "bb"))),
     "DDS-QOS": _seen(_pair(reader=Policies("reliable", "transient_local"))),
-    "DDS-ONE-SIDE": _seen(_pair(("left",))),
+    "DDS-ONE-SIDE": _seen(_one_side()),
     "DDS-SILENT": _seen(_pair(samples=0)),
     "DDS-UNREADABLE": _seen(_pair(undecodable=1000)),
     "DDS-ALL-ZERO": _seen(_pair(model="dex3", nonzero=False)),
+    "DDS-SAYS-NOTHING": _seen(_pair(nonzero=False, blank=True)),
+    "DDS-TRIPPED": _seen(_driven(*STANDS["tripped"][:2])),
+    "DDS-MODE": _seen(_driven(*STANDS["wrong mode byte"][:2])),
+    "DDS-NOT-FOLLOWING": _seen(_driven(*STANDS["locked"][:2])),
     "DDS-TWO-PUBLISHERS": _seen(_two_publishers()),
     "DDS-HAND-DEAF": _seen(_without(GOOD, "hand", "reader")),
     "DDS-UNHEARD": _seen(_without(GOOD, "hand", "reader")),
@@ -572,10 +696,62 @@ def test_unrelated_topic_name_is_no_misspelling(topic: str) -> None:
     assert closest_topic(topic) is None
 
 
-def test_topics_are_not_cut_in_a_narrow_terminal() -> None:
-    seen = _seen(_legacy())
+def test_topics_take_a_line_each_in_a_narrow_terminal() -> None:
+    other = _waiting("rt/" + "x" * 90)
+    seen = _seen(_legacy(), _pair(model="dex3", number=2), other)
     text = io.StringIO()
     console = Console(file=text, width=80)
     print_report(console, seen, [], verdict(seen, [], Scope()), [])
+    lines = text.getvalue().splitlines()
     assert "…" not in text.getvalue()
-    assert all(e.topic in text.getvalue() for view in seen.domains for e in view.endpoints)
+    for view in seen.domains:
+        for topic in {e.topic for e in view.endpoints}:
+            (line,) = [s for s in lines if s.startswith(f"{view.number} ") and topic in s.split()]
+            assert len(line) <= 80 or len(topic) > 60
+    assert len(lines) < 30
+    (line,) = [s for s in lines if "rt/dex3/left/state" in s]
+    hand, client = (
+        next(s for s in lines if s.endswith(f"{who}.py (pid {int(who, 36)}) (domain 2)"))
+        for who in ("hand", "client")
+    )
+    assert line.split() == [
+        *("2", "rt/dex3/left/state", "hg", "HandState_", "500"),
+        *(hand.split()[0], ">", client.split()[0]),
+    ]
+
+
+@each(
+    ("mode", "kp", "kd", "drives", "asks", "limp"),
+    [
+        (0x10, 1.5, 0.1, True, True, False),
+        (0x01, 1.5, 0.1, False, True, False),
+        (0x10, 0.0, 0.0, False, False, True),
+        (0x10, 0.0, 0.1, False, False, False),
+    ],
+)
+def test_commands_are_told_apart(
+    mode: int, kp: float, kd: float, drives: bool, asks: bool, limp: bool
+) -> None:
+    kind = message_type(HAND_CMD)
+    watch = _watch("rt/dex3/left/cmd", HAND_CMD)
+    for k, q in enumerate((0.1, 0.4)):
+        motors = [hg.MotorCmd_(mode=mode, q=q, kp=kp, kd=kd) for _ in range(7)]
+        watch.take(k + 1, kind.encode(hg.HandCmd_(motors)), float(k), 0.0)
+    stream = watch.stream(2.0, 0.0)
+    assert (stream.drives, stream.asks, stream.limp) == (drives, asks, limp)
+    assert stream.asked_span == pytest.approx(0.3 if asks else 0.0)
+    assert stream.modes == (mode,) * 7
+    assert not stream.blank
+
+
+@each(("temperature", "blank"), [(0, True), (30, False)])
+def test_state_of_zeros_is_blank(temperature: int, blank: bool) -> None:
+    kind = message_type(HAND_STATE)
+    watch = _watch("rt/dex3/left/state", HAND_STATE)
+    motors = [hg.MotorState_(temperature=(temperature, 0)) for _ in range(7)]
+    watch.take(1, kind.encode(hg.HandState_(motors)), 0.0, 0.0)
+    assert watch.stream(1.0, 0.0).blank is blank
+
+
+def _watch(topic: str, type_name: str) -> _Watch:
+    return _Watch(EndpointData(bytes(16), topic, type_name, Policies(), ""), 0.0, 1, 0.0, 1)

@@ -260,7 +260,7 @@ _ALL = (
         "only one of the two hands publishes",
         _WAITS + ", though one hand runs",
         "xr_teleoperate waits for the first state of both hands",
-        "start the other hand too; 'dexkit serve sim-dex1 --side right' replaces a missing one",
+        "start the other hand too",
     ),
     Diagnosis(
         "DDS-SILENT",
@@ -287,6 +287,15 @@ _ALL = (
         "state yet'",
         "check that the hand is powered and its motors answer; an emulator must rest a little "
         "off zero",
+    ),
+    Diagnosis(
+        "DDS-SAYS-NOTHING",
+        _W,
+        "nothing in a hand's state shows that there is a hand",
+        "the client starts, the hand does not move",
+        "a hand that failed to start may publish valid states of zeros; a hand that measures only "
+        "positions looks the same while it rests at 0",
+        "check that the hand is powered; move a finger by hand or by a command, and look again",
     ),
     Diagnosis(
         "DDS-TWO-PUBLISHERS",
@@ -322,6 +331,33 @@ _ALL = (
         "restart the client, and always start the hand first",
     ),
     Diagnosis(
+        "DDS-TRIPPED",
+        _E,
+        "the hand's time-out protection has tripped, and the client does not clear it",
+        "the client runs, the hand never moves; the client's first run worked",
+        "after 1 s without commands a motor with bit 7 in its mode byte brakes, and obeys no "
+        "command that still has the bit; a client that always sets it cannot move the hand again "
+        "after a pause or a restart (GR00T-WholeBodyControl always does)",
+        "send each motor one command with bit 7 = 0 (0x10 | index), or restart the hand's service",
+    ),
+    Diagnosis(
+        "DDS-MODE",
+        _E,
+        "the mode byte of a client's commands drives no motor",
+        "the client runs, the hand never moves",
+        "the mode byte decides whether a motor obeys or is locked; whether all hands read it as "
+        "documented is disputed (docs/dex3.md)",
+        "send the documented byte: 0x10 | index to a Dex3-1, 1 to a Dex5-1",
+    ),
+    Diagnosis(
+        "DDS-NOT-FOLLOWING",
+        _E,
+        "a hand gets commands and does not move",
+        "the client runs, the hand never moves",
+        "states and commands flow; what the commands ask for does not happen",
+        "check the hand's power and the log of its service",
+    ),
+    Diagnosis(
         "DDS-FROZEN",
         _E,
         "the state does not follow commands that change",
@@ -355,8 +391,7 @@ _ALL = (
         "a client changes q in commands without gains",
         "the client runs, the hand stays limp",
         "kp = kd = dq = tau = 0 is the command to be limp; a service counts it as accepted",
-        "send gains with q (xr_teleoperate: kp 5.0, kd 0.05); an EZGripper obeys q alone with "
-        "'dexkit serve ezgripper --set zero_gains=position'",
+        "send gains with q: those of Unitree's client",
     ),
     Diagnosis(
         "DDS-RATE",

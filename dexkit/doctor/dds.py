@@ -23,9 +23,10 @@ from dexkit.doctor.observations import DomainView, Endpoint, Participant, Stream
 from dexkit.doctor.observer import Observer, Send
 from dexkit.doctor.proc_files import command_line, environment_of, start_time
 from dexkit.doctor.rtps import EndpointData, Locator
-from dexkit.doctor.topic_spelling import is_driven, is_hand_topic, is_limp
+from dexkit.doctor.topic_spelling import is_asked, is_driven, is_hand_topic, is_limp
 from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
+from dexkit.messages.columns import Columns
 from dexkit.messages.earlier import layout_of
 from dexkit.topics import roles
 
@@ -68,6 +69,10 @@ class _Watch:
     began: tuple[float, ...] = ()
     driven: dict[int, tuple[float, float]] = field(default_factory=dict)
     limp: dict[int, tuple[float, float]] = field(default_factory=dict)
+    asked: dict[int, tuple[float, float]] = field(default_factory=dict)
+    modes: tuple[int, ...] = ()
+    tau: float = 0.0
+    blank: bool = True
     nonzero: bool = False
     undecodable: int = 0
     earlier: str = ""
@@ -78,6 +83,7 @@ class _Watch:
     def __post_init__(self) -> None:
         found = roles(self.endpoint.topic, self.endpoint.type_name)
         self.dialects = [role.dialect for role in found if role.kind == "cmd"]
+        self.states = any(role.kind == "state" for role in found)
 
     def take(self, sequence: int, data: bytes, now: float, written: float) -> None:
         if self.samples and sequence <= self.last_sequence:
@@ -108,8 +114,15 @@ class _Watch:
         q = [float(motor.q) for motor in motors]
         self.nonzero = self.nonzero or any(q)
         self.q = tuple(q)
+        self.modes = tuple(int(getattr(motor, "mode", 0)) for motor in motors)
+        if self.states:
+            self.tau = max((abs(float(m.tau_est)) for m in motors), default=0.0)
+            self.blank = self.blank and Columns(kind.layout, [data]).are_zero
         for i, motor in enumerate(motors if self.dialects else ()):
-            for seen, matches in ((self.driven, is_driven), (self.limp, is_limp)):
+            for seen, matches in (
+                *((self.driven, is_driven), (self.asked, is_asked)),
+                *((self.limp, is_limp),),
+            ):
                 if any(matches(motor, dialect) for dialect in self.dialects):
                     low, high = seen.get(i, (q[i], q[i]))
                     seen[i] = min(low, q[i]), max(high, q[i])
@@ -137,15 +150,27 @@ class _Watch:
             q=self.q,
             began=self.began,
             q_span=max((h - low for low, h in zip(self.low, self.high, strict=True)), default=0.0),
-            driven_span=max((high - low for low, high in self.driven.values()), default=0.0),
-            limp_span=max((high - low for low, high in self.limp.values()), default=0.0),
+            driven_span=_widest(self.driven),
+            limp_span=_widest(self.limp),
+            asked_span=_widest(self.asked),
+            drives=bool(self.driven),
+            asks=bool(self.asked),
+            limp=bool(self.limp),
+            modes=self.modes,
+            tau=self.tau,
             nonzero=self.nonzero,
+            blank=self.blank and self.states and self.samples > self.undecodable,
             undecodable=self.undecodable,
             earlier=self.earlier,
             lost=gaps + 1 - self.samples if self.samples else 0,
             delay_min=percentile(self.delays, 0.0),
             delay_95=percentile(self.delays, 0.95),
         )
+
+
+def _widest(ranges: dict[int, tuple[float, float]]) -> float:
+    """The widest of some ranges."""
+    return max((high - low for low, high in ranges.values()), default=0.0)
 
 
 def _wall_clock_offset() -> float:

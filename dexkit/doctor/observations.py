@@ -101,7 +101,15 @@ class Stream:
     :param driven_span: of commands: the furthest that the target of any joint moved, rad, over
         the commands that drive it (with a position gain, and a mode that obeys).
     :param limp_span: of commands: the same over the commands without gains, which leave it limp.
+    :param asked_span: of commands: the same over those with a position gain, whatever their mode
+        byte.
+    :param drives: of commands: some command drives some joint.
+    :param asks: of commands: some command has a position gain for some joint.
+    :param limp: of commands: some command leaves some joint limp.
+    :param modes: mode bytes of the last sample; empty where the type has none.
+    :param tau: largest abs(tau_est) in the last sample of states.
     :param nonzero: some position of some sample was not exactly 0.
+    :param blank: every number in every sample of states was 0.
     :param undecodable: samples that do not decode as their type.
     :param earlier: month of the earlier layout that the last of these has, or empty.
     :param lost: sequence numbers that are missing between the first and the last sample.
@@ -121,7 +129,14 @@ class Stream:
     q_span: float = 0.0
     driven_span: float = 0.0
     limp_span: float = 0.0
+    asked_span: float = 0.0
+    drives: bool = False
+    asks: bool = False
+    limp: bool = False
+    modes: tuple[int, ...] = ()
+    tau: float = 0.0
     nonzero: bool = False
+    blank: bool = False
     undecodable: int = 0
     earlier: str = ""
     lost: int = 0

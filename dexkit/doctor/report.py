@@ -6,8 +6,6 @@ import dataclasses
 import math
 from typing import Any
 
-from rich.table import Column, Table
-
 from dexkit.console import Console
 from dexkit.console import markup as escape
 from dexkit.doctor.awaited_topics import AWAITED
@@ -87,30 +85,15 @@ def print_report(
         for line in _link_text(seen.link).splitlines():
             console.print(escape(line), highlight=False)
     for state in states:
-        text = "a client gets past its wait" if state.ready else f"a client waits: {state.missing}"
+        does = "a client waits" if state.waiting else "a client would wait"
+        text = "a client gets past its wait" if state.ready else f"{does}: {state.missing}"
         console.print(f"\ndomain {state.domain}, {state.dialect}: {escape(text)}", highlight=False)
-    # topics are compared letter for letter, so they are never cut: other columns give way
-    table = Table(
-        "domain",
-        Column("topic", no_wrap=True),
-        Column("type", overflow="fold"),
-        Column("what", no_wrap=True),
-        Column("Hz", no_wrap=True),
-        Column("process", overflow="fold"),
-        box=None,
-        padding=(0, 2, 0, 0),
-    )
-    for view in seen.domains:
-        for endpoint in view.endpoints:
-            table.add_row(*(escape(cell, LONGEST) for cell in _row(view, endpoint)))
-        if view.participants and not view.endpoints:
-            for participant in view.participants:
-                table.add_row(
-                    str(view.number), "-", "-", "-", "", escape(participant.name, LONGEST)
-                )
-    if table.row_count:
+    lines = _topic_lines(seen)
+    if lines:
         console.print()
-        console.print(table)
+    for line in lines:
+        # topics are compared letter for letter, so they are never cut, nor is a line folded
+        console.print(escape(line, LONGEST), highlight=False, soft_wrap=True)
     looked = ", ".join(str(view.number) for view in seen.domains)
     if looked:
         console.print(f"\n[dim]looked at domains {looked} on {', '.join(seen.examined)}[/dim]")
@@ -143,17 +126,55 @@ def _link_text(link: Link) -> str:
     return "\n".join(lines)
 
 
-def _row(view: DomainView, endpoint: Endpoint) -> tuple[str, ...]:
-    stream = view.stream(endpoint)
-    rate = f"{stream.rate:.0f}" if stream and stream.samples else ("0" if stream else "")
-    known = roles(endpoint.topic) or endpoint.topic in _BODY_TOPICS or endpoint.topic in AWAITED
-    mark = "" if known else " (not known)"
-    kind = "publishes" if endpoint.kind == "writer" else "reads"
-    return (
-        str(view.number),
-        endpoint.topic + mark,
-        short(endpoint.type_name),
-        kind,
-        rate,
-        view.owner(endpoint),
-    )
+def _topic_lines(seen: Observations) -> list[str]:
+    """Each topic in one line, with the numbers of those who publish and read it; then those."""
+    numbers: dict[tuple[int, str], int] = {}
+
+    def who(view: DomainView, endpoints: list[Endpoint]) -> str:
+        keys = dict.fromkeys((view.number, e.participant) for e in endpoints)
+        found = [numbers.setdefault(key, len(numbers) + 1) for key in keys]
+        return ",".join(map(str, sorted(found))) or "-"
+
+    rows = [("dom", "topic", "type", "Hz", "who > who reads")]
+    for view in seen.domains:
+        topics: dict[tuple[str, str], list[Endpoint]] = {}
+        for endpoint in view.endpoints:
+            topics.setdefault((endpoint.topic, endpoint.type_name), []).append(endpoint)
+        for (topic, type_name), ends in topics.items():
+            writers, readers = ([e for e in ends if e.kind == k] for k in ("writer", "reader"))
+            known = roles(topic) or topic in _BODY_TOPICS or topic in AWAITED
+            told = f"{who(view, writers)} > {who(view, readers)}" + ("" if known else "  (unknown)")
+            kind = short(type_name).replace("unitree_", "")
+            rows.append((str(view.number), topic, kind, _rates(view, writers), told))
+    most = [min(max(len(row[i]) for row in rows), widest) for i, widest in enumerate(_WIDEST)]
+    lines = [
+        "  ".join(c.ljust(n) for c, n in zip(row, (*most, 0), strict=True)).rstrip() for row in rows
+    ]
+    silent = [
+        (view.number, p.key)
+        for view in seen.domains
+        for p in view.participants
+        if (view.number, p.key) not in numbers
+    ]
+    for key in silent:
+        numbers[key] = len(numbers) + 1
+    names = {
+        (view.number, p.key): p.name + ("" if (view.number, p.key) not in silent else _NO_TOPIC)
+        for view in seen.domains
+        for p in view.participants
+    }
+    for key, number in numbers.items():
+        at = f" (domain {key[0]})" if len({domain for domain, _ in numbers}) > 1 else ""
+        lines.append(f"{number:>3}  {names.get(key, 'an unknown process')}{at}")
+    return lines if numbers else []
+
+
+_WIDEST = (3, 25, 15, 5)
+"""Widest columns of the topics, so that a line of usual ones fits into 80 characters."""
+_NO_TOPIC = ", without a topic"
+
+
+def _rates(view: DomainView, writers: list[Endpoint]) -> str:
+    """How often each of the writers that were watched publishes."""
+    streams = [s for e in writers if (s := view.stream(e)) is not None]
+    return "+".join(f"{s.rate:.0f}" if s.samples else "0" for s in streams)

@@ -26,7 +26,7 @@ from dexkit.doctor.topic_spelling import closest_topic, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.messages.earlier import EARLIER, earlier_by_hash
-from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.models import DIALECTS, MODELS, Dialect, ModeByte
 from dexkit.topics import Role, roles
 from dexkit.wire import dex3_usb, mx64
 
@@ -36,6 +36,12 @@ ROBOT_NETWORK = "192.168.123."
 """Network of Unitree's robots (docs/sources/unitree-dex.md#a6)."""
 
 _FROZEN_COMMANDS = 0.1  # rad that commands move while a measured state must change
+_COMMANDED = 0.2  # rad (or the model's unit) of commands after which a hand must have moved
+_STANDS = 0.1  # part of a command's way that is no motion
+_FOLLOWS = 0.3  # part of it that is
+_FAR = 0.25  # of a joint's range from its goal, where it does not stand by friction
+_NO_TORQUE = 0.01  # N m, below which a motor does not try
+_TIMEOUT = 0x80  # bit of RIS_Mode_t: protection wanted, or tripped
 _MARGIN = 0.9  # of a rate, for what a busy machine does to a measurement
 # what a link may have before it is reported; docs/doctor.md gives the reasons
 _MOST_LOSS = 0.01
@@ -67,12 +73,14 @@ class Readiness:
     """Whether a client of a dialect would get past its wait on a domain.
 
     :param missing: what it still waits for, or empty.
+    :param waiting: there is such a client.
     """
 
     domain: int
     dialect: str
     ready: bool
     missing: str = ""
+    waiting: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,7 +217,8 @@ def readiness(seen: Observations, scope: Scope | None = None) -> list[Readiness]
         for dialect in DIALECTS.values():
             if dialect.name in names:
                 missing = _missing(view, dialect) or _unmet(seen, view, dialect)
-                out.append(Readiness(view.number, dialect.name, not missing, missing))
+                waits = bool(missing) and bool(_read_sides(view, dialect))
+                out.append(Readiness(view.number, dialect.name, not missing, missing, waits))
     return out
 
 
@@ -221,9 +230,18 @@ def _unmet(seen: Observations, view: DomainView, dialect: Dialect) -> str:
     return found[0].diagnosis.title if found else ""
 
 
+def _read_sides(view: DomainView, dialect: Dialect) -> set[Side]:
+    """The sides whose state some process reads."""
+    parts = _parts(view, "reader", "state", Scope(dialects=(dialect,)))
+    return {side for part in parts for side in part.role.sides}
+
+
 def _missing(view: DomainView, dialect: Dialect) -> str:
     scope = Scope(dialects=(dialect,))
+    read = _read_sides(view, dialect)
     for side in Side:
+        if read and side not in read:
+            continue  # its clients are of the other hand alone
         parts = [p for p in _hands(view, scope) if side in p.role.sides]
         who = "both hands" if dialect.topics(Side.LEFT) == dialect.topics(Side.RIGHT) else side
         if not parts:
@@ -258,6 +276,7 @@ def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
         yield from _listeners(view, scope)
         yield from _streams(view, scope)
         yield from _ways(view, scope)
+        yield from _motionless(view, scope)
         yield from _limp_clients(view, scope)
         if not scope.dialects:
             yield from _waiting(seen, view)
@@ -547,7 +566,18 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
             continue
         if not stream.nonzero and dialect.zero_is_no_state:
             yield _finding(
-                "DDS-ALL-ZERO", f"{what}: every q is 0.0", domain=view.number, topic=topic
+                "DDS-ALL-ZERO",
+                f"{what}: every q is 0.0"
+                + (", as is every other number: it has not started" if stream.blank else ""),
+                domain=view.number,
+                topic=topic,
+            )
+        elif stream.blank:
+            yield _finding(
+                "DDS-SAYS-NOTHING",
+                f"{what}: every number in {stream.samples} states is 0",
+                domain=view.number,
+                topic=topic,
             )
         least = MODELS[dialect.model].min_state_rate
         if stream.samples > 1 and stream.rate < least * _MARGIN:
@@ -558,7 +588,9 @@ def _streams(view: DomainView, scope: Scope) -> Iterator[Finding]:
                 topic=topic,
             )
         command = _command(view, part, scope)
-        if stream.identical and command is not None and command.driven_span >= _FROZEN_COMMANDS:
+        tripped = any(mode & _TIMEOUT for mode in _told(part, stream))  # is reported as that
+        moved = command is not None and command.driven_span >= _FROZEN_COMMANDS
+        if stream.identical and command is not None and moved and not tripped:
             yield _finding(
                 "DDS-FROZEN",
                 f"{what}: {stream.samples} identical states while the commands moved by "
@@ -607,11 +639,7 @@ def _ways(view: DomainView, scope: Scope) -> Iterator[Finding]:
 
 
 def _reversed(view: DomainView, part: _Part, side: Side, course: Course) -> Iterator[Finding]:
-    spoken = part.role.dialect
-    ranges = [
-        (0.0, spoken.q_open) if spoken.is_gripper else (joint.q_min, joint.q_max)
-        for joint in MODELS[spoken.model].joints[side]
-    ]
+    ranges = _ranges(part.role.dialect, side)
     against = moves_against(course, ranges)
     if against:
         yield _finding(
@@ -623,19 +651,164 @@ def _reversed(view: DomainView, part: _Part, side: Side, course: Course) -> Iter
         )
 
 
+def _motionless(view: DomainView, scope: Scope) -> Iterator[Finding]:
+    """Hands that cannot move, or do not, though a client commands them."""
+    for part in _hands(view, scope):
+        state, command = view.stream(part.endpoint), _command(view, part, scope)
+        if state is None or not state.samples:
+            continue
+        topic = part.endpoint.topic
+        what = f"{topic} of {part.who} on domain {view.number}"
+        told = _told(part, state)
+        tripped = [i for i, mode in enumerate(told) if mode & _TIMEOUT]
+        if tripped:
+            again = command is not None and any(
+                command.modes[i] & _TIMEOUT for i in tripped if i < len(command.modes)
+            )
+            yield _finding(
+                "DDS-TRIPPED",
+                f"{what}: {len(tripped)} of {len(told)} motors report that it has tripped (mode "
+                f"byte 0x{told[tripped[0]]:02x})"
+                + ("; the commands still have bit 7" if again else ""),
+                severity=None if again else Severity.WARNING,
+                domain=view.number,
+                topic=topic,
+            )
+        if command is None:
+            continue
+        moves = command.asked_span >= _FROZEN_COMMANDS and (
+            state.q_span >= _FOLLOWS * command.asked_span
+        )
+        if command.asks and not command.drives:
+            bytes_sent = ", ".join(f"0x{m:02x}" for m in dict.fromkeys(command.modes))
+            yield _finding(
+                "DDS-MODE",
+                f"{what}: commands with gains have mode {bytes_sent}, which drives no motor by the "
+                "documents" + ("; this hand moves all the same" if moves else ""),
+                fix="in the client: mode = "
+                + ("0x10 | index" if part.role.dialect.mode_byte is ModeByte.RIS else "1")
+                + " while it drives a motor",
+                severity=Severity.WARNING if moves else None,
+                domain=view.number,
+                topic=topic,
+            )
+        elif not tripped and (why := _stands(part, state, command, told)):
+            seen, causes, sure = why
+            yield _finding(
+                "DDS-NOT-FOLLOWING",
+                f"{what}: {seen}",
+                fix=f"likeliest first: {'; '.join(causes)}",
+                severity=None if sure else Severity.WARNING,
+                domain=view.number,
+                topic=topic,
+            )
+
+
+def _told(part: _Part, state: Stream) -> tuple[int, ...]:
+    """The mode bytes of a hand's motors, where they are RIS_Mode; else empty.
+
+    Only a hand that fills the ids says anything by the other bits.
+    """
+    modes = state.modes if part.role.dialect.mode_byte is ModeByte.RIS else ()
+    return modes if all(mode & 15 == i for i, mode in enumerate(modes)) else ()
+
+
+def _stands(
+    part: _Part, state: Stream, command: Stream, told: tuple[int, ...]
+) -> tuple[str, list[str], bool] | None:
+    """What shows that a hand does not do what it is commanded, the causes, and whether it is sure;
+    None if it does, or if another finding says so.
+    """
+    locked = bool(told) and all(mode >> 4 & 7 == 0 for mode in told)
+    if command.drives and locked and state.q_span < _STANDS:
+        causes = ["a motor error or a lost device: see the log of the hand's service"]
+        return "its motors report status 0 (locked), though the commands drive them", causes, True
+    said = (
+        state.identical and command.driven_span >= _FROZEN_COMMANDS
+    ) or command.limp_span >= _FROZEN_COMMANDS
+    if said:
+        return None
+    causes = [
+        "the hand is not powered, or in an error: see the log of its service",
+        "its gains are too small to move it (Unitree's client: docs/clients.md)",
+        "something holds the fingers",
+    ]
+    if command.q_span >= _COMMANDED and state.q_span < _STANDS * command.q_span:
+        if not command.asks:
+            causes.insert(0, "the commands have no position gain")
+        unit = MODELS[part.role.dialect.model].unit
+        seen = f"q of the commands changed by {command.q_span:.2f} {unit}, that of the hand by "
+        return f"{seen}{state.q_span:.3f}", causes, True
+    far = command.drives and part.role.dialect.gains_are_used and state.tau < _NO_TORQUE
+    if far and _far(part, state, command) and state.q_span < _STANDS * _COMMANDED:
+        return "it stands far from where it is commanded, without a torque", causes, False
+    return None
+
+
+def _far(part: _Part, state: Stream, command: Stream) -> bool:
+    """Whether most joints are far from their goals."""
+    far = count = 0
+    for side in part.role.sides:
+        here, goal = (_positions(part, s, side, "q") for s in (state, command))
+        if not here or not goal:
+            return False
+        for q, target, (low, high) in zip(
+            here, goal, _ranges(part.role.dialect, side), strict=True
+        ):
+            count += 1
+            far += abs(min(max(target, low), high) - q) > _FAR * (high - low)
+    return far > count / 2
+
+
+def _ranges(spoken: Dialect, side: Side) -> list[tuple[float, float]]:
+    """Lower and upper limit of each joint of a side."""
+    return [
+        (0.0, spoken.q_open) if spoken.is_gripper else (joint.q_min, joint.q_max)
+        for joint in MODELS[spoken.model].joints[side]
+    ]
+
+
 def _limp_clients(view: DomainView, scope: Scope) -> Iterator[Finding]:
     for part in _parts(view, "writer", "cmd", scope):
         stream = view.stream(part.endpoint)
-        # what is driven at times is let go on purpose
-        if stream is None or stream.driven_span or stream.limp_span < _FROZEN_COMMANDS:
+        # what is driven at times is let go on purpose; a stop has q = 0, or the hand's own
+        if stream is None or stream.drives or stream.driven_span:
             continue
+        goes = stream.limp_span >= _FROZEN_COMMANDS
+        stays = stream.limp and not stream.asks and stream.nonzero and not stream.limp_span
+        if not goes and not (stays and _elsewhere_than_hand(view, part, stream, scope)):
+            continue
+        how = f"q changed by {stream.limp_span:.2f} rad" if goes else "q is not where the hand is"
         yield _finding(
             "DDS-NO-GAINS",
-            f"{part.endpoint.topic} of {part.who} on domain {view.number}: q changed by "
-            f"{stream.limp_span:.2f} rad, with kp = kd = dq = tau = 0",
+            f"{part.endpoint.topic} of {part.who} on domain {view.number}: {how}, with "
+            "kp = kd = dq = tau = 0",
+            fix=_gains_of(part.role.dialect),
             domain=view.number,
             topic=part.endpoint.topic,
         )
+
+
+def _gains_of(spoken: Dialect) -> str:
+    """Advice for a client that sends none."""
+    kp, kd = MODELS[spoken.model].gains[0]
+    advice = f"send gains with q (Unitree's client: kp {kp:g}, kd {kd:g})"
+    if spoken.is_gripper:
+        advice += (
+            "; an EZGripper obeys q alone with 'dexkit serve ezgripper --set zero_gains=position'"
+        )
+    return advice
+
+
+def _elsewhere_than_hand(view: DomainView, part: _Part, command: Stream, scope: Scope) -> bool:
+    """Whether the hand that a client commands is far from the commanded q."""
+    return any(
+        _far(hand, state, command)
+        for hand in _hands(view, scope)
+        if hand.role.dialect is part.role.dialect
+        and hand.role.sides == part.role.sides
+        and (state := view.stream(hand.endpoint)) is not None
+    )
 
 
 def _waiting(seen: Observations, view: DomainView) -> Iterator[Finding]:
@@ -813,10 +986,21 @@ def _absent(
             if len(sides) == 1:
                 (there,) = sides
                 other_side = Side.RIGHT if there is Side.LEFT else Side.LEFT
+                is_read = other_side in _read_sides(view, dialect)
+                backend = MODELS[dialect.model].simulator or "BACKEND"
+                replacement = (
+                    f"'dexkit serve {backend} --side {other_side} --domain {view.number}' replaces "
+                    "a missing one"
+                )
                 yield _finding(
                     "DDS-ONE-SIDE",
                     f"domain {view.number} has {dialect.topics(there)[1]}, but not "
-                    f"{dialect.topics(other_side)[1]}",
+                    f"{dialect.topics(other_side)[1]}"
+                    + ("" if is_read else ", which no process reads"),
+                    fix=f"start the other hand too; {replacement}"
+                    if is_read
+                    else f"nothing, for one hand; for a client of both, {replacement}",
+                    severity=None if is_read else Severity.NOTE,
                     domain=view.number,
                     topic=dialect.topics(other_side)[1],
                 )

@@ -11,7 +11,7 @@ from dexkit.messages import message_types
 from dexkit.models import Dialect, ModeByte
 from dexkit.topics import HAND_TOPICS, roles
 
-__all__ = ["closest_topic", "is_driven", "is_hand_topic", "is_limp", "short"]
+__all__ = ["closest_topic", "is_asked", "is_driven", "is_hand_topic", "is_limp", "short"]
 
 _KNOWN_TYPES = frozenset(kind.name for kind in message_types())
 _ALIKE = 0.86  # ratio of difflib above which a name is a slip of the pen
@@ -27,11 +27,16 @@ def is_hand_topic(topic: str, type_name: str) -> bool:
 
 def is_driven(motor: Any, dialect: Dialect) -> bool:
     """Whether a motor's command makes it follow ``q``: it has a position gain and is not locked."""
-    if dialect.mode_byte is ModeByte.STATUS and not motor.mode:
+    if dialect.mode_byte is ModeByte.STATUS and motor.mode != _FOC:
         return False
     if dialect.mode_byte is ModeByte.RIS and (motor.mode >> 4) & 7 != _FOC:
         return False
-    return bool(motor.kp) or not dialect.gains_are_used
+    return is_asked(motor, dialect)
+
+
+def is_asked(motor: Any, dialect: Dialect) -> bool:
+    """Whether a motor's command has a position gain, where the dialect has gains at all."""
+    return not dialect.gains_are_used or bool(motor.kp)
 
 
 def is_limp(motor: Any, dialect: Dialect) -> bool:
