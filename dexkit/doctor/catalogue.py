@@ -347,7 +347,7 @@ _ALL = (
         "the client runs, the hand never moves",
         "the mode byte decides whether a motor obeys or is locked; whether all hands read it as "
         "documented is disputed (docs/dex3.md)",
-        "send the documented byte: 0x10 | index to a Dex3-1, 1 to a Dex5-1",
+        "send the byte that the documents of that hand give",
     ),
     Diagnosis(
         "DDS-NOT-FOLLOWING",
