@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
+from dexkit.conformance.mutants import mutants
+from dexkit.conformance.mutants.fingers import FingerService, MilliNewtonMetres
+from dexkit.conformance.mutants.matrix import try_one
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Result, Verdict
 from dexkit.traces import open_trace, sample_path
@@ -66,3 +70,18 @@ def test_thousandths_warn_and_are_judged() -> None:
 def test_single_wrong_values_do_not_end_the_judgement_of_force(part: float) -> None:
     recording = with_torque("dex3_pinch", TO_COUNTS, COUNTS, part=part)
     assert not any(view.has_raw_torque for view in recording.sides.values())
+
+
+def test_a_whole_run_with_raw_counts_warns_of_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(self: MilliNewtonMetres, motors: Any, hand: Any) -> None:
+        FingerService.fill(self, motors, hand)
+        motors["tau_est"] = TO_COUNTS * motors["tau_est"] + COUNTS
+
+    monkeypatch.setattr(MilliNewtonMetres, "fill", fill)
+    (hand,) = [
+        m
+        for m in mutants("dds")
+        if m.kills == "DEX3-FORCE-02" and issubclass(m.made, MilliNewtonMetres)
+    ]
+    result = try_one(replace(hand, brief=False, whole=True))
+    assert (result.missed, result.wrongly) == ((), ())
