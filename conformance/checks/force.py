@@ -434,7 +434,7 @@ def raw_counts(
 ) -> Outcome:
     """The outcome of a hand whose tau_est is in raw counts: no other requirement judges it."""
     text = ctx.named(f"|tau_est| of at most {most:.0f}: not {unit}, looks like raw counts", joint)
-    outcome = ctx.failed(f"{most:.0f} counts", text, place).about(joint)
+    outcome = ctx.failed(f"{most:.0f} counts", text, place).about(joint).tolerated()
     return outcome.because(
         f"tau_est holds the raw register, as some real hands do. Its force in {unit} is not known, "
         "and not judged."

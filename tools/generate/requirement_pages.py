@@ -108,7 +108,7 @@ def _linked(text: str) -> str:
 
     def link(match: re.Match[str]) -> str:
         target, anchor = match.groups()
-        # a section (B.4), or a fact by name
+        # a letter with a number is a section, all else the name of a fact
         section = re.sub(r"^([a-z])(?=\d)", lambda m: f"{m[1].upper()}.", anchor)
         return f"[{section.upper() if len(anchor) == 1 else section}]({target})"
 
