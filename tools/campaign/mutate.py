@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import math
 import random
 from collections.abc import Callable, Sequence
+from copy import deepcopy
+from typing import Any
 
-__all__ = ["TextMutator", "mutator"]
+__all__ = ["ODD", "TextMutator", "damaged_json", "mutator"]
+
+ODD: tuple[Any, ...] = (
+    None, True, 0, -1, 1.5, 10**30, 1e308, math.inf, "", "x", "\x1b[31m\x00", [], {}, [[]],
+    [None], {"a": 1}, "left", ["left"], math.nan, 2**63, -(2**63) - 1, 1e-320, "\ud800", "\n",
+)  # fmt: skip
+"""Values of each JSON type, and at the limits of others."""
 
 _EDGES = (0x00, 0x01, 0x7F, 0x80, 0xFE, 0xFF, 0x10, 0x20)
 _WORDS = (
@@ -142,3 +152,38 @@ class TextMutator:
                 other = rng.choice(self._corpus)
                 text = text[:at] + other[rng.randrange(len(other) + 1) :]
         return text
+
+
+def damaged_json(content: Any, rng: random.Random, words: Sequence[str] = ()) -> str:
+    """JSON text of ``content`` with one to three places of another type, absent or too deep.
+
+    :param words: of the grammar; in their place, or as a name.
+    """
+    copy = json.loads(json.dumps(content))
+    for _ in range(1 + rng.getrandbits(1)):
+        place: Any = copy
+        parent: Any = None
+        key: Any = None
+        while isinstance(place, dict | list) and place and (parent is None or rng.random() < 0.8):
+            parent = place
+            key = rng.choice(list(place)) if isinstance(place, dict) else rng.randrange(len(place))
+            place = place[key]
+        if parent is None:
+            continue
+        if rng.random() < 0.15:
+            del parent[key]
+        elif words and rng.random() < 0.3:
+            word = rng.choice(words)
+            if isinstance(place, str) or not isinstance(parent, dict):
+                parent[key] = word
+            else:  # under another name, too or instead
+                parent[word] = place if rng.random() < 0.5 else parent.pop(key)
+        else:
+            parent[key] = deepcopy(rng.choice(ODD))
+    text = json.dumps(copy)
+    if rng.random() < 0.01:
+        deep = rng.choice((900, 20_000))
+        return text[: rng.randrange(len(text))] + "[" * deep + "]" * deep
+    if rng.random() < 0.02:
+        return text[: rng.randrange(len(text))]
+    return text

@@ -9,11 +9,11 @@ import random
 import struct
 import zlib
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zstandard
 
 from dexkit.backends import BackendOptions
@@ -50,14 +50,17 @@ from dexkit.emulators.faults import (
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import message_type
+from dexkit.models import model
 from dexkit.traces import open_trace
 from dexkit.traces.recorder import Recorder
+from dexkit.traces.sessions.pictures import parse_picture
+from dexkit.urdf import read_urdf
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
 from tools.campaign.fuzz.recordings import TIME, TYPES, content
-from tools.campaign.mutate import TextMutator, mutator
+from tools.campaign.mutate import TextMutator, damaged_json, mutator
 
-__all__ = ["cases", "damaged_json"]
+__all__ = ["cases"]
 
 
 # --- recordings
@@ -184,38 +187,6 @@ def _judged(rng: random.Random, scratch: Path) -> Target:
 
 
 # --- results
-
-
-_ODD: tuple[Any, ...] = (
-    None, True, 0, -1, 1.5, 10**30, 1e308, math.inf, "", "x", "\x1b[31m\x00", [], {}, [[]],
-    [None], {"a": 1}, "left", ["left"],
-)  # fmt: skip
-
-
-def damaged_json(content: Any, rng: random.Random) -> str:
-    """JSON text of ``content`` with one to three places of another type, absent or too deep."""
-    copy = json.loads(json.dumps(content))
-    for _ in range(1 + rng.getrandbits(1)):
-        place: Any = copy
-        parent: Any = None
-        key: Any = None
-        while isinstance(place, dict | list) and place and (parent is None or rng.random() < 0.8):
-            parent = place
-            key = rng.choice(list(place)) if isinstance(place, dict) else rng.randrange(len(place))
-            place = place[key]
-        if parent is None:
-            continue
-        if rng.random() < 0.15:
-            del parent[key]
-        else:
-            parent[key] = deepcopy(rng.choice(_ODD))
-    text = json.dumps(copy)
-    if rng.random() < 0.01:
-        deep = rng.choice((900, 20_000))
-        return text[: rng.randrange(len(text))] + "[" * deep + "]" * deep
-    if rng.random() < 0.02:
-        return text[: rng.randrange(len(text))]
-    return text
 
 
 @cache
@@ -428,10 +399,90 @@ def _uri(rng: random.Random, scratch: Path) -> Target:
     return Target(lambda: text().replace("\0", ""), uri_problem, ())
 
 
+_XML = (
+    "<!DOCTYPE a [<!ENTITY b 'c'>]>", '<!DOCTYPE a SYSTEM "file:///etc/passwd">', "&b;", "&#0;",
+    "<?xml version='1.0' encoding='utf-16'?>", "<?xml version='1.0' encoding='x'?>", "<![CDATA[",
+    "<!--", "<robot>", "</robot>", "<link name='", "<joint name='", "<mimic joint='a'/>", "<axis/>",
+    "<origin xyz='", "<parent link='base'/>", "<child link='base'/>", " multiplier='1e300'", "/>",
+    "revolute", "prismatic", "continuous", "fixed", "xmlns:a='b'", "a:b", "0 0", "1e4 0 0",
+    "<a>" * 3000, "<geometry>", "<box size='1 1 1'/>", "<sphere radius='-1'/>", "<cylinder/>",
+)  # fmt: skip
+
+
+def _urdf_text() -> str:
+    """A skeleton with the joints of a hand."""
+    joints = model("dex3-1").joints[Side.LEFT]
+    parts = ["<?xml version='1.0'?>\n<robot name='a'>\n<link name='base'/>"]
+    before = "base"
+    for i, joint in enumerate(joints):
+        shape = ("box size='1 1 1'", "sphere radius='1'", "cylinder radius='1' length='2'")[i % 3]
+        kind = ("revolute", "prismatic")[i % 2]
+        parts.append(
+            f"<link name='l{i}'><visual><origin xyz='0 0 1'/><geometry><{shape}/></geometry>"
+            f"</visual></link>\n<joint name='{joint.urdf or joint.name}' type='{kind}'>"
+            f"<parent link='{before}'/><child link='l{i}'/><origin xyz='0 0 0.1' rpy='0 0 1'/>"
+            "<axis xyz='0 1 0'/></joint>"
+        )
+        before = f"l{i}"
+    mimic = f"<mimic joint='{joints[0].urdf or joints[0].name}' multiplier='2' offset='1'/>"
+    parts.append(
+        f"<link name='m'/><joint name='other' type='revolute'><parent link='{before}'/>"
+        f"<child link='m'/>{mimic}</joint>\n</robot>"
+    )
+    return "\n".join(parts)
+
+
+def _urdf(rng: random.Random, scratch: Path) -> Target:
+    """Skeletons, drawn."""
+    path = scratch / "hand.urdf"
+    hand = model("dex3-1")
+    joints = hand.joints[Side.LEFT]
+    names = [n for j in joints for n in (j.name, j.urdf) if n]
+    text = TextMutator([_urdf_text()], [*_XML, *_NUMBERS, *names], rng)
+    bytewise = mutator([_urdf_text().encode(), _urdf_text().encode("utf-16")], rng)
+
+    def make() -> bytes:
+        if rng.getrandbits(2) == 0:
+            return bytewise()
+        form = rng.choice(("utf-8", "utf-8", "utf-8-sig", "utf-16", "utf-32", "utf-7"))
+        return text().encode(form, "backslashreplace")
+
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        found = read_urdf(path, joints)
+        poses = found.poses([0.5] * found.joints)
+        drawn = [poses, found.sizes, found.box_poses(poses), found.pin_poses(poses)]
+        if not all(np.isfinite(d).all() for d in drawn):
+            raise Difference("a skeleton with a place that is no number")
+
+    return Target(make, run)
+
+
+def _png() -> bytes:
+    head = struct.pack(">I4sIIBBBBB", 13, b"IHDR", 8, 6, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + head + bytes(40)
+
+
+def _picture(rng: random.Random, scratch: Path) -> Target:
+    """The heads of pictures."""
+    size = struct.pack(">BHHB", 8, 6, 8, 3) + bytes(9)
+    jpeg = b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(10) + b"\xff\xc0\x00\x11" + size + b"\xff\xda"
+    damaged = mutator([jpeg, _png(), jpeg + bytes(60)], rng)
+
+    def run(data: bytes) -> None:
+        found = parse_picture(data)
+        if found is not None and not (found.width > 0 and found.height > 0):
+            raise Difference("a picture without a size")
+
+    return Target(damaged, run)
+
+
 def cases() -> list[FuzzCase]:
     """Every fuzzer of this module."""
     slow = 300_000
     return [
+        FuzzCase("urdf", "skeletons of hands in XML", _urdf, size=500, aim=slow, weight=2),
+        FuzzCase("picture", "heads of JPEG and PNG", _picture, size=40_000, aim=1_000_000),
         FuzzCase("mcap.flip", "one bit of a recording of dexkit's own", _flips, size=300,
                  aim=slow, weight=3),
         FuzzCase("mcap.greedy", "small recordings that want much", _greedy, size=12, aim=2_000),
