@@ -15,13 +15,22 @@ __all__ = ["all_cases", "case", "select"]
 def all_cases() -> tuple[Case, ...]:
     """Every case, fuzzers first."""
     from tools.campaign import devices, disk, options, peers, programs, soak
+    from tools.campaign.fuzz import (
+        archives,
+        drivers,
+        files,
+        messages,
+        packet_codecs,
+        recordings,
+        sessions,
+        sources,
+    )
     from tools.campaign.fuzz import devices as fuzzed_devices
-    from tools.campaign.fuzz import drivers, files, messages, packet_codecs, recordings, sessions
 
     found: list[Case] = []
-    for fuzzers in (packet_codecs, messages, fuzzed_devices, drivers, recordings, sessions, files):
-        found += fuzzers.cases()
-    for module in (devices, programs, peers, disk, options, soak):
+    fuzzers = (packet_codecs, messages, fuzzed_devices, drivers, recordings, sessions, files)
+    untrusted = (sources, archives)
+    for module in (*fuzzers, *untrusted, devices, programs, peers, disk, options, soak):
         found += module.cases()
     return tuple(found)
 

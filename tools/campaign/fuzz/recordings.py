@@ -28,7 +28,7 @@ from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
 from tools.campaign.mutate import mutator
 
-__all__ = ["TIME", "TYPES", "cases", "content", "count_calls", "damage"]
+__all__ = ["TIME", "TYPES", "cases", "content", "count_calls", "damage", "small_recording"]
 
 TIME = 1_795_251_429_000_000_000
 TYPES = {
@@ -56,7 +56,7 @@ _TEXTS = (
 )
 
 
-def _recording(
+def small_recording(
     rng: random.Random,
     compression: CompressionType = CompressionType.NONE,
     *,
@@ -101,13 +101,13 @@ def _bases(rng: random.Random) -> list[tuple[bytes, bool]]:
     """Small recordings of each shape, and whether all of their bytes are under a checksum."""
     zstd, lz4_ = CompressionType.ZSTD, CompressionType.LZ4
     return [
-        (_recording(rng), True),
-        (_recording(rng, zstd), True),
-        (_recording(rng, lz4_), True),
-        (_recording(rng, chunked=False), True),
-        (_recording(rng, zstd, sums=False), False),
-        (_recording(rng, index=IndexType.NONE, sums=False), False),
-        (_recording(rng, chunked=False, summary=False, sums=False), False),
+        (small_recording(rng), True),
+        (small_recording(rng, zstd), True),
+        (small_recording(rng, lz4_), True),
+        (small_recording(rng, chunked=False), True),
+        (small_recording(rng, zstd, sums=False), False),
+        (small_recording(rng, index=IndexType.NONE, sums=False), False),
+        (small_recording(rng, chunked=False, summary=False, sums=False), False),
     ]
 
 
