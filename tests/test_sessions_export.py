@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import Phase, given, settings
@@ -16,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from dexkit.messages import message_type
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.traces import Recorder, open_trace, sample_path
-from dexkit.traces.sessions import topic_tables
+from dexkit.traces.sessions import ros_types, topic_tables
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.streams import streams_of
 from dexkit.traces.writer import RecordingWriter, definition
@@ -143,6 +144,52 @@ def test_several_recordings_are_exported_and_one_refused(tmp_path: Path, part: P
     assert (code, "bad.mcap: refused" in output) == (1, True)
     assert [p.name for p in (tmp_path / "all").iterdir()] == ["part"]
     assert dexkit("export", bad, "--to", "csv", "--out", tmp_path / "one")[0] == 2
+
+
+@each(
+    "values",
+    [
+        pa.array([[1.0]] * 2),
+        pa.array([{"a": 1}] * 2),
+        pa.array([2**30] * 2, pa.date32()),
+        pa.array([2**62] * 2, pa.timestamp("ns")),
+        pa.array([1] * 2, pa.duration("s")),
+        pa.array([[("a", 1)]] * 2, pa.map_(pa.string(), pa.int64())),
+    ],
+    ids=lambda values: str(values.type).partition("<")[0],
+)
+def test_a_table_with_columns_of_other_types_is_refused(
+    tmp_path: Path, part: Path, values: pa.Array
+) -> None:
+    assert dexkit("export", part, "--to", "parquet", "--out", tmp_path / "t")[0] == 0
+    path = sorted((tmp_path / "t").glob("*.parquet"))[0]
+    table = pq.read_table(path).slice(0, 2)
+    name = table.column_names[-1]
+    pq.write_table(table.set_column(table.num_columns - 1, name, values), path)
+    code, output = dexkit("import", tmp_path / "t", tmp_path / "back.mcap")
+    assert (code, f"column {name}" in output, path.name in output) == (1, True, True), output
+    there = len(open_trace(tmp_path / "back.mcap").definitions)
+    assert there == len(open_trace(part).definitions) - 1
+
+
+@each("to", ["csv", "parquet", "rosbag2", "rosbag2 --storage mcap"])
+def test_times_after_2262_are_told(tmp_path: Path, to: str) -> None:
+    mt = message_type("unitree_hg::msg::dds_::HandState_")
+    data = mt.encode(mt.cls())
+    known = definition("rt/dex3/left/state", mt)
+    other = ros_types.STRING.definition("rt/text")
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for channel, payload in ((known, data), (other, ros_types.encode_string("a"))):
+            number = writer.add_channel(channel)
+            for stamp in (T0, 2**63 - 1, 2**64 - 1):
+                writer.put(number, payload, stamp, stamp)
+    code, output = dexkit(
+        "export", tmp_path / "a.mcap", "--to", *to.split(), "--out", tmp_path / "out"
+    )
+    assert (code, output.count("after the year 2262")) == (0, 2), output
+    assert dexkit("import", tmp_path / "out", tmp_path / "back.mcap")[0] == 0
+    times = [m.log_time_ns for m in open_trace(tmp_path / "back.mcap").messages()]
+    assert times == [T0] * 2 + [2**63 - 1] * 4
 
 
 @each("robot", ROBOTS.values(), ids=list(ROBOTS))

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from dexkit.traces import schemas
 
 __all__ = [
+    "LATEST_NS",
+    "LATE_TIMES",
     "MAX_CHUNK",
     "ChannelInfo",
     "Definition",
@@ -41,9 +43,14 @@ __all__ = [
     "TraceEndpoint",
     "TraceMessage",
     "open_trace",
+    "signed_times",
 ]
 
 Times = NDArray[np.int64]
+LATEST_NS = 2**63 - 1
+"""Last time as a signed number, in the year 2262; those of a recording are unsigned."""
+LATE_TIMES = "times after the year 2262, which become the last one that fits"
+"""What an export says of later ones."""
 
 # Let glibc keep freed memory for the next chunk, up to this size. Returning it to the system page
 # by page costs as much time as all the rest of reading.
@@ -598,9 +605,12 @@ def _columns(info: ChannelInfo, sinks: list[_Sink]) -> SampleArray:
 
 
 def _times(pieces: list[NDArray[np.uint64]]) -> Times:
-    # times are unsigned in the file; beyond the year 2262 they are not times
-    times = np.concatenate([np.empty(0, np.uint64), *pieces])
-    return np.asarray(np.minimum(times, np.uint64(2**63 - 1)), dtype=np.int64)
+    return signed_times(np.concatenate([np.empty(0, np.uint64), *pieces]))
+
+
+def signed_times(times: NDArray[np.uint64]) -> Times:
+    """Times of a recording, ns, as signed numbers: at most :data:`LATEST_NS`."""
+    return np.asarray(np.minimum(times, np.uint64(LATEST_NS)), dtype=np.int64)
 
 
 def _shorten(text: str) -> str:

@@ -22,7 +22,7 @@ from dexkit.messages.layout import STRUCTS
 from dexkit.staging import whole_folder
 from dexkit.traces import schemas
 from dexkit.traces.names import dds_topic, dds_type
-from dexkit.traces.reader import Definition, Trace
+from dexkit.traces.reader import LATE_TIMES, LATEST_NS, Definition, Trace
 from dexkit.traces.sessions import old_layouts
 from dexkit.traces.sessions.bag_checks import Unpacker, checked_bag
 from dexkit.traces.sessions.imported import RECORD
@@ -270,10 +270,14 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
                 connections[key] = writer.add_connection(
                     f"/{key[0].removeprefix('rt/')}", ros_name, msgdef=text, rihs01=digest
                 )
+            late = dict[str, None]()
             for m in trace.messages():
                 connection = connections.get((m.topic, m.type_name))
                 if connection is not None:
-                    writer.write(connection, m.log_time_ns, m.data)
+                    if m.log_time_ns >= LATEST_NS:
+                        late[f"{m.topic}: {LATE_TIMES}"] = None
+                    writer.write(connection, min(m.log_time_ns, LATEST_NS), m.data)
+            lost += late
             for name, values in trace.metadata.items():
                 writer.set_custom_data(f"{_METADATA}{name}", json.dumps(values))
             writer.set_custom_data(_LOSSES, json.dumps(lost))

@@ -23,11 +23,19 @@ from numpy.typing import NDArray
 
 from dexkit.documents import open_ordinary, read_bytes
 from dexkit.errors import DexkitError, ExtraMissing, SessionError, UsageError
+from dexkit.escaping import one_line
 from dexkit.messages import MessageType, message_type
 from dexkit.messages.columns import encode_columns
 from dexkit.messages.layout import Primitive, Struct
 from dexkit.staging import whole_folder
-from dexkit.traces.reader import ChannelInfo, Definition, Trace
+from dexkit.traces.reader import (
+    LATE_TIMES,
+    LATEST_NS,
+    ChannelInfo,
+    Definition,
+    Trace,
+    signed_times,
+)
 from dexkit.traces.sessions.lerobot_format import parquet_library, parquet_pieces
 from dexkit.traces.sessions.model import Problems
 from dexkit.traces.sessions.paths import below, file_name
@@ -140,11 +148,10 @@ def _export_topic(
     if info.problem or samples.type_name != info.type_name:
         found = [m for m in trace.messages([info.topic]) if m.type_name == info.type_name]
         entry["columns"] = _PAYLOAD
-        columns = [
-            _Column(np.array([m.log_time_ns for m in found], dtype=np.int64)),
-            _Column(np.array([m.publish_time_ns for m in found], dtype=np.int64)),
-        ]
+        times = ([m.log_time_ns for m in found], [m.publish_time_ns for m in found])
+        columns = [_Column(signed_times(np.array(t, dtype=np.uint64))) for t in times]
         names.append(_PAYLOAD)
+        _note_late_times(info.topic, columns, lost)
         _write(path, form, names, columns, [m.data for m in found])
         return
     decoded = samples.columns()
@@ -162,6 +169,7 @@ def _export_topic(
         )
     entry["columns"] = "members"
     columns = [_Column(samples.log_time_ns[good]), _Column(samples.publish_time_ns[good])]
+    _note_late_times(info.topic, columns, lost)
     for s in sequences:
         names.append(f"len({s})")
         columns.append(_Column(counts[s].astype(np.int32)))
@@ -175,6 +183,11 @@ def _export_topic(
         names.append(leaf.path)
         columns.append(_Column(values.astype(leaf.dtype), there))
     _write(path, form, names, columns)
+
+
+def _note_late_times(topic: str, times: Sequence[_Column], lost: list[str]) -> None:
+    if any((c.values == LATEST_NS).any() for c in times):
+        lost.append(f"{topic}: {LATE_TIMES}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -480,11 +493,31 @@ def _lines(text: io.TextIOBase, path: Path) -> Iterator[str]:
         yield line
 
 
+def _is_plain(kind: Any) -> bool:
+    """Whether a type of Arrow has values that are numbers, texts, bytes or none."""
+    arrow, _ = parquet_library()
+    types = arrow.types
+    if types.is_dictionary(kind):
+        kind = kind.value_type
+    plain = (
+        *(types.is_integer, types.is_floating, types.is_boolean, types.is_null),
+        *(types.is_decimal, types.is_string, types.is_large_string),
+        *(types.is_binary, types.is_large_binary, types.is_fixed_size_binary),
+    )
+    return any(is_a(kind) for is_a in plain)
+
+
 def _parquet_pieces(path: Path) -> Iterator[_Piece]:
     line = 2
     for table in parquet_pieces(path):
         if table.num_columns > _MOST_COLUMNS:
             raise SessionError(f"{path} has more than {_MOST_COLUMNS} columns")
+        for field in table.schema:
+            if not _is_plain(field.type):
+                raise SessionError(
+                    f"{path}: column {one_line(field.name, 60)} has values of type "
+                    f"{one_line(field.type, 60)}, not numbers, texts or bytes"
+                )
         try:
             header, columns = list(table.column_names), [c.to_pylist() for c in table.columns]
         except UnicodeDecodeError as error:
