@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -157,3 +159,40 @@ def test_tables_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     assert written == 7
     assert "row 5" in " ".join(problems.sentences())
+
+
+_READ_DAMAGED = """
+import io, sys
+from pathlib import Path
+import pyarrow as pa, pyarrow.parquet as pq
+from dexkit.errors import SessionError
+from dexkit.traces.sessions.lerobot_format import parquet_pieces
+
+columns = {"number": [0.5, None], "text": ["a", "a"], "list": [[1.0], [2.0]]}
+out, path, refused = io.BytesIO(), Path(sys.argv[1]), 0
+pq.write_table(pa.table(columns), out)
+whole = out.getvalue()
+footer = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
+for at in range(footer, len(whole)):
+    for bit in (1, 2, 16):
+        data = bytearray(whole)
+        data[at] ^= bit
+        path.write_bytes(data)
+        try:
+            list(parquet_pieces(path))
+        except SessionError:
+            refused += 1
+print(refused)
+"""
+
+
+def test_no_bit_of_a_footer_ends_the_process(tmp_path: Path) -> None:
+    # in a process of its own: the library ends it where it is asked about some columns
+    done = subprocess.run(
+        [sys.executable, "-c", _READ_DAMAGED, tmp_path / "x.parquet"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert int(done.stdout) > 100

@@ -94,6 +94,10 @@ def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -
                     raise too_large
                 yield file.schema_arrow.empty_table().select(names)
                 for group in range(file.metadata.num_row_groups):
+                    # the library ends the process when it is asked about a column that it cannot
+                    # read, and raises an error when it reads it
+                    if next(file.iter_batches(1, [group]), None) is None:
+                        continue
                     for batch in file.iter_batches(
                         _rows_at_once(file.metadata.row_group(group)),
                         [group],
