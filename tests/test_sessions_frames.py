@@ -22,7 +22,7 @@ from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.frames import open_source, sample
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.lerobot_out import statistics
-from dexkit.traces.sessions.model import picture_topic
+from dexkit.traces.sessions.model import REST_TOPIC, picture_topic
 from dexkit.traces.sessions.streams import COMMAND, STATE
 from dexkit.traces.writer import RecordingWriter, definition
 from tests.each import each
@@ -445,3 +445,25 @@ def test_export_leaves_gaps_of_touch_out_and_reports_short_lists(tmp_path: Path)
     assert "it is written as 2 episodes" in output
     _, table = read(tmp_path / "d")
     assert np.isfinite(vectors(table, "observation.pressure")).all()
+
+
+@each("topic", [picture_topic("color_0"), REST_TOPIC, ""], ids=["picture", "rest", "all"])
+def test_times_after_2262_end_no_export(tmp_path: Path, topic: str) -> None:
+    found = document(frames=20)
+    found["data"][-1]["extra"] = 1  # kept beside joints and pictures
+    source = episode(tmp_path / "e", whole(found), 1, 20)
+    assert dexkit("import", source, tmp_path / "a.mcap", "--embed-pictures")[0] == 0
+    trace = open_trace(tmp_path / "a.mcap")
+    assert {topic} <= {*trace.topics, ""}
+    with RecordingWriter(tmp_path / "b.mcap") as writer:
+        numbers = {key: writer.add_channel(d) for key, d in trace.definitions.items()}
+        for m in trace.messages():
+            late = topic in ("", m.topic) and m.log_time_ns == trace.last_ns
+            stamp = 2**64 - 1 if late else m.log_time_ns
+            writer.put(numbers[m.topic, m.type_name], m.data, stamp, stamp)
+        writer.add_metadata(RECORD, trace.metadata[RECORD])
+    for form in ("lerobot", "episodes"):
+        for more in ([], ["--fps", 30]):
+            out = tmp_path / f"{form}{len(more)}"
+            code, output = dexkit("export", tmp_path / "b.mcap", "--to", form, "--out", out, *more)
+            assert code in (0, 1, 2), output

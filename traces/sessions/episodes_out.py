@@ -19,7 +19,7 @@ from dexkit import __version__
 from dexkit.errors import DexkitError, SessionError, WireError
 from dexkit.hand import Floats
 from dexkit.staging import whole_folder
-from dexkit.traces.reader import Trace
+from dexkit.traces.reader import LATEST_NS, Trace
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.episodes import DATA
 from dexkit.traces.sessions.frames import RULE, Source, open_source, sample
@@ -259,7 +259,7 @@ def _rest(trace: Trace) -> dict[int, dict[str, Any]]:
             text = ros_types.decode_string(m.data)
         except WireError as error:
             raise SessionError(f"{origin}: {error}") from error
-        found[m.log_time_ns] = parse_record(text, dict[str, Any], origin)
+        found[min(m.log_time_ns, LATEST_NS)] = parse_record(text, dict[str, Any], origin)
     return found
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dexkit.errors import SessionError, WireError
 from dexkit.hand import Floats
 from dexkit.traces.names import SESSION
-from dexkit.traces.reader import Trace, TraceMessage
+from dexkit.traces.reader import Trace, TraceMessage, signed_times
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.imported import RECORD, ImportRecord, import_record
 from dexkit.traces.sessions.model import REST_TOPIC
@@ -42,6 +42,8 @@ RULE = (
     "which is ten usual periods, at least 0.1 s"
 )
 _LEAST = 2  # frames of a run
+_MOST = 10_000_000
+"""Frames of a recording, those in gaps included: 92 hours at 30 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +230,7 @@ def _session_folder(trace: Trace, imported: ImportRecord, folder: Path) -> Path:
 
 
 def _times(messages: Sequence[TraceMessage]) -> NDArray[np.int64]:
-    return np.array([m.log_time_ns for m in messages], dtype=np.int64)
+    return signed_times(np.array([m.log_time_ns for m in messages], dtype=np.uint64))
 
 
 def _embedded(messages: Sequence[TraceMessage]) -> Callable[[int], bytes | None]:
@@ -270,7 +272,12 @@ def sample(source: Source, fps: float) -> tuple[list[Frames], list[str]]:
     if end <= begin:
         raise SessionError(f"{name}: its streams have no time in common")
     count = int((end - begin) * fps / 1e9 + 1e-6) + 1
-    grid = np.array([begin + round(k * 1e9 / fps) for k in range(count)], dtype=np.int64)
+    if count > _MOST:
+        raise SessionError(
+            f"{name}: {(end - begin) / 1e9:.0f} s at {fps:g} Hz are more than {_MOST} frames",
+            hint="is a time in it wrong? 'dexkit info' shows them, 'dexkit cut' writes a part",
+        )
+    grid = begin + np.rint(np.arange(count) * 1e9 / fps).astype(np.int64)
     good = np.ones(count, dtype=np.bool_)
     values: dict[tuple[str, str, str], Floats] = {}
     pressure: dict[str, Floats] = {}
