@@ -26,12 +26,17 @@ from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, Motor
 from dexkit.messages.unitree_hg import HandCmd_, HandState_
 from dexkit.messages.unitree_hg import MotorCmd_ as HgCmd
 from dexkit.messages.unitree_hg import MotorState_ as HgState
-from dexkit.models import DEX3_1, dialect
+from dexkit.models import DEX3_1, ModeByte, dialect
 from dexkit.models import model as model_by_name
 from dexkit.teleop.client import JointCommand
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.replay import prepare as preparation
-from dexkit.traces.replay.commands import RecordedCommands, read_session, read_trace
+from dexkit.traces.replay.commands import (
+    HandCommands,
+    RecordedCommands,
+    read_session,
+    read_trace,
+)
 from dexkit.traces.replay.machine import HOLD, End, Guards, Phase, ReplayMachine
 from dexkit.traces.replay.prepare import (
     Finding,
@@ -132,33 +137,65 @@ def test_genuine_sessions_are_found_fit_to_be_played() -> None:
         assert found.plan.sides == (LEFT, RIGHT)
 
 
-def test_session_without_gains_is_refused_and_played_with_the_models_gains(tmp_path: Path) -> None:
+def test_a_session_without_force_is_refused_and_never_given_any(tmp_path: Path) -> None:
     """No motion (unitree_lerobot 79): without gains, or with motors locked by their mode."""
-    (tmp_path / "a").mkdir()
-    limp = session(tmp_path / "a", gripper(slow_wave(), kp=0.0))
-    found = prepare(limp)
-    assert levels(found) == {"zero-gains": "refused"}
-    assert "no motion" in found.findings[0].text
-    assert found.cures == ["--gains model"]
-    assert found.plan is not None
-    moved = rehearse(found.plan).figures()[LEFT]
-    assert moved[0].commanded > 2
-    assert moved[0].moved < 0.1
-    cured = prepare(limp, ReplayOptions(gains="model"))
-    assert levels(cured) == {"zero-gains": "cured"}
-    assert cured.plan is not None
-    assert rehearse(cured.plan).figures()[LEFT][0].moved > 2
+    waves = hand_waves("dex3-1", LEFT, 300, 0.0)
+    for name, rows in (
+        ("zero-gains", gripper(slow_wave(), kp=0.0)),
+        ("locked", fingers(waves, mode=0)),
+    ):
+        (tmp_path / name).mkdir()
+        idle = session(tmp_path / name, rows)
+        found = prepare(idle)
+        assert levels(found) == {name: "refused"}
+        assert "no motion" in found.findings[0].text
+        assert found.cures == []
+        assert found.findings[0].advice.startswith(f"--accept {name}")
+        for options in (ReplayOptions(accept=[name]), ReplayOptions(gains="model")):
+            plan = prepare(idle, options).plan
+            assert plan is not None
+            assert not plan.tracks[LEFT].follows.any()
+            assert max(f.moved for f in rehearse(plan).figures()[LEFT]) < 0.1
 
-    locked = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 300, 0.0), mode=0))
-    found = prepare(locked)
-    assert levels(found) == {"locked": "refused"}
-    assert found.plan is not None
-    assert not found.plan.tracks[LEFT].driven.any()
-    assert max(f.moved for f in rehearse(found.plan).figures()[LEFT]) < 0.1
-    cured = prepare(locked, ReplayOptions(gains="model"))
-    assert cured.plan is not None
-    assert cured.plan.tracks[LEFT].driven.all()
-    assert max(f.moved for f in rehearse(cured.plan).figures()[LEFT]) > 0.5
+
+def test_a_hand_that_moved_without_force_commanded_is_played_by_its_states(tmp_path: Path) -> None:
+    kind = message_type(STATE_TYPE)
+    q = slow_wave()
+    states = [
+        (STATE, T0 + i * 5_000_000, 0, kind.encode(MotorStates_([MotorState_(q=float(x))])))
+        for i, x in enumerate(q)
+    ]
+    taught = session(tmp_path, sorted(gripper(q, kp=0.0) + states, key=lambda row: row[1]))
+    found = prepare(taught)
+    assert levels(found) == {"zero-gains": "refused"}
+    assert found.cures == ["--play states"]
+    played = prepare(taught, ReplayOptions(states=True))
+    assert not played.refused
+    assert played.plan is not None
+    assert played.plan.tracks[LEFT].q[:, 0] == pytest.approx(q, abs=1e-6)
+
+
+def test_a_stop_at_the_end_is_played_as_a_stop(tmp_path: Path) -> None:
+    """Clients end with kp = kd = 0 and q = 0: nothing may drive the hand there."""
+    end = T0 + 400 * 5_000_000
+    stop = [(topic, end + i * 5_000_000, end + i * 5_000_000, data)
+            for i, (topic, _, _, data) in enumerate(gripper([0.0] * 5, kp=0.0))]  # fmt: skip
+    stopped = session(tmp_path, gripper(slow_wave()) + stop)
+    found = prepare(stopped)
+    assert levels(found) == {"stop": "note"}
+    for options in (
+        ReplayOptions(),
+        ReplayOptions(gains="model", jumps="stretch", limit="clamp", invalid="drop"),
+        ReplayOptions(resample=1000.0),
+        ReplayOptions(dialect="unitree_hg"),
+    ):
+        plan = prepare(stopped, options).plan
+        assert plan is not None
+        track = plan.tracks[LEFT]
+        scale = plan.dialect.q_open / 5.4
+        assert track.q.min() >= slow_wave().min() * scale - 1e-6, options
+        assert track.kp[-1] == 0
+        assert track.q[-1, 0] == pytest.approx(slow_wave()[-1] * scale, abs=1e-6)
 
 
 def test_session_with_high_gains_and_thin_rate_is_refused_and_corrected(tmp_path: Path) -> None:
@@ -427,6 +464,117 @@ def test_corrected_plan_stays_within_the_limits_of_the_hand(
 def _recorded(t: np.ndarray, q: np.ndarray) -> RecordedCommands:
     commands = preparation._from_states(t, q, model_by_name("dex1-1"))
     return RecordedCommands("test", "recording", GO, {LEFT: commands}, {})
+
+
+# -- what the cures do
+
+SHORT = {"dex1-1": GO, "dex3-1": DEX3}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--gains model": {"gains": "model"},
+    "--jumps stretch": {"jumps": "stretch"},
+    "--limit clamp": {"limit": "clamp"},
+    "--invalid drop": {"invalid": "drop"},
+    "--play states": {"states": True},
+    "--swap-sides": {"swap_sides": True},
+    **{f"--resample {hz}": {"resample": float(hz)} for hz in (100, 200)},
+}
+"""What an option that a finding prints stands for."""
+KINDS = ("drive", "limp", "locked", "loud", "weak", "damped")
+
+
+def recorded_phases(
+    name: str, phases: list[tuple[str, int, float]], cut: tuple[int, int], period: float
+) -> tuple[RecordedCommands, np.ndarray]:
+    """A session whose first joint is commanded in phases, cut; and where its joints were.
+
+    The hand that was recorded follows at once what has force, and stays otherwise.
+    """
+    hand, spoken = model_by_name(name), SHORT[name]
+    pose = np.array(hand.rest_q[LEFT])
+    joint = hand.joints[LEFT][-1]
+    kinds = np.array([k for k, n, _ in phases for _ in range(n)])
+    q = np.tile(pose, (len(kinds), 1))
+    goals = np.concatenate([np.full(n, goal) for _, n, goal in phases])
+    q[:, -1] = joint.q_min + joint.stroke * goals
+    table = preparation._from_states(np.arange(len(q)) * period, q, hand)
+    kp, kd, driven = np.array(table.kp), np.array(table.kd), np.array(table.driven)
+    kp[np.isin(kinds, ["limp", "damped"]), -1] = 0.0
+    kd[kinds == "limp", -1] = 0.0
+    kp[kinds == "loud", -1] *= 10
+    kp[kinds == "weak", -1] *= 0.01
+    driven[kinds == "locked", -1] = spoken.mode_byte is ModeByte.UNUSED
+    states = np.array(q)
+    follows = driven & (kp > 0)
+    for i in range(len(q)):
+        states[i] = np.where(follows[i], q[i], states[i - 1] if i else pose)
+    tables = {**vars(table), "kp": kp, "kd": kd, "driven": driven}
+    kept = slice(*cut)
+    commands = {LEFT: HandCommands(**{n: t[kept] for n, t in tables.items()})}
+    seen = {LEFT: (table.t[kept], states[kept])}
+    return RecordedCommands("test", "recording", spoken, commands, seen), states[kept]
+
+
+@given(
+    name=st.sampled_from(sorted(SHORT)),
+    phases=st.lists(
+        st.tuples(st.sampled_from(KINDS), st.integers(1, 25), st.floats(0.0, 1.0)),
+        min_size=1,
+        max_size=6,
+    ),
+    cut=st.tuples(st.integers(0, 40), st.integers(1, 100)),
+    period=st.sampled_from([0.005, 0.01, 0.05]),
+)
+@settings(max_examples=60, deadline=None)
+def test_no_cure_makes_a_hand_do_what_the_recorded_one_did_not(
+    name: str, phases: list[tuple[str, int, float]], cut: tuple[int, int], period: float
+) -> None:
+    total = sum(n for _, n, _ in phases)
+    begin = min(cut[0], total - 1)
+    session, states = recorded_phases(name, phases, (begin, begin + cut[1]), period)
+    (commands,) = session.commands.values()
+    chosen: dict[str, Any] = {}
+    found = prepare(session)
+    while found.refused and found.cures:
+        for option in found.cures:
+            chosen |= OPTIONS[option]
+        found = prepare(session, ReplayOptions(**chosen))
+        assert len(chosen) <= len(OPTIONS)
+    if found.refused:  # nothing cures it: what it is accepted with moves nothing either
+        found = prepare(session, ReplayOptions(**chosen, accept=[f.name for f in found.refused]))
+        assert not found.refused
+    assert found.plan is not None
+    limits = preparation.joint_limits(found.plan.dialect, LEFT)
+    low, high = states.min(axis=0) - 1e-6, states.max(axis=0) + 1e-6
+    jumped = np.abs(np.diff(commands.q, axis=0)).max(axis=0, initial=0.0)
+    machine = ReplayMachine(found.plan, Guards(ramp_speed=5.0))
+    now, q = 100.0, states[0] + 0.0
+    soft = np.maximum(0.05 * limits.stroke, 5.0 * HOLD) + 1e-6
+    sent_kp = np.zeros(len(q))
+    follows = np.zeros(len(q), dtype=bool)
+    while machine.phase is not Phase.END:
+        now = machine.wakes_at(now)
+        machine.receive(now, LEFT, DecodedHand(tuple(q.tolist()), (0.0,) * len(q)))
+        phase = machine.phase
+        for motors in machine.step(now).values():
+            for j, c in enumerate(motors):
+                drives = machine._drives(c, j)
+                if not drives:
+                    continue
+                assert low[j] <= c.q <= high[j], (phase, j, c.q)
+                step = abs(c.q - q[j])
+                if not follows[j]:  # from where the hand is, however it came there
+                    assert step <= soft[j], (phase, j, step)
+                assert step <= max(jumped[j] + 1e-6, soft[j]), (phase, j, step)
+                # at the end it holds what had force, where it is
+                if not chosen.get("states") and phase is not Phase.LEAVE:
+                    assert c.kp <= commands.kp[:, j].max() + 1e-9
+                    assert (commands.driven & (commands.kp > 0))[:, j].any()
+            follows = np.array([machine._drives(c, j) for j, c in enumerate(motors)])
+            q = np.where(follows, [c.q for c in motors], q)
+            sent_kp = np.array([c.kp for c in motors])
+    assert machine.end is End.DONE, machine.reason
+    if not chosen.get("states") and not commands.kp[-1].any():
+        assert not sent_kp.any()
 
 
 # -- the machine
@@ -748,7 +896,8 @@ def test_a_refused_session_is_rehearsed_nevertheless(tmp_path: Path) -> None:
     code, output = dexkit("replay", tmp_path / "session.mcap", "--rehearse", "--report", page)
     assert code == 1
     assert "refused: zero-gains" in output
-    assert "cured by: --gains model" in output
+    assert "--accept zero-gains" in output
+    assert "cured by" not in output
     assert "It is refused" in page.read_text()
 
 

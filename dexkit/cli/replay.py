@@ -104,7 +104,8 @@ _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bo
     type=click.Choice(["recorded", "model"]),
     default="recorded",
     show_default=True,
-    help="kp, kd and mode of the session, or those that the model's client sends.",
+    help="kp and kd of the session, or lowered to those that the model's client sends. Commands "
+    "without gains never get any.",
 )
 @click.option(
     "--resample",

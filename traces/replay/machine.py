@@ -11,9 +11,11 @@
 * RAMP leads from the pose that the hand has *now* to the next one of the session, at a stated
   speed.
 * PLAY sends the newest command that is due. Session time advances by at most :data:`HOLD` a cycle:
-after a delay of the caller the session continues where it was, and nothing is skipped.
+  after a delay of the caller the session continues where it was, and nothing is skipped. Where
+  force returns to a joint that had none (a hand let go, a locked motor), the hand is led to the
+  command from where it is now, as by RAMP.
 * LEAVE commands the hand to stay where it is, its motors locked where the dialect has a mode byte,
-  as the modelled teleoperation client does at its end.
+  as the modelled teleoperation client does at its end. Joints without force at the end get none.
 
 After a pause of the caller (:data:`~dexkit.command_age.PAUSE`) the machine starts over with WAIT:
 the hand may have moved, and is led from there back to the session. When it is stopped before that,
@@ -61,6 +63,10 @@ _REPEAT = 0.02
 """Seconds after which a command is sent again where none is due: far below any time-out."""
 _FAR = 0.25
 """Default of the largest distance from the command, as a part of the joint's stroke."""
+
+_NEAR = 0.05
+"""Distance from its command up to which a joint gets force without a ramp, as a part of the
+stroke."""
 
 Commands = Mapping[Side, Sequence[JointCommand]]
 Values = tuple[float, ...]
@@ -156,6 +162,7 @@ class ReplayMachine:
             )
             for s, limits in self._limits.items()
         }
+        self._near = {s: _NEAR * limits.stroke for s, limits in self._limits.items()}
         self._rows = {s: _Rows(plan, t) for s, t in plan.tracks.items()}
         self._times: dict[Side, list[float]] = {s: t.t.tolist() for s, t in plan.tracks.items()}
         self._next = dict.fromkeys(plan.sides, 0)
@@ -291,14 +298,16 @@ class ReplayMachine:
         # an accepted goal beyond a joint's range counts as the end of the range: a ramp takes no
         # longer than a stroke
         way = max(
-            abs(min(max(c.q, low), high) - q)
+            abs(min(max(c.q, low), high) - q) if self._drives(c, j) else 0.0
             for s, start in self._from.items()
-            for c, q, low, high in zip(
-                self._goal(s),
-                start,
-                self._limits[s].low.tolist(),
-                self._limits[s].high.tolist(),
-                strict=True,
+            for j, (c, q, low, high) in enumerate(
+                zip(
+                    self._goal(s),
+                    start,
+                    self._limits[s].low.tolist(),
+                    self._limits[s].high.tolist(),
+                    strict=True,
+                )
             )
         )
         self._ramp = way / self.guards.ramp_speed
@@ -326,13 +335,18 @@ class ReplayMachine:
     def _play(self, now: float, part: float) -> Commands:
         self.at += part
         found: dict[Side, Sequence[JointCommand]] = {}
+        far = False
         for side, times in self._times.items():
             k = self._next[side]
             while k < len(times) and times[k] <= self.at + 1e-9:
                 k += 1
+            far |= self._is_caught_far(side, k)
             if k > self._next[side] or now - self._sent[side][0] >= _REPEAT:
                 found[side] = self._rows[side][max(k - 1, 0)]
             self._next[side] = k
+        if far:
+            self._enter(Phase.WAIT)
+            return {}
         if all(self._next[s] == len(times) for s, times in self._times.items()):
             self.progress.passes += 1
             if self.guards.loop:
@@ -341,6 +355,20 @@ class ReplayMachine:
             else:
                 self.stop(End.DONE, "played to the end")
         return self._note(now, found)
+
+    def _is_caught_far(self, side: Side, k: int) -> bool:
+        """Whether the newest of ``k`` commands gives force to a joint that had none, far from it.
+
+        A ramp leads to a command; so the one before counts, and not what was sent.
+        """
+        if k <= self._next[side]:
+            return False
+        rows = self._rows[side]
+        caught = rows.follows[k - 1] & ~rows.follows[max(self._next[side] - 1, 0) : k - 1].all(
+            axis=0
+        )
+        away = np.abs(rows.q[k - 1] - np.array(self._seen[side][1].q))
+        return bool((caught & (away > self._near[side])).any())
 
     def _leave(self) -> Commands:
         if self._stale and any(s not in self._seen for s in self._sent):
@@ -358,7 +386,12 @@ class ReplayMachine:
         """Command to stay. The position of a silent hand is unknown: it is damped only."""
         known = side in self._seen and self.end is not End.SILENT
         pose = self._seen[side][1].q if known else tuple(c.q for c in self._sent[side][1])
-        found = self._client.final_command(pose)
+        found = tuple(
+            c if self._drives(sent, j) else sent._replace(q=c.q, dq=0.0, tau=0.0)
+            for j, (c, sent) in enumerate(
+                zip(self._client.final_command(pose), self._sent[side][1], strict=True)
+            )
+        )
         return found if known else tuple(c._replace(kp=0.0) for c in found)
 
     def _note(self, now: float, commands: Commands) -> Commands:
@@ -433,6 +466,7 @@ class _Rows:
     def __init__(self, plan: Plan, track: Track) -> None:
         n = track.q.shape[1]
         units = np.array(plan.dialect.torque_units or (1.0,) * n)
+        self.q, self.follows = track.q, track.follows
         self._tables = (track.q, track.dq, track.tau / units, track.kp, track.kd)
         self._driven = track.driven
         self._modes = [

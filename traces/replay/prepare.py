@@ -118,7 +118,7 @@ class ReplayOptions:
     :param sides: hands to drive; None for all that it commands.
     :param dialect: of the hands to be driven; None for that of the session.
     :param pace: 0.5 plays in twice the time.
-    :param gains: those of the session, or those of the model's client with its mode.
+    :param gains: those of the session, or none above those of the model's client.
     :param resample: commands a second, interpolated; None to send the recorded ones.
     :param limit: whether commands outside the limits are moved to them.
     :param jumps: whether time is stretched where joints would have to turn too fast.
@@ -199,6 +199,11 @@ class Track:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @property
+    def follows(self) -> Flags:
+        """Whether a command makes a motor with gains go to q, shape (n, joints)."""
+        return np.logical_and(self.driven, self.kp > 0)
 
     @property
     def period(self) -> float:
@@ -423,11 +428,16 @@ class _Preparation:
         return kept if len(kept) else None
 
     def _translated(self, given: HandCommands) -> Track:
-        """Convert to the radians of the dialect and the chosen pace."""
+        """Convert to the radians of the dialect and the chosen pace; leave out what does nothing.
+
+        A motor without kp, or locked, takes no notice of q: a stop often has 0 there. To
+        interpolate towards it, or to send it to a hand without gains, would move a joint that
+        stayed.
+        """
         scale = 1.0
         if self.spoken.name != self.recorded.name and self.spoken.is_gripper:
             scale = self.spoken.q_open / self.recorded.q_open
-        return Track(
+        track = Track(
             t=given.t / self.options.pace,
             q=given.q * scale,
             dq=given.dq * scale * self.options.pace,
@@ -435,6 +445,14 @@ class _Preparation:
             kp=given.kp,
             kd=given.kd,
             driven=given.driven,
+        )
+        if not self.recorded.gains_are_used:
+            return track
+        return replace(
+            track,
+            q=_held(track.q, track.follows),
+            dq=np.where(track.driven & (track.kd != 0), track.dq, 0.0),
+            tau=np.where(track.driven, track.tau, 0.0),
         )
 
     def _side(self, side: Side, track: Track) -> bool:
@@ -461,36 +479,23 @@ class _Preparation:
         return float(outside.any(axis=1).mean())
 
     def _gains(self, side: Side, track: Track) -> Track:
-        """Check kp, kd and mode; with ``--gains model`` replace them."""
+        """Check kp, kd and mode; with ``--gains model`` lower the gains to those of its client.
+
+        A command without force gets none, whatever the options: the recorded hand did not obey it.
+        """
         if not self.spoken.gains_are_used:
             return track
         limits = joint_limits(self.spoken, side)
         kp, kd = np.array(self.model.gains).T
-        cured = self.options.gains == "model"
+        lowered = self.options.gains == "model"
+        if lowered and not self.recorded.gains_are_used:  # the recorded hand obeyed without gains
+            track = replace(
+                track,
+                kp=np.broadcast_to(kp, track.q.shape),
+                kd=np.broadcast_to(kd, track.q.shape),
+            )
         moves = np.ptp(track.q, axis=0) > _MOVES * limits.stroke
-        option = "--gains model"
-        locked = ~track.driven
-        if locked.any():
-            self.judge(
-                "locked",
-                f"no motion: the mode byte locks {_joints(limits, locked)} in "
-                f"{locked.any(axis=1).mean():.0%} of the commands",
-                option,
-                cured=cured,
-                where=str(side),
-            )
-        pushed = (track.tau != 0) | ((track.dq != 0) & (track.kd > 0))
-        limp = track.driven & (track.kp <= 0) & ~pushed
-        if limp.any():
-            still = "" if moves.any() else ", though nothing is commanded to move"
-            self.judge(
-                "zero-gains",
-                f"no motion: kp is 0 for {_joints(limits, limp)} in "
-                f"{limp.any(axis=1).mean():.0%} of the commands{still}",
-                option,
-                cured=cured,
-                where=str(side),
-            )
+        self._idle(side, track, limits, moves)
         wrong = (track.kp > _HIGH_GAINS * kp) | (track.kd > _HIGH_GAINS * kd)
         wrong |= (track.kp < 0) | (track.kd < 0)
         high = track.driven & wrong
@@ -505,21 +510,69 @@ class _Preparation:
                 "high-gains",
                 f"loud motors: {' and '.join(ranges)} for {limits.names[j]}, where the model's "
                 f"client sends {kp[j]:g} and {kd[j]:g}",
-                option,
-                cured=cured,
+                "--gains model",
+                cured=lowered,
                 where=str(side),
             )
         if not moves.any():
             self.note("still", "its commands move no joint", str(side))
-        if not cured:
+        if not lowered:
             return track
-        shape = track.q.shape
-        return replace(
-            track,
-            kp=np.broadcast_to(kp, shape),
-            kd=np.broadcast_to(kd, shape),
-            driven=np.ones(shape, dtype=np.bool_),
-        )
+        return replace(track, kp=np.clip(track.kp, 0.0, kp), kd=np.clip(track.kd, 0.0, kd))
+
+    def _idle(self, side: Side, track: Track, limits: JointLimits, moves: Flags) -> None:
+        """Check for commands without force: a stop, a hand let go, or motion that never comes."""
+        locked = ~track.driven
+        pushed = (track.tau != 0) | ((track.dq != 0) & (track.kd > 0))
+        limp = track.driven & (track.kp <= 0) & ~pushed
+        idle_joints = ~track.follows.any(axis=0)
+        dead = idle_joints & (moves | idle_joints.all())
+        bare = not self.recorded.gains_are_used  # its hand went to q without gains
+        for name, idle, what in (
+            ("locked", locked, "the mode byte locks"),
+            ("zero-gains", limp, "kp is 0 for"),
+        ):
+            rows = idle & dead
+            if not rows.any():
+                continue
+            option = "--gains model" if bare else self._states_move(side)
+            self.judge(
+                name,
+                f"no motion: {what} {_joints(limits, rows)} in "
+                f"{rows.any(axis=1).mean():.0%} of the commands, and nothing else moves them",
+                option,
+                cured=False,
+                where=str(side),
+                advice="" if option else f"--accept {name} plays it, without that motion",
+            )
+        still = (locked | limp) & ~dead
+        forceless = (locked | limp).all(axis=1)
+        last = 0 if forceless.all() else int(np.argmin(forceless[::-1]))
+        if last:
+            self.note(
+                "stop",
+                f"its last {last} command{'s have' if last > 1 else ' has'} no force: it is played "
+                "as a stop",
+                str(side),
+            )
+        if (earlier := still[: len(track) - last]).any():
+            self.note(
+                "limp",
+                f"{_joints(limits, earlier)} without force in "
+                f"{earlier.any(axis=1).mean():.0%} of the commands; where force returns, the hand "
+                "is led slowly from where it is",
+                str(side),
+            )
+
+    def _states_move(self, side: Side) -> str:
+        """The option that plays what the recorded hand did, if it moved without such commands."""
+        if self.options.swap_sides:
+            side = Side.RIGHT if side is Side.LEFT else Side.LEFT
+        _, q = self.session.states.get(side, (None, np.zeros((0, 1))))
+        if not len(q):
+            return ""
+        way = np.ptp(q, axis=0) > _MOVES * joint_limits(self.recorded, side).stroke
+        return "--play states" if way.any() else ""
 
     def _limits(self, side: Side, track: Track) -> Track:
         """Check position, feed-forward velocity and torque."""
@@ -607,14 +660,16 @@ class _Preparation:
 
     def _jumps(self, side: Side, track: Track) -> bool:
         """Check whether a joint would have to turn faster than it can."""
-        if len(track) < 2:
-            return False
+        if len(track) < 2 or not self.spoken.gains_are_used:
+            return False  # a position servo goes to its goal at its own speed
         limits = joint_limits(self.spoken, side)
         window = max(_WINDOW, track.period)
         before = np.searchsorted(track.t, track.t - window, side="right") - 1
         before = np.clip(before, 0, np.maximum(np.arange(len(track)) - 1, 0))
         speed = np.abs(track.q - track.q[before]) / window
-        over = (speed > _FASTER * limits.dq) & track.driven
+        loose = np.cumsum(~track.follows, axis=0)
+        throughout = track.follows[before] & (loose == loose[before])
+        over = (speed > _FASTER * limits.dq) & throughout
         if not over.any():
             return False
         i, j = np.unravel_index(int(np.argmax(np.where(over, speed / limits.dq, 0))), over.shape)
@@ -657,7 +712,8 @@ class _Preparation:
         """Seconds that the hand needs from each command to the next, within its limits."""
         limits = joint_limits(self.spoken, side)
         q = np.clip(track.q, limits.low, limits.high)
-        return np.asarray((np.abs(np.diff(q, axis=0)) / limits.dq).max(axis=1))
+        follows = track.follows[1:] & track.follows[:-1]
+        return np.asarray((np.abs(np.diff(q, axis=0)) * follows / limits.dq).max(axis=1))
 
     def _rate(self, side: Side, track: Track) -> None:
         """Check that the command rate is not too low (a staircase)."""
@@ -666,9 +722,10 @@ class _Preparation:
             return
         rate, least = 1.0 / track.period, _THIN * self.model.command_rate
         steps = np.abs(np.diff(track.q, axis=0))
-        if rate >= least or not (steps > 0).any():
+        torque = steps * track.kp[1:] * track.driven[1:]
+        # a position servo makes its own way from goal to goal
+        if rate >= least or not (torque > 0).any():
             return
-        torque = steps * track.kp[1:]
         i, j = np.unravel_index(int(np.argmax(torque)), torque.shape)
         wished = self.options.resample or 0.0
         self.judge(
@@ -700,6 +757,17 @@ def _from_states(t: Floats, q: Floats, hand: HandModel) -> HandCommands:
         late=np.zeros(n),
         backwards=np.zeros(n, dtype=np.bool_),
     )
+
+
+def _held(q: Floats, follows: Flags) -> Floats:
+    """Goals with each one that a motor does not follow replaced by its last one, or its first.
+
+    A joint that never follows keeps what was sent.
+    """
+    index = np.arange(len(q))[:, None]
+    last = np.maximum.accumulate(np.where(follows, index, -1), axis=0)
+    first = np.where(follows.any(axis=0), np.argmax(follows, axis=0), index)
+    return np.asarray(np.take_along_axis(q, np.where(last < 0, first, last), axis=0))
 
 
 def _apart(t: Floats) -> Floats:
