@@ -120,6 +120,8 @@ class Backend:
     :param emulator: how its device is emulated, so that the conformance kit can start one; None
         where dexkit emulates none.
     :param usb_requirements: whether the USB requirements of the model apply to its device.
+    :param settings_file: gives the path of the user's file with the settings of single hands, which
+        the setting ``config`` replaces; None where there is none.
     """
 
     summary: str
@@ -132,6 +134,7 @@ class Backend:
     udev_rules: Lazy[Callable[[], str]] | None = None
     emulator: Emulator | None = None
     usb_requirements: bool = False
+    settings_file: Lazy[Callable[[], Path]] | None = None
 
     def create(self, options: BackendOptions) -> Hand:
         """Make the hand; nothing is opened yet.

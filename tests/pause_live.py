@@ -193,7 +193,9 @@ def _setup(name: str, domain: int, other: int) -> Iterator[tuple[Tool, _Hand, in
         elif name == "dex3-usb":
             hands = enter(Dex3Hands((SIDE,)))
             joints = hands.device(SIDE).mechanics.joints
-            tool = enter(_serve("serve", name, "--usb", hands.url, *patient, *options))
+            tool = enter(
+                _serve("serve", name, "--accept-guesses", "--usb", hands.url, *patient, *options)
+            )
             hand = _Hand(dialect("dex3"), lambda: np.array([joint.q for joint in joints]))
             yield tool, hand, domain
         elif name == "bridge":

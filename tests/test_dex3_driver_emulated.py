@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +18,14 @@ import pytest
 from dexkit.backoff import Backoff
 from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import parse_server
+from dexkit.drivers.dex3_usb.settings import format_places
 from dexkit.emulators.dex3_mcu import Dex3Hands, emulated_dex3
-from dexkit.errors import HandError, HandLost, HandNotFound, HandTimeout
+from dexkit.errors import HandError, HandLost, HandNotFound, HandRefused, HandTimeout
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import HandService
+from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP
 from tests.patience import PATIENCE
 from tests.service_helpers import FakeNode, deliver_until, wait_until
 
@@ -62,6 +66,30 @@ def drive(
             return state
         assert time.monotonic() < deadline, f"not within {timeout} s: {state}"
         time.sleep(0.001)
+
+
+def test_a_hand_that_was_never_brought_up_gets_no_command(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Bus map, signs, zeros and gears are guesses then: another joint would move, the other way."""
+    file = tmp_path / "dex3.json"
+    with emulated_dex3((Side.LEFT,), process=False) as emulated:
+        with pytest.raises(HandRefused, match=r"not been brought up.*zero of each") as e:
+            hand_at(emulated.url, config=file, **PATIENT).open()
+        assert "--accept-guesses" in str(e.value.hint)
+        with hand_at(emulated.url, config=file, guesses=True, **PATIENT) as hand:
+            key = hand.serial
+        assert "guessed: the place of each motor" in caplog.text
+        ones = ",".join(["1"] * 7)
+        known = {"motors": format_places(DEFAULT_BUS_MAP.motors), "signs": ones,
+                 "offsets": ",".join(["0"] * 7)}  # fmt: skip
+        file.write_text(json.dumps({key: {"settings": known}}))
+        with pytest.raises(HandRefused, match="does not say the gear of each joint"):
+            hand_at(emulated.url, config=file, **PATIENT).open()
+        ratios = ",".join(f"{j.gear_ratio:g}" for j in DEX3_1.joints[Side.LEFT])
+        file.write_text(json.dumps({key: {"settings": {**known, "ratios": ratios}}}))
+        with hand_at(emulated.url, config=file, **PATIENT) as hand:
+            assert hand.serial == key
 
 
 @pytest.mark.parametrize("process", [False, True], ids=["thread", "process"])

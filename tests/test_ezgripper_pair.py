@@ -267,8 +267,10 @@ def test_a_pair_that_is_not_calibrated_is_refused(tmp_path: Path) -> None:
             )
             assert refused.exit_code != 0
         settings = configured(tmp_path, gripper.path, config=tmp_path / "other.json")
+        before = [bytes(servo._table) for servo in gripper.servos]
         with pytest.raises(HandRefused, match="has not been calibrated"):
             EZGripper(gripper.path, Side.LEFT, settings).open()
+        assert [bytes(servo._table) for servo in gripper.servos] == before  # nothing was written
 
 
 @pytest.mark.soak

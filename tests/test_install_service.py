@@ -65,6 +65,34 @@ def test_one_unit_a_hand_is_written_and_a_dry_run_writes_nothing(tmp_path: Path)
     assert "--wait-for-interface" in left
 
 
+@each(
+    ("backend", "variable"),
+    [
+        ("dex3-usb", "DEXKIT_DEX3_CONFIG"),
+        ("ezgripper", "DEXKIT_EZGRIPPER_CONFIG"),
+        ("dex1-serial", "DEXKIT_DEX1_CONFIG"),
+    ],
+)
+def test_the_unit_names_the_settings_file(
+    backend: str, variable: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The service's user may have another one, or none: the hand would be served by guesses."""
+    words = (backend, "--side", "left", "--interface", "lo", "--user", "root", "--no-udev",
+             "--device", "/dev/ttyUSB0", "--dry-run")  # fmt: skip
+    monkeypatch.setenv(variable, str(tmp_path / "hands.json"))
+    said = _install(*words)
+    assert f"config={tmp_path / 'hands.json'}" in _command(said)
+    assert "is not there yet" in said
+    given = _command(_install(*words, "--set", "config=/etc/mine.json"))
+    assert [w for w in given if w.startswith("config=")] == ["config=/etc/mine.json"]
+    monkeypatch.delenv(variable)
+    monkeypatch.setenv("SUDO_USER", "nobody")
+    (config,) = [w for w in _command(_install(*words)) if w.startswith("config=")]
+    assert Path(config.removeprefix("config=")).parent == Path(
+        pwd.getpwnam("nobody").pw_dir, ".config", "dexkit"
+    )
+
+
 def test_packaged_units_equal_the_written_ones() -> None:
     for side in Side:
         device = systemd_units.device_link(side)

@@ -554,6 +554,9 @@ LEFT = ["--side", "left"]
         (["sim-dex1", *LEFT, "--baseline", "junk.json"], "not a self-test"),
         (["sim-dex1", *LEFT, "--baseline", "mine.json", "--json", "mine.json"], "an input"),
         (["sim-dex1", *LEFT, "--speed", "2"], "--speed"),
+        (["ezgripper", *LEFT, "--device", "/dev/ttyUSB0"], "whether the hand is free"),
+        (["--external", *LEFT, "--dialect", "unitree_go"], "whether the hand is free"),
+        (["sim-dex1", *LEFT, "--accept-guesses"], "guesses nothing"),
         (["sim-dex1", *LEFT, "--set", "wear=rust=1"], "not understood"),
     ],
 )

@@ -17,6 +17,7 @@ from dexkit.cli.options import (
     device_option,
     dry_run_option,
     one_side_option,
+    yes_option,
 )
 from dexkit.console import Console
 from dexkit.drivers.ezgripper import (
@@ -146,7 +147,7 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
     help="File to store in, instead of the user's.",
 )
 @dry_run_option("Only print the servo's state: nothing moves, nothing is written.")
-@click.option("--yes", is_flag=True, help="Do not ask whether the gripper is empty.")
+@yes_option("whether the gripper is empty")
 @click.option("--show", is_flag=True, help="Print the stored values, and stop.")
 @click.pass_context
 def command(

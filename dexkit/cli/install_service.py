@@ -9,12 +9,15 @@ import shlex
 import stat
 import subprocess
 import sys
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
+import platformdirs
 
-from dexkit.backends import backend
+from dexkit.backends import Backend, backend
 from dexkit.child_processes import code_line, command_line
 from dexkit.cli.options import (
     LocalPath,
@@ -101,6 +104,8 @@ def command(
             if not no_udev:
                 rules += serial_rule(side, Path(paths[side]))
             words += ["--device", paths[side] if no_udev else device_link(side)]
+        if (stored := _settings_file(kind, settings, side)) is not None:
+            words += ["--set", f"config={stored}"]
         for text in settings:
             if text.partition(".")[0] not in {str(other) for other in Side if other is not side}:
                 words += ["--set", text]
@@ -141,6 +146,27 @@ def command(
     click.echo(f"  sudo systemctl daemon-reload && sudo systemctl enable --now {services}")
     click.echo(f"see: systemctl status {services}; journalctl -u {unit_name(sides[0])}")
     return 0
+
+
+def _settings_file(kind: Backend, settings: Sequence[str], side: Side) -> Path | None:
+    """The file with the settings of single hands that the unit names; None if it is given.
+
+    The service may run as another user, whose own file is another one. Behind sudo it is the file
+    of the user who calls it: that is where a bring-up without sudo has written.
+    """
+    keys = {text.partition("=")[0] for text in settings}
+    if kind.settings_file is None or keys & {"config", f"{side}.config"}:
+        return None
+    path = Path.cwd() / kind.settings_file.load()()
+    caller = os.environ.get("SUDO_USER")
+    if caller and path.parent == platformdirs.user_config_path("dexkit"):
+        with suppress(KeyError):
+            path = Path(pwd.getpwnam(caller).pw_dir, ".config", "dexkit", path.name)
+    if not path.exists():
+        click.echo(
+            f"{path} is not there yet: bring-up or calibration of the hand writes it", err=True
+        )
+    return path
 
 
 def _user(name: str | None) -> pwd.struct_passwd:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,6 +38,7 @@ __all__ = [
     "force_option",
     "found_interface",
     "grade_option",
+    "guesses_option",
     "host_option",
     "html_option",
     "id_option",
@@ -79,6 +80,8 @@ __all__ = [
     "wait_for_interface_option",
     "wait_option",
     "wiring_option",
+    "with_guesses",
+    "yes_option",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -452,6 +455,37 @@ def usb_option(hands: str) -> Callable[[F], F]:
         metavar="URL",
         help=f"{hands} on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
     )
+
+
+def guesses_option() -> Callable[[F], F]:
+    """``--accept-guesses``; :func:`with_guesses` makes a setting of it."""
+    return click.option(
+        "--accept-guesses",
+        is_flag=True,
+        help="Command also a hand that was never brought up, on what dexkit guesses of it; short "
+        "for --set guesses=accept.",
+    )
+
+
+def with_guesses(settings: Sequence[str], known: Collection[str], accept: bool) -> tuple[str, ...]:
+    """The settings, with that of ``--accept-guesses``.
+
+    :param known: names of the backend's settings.
+    :raises UsageError: the backend guesses nothing.
+    """
+    if not accept:
+        return tuple(settings)
+    if "guesses" not in known:
+        raise UsageError("--accept-guesses: this backend guesses nothing about its hand")
+    return (*settings, "guesses=accept")
+
+
+def yes_option(question: str) -> Callable[[F], F]:
+    """``--yes``.
+
+    :param question: what is not asked then.
+    """
+    return click.option("--yes", is_flag=True, help=f"Do not ask {question}.")
 
 
 def devices_by_side(devices: Sequence[str], sides: Sequence[Side]) -> dict[Side, str]:

@@ -19,6 +19,7 @@ from dexkit.cli.options import (
     device_option,
     dialect_option,
     force_option,
+    guesses_option,
     html_option,
     json_file_option,
     one_side_option,
@@ -26,6 +27,8 @@ from dexkit.cli.options import (
     set_option,
     setting,
     wait_option,
+    with_guesses,
+    yes_option,
 )
 from dexkit.cli.status_line import StatusLine
 from dexkit.cli.stop_keys import Keys, is_enter, is_stop, keys
@@ -54,6 +57,7 @@ whose client asks for all of it, are tried at it."""
 @one_side_option("Hand to test.", required=True)
 @device_option("Path or serial number of the device.")
 @set_option("Setting of the backend; 'dexkit backends' lists them.")
+@guesses_option()
 @dialect_option("With --external: the dialect of the hand.")
 @click.option(
     "--joint",
@@ -91,14 +95,16 @@ whose client asks for all of it, are tried at it."""
 @dds_options()
 @wait_option("With --external: wait up to S seconds for the hand.")
 @force_option()
+@yes_option("whether the hand is free to move")
 @quiet_option()
 def command(backend_name: str | None, **given: Any) -> int:
     """Test one hand: its joints one by one, and its tactile elements.
 
     BACKEND is a name from 'dexkit backends' or package.module:Class; the hand is driven directly.
-    Every joint MOVES over its whole range, slowly at first: keep the hand free. Space, q or Ctrl-C
-    stops and leaves the hand at rest. If this program was suspended for more than a second, it asks
-    before it goes on; without a terminal it ends.
+    Every joint MOVES over its whole range, slowly at first: keep the hand free. It asks first,
+    except for a simulated hand; without a terminal it needs --yes. Space, q or Ctrl-C stops and
+    leaves the hand at rest. If this program was suspended for more than a second, it asks before it
+    goes on; without a terminal it ends.
 
     Writes a page and a JSON file. With --baseline it reports what has become worse since.
 
@@ -109,8 +115,8 @@ def command(backend_name: str | None, **given: Any) -> int:
         raise UsageError(
             "name one hand: a backend, or --external", hint="'dexkit backends' lists the backends"
         )
-    if given["external"] and (given["device"] or given["settings"]):
-        raise UsageError("--device and --set are for a backend, not for --external")
+    if given["external"] and (given["device"] or given["settings"] or given["accept_guesses"]):
+        raise UsageError("--device, --set, --accept-guesses are for a backend, not for --external")
     if backend_name is not None and given["dialect"]:
         raise UsageError("--dialect is for --external: a backend is driven without DDS")
     if given["external"] and given["dialect"] is None:
@@ -140,6 +146,7 @@ def command(backend_name: str | None, **given: Any) -> int:
         check_output_paths([json_path, page], [given["baseline"]])
         joints = _joints([joint.name for joint in spec.joints], given["joints"])
         touch = _touch(spec.model, given["touch"])
+        _ask(backend_name, given["yes"], spec.side)
         try:
             hand.open()
         except DdsError:
@@ -183,8 +190,10 @@ def _hand(
     if name is not None:
         from dexkit.backends import BackendOptions, backend
 
-        settings = dict(map(setting, given["settings"]))
-        return backend(name).create(BackendOptions(side, given["device"], settings)), None
+        kind = backend(name)
+        texts = with_guesses(given["settings"], kind.settings, given["accept_guesses"])
+        settings = dict(map(setting, texts))
+        return kind.create(BackendOptions(side, given["device"], settings)), None
     from dexkit.conformance.selftest.external import ExternalHand
     from dexkit.dds import DdsNode
 
@@ -201,6 +210,23 @@ def _hand(
 
     hand = ExternalHand(node, spoken, side, stop=stop.event, waiting=waiting, force=given["force"])
     return hand, spoken
+
+
+def _ask(name: str | None, yes: bool, side: Side) -> None:
+    """Ask whether the hand may move, unless it is simulated or ``--yes`` was given.
+
+    :raises UsageError: there is no terminal to ask at.
+    """
+    from dexkit.conformance.known_backends import SIMULATED
+
+    if yes or name in SIMULATED:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError("cannot ask whether the hand is free: no terminal", hint="give --yes")
+    if not click.confirm(
+        f"Every joint of the {side} hand will move over its whole range. Is it free to move?"
+    ):
+        raise click.Abort
 
 
 def _joints(names: list[str], chosen: tuple[str, ...]) -> list[int] | None:

@@ -20,6 +20,7 @@ from dexkit.cli.options import (
     devices_option,
     dialect_option,
     force_option,
+    guesses_option,
     quiet_option,
     real_time_option,
     set_option,
@@ -27,6 +28,7 @@ from dexkit.cli.options import (
     side_option,
     usb_option,
     view_option,
+    with_guesses,
 )
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
 from dexkit.errors import DexkitError, TopicConflict, UsageError
@@ -57,6 +59,7 @@ _LONELY = 10.0  # seconds without a client before a hint
     "lists the settings."
 )
 @usb_option("USB hands")
+@guesses_option()
 @dialect_option(
     "Topics, types and units.  [default: the model's first: "
     + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())
@@ -106,6 +109,7 @@ def command(
     devices: tuple[str, ...],
     settings: tuple[str, ...],
     usb: str | None,
+    accept_guesses: bool,
     dialect: str | None,
     domain: int | None,
     interface: str,
@@ -138,6 +142,7 @@ def command(
     status = StatusLine(quiet)
     log_to_stderr(quiet, status.on_terminal, "dexkit.service.counters")
     kind = backend(backend_name)
+    settings = with_guesses(settings, kind.settings, accept_guesses)
     by_side = devices_by_side(devices, sides)
     values = _settings(settings, sides)
     hands = [kind.create(BackendOptions(side, by_side.get(side), values[side])) for side in sides]

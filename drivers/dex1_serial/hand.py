@@ -363,5 +363,6 @@ backend = Backend(
     needs="--device PATH or USB serial number, if the port is not to be looked for",
     settings=SETTINGS,
     bringup=Lazy("dexkit.drivers.dex1_serial.bringup:bench"),
+    settings_file=Lazy("dexkit.drivers.dex1_serial.settings:default_path"),
     emulator=Emulator(("dex1-motor", "--side", "{side}"), linked=True, settings=SHARED_MACHINE),
 )

@@ -13,7 +13,13 @@ from dexkit.clock import Clock, RealClock
 from dexkit.command_age import WriteDeadline
 from dexkit.drivers.dex3_usb.discovery import Server, find_hand
 from dexkit.drivers.dex3_usb.link import LinkStatistics, UsbLink
-from dexkit.drivers.dex3_usb.settings import SETTINGS, Dex3Settings, from_options, with_stored
+from dexkit.drivers.dex3_usb.settings import (
+    MEASURED,
+    SETTINGS,
+    Dex3Settings,
+    from_options,
+    with_stored,
+)
 from dexkit.drivers.dex3_usb.stored import Store, record_key
 from dexkit.errors import HandError, HandLost, HandRefused, HandTimeout, UsageError, WireError
 from dexkit.hand import HandCommand, HandSpec, HandState, MotorError, Side
@@ -124,11 +130,26 @@ class Dex3Usb:
         )
 
     def _load_stored(self, serial: str) -> None:
-        """Apply the settings that the file holds for this hand."""
+        """Apply the settings that the file holds for this hand.
+
+        :raises HandRefused: nobody has found its wiring, and guesses are not accepted.
+        """
         if self.configuration.config is None:
             return
         store, key = Store(self.configuration.config), record_key(serial, self._spec.side)
         texts = store.section(key, "settings")
+        guessed = [what for name, what in MEASURED.items()
+                   if name not in texts and name not in self.configuration.given]  # fmt: skip
+        if guessed and not self.configuration.guesses:
+            raise HandRefused(
+                f"hand {key} has not been brought up: {store.path} does not say "
+                f"{', '.join(guessed)}",
+                hint=f"dexkit bringup dex3-usb --side {self._spec.side} finds them; "
+                "--set config=FILE names another file; --accept-guesses commands the hand on "
+                "dexkit's guesses",
+            )
+        if guessed:
+            log.warning("hand %s has not been brought up; guessed: %s", key, ", ".join(guessed))
         if not texts:
             return
         try:
@@ -161,7 +182,7 @@ class Dex3Usb:
 
         :raises HandNotFound: there is none, or more than one; the message lists what there is.
         :raises HandRefused: no permission, another program uses it, it is the other side's, or a
-            motor is not where the bus map says.
+            motor is not where the bus map says, or it was never brought up.
         :raises HandTimeout: it does not answer, or not with whole state frames.
         :raises HandLost: it goes away meanwhile.
         """
@@ -407,6 +428,8 @@ backend = Backend(
     settings=SETTINGS,
     bringup=Lazy("dexkit.drivers.dex3_usb.bringup:bench"),
     udev_rules=Lazy("dexkit.systemd_units:usb_rules"),
-    emulator=Emulator(("dex3-usb", "--port", "0"), linked=False),
+    # the emulated hand is wired as the guesses say
+    emulator=Emulator(("dex3-usb", "--port", "0"), linked=False, settings={"guesses": "accept"}),
     usb_requirements=True,
+    settings_file=Lazy("dexkit.drivers.dex3_usb.settings:default_path"),
 )

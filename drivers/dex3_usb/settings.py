@@ -28,6 +28,7 @@ from dexkit.wire.dex3_usb import (
 )
 
 __all__ = [
+    "MEASURED",
     "OF_THE_HAND",
     "SETTINGS",
     "Dex3Settings",
@@ -71,6 +72,7 @@ class Dex3Settings:
     :param config: file with settings of single hands, by serial number (docs/bringup.md); None to
         read none.
     :param given: names of settings that those in the file do not replace.
+    :param guesses: with a file, open also a hand for which it lacks :data:`MEASURED`.
     :param protect: enable the motors' time-out protection, which stops them 1 s after a command.
     :param timeout: seconds to wait for an answer.
     :param send_timeout: seconds that the hand may take to accept a command.
@@ -91,6 +93,7 @@ class Dex3Settings:
     poll_sensors: bool | None = None
     config: Path | None = None
     given: frozenset[str] = frozenset()
+    guesses: bool = False
     protect: bool = True
     timeout: float = 0.1
     send_timeout: float = 0.1
@@ -173,6 +176,12 @@ def _parse_switch(text: str) -> bool:
     if text not in ("on", "off"):
         raise ValueError("on or off")
     return text == "on"
+
+
+def _parse_guesses(text: str) -> bool:
+    if text not in ("accept", "refuse"):
+        raise ValueError("accept or refuse")
+    return text == "accept"
 
 
 def _parse_layout(text: str) -> CommandLayout:
@@ -266,6 +275,10 @@ _PARSERS: Parsers = {
         "on: command frames address the sensors, too; off; auto: if none answers otherwise "
         "(default auto)",
     ),
+    "guesses": (
+        _parse_guesses,
+        "accept: command also a hand whose wiring nobody has found; refuse (default refuse)",
+    ),
     "config": (Path, "file with settings of single hands (default the user's)"),
     "out_endpoint": (_parse_address, "address such as 0x02 (default the first bulk OUT)"),
     "in_endpoint": (_parse_address, "address such as 0x81 (default the first bulk IN)"),
@@ -280,6 +293,14 @@ OF_THE_HAND = (
     "poll_sensors",
 )
 """Settings of one hand that the settings file stores by serial number."""
+MEASURED = {
+    "motors": "the place of each motor",
+    "signs": "the direction of each joint",
+    "offsets": "the zero of each joint",
+    "ratios": "the gear of each joint",
+}
+"""Settings of one hand whose defaults are guesses, and what they say: no source gives them, and
+with a wrong one a command moves another joint, the other way, or too far."""
 SETTINGS: dict[str, str] = {"usb": _USB} | {
     name: meaning for name, (_, meaning) in _PARSERS.items()
 }

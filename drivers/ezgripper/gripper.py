@@ -213,10 +213,13 @@ class EZGripper:
         if self._units:
             return
         try:
-            self.connect()
             may_move = not self._moved_for
+            # no register is written to a servo that is refused
+            self._connect(log.info, lambda unit: self._known_zero(unit, may_move=may_move))
             for unit in self._units:
-                zero = self._zero(unit, may_move=may_move)
+                zero = self._known_zero(unit, may_move=may_move)
+                if zero is None:
+                    zero = self._find_zero(unit)
                 unit.control = Control(zero, self.configuration.control, stroke=unit.stroke)
             for unit in self._units:
                 unit.last = unit.servo.sample()
@@ -241,6 +244,13 @@ class EZGripper:
 
         For ``dexkit calibrate``. Returns the first servo. Raises as :meth:`open`.
         """
+        return self._connect(progress, lambda unit: None)
+
+    def _connect(self, progress: Callable[[str], None], check: Callable[[Unit], object]) -> Servo:
+        """:meth:`connect`.
+
+        :param check: called with each servo that was found, before any register is written.
+        """
         configuration = self.configuration
         device = find_device(self.device_name)
         self.device = device
@@ -259,6 +269,8 @@ class EZGripper:
             for number in configuration.servo_ids:
                 units.append(self._find_unit(bus, device, number, rate, progress))
                 rate = bus.baudrate
+            for unit in units:
+                check(unit)
             self._units, self._known = units, list(units)
             self._group = ServoGroup([unit.servo for unit in units], self._clock)
             timer = latency_timer(device.path)
@@ -323,10 +335,11 @@ class EZGripper:
         """The servos with key, record, stroke; while the gripper is connected."""
         return tuple(self._units)
 
-    def _zero(self, unit: Unit, *, may_move: bool) -> int:
-        """Zero of a servo: given, stored, or found by a motion at the first opening.
+    def _known_zero(self, unit: Unit, *, may_move: bool) -> int | None:
+        """Zero of a servo: given, stored, or found by an earlier motion; None to find it by one.
 
         :param may_move: no earlier opening has moved it; opening again after a lost link must not.
+        :raises HandRefused: it has none, and may not be moved.
         """
         configuration = self.configuration
         if configuration.zero is not None:
@@ -347,6 +360,11 @@ class EZGripper:
                 hint=f"empty it and run: dexkit calibrate ezgripper --device {self.device_name}"
                 f"{number} (or calibrate at every start with --set calibrate=yes)",
             )
+        return None
+
+    def _find_zero(self, unit: Unit) -> int:
+        """Zero of a servo, found by a motion."""
+        configuration = self.configuration
         self._moved_for.add(unit.key)
         zero = calibration.find_zero(unit.servo, stroke=unit.stroke, progress=log.info)
         self._found[unit.key] = zero
@@ -517,6 +535,7 @@ backend = Backend(
     "calibration file",
     settings={name: meaning for name, (_, meaning) in PARSERS.items()},
     bringup=Lazy("dexkit.drivers.ezgripper.bringup:bench"),
+    settings_file=Lazy("dexkit.drivers.ezgripper.calibration_file:default_path"),
     emulator=Emulator(
         ("mx64", "--closed-at", _EMULATED_ZERO),
         linked=True,

@@ -149,5 +149,8 @@ def _how_to(url: str, host: str, busids: list[str]) -> list[str]:
     tcp = "" if port == "3240" else f"--tcp-port {port} "
     lines = ["as a USB device of a Linux host (as root): modprobe vhci-hcd"]
     lines += [f"  usbip {tcp}attach -r {host} -b {busid}" for busid in busids]
-    lines += ["  lsusb -d 34b7:", f"without kernel support: dexkit serve dex3-usb --usb {url}"]
+    lines += [
+        "  lsusb -d 34b7:",
+        f"without kernel support: dexkit serve dex3-usb --accept-guesses --usb {url}",
+    ]
     return lines

@@ -196,7 +196,15 @@ class _Dex3:
     # --- the service
 
     def serve(self) -> str:
-        words = ("--side", "both", "--domain", str(DOMAIN), "--set", "usb=system")
+        words = (
+            "--side",
+            "both",
+            "--domain",
+            str(DOMAIN),
+            "--set",
+            "usb=system",
+            "--accept-guesses",
+        )
         self.service = Serve("dex3-usb", *words)
         self.node = DdsNode(domain=DOMAIN, interface="lo")
         for side in Side:
