@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from dexkit.cli import cli
 from dexkit.cli.replay import command
 from dexkit.command_age import PAUSE, SETTLE
+from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.hand import MotorError, Side
@@ -26,7 +27,7 @@ from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, Motor
 from dexkit.messages.unitree_hg import HandCmd_, HandState_
 from dexkit.messages.unitree_hg import MotorCmd_ as HgCmd
 from dexkit.messages.unitree_hg import MotorState_ as HgState
-from dexkit.models import DEX3_1, ModeByte, dialect
+from dexkit.models import DEX3_1, MODELS, ModeByte, dialect
 from dexkit.models import model as model_by_name
 from dexkit.teleop.client import JointCommand
 from dexkit.traces import open_trace, sample_path
@@ -254,6 +255,50 @@ def test_positions_outside_the_limits_are_refused_or_clamped(tmp_path: Path) -> 
     assert plan is not None
     q = plan.tracks[LEFT].q
     assert (q.min(), q.max()) == (0.0, 5.4)
+
+
+def test_postures_of_real_hands_beyond_the_limits_are_played(tmp_path: Path) -> None:
+    """Real Dex3-1 rest up to 0.085 rad beyond them (docs/sources/real-hands.md)."""
+    beyond = np.array([0.0, 0.5, -0.085, -1.647, -1.827, -1.647, -1.827])
+    poses = np.linspace(beyond, hand_waves("dex3-1", LEFT, 1, 0.0)[0], 200)
+    kind = message_type(HAND_STATE)
+    rows = [
+        (DEX3_STATE, T0 + i * 10_000_000, 0, kind.encode(HandState_([HgState(q=x) for x in q])))
+        for i, q in enumerate(poses.tolist())
+    ]
+    commands = fingers(poses)
+    both = session(tmp_path, sorted(rows + commands, key=lambda row: row[1]))
+    for options in (ReplayOptions(), ReplayOptions(states=True)):
+        found = prepare(both, options)
+        assert not found.refused
+        assert found.plan is not None
+        limits = preparation.joint_limits(DEX3, LEFT)
+        q = found.plan.tracks[LEFT].q
+        assert ((limits.low <= q) & (q <= limits.high)).all()
+    far = prepare(session(tmp_path, fingers(poses - 0.2)))
+    assert "limits" in {f.name for f in far.refused}
+
+
+def test_the_margins_of_the_limits_are_those_of_the_kit() -> None:
+    """Judge, replay and doctor take one figure."""
+    found = set()
+    for hand in MODELS.values():
+        for requirement in catalogue(hand.name, None):
+            margin = requirement.tolerances.get("margin_rad")
+            if margin is not None and requirement.id.split("-")[1] in ("FIELD", "SAFE", "CLIENT"):
+                assert margin == hand.limit_margin, requirement.id
+                found.add(hand.name)
+    assert found == set(MODELS)
+
+
+def test_steps_of_position_servos_are_no_jumps(tmp_path: Path) -> None:
+    """FTP, DFX and Revo2 go to a goal at their own speed."""
+    for name in ("inspire-dfx", "inspire-ftp", "brainco-revo2"):
+        hand = model_by_name(name)
+        q = np.where(np.arange(60)[:, None] < 30, 0.1, 0.9) * np.ones(6)
+        commands = preparation._from_states(np.arange(60) / 30, q, hand)
+        servo = RecordedCommands("t", "recording", hand.dialects[0], {LEFT: commands}, {})
+        assert prepare(servo).findings == [], name
 
 
 def test_jumps_are_refused_or_given_time(tmp_path: Path) -> None:

@@ -108,6 +108,15 @@ def test_a_phase_is_cut_with_its_record(tmp_path: Path) -> None:
     assert (code, text) == (2, "run.mcap has no phase walk")
 
 
+def test_a_cut_beyond_the_recording_names_the_option_that_is(tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    for option, time in (("--from", 100), ("--to", -1000)):
+        code, text = dexkit("cut", PICK, out, option, time)
+        assert code == 2
+        assert text.startswith(f"{option} {time}: nothing is left, {PICK.name} is ")
+    assert dexkit("cut", PICK, out, "--from", 3, "--to", 3)[1] == "--to must be later than --from"
+
+
 def test_failed_cut_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     for arguments in (

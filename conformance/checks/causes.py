@@ -13,12 +13,16 @@ from dexkit.models import DIALECTS, Dialect
 __all__ = ["of_positions", "of_range", "of_scale", "of_type"]
 
 
-def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec]) -> str:
+def of_positions(
+    q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSpec], unit: str = "rad"
+) -> str:
     """Explain positions outside their range; empty if no cause is known.
 
     :param q: rad, shape (n, n_joints).
     :param other: the joints of the hand's other side.
+    :param unit: that q should have.
     """
+    right = "radians" if unit == "rad" else f"parts of the {unit}"
     q = q[np.isfinite(q).all(axis=1)]
     if not len(q):
         return ""
@@ -38,11 +42,11 @@ def of_positions(q: Floats, joints: Sequence[JointSpec], other: Sequence[JointSp
     if within([_mirrored(j) for j in joints]):
         return "The sign of q is wrong."
     if low.min() >= -1.0 and 20.0 < high.max() <= 101.0:
-        return "q appears to be in percent, not radians."
+        return f"q appears to be in percent, not {right}."
     widest = max(max(-j.q_min, j.q_max) for j in joints)
     if np.abs(q).max() > 3 * widest and within(joints, 180 / np.pi):
         also = "percent or " if low.min() >= -1.0 and high.max() <= 20.0 else ""
-        return f"q appears to be in {also}degrees, not radians."
+        return f"q appears to be in {also}degrees, not {right}."
     if np.abs(q).max() > 100.0:
         return "q appears to be in the device's counts, or to be the rotor's angle before the gear."
     return ""

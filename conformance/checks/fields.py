@@ -102,6 +102,7 @@ def in_stroke(ctx: Context) -> Outcome:
                         states.q[~excused],
                         ctx.joints,
                         joints_of(ctx.recording.dialect, ctx.other),
+                        ctx.unit,
                     )
                 )
             )

@@ -100,6 +100,16 @@ def _spans(
     first, last = trace.first_ns, trace.last_ns + 1
     low = first if begin is None else _instant(trace, begin)
     high = last if end is None else _instant(trace, end)
+    for option, seconds, outside in (
+        ("--from", begin, low >= last),
+        ("--to", end, high <= first),
+    ):
+        if seconds is not None and outside:
+            raise UsageError(
+                f"{option} {seconds:g}: nothing is left, {trace.path.name} is "
+                f"{trace.duration:g} s long",
+                hint="times count from the first message, negative ones from the last",
+            )
     if high <= low:
         raise UsageError("--to must be later than --from")
     spans = [Span(low, high)]

@@ -38,6 +38,7 @@ BRAINCO_REVO2 = HandModel(
     title="BrainCo Revo2 hand",
     unit="full travel",
     torque_unit="A",
+    limit_margin=0.05,
     joints=dict.fromkeys(Side, _JOINTS),
     dialects=(
         Dialect(

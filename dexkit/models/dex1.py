@@ -25,6 +25,7 @@ _JOINT = JointSpec("gripper", q_min=0.0, q_max=5.4, dq_max=24.0, tau_max=15.0, c
 DEX1_1 = HandModel(
     name="dex1-1",
     title="Dex1-1 gripper",
+    limit_margin=0.25,  # the catalogue of the kit gives its reasons
     joints={Side.LEFT: (_JOINT,), Side.RIGHT: (_JOINT,)},
     dialects=(
         Dialect(

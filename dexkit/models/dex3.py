@@ -84,6 +84,8 @@ _SENSORS = (
 DEX3_1 = HandModel(
     name="dex3-1",
     title="Dex3-1 hand",
+    # real hands: up to 0.085 rad (docs/sources/real-hands.md); xr_teleoperate's wider limits
+    limit_margin=0.15,
     joints={side: _joints(side) for side in Side},
     dialects=(
         Dialect(

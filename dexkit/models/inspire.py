@@ -25,6 +25,7 @@ INSPIRE_DFX = HandModel(
     title="Inspire DFX hand",
     unit="full travel",
     torque_unit="full force",
+    limit_margin=0.05,
     joints=dict.fromkeys(Side, _JOINTS),
     dialects=(
         Dialect(

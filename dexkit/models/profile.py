@@ -294,6 +294,9 @@ class HandModel:
         without its revision.
     :param unit: of q, of its limits and of all that is derived from them.
     :param torque_unit: of tau_est and tau_max: A, where a hand reports currents.
+    :param limit_margin: how far beyond its joint's limits q of a genuine hand, or of its client,
+        may lie: end stops and zeros differ from hand to hand (docs/sources/real-hands.md). For the
+        kit, which states it in its requirements, and for ``dexkit replay``.
 
     **On DDS.**
 
@@ -373,6 +376,7 @@ class HandModel:
     other_short_name: str = ""
     unit: str = "rad"
     torque_unit: str = "N m"
+    limit_margin: float = 0.15
     client_dq: float = 0.0
     joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
     shared_motors: tuple[tuple[int, ...], ...] = ()

@@ -52,7 +52,7 @@ _THIN = 0.4
 _HIGH_GAINS = 2.0
 """Gains are too high from this multiple of the client's on."""
 _BEYOND = 0.02
-"""Excess over a limit that counts as rounding or calibration, as a part of the stroke."""
+"""Excess over a limit that counts as rounding, as a part of the stroke, whatever the model."""
 _MOVES = 0.02
 """Smallest commanded motion that counts as intended, as a part of the stroke."""
 _MOST = 1_000_000
@@ -149,6 +149,7 @@ class JointLimits:
 
     :param unit: of q, and of dq a second: that of the model.
     :param torque_unit: of tau.
+    :param margin: excess over a limit of q that counts as rounding or calibration.
     """
 
     names: tuple[str, ...]
@@ -158,6 +159,7 @@ class JointLimits:
     tau: Floats
     unit: str
     torque_unit: str
+    margin: Floats
 
     @property
     def stroke(self) -> Floats:
@@ -174,6 +176,7 @@ def joint_limits(spoken: Dialect, side: Side) -> JointLimits:
     def of_each(attribute: str, by: float) -> Floats:
         return np.array([getattr(j, attribute) for j in joints]) * by
 
+    stroke = of_each("q_max", scale) - of_each("q_min", scale)
     return JointLimits(
         names=tuple(j.name for j in joints),
         low=of_each("q_min", scale),
@@ -182,6 +185,7 @@ def joint_limits(spoken: Dialect, side: Side) -> JointLimits:
         tau=of_each("tau_max", 1.0),
         unit=hand.unit,
         torque_unit=hand.torque_unit,
+        margin=np.maximum(_BEYOND * stroke, hand.limit_margin * scale),
     )
 
 
@@ -474,8 +478,7 @@ class _Preparation:
 
     def _outside(self, track: Track, side: Side) -> float:
         limits = joint_limits(self.spoken, side)
-        margin = _BEYOND * limits.stroke
-        outside = (track.q < limits.low - margin) | (track.q > limits.high + margin)
+        outside = (track.q < limits.low - limits.margin) | (track.q > limits.high + limits.margin)
         return float(outside.any(axis=1).mean())
 
     def _gains(self, side: Side, track: Track) -> Track:
@@ -577,7 +580,7 @@ class _Preparation:
     def _limits(self, side: Side, track: Track) -> Track:
         """Check position, feed-forward velocity and torque."""
         limits = joint_limits(self.spoken, side)
-        margin = _BEYOND * limits.stroke
+        margin = limits.margin
         clamp = self.options.limit == "clamp"
         clamped = replace(
             track,
@@ -590,7 +593,8 @@ class _Preparation:
             ("dq", f"{limits.unit}/s", -limits.dq, limits.dq),
             ("tau", limits.torque_unit, -limits.tau, limits.tau),
         )
-        for name, unit, low, high in bounds:
+        # a position servo takes no notice of tau, and dq is the most that it may move with
+        for name, unit, low, high in bounds[:1] if self.spoken.position_servo else bounds:
             table = getattr(track, name)
             beyond = np.maximum(low - table, table - high)
             if not (beyond > 0).any():
