@@ -49,6 +49,7 @@ from dexkit.traces.replay.prepare import (
     prepare,
 )
 from dexkit.traces.replay.states import DecodedHand, HandStateCodec
+from dexkit.traces.sessions.finger_order import Order, finger_orders
 from tests.each import each
 from tests.session_helpers import document, episode, hand_waves, whole
 from tests.test_sessions_import import NAMES, dataset
@@ -289,6 +290,32 @@ def test_the_margins_of_the_limits_are_those_of_the_kit() -> None:
                 assert margin == hand.limit_margin, requirement.id
                 found.add(hand.name)
     assert found == set(MODELS)
+
+
+def test_motion_tells_whether_the_fingers_of_a_session_are_exchanged(tmp_path: Path) -> None:
+    """Public programs of real Dex3-1 disagree about middle and index of the right hand."""
+    waves = np.array(hand_waves("dex3-1", LEFT, 300, 0.0))
+    waves[:, 3:5] = -0.1  # only the last finger moves
+    kind = message_type(HAND_STATE)
+    alike = np.full(waves.shape, -0.1)
+    for name, seen, asked, order in (
+        ("same", waves, waves, Order.SAME),
+        ("exchanged", waves[:, [0, 1, 2, 5, 6, 3, 4]], waves, Order.EXCHANGED),
+        ("alike", alike, alike, Order.UNKNOWN),
+    ):
+        rows = [
+            (DEX3_STATE, T0 + i * 10_000_000, 0, kind.encode(HandState_([HgState(q=x) for x in q])))
+            for i, q in enumerate(seen.tolist())
+        ]
+        (tmp_path / name).mkdir()
+        both = session(tmp_path / name, sorted(rows + fingers(asked), key=lambda row: row[1]))
+        (found,) = finger_orders(open_trace(tmp_path / name / "session.mcap")).values()
+        assert found.order is order, (name, found.text)
+        assert ("order" in levels(prepare(both))) is (order is Order.EXCHANGED)
+        _, said = dexkit("info", tmp_path / name / "session.mcap")
+        assert "order of the fingers, left hand: " in said
+        if order is not Order.EXCHANGED:
+            assert "cannot" in said  # which finger is which, it never says
 
 
 def test_steps_of_position_servos_are_no_jumps(tmp_path: Path) -> None:

@@ -73,8 +73,24 @@ def summary(trace: Trace) -> dict[str, Any]:
         ],
         "metadata": trace.metadata,
         "warnings": trace.warnings,
-        "notes": trace.notes,
+        "notes": [*trace.notes, *_orders(trace)],
     }
+
+
+def _orders(trace: Trace) -> list[str]:
+    """What motion says about the order of each Dex3-1's fingers."""
+    from dexkit.models import DEX3_1
+
+    types = {(d.cmd_type, d.state_type) for d in DEX3_1.dialects}
+    present = {c.type_name for c in trace.channels if c.message_count}
+    if not any(set(pair) <= present for pair in types):
+        return []
+    from dexkit.traces.sessions.finger_order import finger_orders
+
+    return [
+        f"order of the fingers, {part.replace('_', ' ')}: {found.text}"
+        for part, found in finger_orders(trace).items()
+    ]
 
 
 @click.command("info")

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from dexkit.command_age import PAUSE
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
-from dexkit.models import Dialect, HandModel, dialect, model
+from dexkit.models import DEX3_1, Dialect, HandModel, dialect, model
 from dexkit.traces.replay.commands import Flags, HandCommands, RecordedCommands, counted
+from dexkit.traces.sessions.finger_order import Order, finger_order
 from dexkit.traces.sessions.resample import gap_of
 
 __all__ = [
@@ -312,6 +313,7 @@ class _Preparation:
 
     def run(self) -> Prepared:
         self._origin()
+        self._order()
         if self.spoken.model != self.recorded.model:
             self.refuse(
                 "model",
@@ -355,6 +357,16 @@ class _Preparation:
             )
         if session.others and session.dialect is not None:
             self.note("not-played", ", ".join(session.others))
+
+    def _order(self) -> None:
+        """Note fingers that moved for each other: played, the commands do that again."""
+        if self.model is not DEX3_1:
+            return
+        for side, c in self.session.commands.items():
+            t, q = self.session.states.get(side, (np.zeros(0), np.zeros((0, 7))))
+            found = finger_order(c.t, c.q, t, q)
+            if found.order is Order.EXCHANGED:
+                self.note("order", found.text, str(side))
 
     def _chosen(self) -> dict[Side, HandCommands]:
         """The commands of the chosen hands, on the sides where they are to be played."""
