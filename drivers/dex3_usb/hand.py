@@ -138,6 +138,12 @@ class Dex3Usb:
             return
         store, key = Store(self.configuration.config), record_key(serial, self._spec.side)
         texts = store.section(key, "settings")
+        try:
+            self._apply(with_stored(self.configuration, texts))
+        except UsageError as error:
+            raise UsageError(
+                f"{store.path}: {key}: {error.message}", hint=error.hint or "dexkit bringup"
+            ) from error
         guessed = [what for name, what in MEASURED.items()
                    if name not in texts and name not in self.configuration.given]  # fmt: skip
         if guessed and not self.configuration.guesses:
@@ -150,15 +156,8 @@ class Dex3Usb:
             )
         if guessed:
             log.warning("hand %s has not been brought up; guessed: %s", key, ", ".join(guessed))
-        if not texts:
-            return
-        try:
-            self._apply(with_stored(self.configuration, texts))
-        except UsageError as error:
-            raise UsageError(
-                f"{store.path}: {key}: {error.message}", hint=error.hint or "dexkit bringup"
-            ) from error
-        log.info("settings of hand %s from %s: %s", key, store.path, ", ".join(sorted(texts)))
+        if texts:
+            log.info("settings of hand %s from %s: %s", key, store.path, ", ".join(sorted(texts)))
 
     @property
     def settings(self) -> Dex3Settings:
