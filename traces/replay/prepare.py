@@ -554,7 +554,8 @@ class _Preparation:
             self.judge(
                 name,
                 f"no motion: {what} {_joints(limits, rows)} in "
-                f"{rows.any(axis=1).mean():.0%} of the commands, and nothing else moves them",
+                f"{rows.any(axis=1).mean():.0%} of the commands"
+                + (", though the recorded hand moved" if self._states_move(side) else ""),
                 option,
                 cured=False,
                 where=str(side),
