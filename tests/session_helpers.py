@@ -9,16 +9,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from click.testing import CliRunner
 
+from dexkit.cli import cli
+from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.models import model
 
-__all__ = ["document", "episode", "jpeg", "png", "streamed", "waves", "whole"]
+__all__ = ["dexkit", "document", "episode", "jpeg", "png", "streamed", "waves", "whole"]
 
 ARM = [
     *("kLeftShoulderPitch", "kLeftShoulderRoll", "kLeftShoulderYaw", "kLeftElbow"),
     *("kLeftWristRoll", "kLeftWristPitch", "kLeftWristyaw"),
 ]
+
+
+def dexkit(*arguments: object) -> tuple[int, str]:
+    """Exit code and everything printed; of an error, its message and hint."""
+    result = CliRunner().invoke(cli, [str(a) for a in arguments], standalone_mode=False)
+    if isinstance(result.exception, DexkitError):
+        error = result.exception
+        return error.exit_code, f"{result.output}{error.message} {error.hint}"
+    assert result.exception is None, result.exception
+    return int(result.return_value or 0), result.output
 
 
 def waves(count: int, frames: int, phase: float, low: Any = 0.1, high: Any = 0.9) -> np.ndarray:

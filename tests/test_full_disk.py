@@ -9,7 +9,7 @@ import pytest
 
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.edit import Span, cut
-from tests.test_sessions_import import dexkit
+from tests.session_helpers import dexkit
 
 LIMIT = 20_000
 """Bytes that a file can take, as if the disk had no more; there is no disk to be filled."""

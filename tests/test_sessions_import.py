@@ -13,14 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from dexkit.cli import cli
 from dexkit.conformance.recording import Recording
-from dexkit.errors import DexkitError, SessionError
+from dexkit.errors import SessionError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.messages.earlier import EARLIER
@@ -34,19 +32,9 @@ from dexkit.traces.sessions.model import REST_TOPIC, picture_topic, reference_to
 from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 from tests.each import each
-from tests.session_helpers import document, episode, jpeg, png, streamed, whole
+from tests.session_helpers import dexkit, document, episode, jpeg, png, streamed, whole
 
 HG = "unitree_hg::msg::dds_::HandState_"
-
-
-def dexkit(*arguments: object) -> tuple[int, str]:
-    """Exit code and everything printed; of an error, its message and hint."""
-    result = CliRunner().invoke(cli, [str(a) for a in arguments], standalone_mode=False)
-    if isinstance(result.exception, DexkitError):
-        error = result.exception
-        return error.exit_code, f"{result.output}{error.message} {error.hint}"
-    assert result.exception is None, result.exception
-    return int(result.return_value or 0), result.output
 
 
 def streams(trace: Trace) -> dict[tuple[str, str], Stream]:
@@ -454,6 +442,41 @@ def test_lerobot_datasets_are_read_by_the_place_of_the_columns(
     if version == "v3.0":
         assert dexkit("import", source, tmp_path / "all")[0] == 0
         assert len(list((tmp_path / "all").glob("*.mcap"))) == 2
+
+
+INSPIRE = [
+    f"k{side}Hand{finger}"
+    for side in ("Left", "Right")
+    for finger in ("Pinky", "Ring", "Middle", "Index", "ThumbBend", "ThumbRotation")
+]
+
+
+def test_names_of_several_models_are_no_hand_unless_one_is_named(tmp_path: Path) -> None:
+    matrix = np.linspace(0.1, 0.9, 12 * 20).reshape(20, 12).astype(np.float32)
+    source = dataset(tmp_path / "d", "v2.1", INSPIRE, matrix)
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert code == 1
+    assert "left_hand may be one of inspire-dfx, inspire-ftp" in output
+    assert {s.model for s in streams_of(open_trace(tmp_path / "a.mcap"))} == {""}
+    for hand, rounded in (("inspire-dfx", False), ("inspire-ftp", True)):
+        out = tmp_path / f"{hand}.mcap"
+        code, output = dexkit("import", source, out, "--hand", hand)
+        assert code == 0, output
+        assert ("is rounded to the whole numbers of" in output) == rounded
+        got = streams(open_trace(out))
+        assert {s.model for s in got.values()} == {hand}
+        assert np.allclose(got["right_hand", STATE].q, matrix[:, 6:], atol=0.0006 if rounded else 0)
+
+
+@each("end", [".q", ".pos"])
+def test_names_of_lerobots_robots_are_read(tmp_path: Path, end: str) -> None:
+    matrix = np.full((5, 14), 0.1, dtype=np.float32)
+    names = [f"k{s}Hand{j}{end}" for s in ("Left", "Right") for j in LEFT_HAND]
+    code, output = dexkit(
+        "import", dataset(tmp_path / "d", "v2.1", names, matrix), tmp_path / "a.mcap"
+    )
+    assert code == 0, output
+    assert {s.model for s in streams_of(open_trace(tmp_path / "a.mcap"))} == {"dex3-1"}
 
 
 def test_lerobot_columns_of_other_kinds_are_reported(tmp_path: Path) -> None:

@@ -129,6 +129,17 @@ class MessageType:
         table = columns.table([path for path, _ in here])
         return table if not self._lists else table / here[0][1]
 
+    def motor_values_sent(
+        self, member: str, values: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        """What a message holds of such values: rounded; None if it has no place for them."""
+        if not self._lists:
+            return values.astype(np.float32).astype(np.float64)
+        place = self.motor_place(member, 0)
+        if place is None:
+            return None
+        return np.asarray(np.rint(np.clip(values * place[1], -32768, 32767)) / place[1])
+
     @cached_property
     def _lists(self) -> JointLists | None:
         return JOINT_LISTS.get(self.name)

@@ -86,7 +86,10 @@ def absent_key(topic: str) -> str:
 
 
 def absent_fields(record: Mapping[str, str]) -> dict[str, frozenset[str]]:
-    """By topic, the fields that are 0 because the source does not have them."""
+    """By topic, the fields that are 0 because the source does not have them.
+
+    ``q``, or ``left.q`` where both hands share the topic and the source has it of the other one.
+    """
     return {
         dds_topic(key.removeprefix(_ABSENT)): frozenset(value.split())
         for key, value in record.items()

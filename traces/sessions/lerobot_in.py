@@ -375,7 +375,7 @@ class Dataset:
                 names = tuple(f"joint_{i}" for i in range(matrix.shape[1]))
             if not np.isfinite(matrix).all():
                 problems.add(f"{column} has values that are not finite; these frames lack it")
-            for group in self._groups(names, corrections):
+            for group in self._groups(names, problems, corrections):
                 known, values = found.setdefault(group.name, (group, {}))
                 if known.joints != group.joints:
                     problems.add(f"{column}: {group.name} has other joints than elsewhere")
@@ -386,7 +386,9 @@ class Dataset:
             if good:
                 yield Part(group.name, group.joints, good, group.model)
 
-    def _groups(self, names: Sequence[str], corrections: list[str]) -> list[_Group]:
+    def _groups(
+        self, names: Sequence[str], problems: Problems, corrections: list[str]
+    ) -> list[_Group]:
         """Assign a vector's elements to parts."""
         stated = self._stated_groups(names)
         if stated is not None:
@@ -394,7 +396,7 @@ class Dataset:
         groups: list[_Group] = []
         left = dict(enumerate(names))
         for side in Side:
-            hand = self._hand(side, left, corrections)
+            hand = self._hand(side, left, problems, corrections)
             if hand is not None:
                 groups.append(hand)
                 for i in hand.columns:
@@ -431,31 +433,44 @@ class Dataset:
         taken = sorted(c for g in groups for c in g.columns)
         return groups if taken == list(range(len(names))) else None
 
-    def _hand(self, side: Side, names: Mapping[int, str], corrections: list[str]) -> _Group | None:
-        """The hand of a side: the columns whose names are those of a model's joints."""
+    def _hand(
+        self, side: Side, names: Mapping[int, str], problems: Problems, corrections: list[str]
+    ) -> _Group | None:
+        """The hand of a side: the columns whose names are those of a model's joints.
+
+        None where they are those of several models, unless the options say which.
+        """
         if self.options.hand == "none":
             return None
         own = {i: _bare(name, side) for i, name in names.items() if _side(name) is side}
+        fitting: list[tuple[HandModel, tuple[int, ...]]] = []
         for name in dict.fromkeys(d.model for d in DIALECTS.values()):
             hand = model(name)
             if self.options.hand not in (None, name):
                 continue
             wanted = [j.name.replace("_", "").lower() for j in hand.joints[side]]
             found = {bare: i for i, bare in own.items() if bare in wanted}
-            if len(found) != len(wanted):
-                continue
-            columns = tuple(found[w] for w in wanted)
-            if list(columns) != sorted(columns) and _is_unitree(names[columns[0]]):
-                given = ", ".join(names[i] for i in sorted(columns))
-                corrections.append(
-                    f"{side} hand: the columns are taken by their place, as "
-                    f"{', '.join(j.name for j in hand.joints[side])}; the names that "
-                    f"unitree_lerobot gives them ({given}) are not the order of the numbers, "
-                    "which is that of the wire"
-                )
-                columns = tuple(sorted(columns))
-            return _Group(f"{side}{HAND}", tuple(j.name for j in hand.joints[side]), columns, hand)
-        return None
+            if len(found) == len(wanted):
+                fitting.append((hand, tuple(found[w] for w in wanted)))
+        if len(fitting) > 1:
+            models = ", ".join(hand.name for hand, _ in fitting)
+            problems.add(
+                f"{side}{HAND} may be one of {models}; it is kept as a group of joints, unless "
+                f"--hand says which"
+            )
+        if len(fitting) != 1:
+            return None
+        hand, columns = fitting[0]
+        if list(columns) != sorted(columns) and _is_unitree(names[columns[0]]):
+            given = ", ".join(names[i] for i in sorted(columns))
+            corrections.append(
+                f"{side} hand: the columns are taken by their place, as "
+                f"{', '.join(j.name for j in hand.joints[side])}; the names that "
+                f"unitree_lerobot gives them ({given}) are not the order of the numbers, "
+                "which is that of the wire"
+            )
+            columns = tuple(sorted(columns))
+        return _Group(f"{side}{HAND}", tuple(j.name for j in hand.joints[side]), columns, hand)
 
     # -- pictures and other columns
     # -----------------------------------------------------------------
@@ -617,6 +632,7 @@ def _names(feature: _Feature, count: int) -> tuple[str, ...] | None:
 def _words(name: str) -> list[str]:
     """``kLeftHandThumb0`` and ``left_hand_thumb_0`` as words."""
     bare = name.removeprefix("k") if _is_unitree(name) else name
+    bare = bare.removesuffix(".q").removesuffix(".pos")  # as LeRobot's robots name positions
     return [w.lower() for w in re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", bare)]
 
 

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from dexkit import __version__
 from dexkit.errors import SessionError
 from dexkit.hand import Floats, JointMode, Side
-from dexkit.messages import message_type
+from dexkit.messages import MessageType, message_type
 from dexkit.models import DIALECTS, Dialect, HandModel, ModeByte, model
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.imported import MEASURED, NOMINAL, RECORD, absent_key
-from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, STATE
+from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, MEMBERS, STATE
 from dexkit.traces.writer import RecordingWriter, definition
 
 __all__ = [
@@ -212,10 +212,16 @@ def messages(
     if session.times_ns.min() < 0 or session.times_ns.max() >= ros_types.LAST_NS:
         raise SessionError(f"{session.source} has times before 1970 or after January 2038")
     sources: list[tuple[int, Callable[[int], bytes | None]]] = []
-    for part in session.parts:
-        for kind in (STATE, COMMAND):
-            if kind in part.values:
-                sources.append(_part_channel(writer, session, part, kind))
+    for kind in (STATE, COMMAND):
+        hands: dict[str, list[Part]] = {}
+        for part in session.parts:
+            if kind in part.values and part.model is None:
+                sources.append(_group_channel(writer, session, part, kind))
+            elif kind in part.values:
+                hands.setdefault(_hand_topic(part, kind), []).append(part)
+        sources += [
+            _hands_channel(writer, session, topic, parts, kind) for topic, parts in hands.items()
+        ]
     for camera in session.cameras:
         if camera.load is None:
             sources.append(_reference_channel(writer, camera))
@@ -261,32 +267,90 @@ def _rest(session: Session, i: int) -> bytes | None:
     return ros_types.encode_string(session.rest[i]) if session.rest[i] else None
 
 
-def _part_channel(
+def _group_channel(
     writer: RecordingWriter, session: Session, part: Part, kind: str
 ) -> tuple[int, Callable[[int], bytes | None]]:
     values = part.values[kind]
-    if part.model is None:
-        topic = ros_types.group_topic(part.name, "cmd" if kind == COMMAND else "state")
-        channel = writer.add_channel(ros_types.JOINT_STATE.definition(topic))
-        return channel, lambda i: _joint_state(session, part, values, i)
-    dialect = part.model.dialects[0]
-    cmd, state = dialect.topics(part.side)
-    topic, type_name = (cmd, dialect.cmd_type) if kind == COMMAND else (state, dialect.state_type)
+    topic = ros_types.group_topic(part.name, "cmd" if kind == COMMAND else "state")
+    channel = writer.add_channel(ros_types.JOINT_STATE.definition(topic))
+    return channel, lambda i: _joint_state(session, part, values, i)
+
+
+def _hand_topic(part: Part, kind: str) -> str:
+    assert part.model is not None
+    cmd, state = part.model.dialects[0].topics(part.side)
+    return cmd if kind == COMMAND else state
+
+
+def _hands_channel(
+    writer: RecordingWriter, session: Session, topic: str, parts: Sequence[Part], kind: str
+) -> tuple[int, Callable[[int], bytes | None]]:
+    """The channel of a topic: one hand's, or that of both hands where they share it."""
+    hand = parts[0].model
+    assert hand is not None
+    dialect = hand.dialects[0]
+    type_name = dialect.cmd_type if kind == COMMAND else dialect.state_type
     channel = writer.add_channel(definition(topic, message_type(type_name)))
-    session.about[absent_key(topic)] = " ".join(f for f in FIELDS[kind] if f not in values)
+    session.about[absent_key(topic)] = " ".join(_absent(dialect, parts, kind))
     if kind == COMMAND:
         session.about[f"filled {topic}"] = "kp, kd and mode, as xr_teleoperate sends them"
-    _note_rounding(session, part, kind, values)
-    encode = _motor_encoder(dialect, part.model, kind)
-    return channel, lambda i: _motors(values, encode, i)
+    encode = _motor_encoder(dialect, hand, kind)
+    for part in parts:
+        _note_losses(session, part, kind, message_type(type_name))
+    values = {part.side: part.values[kind] for part in parts}
+    places = {part.side: f"{part.name} {kind}" for part in parts}
+
+    def encode_row(i: int) -> bytes | None:
+        rows = {side: {name: table[i] for name, table in v.items()} for side, v in values.items()}
+        bad = [side for side, row in rows.items() if not _is_whole(row)]
+        if bad and len(bad) < len(rows):
+            session.problems.add(
+                f"{topic}: frames that lack one of the hands are left out, as one message has both",
+                f"frame {i}, {places[bad[0]]}",
+            )
+        return None if bad else encode(rows)
+
+    return channel, encode_row
 
 
-def _note_rounding(session: Session, part: Part, kind: str, values: Mapping[str, Floats]) -> None:
-    for name, table in values.items():
+def _absent(dialect: Dialect, parts: Sequence[Part], kind: str) -> Iterator[str]:
+    """What the messages of a topic have, and the source does not: see :func:`absent_fields`."""
+    sides = [s for s in Side if _topic_of(dialect, s, kind) == _hand_topic(parts[0], kind)]
+    given = {p.side: p.values[kind] for p in parts}
+    for name in FIELDS[kind]:
+        lacking = [s for s in sides if name not in given.get(s, {})]
+        if len(lacking) == len(sides):
+            yield name
+        else:
+            yield from (f"{side}.{name}" for side in lacking)
+
+
+def _topic_of(dialect: Dialect, side: Side, kind: str) -> str:
+    return dialect.topics(side)[0 if kind == COMMAND else 1]
+
+
+def _is_whole(row: Mapping[str, Floats]) -> bool:
+    return all(np.isfinite(v).all() and (np.abs(v) <= _FLOAT32_MAX).all() for v in row.values())
+
+
+def _note_losses(session: Session, part: Part, kind: str, mt: MessageType) -> None:
+    """Say what a message cannot hold of a hand's values: fields, and digits of a number."""
+    for name, table in part.values[kind].items():
         with np.errstate(over="ignore", invalid="ignore"):
-            apart = np.abs(table.astype(np.float32).astype(np.float64) - table)
-        worst = np.nanmax(apart, initial=0.0)
-        if worst > 0:
+            sent = mt.motor_values_sent(MEMBERS[kind][name], table)
+            if sent is None:
+                session.problems.add(
+                    f"{part.name}: {name} of its {kind}s is left out: {mt.name} has no place for it"
+                )
+                continue
+            worst = np.nanmax(np.abs(sent - table), initial=0.0)
+            is_float = np.array_equal(sent, table.astype(np.float32), equal_nan=True)
+        if worst > 0 and not is_float:
+            text = (
+                f"{part.name}: {name} of its {kind}s is rounded to the whole numbers of {mt.name}"
+            )
+            session.corrections.append(f"{text}, by at most {worst:.3g}")
+        elif worst > 0:
             session.about[f"rounded {part.name} {kind} {name}"] = (
                 f"to the float32 of the wire, by at most {worst:.3g}"
             )
@@ -303,37 +367,40 @@ def _joint_state(
     )
 
 
-def _motors(
-    values: Mapping[str, Floats], encode: Callable[[Mapping[str, Any]], bytes], i: int
-) -> bytes | None:
-    row = {name: table[i] for name, table in values.items()}
-    if not all(np.isfinite(v).all() and (np.abs(v) <= _FLOAT32_MAX).all() for v in row.values()):
-        return None
-    return encode(row)
+_Rows = Mapping[Side, Mapping[str, Floats]]
+"""By side and field, the values of a hand's joints."""
 
 
-def _motor_encoder(
-    dialect: Dialect, hand: HandModel, kind: str
-) -> Callable[[Mapping[str, Any]], bytes]:
-    """Encodes the joints of one hand as a message of its dialect."""
+def _motor_encoder(dialect: Dialect, hand: HandModel, kind: str) -> Callable[[_Rows], bytes]:
+    """Encodes the joints of the hands of a topic as a message of their dialect.
+
+    The motors of a hand of the topic that is not given are 0.
+    """
     mt = message_type(dialect.cmd_type if kind == COMMAND else dialect.state_type)
     motor = mt.motor_type.cls
     gains = hand.gains
     units = dialect.torque_units or (1.0,) * len(gains)
     tau_name = "tau" if kind == COMMAND else "tau_est"
 
-    def encode(row: Mapping[str, Any]) -> bytes:
-        motors = []
-        for j in range(len(gains)):
-            given = {"q": float(row["q"][j])}
-            if "dq" in row:
-                given["dq"] = float(row["dq"][j])
-            if "tau" in row:
-                given[tau_name] = float(row["tau"][j]) / units[j]
-            if kind == COMMAND:
-                given["kp"], given["kd"] = gains[j]
-                given["mode"] = _mode(dialect, j)
-            motors.append(motor(**given))
+    def encode(rows: _Rows) -> bytes:
+        shared = {
+            s
+            for s in Side
+            for r in rows
+            if _topic_of(dialect, s, kind) == _topic_of(dialect, r, kind)
+        }
+        motors = [motor()] * (max(dialect.index[s] for s in shared) + len(gains))
+        for side, row in rows.items():
+            for j in range(len(gains)):
+                given: dict[str, float] = {"q": float(row["q"][j])}
+                if "dq" in row:
+                    given["dq"] = float(row["dq"][j])
+                if "tau" in row:
+                    given[tau_name] = float(row["tau"][j]) / units[j]
+                if kind == COMMAND:
+                    given["kp"], given["kd"] = gains[j]
+                    given["mode"] = _mode(dialect, j)
+                motors[dialect.index[side] + j] = motor(**given)
         return mt.encode(mt.of_motors(motors))
 
     return encode

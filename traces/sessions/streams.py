@@ -28,7 +28,17 @@ from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.imported import RECORD, absent_fields
 from dexkit.traces.sessions.resample import interpolate
 
-__all__ = ["COMMAND", "FIELDS", "HAND", "STATE", "Pressure", "Stream", "pressures_of", "streams_of"]
+__all__ = [
+    "COMMAND",
+    "FIELDS",
+    "HAND",
+    "MEMBERS",
+    "STATE",
+    "Pressure",
+    "Stream",
+    "pressures_of",
+    "streams_of",
+]
 
 Times = NDArray[np.int64]
 
@@ -37,10 +47,11 @@ HAND = "_hand"
 """End of the name of a hand's part."""
 FIELDS = {STATE: ("q", "dq", "tau"), COMMAND: ("q", "dq", "tau", "kp", "kd")}
 """The fields of a motor that a stream has, in this order. ``tau`` is ``tau_est`` of a state."""
-_MEMBERS = {
+MEMBERS = {
     STATE: {"q": "q", "dq": "dq", "tau": "tau_est"},
     COMMAND: {f: f for f in FIELDS[COMMAND]},
 }
+"""For each of these fields, the member of a motor in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +219,12 @@ def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream
             raise SessionError(f"{trace.path}: {topic}: {error}") from error
         for stream in streams:
             lacking = absent.get(topic, frozenset())
-            values = {f: v for f, v in stream.values.items() if f not in lacking}
+            side = stream.part.removesuffix(HAND)
+            values = {
+                f: v
+                for f, v in stream.values.items()
+                if f not in lacking and f"{side}.{f}" not in lacking
+            }
             if len(stream) and "q" in values:
                 found.append(replace(stream, values=values))
     return found
@@ -279,10 +295,11 @@ def _values(
     array = next(f for f in mt.layout.fields if f.name == mt.motor_sequence).array
     values = {}
     with np.errstate(invalid="ignore"):
-        for name, member in _MEMBERS[kind].items():
+        for name, member in MEMBERS[kind].items():
             here = [i for i in slots if array is None or i < array]
-            values[name] = mt.motor_table(columns, member, here)
-    if units:
+            if mt.motor_place(member, 0) is not None:
+                values[name] = mt.motor_table(columns, member, here)
+    if units and "tau" in values:
         values["tau"] = values["tau"] * np.asarray(units)
     return values
 
