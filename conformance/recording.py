@@ -30,6 +30,7 @@ from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
 from dexkit.robots import RobotModel
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
+from dexkit.traces.clock_steps import ClockStep, refuse_clock_steps
 from dexkit.traces.sessions.imported import NOMINAL, absent_fields
 from dexkit.traces.sessions.imported import RECORD as IMPORTED
 
@@ -67,6 +68,11 @@ class TraceLike(Protocol):
     @property
     def channels(self) -> list[ChannelInfo]:
         """Every channel."""
+        ...
+
+    @property
+    def clock_steps(self) -> list[ClockStep]:
+        """Where the times of a channel step back."""
         ...
 
     @property
@@ -345,6 +351,7 @@ class TopicDecoder:
     :param usb: decode what was transferred on USB as well.
     :param payloads: keep the payloads; columns alone take a tenth of the memory.
     :raises ConformanceError: there is no such topic.
+    :raises SessionError: a stretch of time is there twice.
     :raises TraceUnsupported: the stimulus record, or the USB part, cannot be read.
 
     :ivar present: the topics that have messages.
@@ -362,6 +369,7 @@ class TopicDecoder:
         payloads: bool = False,
     ) -> None:
         self._trace, self._codec = trace, codec
+        refuse_clock_steps("the recording", trace.clock_steps)
         recorded = trace.metadata.get(RECORD)
         self.stimulus = None if recorded is None else Stimulus.from_metadata(recorded)
         self.present = {c.topic for c in trace.channels if c.message_count}

@@ -16,13 +16,17 @@ from dexkit.cli import cli
 from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.errors import DexkitError, TraceError, TraceUnsupported, UsageError
 from dexkit.hand import Side
+from dexkit.messages import message_type
 from dexkit.traces import Recorder, open_trace, sample_path
+from dexkit.traces.clock_steps import order_of, steps_between
 from dexkit.traces.sessions.align import Track, align
 from dexkit.traces.sessions.compare import compare
 from dexkit.traces.sessions.edit import CUT, Span, clock_offset, cut, merge
 from dexkit.traces.sessions.resample import gap_of, hold, interpolate
 from dexkit.traces.sessions.streams import COMMAND, streams_of
+from dexkit.traces.writer import RecordingWriter, definition
 from tests.each import each
+from tests.session_helpers import document, episode, streamed
 from tests.trace_helpers import (
     CMD,
     CMD_TYPE,
@@ -298,3 +302,81 @@ def test_nothing_is_filled_in_across_a_gap(method: object) -> None:
     else:
         expected = [np.nan, 0, 1.5, 3, np.nan, np.nan, 4.5, np.nan]
         assert np.array_equal(got, expected, equal_nan=True)
+
+
+# -- times that say nothing of each other ---------------------------------------------------------
+
+
+def stepped(path: Path, back: float = 1.0) -> Path:
+    """The sample session, whose clock is set back in its middle."""
+    trace = open_trace(PICK)
+    middle = trace.first_ns + round(trace.duration / 2 * 1e9)
+    with RecordingWriter(path) as writer:
+        numbers = {key: writer.add_channel(d) for key, d in trace.definitions.items()}
+        for m in trace.messages():
+            off = round(back * 1e9) if m.log_time_ns >= middle else 0
+            number = numbers[m.topic, m.type_name]
+            writer.put(number, m.data, m.log_time_ns - off, m.publish_time_ns - off)
+    return path
+
+
+def test_a_clock_that_steps_back_mixes_nothing(tmp_path: Path) -> None:
+    """What puts messages in order of time refuses, and each stretch can be taken by itself."""
+    path = stepped(tmp_path / "a.mcap")
+    code, output = dexkit("info", path)
+    assert "its clock steps back by 0.99" in output
+    for command in (
+        ("check", path),
+        *(
+            ("export", path, "--to", form, "--out", tmp_path / form)
+            for form in ("lerobot", "episodes", "rosbag2", "csv", "parquet")
+        ),
+        ("merge", path, PICK, tmp_path / "m.mcap"),
+        ("cut", path, tmp_path / "c.mcap"),
+        ("import", path, tmp_path / "i.mcap"),
+    ):
+        code, output = dexkit(*command)
+        assert (code, "steps back by 0.99" in output) == (2, True), (command[0], output)
+    assert sorted(tmp_path.iterdir()) == [path]
+    pieces = []
+    for number in (1, 2):
+        out = tmp_path / f"{number}.mcap"
+        assert dexkit("cut", path, out, "--stretch", number)[0] == 0
+        pieces.append(messages(out))
+        assert not open_trace(out).clock_steps
+    second = [(topic, log + 10**9, sent + 10**9, data) for topic, log, sent, data in pieces[1]]
+    assert pieces[0] + second == messages(PICK)
+
+
+@given(st.lists(st.integers(0, 40), min_size=1, max_size=40), st.integers(1, 9))
+@settings(max_examples=30)
+def test_steps_of_a_clock_are_those_of_the_times(tenths: list[int], pieces: int) -> None:
+    """However a file is cut into chunks."""
+    times = np.array(tenths, dtype=np.uint64) * np.uint64(10**8) + np.uint64(T0)
+    whole = [(b, a) for b, a in itertools.pairwise(times.tolist()) if a < b]
+    parts = [{3: order_of(p)} for p in np.array_split(times, pieces) if len(p)]
+    assert [(s.before_ns, s.after_ns) for s in steps_between(parts)] == whole
+
+
+def test_recordings_of_two_domains_are_not_one_hand(tmp_path: Path) -> None:
+    for number in (1, 2):
+        with RecordingWriter(tmp_path / f"{number}.mcap") as writer:
+            d = definition(STATE, message_type(STATE_TYPE), {"dds.domain": str(number)})
+            writer.put(writer.add_channel(d), state(0.1), T0 + number, T0 + number)
+    code, output = dexkit("merge", *(tmp_path / f"{n}.mcap" for n in "123"))
+    assert (code, "two robots" in output) == (2, True)
+    assert not (tmp_path / "3.mcap").exists()
+
+
+def test_sessions_with_nominal_times_are_merged_where_they_are_said_to_begin(
+    tmp_path: Path,
+) -> None:
+    for name in "ab":
+        source = episode(tmp_path / name, streamed(document(frames=10, cameras=0)))
+        assert dexkit("import", source, tmp_path / f"{name}.mcap")[0] == 0
+    files = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    code, output = dexkit("merge", *files, tmp_path / "m.mcap")
+    assert (code, "nominal times" in output) == (2, True)
+    code, output = dexkit("merge", *files, tmp_path / "m.mcap", "--shift", f"{files[1]}=100")
+    assert code == 0, output
+    assert open_trace(tmp_path / "m.mcap").duration > 100

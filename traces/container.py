@@ -29,6 +29,7 @@ from dexkit.documents import open_ordinary
 from dexkit.errors import TraceUnreadable
 from dexkit.messages.packed import rows_at
 from dexkit.traces import mcap_records
+from dexkit.traces.clock_steps import ClockStep, Order, drops_in, order_of, steps_between
 from dexkit.traces.mcap_records import HEAD, LEAST, MAGIC, BadRecord, Channel, Opcode, Schema, walk
 from dexkit.traces.summary import Found, Summary, contradictions
 
@@ -108,6 +109,8 @@ class Segment:
     cut: bool = False
     # channel id -> [messages, first log time, last log time]; None: not known from an index
     counts: dict[int, list[int]] | None = None
+    # channel id -> how its log times follow each other
+    order: dict[int, Order] = field(default_factory=dict)
     index: tuple[int, int] = (0, 0)
     index_offsets: dict[int, int] = field(default_factory=dict)
 
@@ -155,8 +158,8 @@ class Container:
         self._found = Found(self.segments, self.schemas, self.channels)
         self._summary = Summary()
         self._bodies: dict[tuple[int, int], bytes] = {}
-        # counts of a segment, channel id, and log times of its message index
-        self._indexed: list[tuple[dict[int, list[int]], int, NDArray[np.uint64]]] = []
+        # a segment, channel id, and log times of its message index, as they lie in the segment
+        self._indexed: list[tuple[Segment, int, NDArray[np.uint64]]] = []
         self._data_end: tuple[int, int] | None = None  # offset, and its CRC
         self._unpacked = 0
         self._size = 0
@@ -166,6 +169,11 @@ class Container:
     def attachments(self) -> int:
         """Attachments in the file."""
         return len(self._found.attachments)
+
+    @property
+    def clock_steps(self) -> list[ClockStep]:
+        """Where the log times of a channel step back, in the order of the file."""
+        return list(steps_between(segment.order for segment in self.segments))
 
     # -- warnings ------------------------------------------------------------------------------
 
@@ -465,8 +473,11 @@ class Container:
         if segment.counts is None:
             segment.counts = {}
         if length:
-            times = np.frombuffer(body, "<u8", count=length // 8, offset=6)[::2].copy()
-            self._indexed.append((segment.counts, channel_id, times))
+            entries = np.frombuffer(body, "<u8", count=length // 8, offset=6)
+            times, places = entries[::2], entries[1::2]
+            # in order of the file, which some writers sort by time
+            times = times.copy() if (places[1:] >= places[:-1]).all() else times[places.argsort()]
+            self._indexed.append((segment, channel_id, times))
 
     def _count_indexed(self) -> None:
         """Put messages and times of the message indexes into the counts of their segments."""
@@ -477,10 +488,18 @@ class Container:
         every = np.concatenate([times for _, _, times in self._indexed])
         # at once, for a call takes as long as a thousand times
         first, last = np.minimum.reduceat(every, begins), np.maximum.reduceat(every, begins)
-        entries = zip(lengths.tolist(), first.tolist(), last.tolist(), strict=True)
-        for (counts, channel_id, _), (n, least, most) in zip(self._indexed, entries, strict=True):
+        drops = drops_in(every) + 1
+        dropping = set((np.searchsorted(begins, drops, "right") - 1)[~np.isin(drops, begins)])
+        ends = zip(every[begins].tolist(), every[begins + lengths - 1].tolist(), strict=True)
+        entries = zip(lengths.tolist(), first.tolist(), last.tolist(), ends, strict=True)
+        for number, ((segment, channel_id, times), (n, least, most, order)) in enumerate(
+            zip(self._indexed, entries, strict=True)
+        ):
+            counts = segment.counts
+            assert counts is not None
             known = counts.get(channel_id, [0, least, most])
             counts[channel_id] = [known[0] + n, min(known[1], least), max(known[2], most)]
+            segment.order[channel_id] = order_of(times) if number in dropping else Order(*order)
         self._indexed.clear()
 
     def _read_attachment(self, file: BinaryIO, at: int, end: int) -> None:
@@ -622,8 +641,10 @@ class Container:
     def _scan_segment(self, file: BinaryIO, segment: Segment) -> None:
         _, _, heads = self.read(file, segment)
         segment.counts = counts = {}
+        segment.order.clear()
         for channel_id, some in by_channel(heads["channel"]):
             log = heads["log"][some]
+            segment.order[channel_id] = order_of(log)
             counts[channel_id] = [len(some), int(log.min()), int(log.max())]
         if counts:
             first = min(c[1] for c in counts.values())

@@ -22,6 +22,7 @@ import numpy as np
 from dexkit.clock import Clock, RealClock, wait_until
 from dexkit.command_age import PAUSE, PauseWatch
 from dexkit.errors import UsageError
+from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.names import select_topics
 from dexkit.traces.reader import Trace, TraceMessage
 
@@ -94,6 +95,7 @@ class Player:
                     f"{trace.path.name} has no topic {', '.join(missing)}",
                     hint=f"it has: {', '.join(trace.topics) or 'none'}",
                 )
+        refuse_clock_steps(trace.path, trace.clock_steps)
         columns = trace.load(picked)
         self.topics = {topic: c.type_name for topic, c in columns.items()}
         self.loop = loop

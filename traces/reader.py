@@ -25,6 +25,7 @@ from dexkit.messages import Columns, MessageType, message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
 from dexkit.messages.schemas import omgidl
+from dexkit.traces.clock_steps import LIMIT_NS, ClockStep
 from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, OpenFile, by_channel
 from dexkit.traces.mcap_records import Schema
 from dexkit.traces.names import SESSION, USB, dds_topic, dds_type, select_topics
@@ -298,6 +299,11 @@ class Trace:
                 )
         return found
 
+    @cached_property
+    def clock_steps(self) -> list[ClockStep]:
+        """Where the times of a channel step back: what follows is another stretch of time."""
+        return [s for s in self._file.clock_steps if s.channel_id in self._info]
+
     @property
     def attachments(self) -> int:
         """Attachments in the file, which dexkit does not read."""
@@ -384,6 +390,36 @@ class Trace:
                         heapq.heappush(held, (found.next_ns, first, found))
                     else:
                         size -= found.bytes
+
+    def stretches(self) -> Iterator[tuple[int, TraceMessage]]:
+        """Every message, as they follow each other in the file, with the number of its stretch of
+        time, from 0; the next one begins where the clock steps back.
+        """
+        last: dict[int, tuple[int, int]] = {}
+        current = 0
+        with self._file.open_file() as file:
+            for segment in self._file.segments:
+                data, begins, heads = self._file.read(file, segment)
+                stops = begins + HEADS.itemsize + heads["length"].astype(np.int64) - 22
+                for channel, log, publish, begin, stop in zip(
+                    heads["channel"].tolist(),
+                    heads["log"].tolist(),
+                    heads["publish"].tolist(),
+                    (begins + HEADS.itemsize).tolist(),
+                    stops.tolist(),
+                    strict=True,
+                ):
+                    name = self._info.get(channel)
+                    if name is None:
+                        continue
+                    before, stretch = last.get(channel, (log, current))
+                    if before - log > LIMIT_NS and stretch == current:
+                        current += 1
+                    last[channel] = log, current
+                    yield (
+                        current,
+                        TraceMessage(name.topic, name.type_name, log, publish, data[begin:stop]),
+                    )
 
     def load(
         self,
@@ -538,6 +574,10 @@ class Trace:
             # written on purpose, for other readers than this one
             if problem and count and not channel.topic.startswith((USB, SESSION)):
                 self._file.warn(f"{_shorten(channel.topic)}: {problem}")
+        if steps := self.clock_steps:  # of channels that are defined
+            topics = dict.fromkeys(self._info[s.channel_id].topic for s in steps)
+            some = ", ".join(map(_shorten, list(topics)[:3])) + ", ..." * (len(topics) > 3)
+            self._file.warn(f"{max(steps, key=lambda s: s.seconds)} ({some})")
         types: dict[str, set[str]] = {}
         for info in self._info.values():
             types.setdefault(info.topic, set()).add(info.type_name)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
+from dexkit.traces.clock_steps import ClockStep
 
 __all__ = ["MemoryTrace"]
 
@@ -20,6 +21,7 @@ class MemoryTrace:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     mixed_types: dict[str, str] = field(default_factory=dict)
+    clock_steps: list[ClockStep] = field(default_factory=list)
     truncated: bool = False
     rows: dict[tuple[str, str], list[tuple[int, int, bytes]]] = field(default_factory=dict)
 

@@ -50,6 +50,12 @@ __all__ = ["command"]
     metavar="S",
     help="Seconds to keep before and after each phase.",
 )
+@click.option(
+    "--stretch",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Of a recording whose clock was set back, the Nth stretch of time.",
+)
 @topic_option("Keep", "all")
 @overwrite_option("OUT")
 def command(
@@ -59,6 +65,7 @@ def command(
     end: float | None,
     phases: tuple[str, ...],
     margin: float,
+    stretch: int | None,
     topics: tuple[str, ...],
     force: bool,
 ) -> int:
@@ -76,7 +83,13 @@ def command(
     trace = open_trace(file)
     spans, metadata = _spans(trace, begin, end, phases, margin)
     written = cut(
-        trace, out, spans=spans, topics=topics or None, metadata=metadata, overwrite=force
+        trace,
+        out,
+        spans=spans,
+        topics=topics or None,
+        stretch=None if stretch is None else stretch - 1,
+        metadata=metadata,
+        overwrite=force,
     )
     remarks("warning", trace.warnings)
     if trace.attachments:

@@ -20,6 +20,7 @@ from dexkit.documents import DEEPEST, open_ordinary, read_bytes
 from dexkit.errors import SessionError, WireError
 from dexkit.escaping import one_line
 from dexkit.temporary_folder import TemporaryFolder
+from dexkit.traces.clock_steps import LIMIT_NS, refuse_clock_steps
 from dexkit.traces.container import MAX_CHUNK, MAX_RATIO, SPARE, Container
 from dexkit.traces.mcap_records import MAGIC
 
@@ -277,6 +278,7 @@ def _check_mcap(path: Path, name: Path) -> None:
             f"{name} cannot be read as a ROS 2 bag: {what}",
             hint="'dexkit info' shows what is wrong, 'dexkit cut' copies what can be read",
         )
+    refuse_clock_steps(name, container.clock_steps)
     _limit(name, "topics", len(container.channels))
     channels = container.channels.values()
     for profiles in {c.metadata.get("offered_qos_profiles", "") for c in channels}:
@@ -347,6 +349,12 @@ def _check_tables(database: sqlite3.Connection, name: Path, size: int) -> None:
             raise refuse(f"a row of {table} has more than {MAX_CHUNK >> 20} MB")
         if table in ("topics", "message_definitions"):
             _limit(name, table.replace("_", " "), count)
+    (back,) = database.execute(
+        "SELECT max(before - timestamp) FROM (SELECT timestamp, lag(timestamp) OVER "
+        "(PARTITION BY topic_id ORDER BY id) AS before FROM messages)"
+    ).fetchone()
+    if isinstance(back, int) and back > LIMIT_NS:
+        raise refuse(f"its clock steps back by {back / 1e9:.3f} s: it has a stretch of time twice")
     (twice,) = database.execute("SELECT count(*) - count(DISTINCT id) FROM topics").fetchone()
     if twice:
         raise refuse("two topics have one number")

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from dexkit.digests import sha256_of_file
-from dexkit.errors import TraceError, UsageError
+from dexkit.errors import SessionError, TraceError, UsageError
+from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.names import select_topics
 from dexkit.traces.reader import Trace, TraceMessage
+from dexkit.traces.sessions.imported import NOMINAL, import_record
 from dexkit.traces.writer import RecordingWriter
 
 __all__ = ["CUT", "MERGE", "Merged", "Span", "clock_offset", "cut", "merge"]
@@ -63,19 +65,24 @@ def cut(
     *,
     spans: Sequence[Span] = (),
     topics: Sequence[str] | None = None,
+    stretch: int | None = None,
     metadata: Metadata | None = None,
     overwrite: bool = False,
 ) -> int:
     """Write a part of a recording.
 
     :param spans: the times to keep; none for all. They may overlap.
+    :param stretch: the stretch of time to keep, from 0, of a recording whose clock steps back.
     :param topics: those to keep, in any spelling, patterns allowed; None for all.
     :param metadata: metadata records in place of the recording's.
     :returns: the number of messages written.
     :raises UsageError: a topic is not in the recording, nothing is left, or ``out`` exists.
+    :raises SessionError: its clock steps back, and no stretch is named.
     :raises TraceError: it cannot be written.
     """
     _refuse_same(out, [trace])
+    if stretch is None:
+        refuse_clock_steps(trace.path, trace.clock_steps)
     picked = trace.topics
     if topics is not None:
         picked, missing = select_topics(trace.topics, topics)
@@ -89,6 +96,7 @@ def cut(
         "source_sha256": sha256_of_file(trace.path),
         "spans": "; ".join(f"{s.begin_ns} {s.end_ns}" for s in spans) or "all",
         "topics": " ".join(picked) if topics is not None else "all",
+        **({} if stretch is None else {"stretch": str(stretch)}),
     }
     with RecordingWriter(out, overwrite=overwrite) as writer:
         _write_metadata(writer, _copied(trace.metadata if metadata is None else metadata))
@@ -96,7 +104,7 @@ def cut(
         numbers = {
             key: writer.add_channel(d) for key, d in trace.definitions.items() if key[0] in picked
         }
-        for m in trace.messages(picked):
+        for m in _of_stretch(trace, stretch, picked):
             if not spans or any(s.begin_ns <= m.log_time_ns < s.end_ns for s in spans):
                 writer.put(numbers[m.topic, m.type_name], m.data, m.log_time_ns, m.publish_time_ns)
         if not writer.written:
@@ -106,6 +114,17 @@ def cut(
                 f"{', '.join(trace.topics) or 'no topics'}",
             )
         return writer.written
+
+
+def _of_stretch(trace: Trace, stretch: int | None, picked: Sequence[str]) -> Iterator[TraceMessage]:
+    """The messages of a stretch of time; of all, if there is one only."""
+    if stretch is None:
+        yield from trace.messages(picked)
+        return
+    wanted = set(picked)
+    for number, m in trace.stretches():
+        if number == stretch and m.topic in wanted:
+            yield m
 
 
 def clock_offset(reference: Trace, other: Trace) -> float:
@@ -146,9 +165,14 @@ def merge(
 
     :param shifts: seconds to add to the log times of each.
     :raises UsageError: ``out`` exists or is one of them; or times become negative.
+    :raises SessionError: the clock of one steps back, or their times or hands have nothing to do
+        with each other.
     :raises TraceError: it cannot be written.
     """
     _refuse_same(out, traces)
+    for trace in traces:
+        refuse_clock_steps(trace.path, trace.clock_steps)
+    _refuse_unrelated(traces, shifts)
     moved = [round(s * 1e9) for s in shifts] if shifts is not None else [0] * len(traces)
     about: dict[str, str] = {}
     with RecordingWriter(out, overwrite=overwrite) as writer:
@@ -190,6 +214,38 @@ def merge(
             writer.put(numbers[m.topic, m.type_name], m.data, time_ns, m.publish_time_ns)
         writer.add_metadata(MERGE, {**about, "duplicates": str(duplicates)})
         return Merged(writer.written, duplicates)
+
+
+def _refuse_unrelated(traces: Sequence[Trace], shifts: Sequence[float] | None) -> None:
+    """Refuse recordings that have no time in common, or are of two robots.
+
+    :raises SessionError: they are.
+    """
+    nominal = [
+        t
+        for i, t in enumerate(traces)
+        if import_record(t).clock == NOMINAL and not (shifts is not None and shifts[i])
+    ]
+    if nominal and len(traces) - sum(map(bool, shifts or ())) > 1:
+        raise SessionError(
+            f"{nominal[0].path} has nominal times: its source has none, and what it has in common "
+            "with the other recordings is not known",
+            hint="'dexkit import --wire' finds its times in a recording; or state where it begins: "
+            "--shift FILE=S",
+        )
+    domains: dict[str, tuple[str, Trace]] = {}
+    for trace in traces:
+        for channel in trace.channels:
+            domain = channel.metadata.get("dds.domain", "")
+            if not (domain and channel.message_count):
+                continue
+            other, first = domains.setdefault(channel.topic, (domain, trace))
+            if other != domain:
+                raise SessionError(
+                    f"{channel.topic} is of domain {other} in {first.path}, and of domain {domain} "
+                    f"in {trace.path}: of two robots, whose messages could not be told apart",
+                    hint="keep their recordings apart",
+                )
 
 
 def _shifted(trace: Trace, shift_ns: int) -> Iterator[tuple[int, TraceMessage]]:

@@ -21,6 +21,7 @@ from dexkit.messages import message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.staging import whole_folder
 from dexkit.traces import schemas
+from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.names import dds_topic, dds_type
 from dexkit.traces.reader import LATE_TIMES, LATEST_NS, Definition, Trace
 from dexkit.traces.sessions import old_layouts
@@ -245,8 +246,10 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
     :param storage: ``sqlite3`` or ``mcap``.
     :returns: descriptions of data that the bag cannot hold.
     :raises ExtraMissing: rosbags is not installed.
-    :raises SessionError: ``out`` exists or cannot be written.
+    :raises SessionError: ``out`` exists or cannot be written, or the recording has a stretch of
+        time twice.
     """
+    refuse_clock_steps(trace.path, trace.clock_steps)
     library = _library()
     plugin = library.StoragePlugin.MCAP if storage == "mcap" else library.StoragePlugin.SQLITE3
     lost = ["source timestamps of the samples (publish time): a bag has one time a message"]

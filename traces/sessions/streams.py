@@ -22,6 +22,7 @@ from dexkit.models import MODELS, model
 from dexkit.pressure import resting_pressure
 from dexkit.robots import ROBOTS
 from dexkit.topics import Role, roles
+from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.names import SESSION
 from dexkit.traces.reader import SampleArray, Trace
 from dexkit.traces.sessions import ros_types
@@ -206,8 +207,10 @@ def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream
 
     :param topics: only these, in any spelling, patterns allowed.
     :raises UsageError: a topic is not in the recording.
-    :raises SessionError: a group of joints of an import has a message that is none.
+    :raises SessionError: a group of joints of an import has a message that is none, or the
+        recording has a stretch of time twice.
     """
+    refuse_clock_steps(trace.path, trace.clock_steps)
     known = [c.topic for c in trace.channels if c.message_count]
     wanted = known if topics is None else list(trace.load(topics, payloads=False))
     found: list[Stream] = []

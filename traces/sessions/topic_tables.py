@@ -28,6 +28,7 @@ from dexkit.messages import MessageType, message_type
 from dexkit.messages.columns import encode_columns
 from dexkit.messages.layout import Primitive, Struct
 from dexkit.staging import whole_folder
+from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.reader import (
     LATE_TIMES,
     LATEST_NS,
@@ -110,8 +111,10 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
     :param form: ``csv`` or ``parquet``.
     :returns: descriptions of data that the tables cannot hold.
     :raises ExtraMissing: pyarrow is not installed.
-    :raises SessionError: ``out`` exists or cannot be written.
+    :raises SessionError: ``out`` exists or cannot be written, or the recording has a stretch of
+        time twice.
     """
+    refuse_clock_steps(trace.path, trace.clock_steps)
     lost = [
         "encapsulation and padding bytes of the payloads, and sequence numbers of the messages",
     ]
