@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -24,13 +27,15 @@ from dexkit.messages import message_type
 from dexkit.messages.earlier import EARLIER
 from dexkit.messages.schemas import ros2msg
 from dexkit.messages.unitree_hg import HandState_, MotorState_, PressSensorState_
-from dexkit.traces import Trace, open_trace
+from dexkit.traces import Trace, open_trace, sample_path
+from dexkit.traces.reader import Definition
 from dexkit.traces.sessions import old_layouts, ros_types
 from dexkit.traces.sessions.episodes import parse_document
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.model import REST_TOPIC, picture_topic, reference_topic
 from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
+from dexkit.traces.writer import RecordingWriter
 from tests.each import each
 from tests.session_helpers import dexkit, document, episode, jpeg, png, streamed, whole
 
@@ -785,3 +790,88 @@ def test_check_says_that_a_session_was_imported(tmp_path: Path) -> None:
     assert dexkit("import", source, tmp_path / "e.mcap")[0] == 0
     notes = Recording.decode(open_trace(tmp_path / "e.mcap")).notes
     assert any("an imported session" in note for note in notes)
+
+
+@each("hand", ["", "dex3-1"])
+def test_degrees_are_not_taken_for_radians(tmp_path: Path, hand: str) -> None:
+    names = [f"left_hand_{j}" if hand else f"left_joint_{j}" for j in map(str.lower, LEFT_HAND)]
+    matrix = np.linspace(-60, 60, 7 * 5).reshape(5, 7).astype(np.float32)
+    code, output = dexkit(
+        "import", dataset(tmp_path / "d", "v2.1", names, matrix), tmp_path / "a.mcap"
+    )
+    assert code == 1
+    assert "its states reach 60" in output
+    (state, command) = streams_of(open_trace(tmp_path / "a.mcap"))
+    assert (state.model, command.unit) == (hand, "rad" if hand else "unknown unit")
+
+
+STATES = [message_type(HG).encode(HandState_([MotorState_(q=0.1 * i)], [])) for i in range(4)]
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_a_bag_whose_metadata_write_the_qos_differently_is_read(
+    tmp_path: Path, storage: StoragePlugin
+) -> None:
+    """The library compares what metadata and file write, and takes what differs for two topics."""
+    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
+    source = bag(tmp_path / "bag", storage, topics)
+    path = source / "metadata.yaml"
+    profile = "offered_qos_profiles:\n      - history: keep_last\n        depth: 1\n" + "".join(
+        f"        {line}\n"
+        for line in (
+            *("reliability: reliable", "durability: volatile"),
+            *("deadline: {sec: 0, nsec: 0}", "lifespan: {sec: 0, nsec: 0}"),
+            *("liveliness: automatic", "liveliness_lease_duration: {sec: 0, nsec: 0}"),
+            "avoid_ros_namespace_conventions: false",
+        )
+    )
+    text = path.read_text()
+    path.write_text(re.sub(r"offered_qos_profiles: .*\n", profile, text))
+    assert path.read_text() != text
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert (code, open_trace(tmp_path / "a.mcap").message_count) == (0, len(STATES)), output
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+@each("as_file", [True, False])
+def test_messages_that_are_packed_one_by_one_are_unpacked(
+    tmp_path: Path, storage: StoragePlugin, as_file: bool
+) -> None:
+    """Also where a file of the bag is given by itself, whose metadata are elsewhere."""
+    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
+    packed = [zstandard.ZstdCompressor().compress(data) for data in STATES]
+    source = bag(tmp_path / "bag", storage, {t: (n, d, packed) for t, (n, d, _) in topics.items()})
+    path = source / "metadata.yaml"
+    text = path.read_text().replace("compression_mode: ''", "compression_mode: message")
+    path.write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+    if as_file:
+        (source,) = (p for p in source.iterdir() if p != path)
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert code == 0, output
+    assert [m.data for m in open_trace(tmp_path / "a.mcap").messages()] == STATES
+
+
+def test_a_recording_of_the_low_rate_topic_has_observations(tmp_path: Path) -> None:
+    trace = open_trace(sample_path("dex3_pinch"))
+    topics = ["rt/dex3/left/state", "rt/dex3/left/cmd"]
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        numbers = {
+            t: writer.add_channel(
+                replace(d, topic=t.replace("/dex3/left/state", "/lf/dex3/left/state"))
+            )
+            for (t, _), d in trace.definitions.items()
+            if t in topics
+        }
+        for m in trace.messages(topics):
+            writer.put(numbers[m.topic], m.data, m.log_time_ns)
+    found = streams_of(open_trace(tmp_path / "a.mcap"))
+    assert {(s.part, s.kind) for s in found} == {("left_hand", STATE), ("left_hand", "command")}
+
+
+def test_a_bag_that_can_hold_nothing_is_not_written(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        number = writer.add_channel(Definition("rt/a", "cdr", {}, None))
+        writer.put(number, bytes(8), 10**18)
+    code, output = dexkit("export", tmp_path / "a.mcap", "--to", "rosbag2", "--out", tmp_path / "b")
+    assert (code, "no message that a bag can hold" in output) == (2, True)
+    assert not (tmp_path / "b").exists()

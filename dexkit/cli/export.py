@@ -84,9 +84,9 @@ def command(
             trace = open_trace(path)
             target.parent.mkdir(parents=True, exist_ok=True)
             if form == "rosbag2":
-                lost = rosbag.export_bag(trace, target, storage=storage)
+                written, lost = rosbag.export_bag(trace, target, storage=storage)
             else:
-                lost = topic_tables.export_tables(trace, target, form)
+                written, lost = topic_tables.export_tables(trace, target, form)
         except DexkitError as error:
             if not several:
                 raise
@@ -97,7 +97,7 @@ def command(
         trouble |= bool(trace.damage)
         remarks("warning", trace.warnings, path)
         remarks(f"not in {form}", lost)
-        click.echo(one_line(f"{target}: {trace.message_count} messages", REMARK))
+        click.echo(one_line(f"{target}: {written} of {trace.message_count} messages", REMARK))
     if not done:
         raise SessionError("none of the recordings could be exported")
     return 1 if trouble else 0

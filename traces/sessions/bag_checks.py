@@ -24,13 +24,14 @@ from dexkit.traces.clock_steps import LIMIT_NS, refuse_clock_steps
 from dexkit.traces.container import MAX_CHUNK, MAX_RATIO, SPARE, Container
 from dexkit.traces.mcap_records import MAGIC
 
-__all__ = ["MOST_TOPICS", "Unpacker", "checked_bag", "parse_yaml"]
+__all__ = ["MOST_TOPICS", "Unpacker", "checked_bag", "is_packed", "parse_yaml"]
 
 MOST_TOPICS = 4096
 """Topics of a bag; that of a whole robot has some hundred."""
 _LARGEST_METADATA = 4 * 2**20
 _MOST_EVENTS = 100_000  # names, values and lists in YAML, which take 100 µs each
 _PIECE = 2**20
+_FRAME = b"\x28\xb5\x2f\xfd"
 _HEAD_OF_FRAME = 18  # most bytes of the header of a frame of zstd
 _LARGEST_WINDOW = 2**27  # bytes that zstd --ultra looks back by default
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
@@ -43,8 +44,8 @@ _UNPACK = "unpack the bag first: 'zstd -d', and compression_mode: '' in its meta
 
 
 @contextlib.contextmanager
-def checked_bag(source: Path) -> Iterator[tuple[Path, Unpacker | None]]:
-    """What to give to the library for a bag, and what unpacks its messages, if they are packed.
+def checked_bag(source: Path) -> Iterator[tuple[Path, Unpacker]]:
+    """What to give to the library for a bag, and what unpacks its messages, where they are packed.
 
     Files that are compressed as a whole are unpacked into a temporary folder, which is removed at
     the end.
@@ -53,7 +54,7 @@ def checked_bag(source: Path) -> Iterator[tuple[Path, Unpacker | None]]:
     """
     if not source.is_dir():
         _check_storage(source)
-        yield source, None
+        yield source, Unpacker()
         return
     metadata = source / "metadata.yaml"
     document = parse_yaml(
@@ -68,7 +69,7 @@ def checked_bag(source: Path) -> Iterator[tuple[Path, Unpacker | None]]:
     if mode == "none":
         for path in files:
             _check_storage(path)
-        yield source, None
+        yield source, Unpacker()
         return
     if about.get("compression_format") != "zstd":
         form = one_line(about.get("compression_format"), 40)
@@ -86,7 +87,7 @@ def checked_bag(source: Path) -> Iterator[tuple[Path, Unpacker | None]]:
             about["relative_file_paths"].append(place.name)
         about["compression_mode"] = about["compression_format"] = ""
         _yaml().dump(document, folder / "metadata.yaml")
-        yield folder, Unpacker() if mode == "message" else None
+        yield folder, Unpacker(every=mode == "message")
 
 
 def _files(source: Path, names: object, metadata: Path) -> list[Path]:
@@ -212,19 +213,31 @@ def _unpack_file(path: Path, place: Path) -> None:
             ) from error
 
 
-class Unpacker:
-    """Unpacks the messages of a bag, all of them to no more than their size accounts for."""
+def is_packed(data: bytes) -> bool:
+    """Whether it is a frame of zstd; nothing in CDR begins like one."""
+    return data.startswith(_FRAME)
 
-    def __init__(self) -> None:
+
+class Unpacker:
+    """Unpacks the messages of a bag, all of them to no more than their size accounts for.
+
+    :param every: each message must be packed, as the bag's metadata say. A file of a bag by itself
+        does not say so: there, those that are packed are unpacked.
+    """
+
+    def __init__(self, *, every: bool = False) -> None:
+        self._every = every
         self._left = SPARE
         self._unpacker = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW)
 
     def __call__(self, data: bytes) -> bytes:
-        """Unpack one.
+        """Unpack one, if it is packed.
 
         :raises SessionError: the messages unpack to more than they may.
         :raises WireError: it cannot be unpacked.
         """
+        if not (self._every or is_packed(data)):
+            return data
         self._left += MAX_RATIO * len(data)
         most = min(self._left, MAX_CHUNK)
         try:

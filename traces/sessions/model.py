@@ -30,7 +30,7 @@ from dexkit.messages import MessageType, message_type
 from dexkit.models import DIALECTS, Dialect, HandModel, ModeByte, model
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.imported import MEASURED, NOMINAL, RECORD, absent_key
-from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, MEMBERS, STATE
+from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, MEMBERS, STATE, may_be_radians
 from dexkit.traces.writer import RecordingWriter, definition
 
 __all__ = [
@@ -271,6 +271,11 @@ def _group_channel(
     writer: RecordingWriter, session: Session, part: Part, kind: str
 ) -> tuple[int, Callable[[int], bytes | None]]:
     values = part.values[kind]
+    if not may_be_radians(values["q"]):
+        session.problems.add(
+            f"{part.name}: its {kind}s reach {np.nanmax(np.abs(values['q'])):.4g}, which is no "
+            "angle in rad; are they degrees? They are kept as they are, without a unit"
+        )
     topic = ros_types.group_topic(part.name, "cmd" if kind == COMMAND else "state")
     channel = writer.add_channel(ros_types.JOINT_STATE.definition(topic))
     return channel, lambda i: _joint_state(session, part, values, i)
@@ -296,6 +301,12 @@ def _hands_channel(
         session.about[f"filled {topic}"] = "kp, kd and mode, as xr_teleoperate sends them"
     encode = _motor_encoder(dialect, hand, kind)
     for part in parts:
+        if not _is_near_limits(part, kind):
+            session.problems.add(
+                f"{part.name}: its {kind}s reach {np.nanmax(np.abs(part.values[kind]['q'])):.4g}, "
+                f"far beyond a {hand.name}, whose joints count in {hand.unit}; they are kept as "
+                "they are"
+            )
         _note_losses(session, part, kind, message_type(type_name))
     values = {part.side: part.values[kind] for part in parts}
     places = {part.side: f"{part.name} {kind}" for part in parts}
@@ -311,6 +322,16 @@ def _hands_channel(
         return None if bad else encode(rows)
 
     return channel, encode_row
+
+
+def _is_near_limits(part: Part, kind: str) -> bool:
+    """Whether positions can be those of the hand: no further beyond than its limits are apart."""
+    assert part.model is not None
+    joints = part.model.joints[part.side]
+    low, high = np.array([[j.q_min, j.q_max] for j in joints]).T
+    with np.errstate(invalid="ignore"):
+        q = part.values[kind]["q"]
+        return not ((q < 2 * low - high) | (q > 2 * high - low)).any()
 
 
 def _absent(dialect: Dialect, parts: Sequence[Part], kind: str) -> Iterator[str]:

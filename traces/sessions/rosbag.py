@@ -77,6 +77,7 @@ def import_bag(
     ):
         try:
             with library.Reader(bag) as reader:
+                _ignore_qos(reader)
                 channels = {}
                 for connection in reader.connections:
                     messages = (data for _, _, data in reader.messages([connection]))
@@ -100,11 +101,22 @@ def import_bag(
         return writer.written, corrections, problems
 
 
+def _ignore_qos(reader: Any) -> None:
+    """Let a bag's metadata and its files differ in QoS, which is written in several spellings; the
+    library takes what differs for other topics.
+    """
+    known = {(c.topic, c.msgtype): c.ext for c in reader.connections}
+    for storage in getattr(reader.storage, "storages", ()):
+        storage.connections = [
+            c._replace(ext=known.get((c.topic, c.msgtype), c.ext)) for c in storage.connections
+        ]
+
+
 def _copy(
     wanted: Sequence[Connection],
     messages: Iterable[tuple[Connection, int, object]],
     channels: dict[int, tuple[int, Convert | None]],
-    unpack: Unpacker | None,
+    unpack: Unpacker,
     writer: RecordingWriter,
     problems: Problems,
 ) -> None:
@@ -124,8 +136,7 @@ def _copy(
             continue
         payload = bytes(data)
         try:
-            if unpack is not None:
-                payload = unpack(payload)
+            payload = unpack(payload)
             if convert is not None:
                 payload = convert(payload)
         except WireError as error:
@@ -145,7 +156,7 @@ def _copy(
 def _channel(
     messages: Iterator[object],
     connection: Connection,
-    unpack: Unpacker | None,
+    unpack: Unpacker,
     problems: Problems,
     corrections: list[str],
 ) -> tuple[Definition, Convert | None] | None:
@@ -182,7 +193,7 @@ def _channel(
     for data in islice(messages, _TRIED):
         payload = bytes(data) if isinstance(data, bytes | bytearray | memoryview) else b""
         with contextlib.suppress(WireError):
-            some.append(unpack(payload) if unpack is not None else payload)
+            some.append(unpack(payload))
     layout = old_layouts.matching_layout(type_name, some)
     if layout is None:
         problems.add(
@@ -240,11 +251,11 @@ def _texts(value: object) -> dict[str, str] | None:
     return None
 
 
-def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str]:
+def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> tuple[int, list[str]]:
     """Convert a recording to a bag (a folder).
 
     :param storage: ``sqlite3`` or ``mcap``.
-    :returns: descriptions of data that the bag cannot hold.
+    :returns: the number of messages written, and descriptions of data that the bag cannot hold.
     :raises ExtraMissing: rosbags is not installed.
     :raises SessionError: ``out`` exists or cannot be written, or the recording has a stretch of
         time twice.
@@ -254,6 +265,7 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
     plugin = library.StoragePlugin.MCAP if storage == "mcap" else library.StoragePlugin.SQLITE3
     lost = ["source timestamps of the samples (publish time): a bag has one time a message"]
     with whole_folder(out, error=SessionError) as root, _named_errors(library, out):
+        written = 0
         writer = library.Writer(root, version=9, storage_plugin=plugin)
         with writer:
             connections = {}
@@ -280,11 +292,16 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> list[str
                     if m.log_time_ns >= LATEST_NS:
                         late[f"{m.topic}: {LATE_TIMES}"] = None
                     writer.write(connection, min(m.log_time_ns, LATEST_NS), m.data)
+                    written += 1
             lost += late
             for name, values in trace.metadata.items():
                 writer.set_custom_data(f"{_METADATA}{name}", json.dumps(values))
             writer.set_custom_data(_LOSSES, json.dumps(lost))
-    return lost
+        if not written:
+            raise SessionError(
+                f"{trace.path} has no message that a bag can hold", hint="; ".join(lost[1:4])
+            )
+    return written, lost
 
 
 @contextlib.contextmanager

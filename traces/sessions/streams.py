@@ -37,11 +37,14 @@ __all__ = [
     "STATE",
     "Pressure",
     "Stream",
+    "may_be_radians",
     "pressures_of",
     "streams_of",
 ]
 
 Times = NDArray[np.int64]
+
+_MOST_RAD = 4 * np.pi
 
 STATE, COMMAND = "state", "command"
 HAND = "_hand"
@@ -92,8 +95,12 @@ class Stream:
 
     @property
     def unit(self) -> str:
-        """The unit of q: that of the hand model, rad for robots and groups without a profile."""
-        return MODELS[self.model].unit if self.model in MODELS else "rad"
+        """The unit of q: that of the hand model, rad for robots, and for groups without a profile
+        whose values can be rad.
+        """
+        if self.model in MODELS:
+            return MODELS[self.model].unit
+        return "rad" if self.model or may_be_radians(self.q) else "unknown unit"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -167,6 +174,13 @@ class Pressure:
         return np.isfinite(interpolate(self.times_ns, here, times_ns))[:, 0]
 
 
+def may_be_radians(q: Floats) -> bool:
+    """Whether positions of joints can be rad: within two turns. Degrees of a joint that moves, and
+    per cent, lie beyond.
+    """
+    return not (np.abs(q) > _MOST_RAD).any()
+
+
 def pressures_of(trace: Trace, streams: Sequence[Stream]) -> list[Pressure]:
     """Pressures of the hands of a recording, by part.
 
@@ -215,9 +229,10 @@ def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream
     wanted = known if topics is None else list(trace.load(topics, payloads=False))
     found: list[Stream] = []
     absent = absent_fields(trace.metadata.get(RECORD, {}))
+    copies = _copies(known)
     for topic, samples in trace.load(sorted(set(wanted) & set(known)), decode=True).items():
         try:
-            streams = list(_streams(topic, samples))
+            streams = [] if topic in copies else list(_streams(topic, samples))
         except WireError as error:
             raise SessionError(f"{trace.path}: {topic}: {error}") from error
         for stream in streams:
@@ -233,6 +248,17 @@ def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream
     return found
 
 
+def _copies(topics: Sequence[str]) -> set[str]:
+    """The low-rate topics that are copies of a state topic of the recording."""
+    there = set(topics)
+    return {
+        topic
+        for topic in topics
+        for role in roles(topic)
+        if role.kind == "low" and there & {role.dialect.topics(s)[1] for s in role.sides}
+    }
+
+
 def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
     if samples.type_name == ros_types.JOINT_STATE.dds_name and not samples.decoded:
         yield from _joint_states(topic, samples)
@@ -240,8 +266,8 @@ def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
     if samples.problem:
         return
     for role in roles(topic, samples.type_name)[:1]:
-        if role.kind in ("low", "touch"):
-            continue  # a copy, or no joints
+        if role.kind == "touch":
+            continue  # no joints
         kind = COMMAND if role.kind == "cmd" else STATE
         hand = model(role.dialect.model)
         columns = _columns(samples)

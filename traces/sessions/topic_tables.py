@@ -105,11 +105,11 @@ def _leaves(kind: Struct, lengths: Mapping[str, int]) -> Iterator[_Leaf]:
 # -----------------------------------------------------------------------------------------
 
 
-def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
+def export_tables(trace: Trace, out: Path, form: str) -> tuple[int, list[str]]:
     """Write a recording as tables.
 
     :param form: ``csv`` or ``parquet``.
-    :returns: descriptions of data that the tables cannot hold.
+    :returns: the number of messages written, and descriptions of data that the tables cannot hold.
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: ``out`` exists or cannot be written, or the recording has a stretch of
         time twice.
@@ -120,7 +120,7 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
     ]
     with whole_folder(out, error=SessionError) as root:
         root.mkdir()
-        topics = []
+        topics, written = [], 0
         for number, ((topic, type_name), d) in enumerate(sorted(trace.definitions.items())):
             name = f"{number:03d}_{file_name(topic)}.{form}"
             entry = {
@@ -134,17 +134,18 @@ def export_tables(trace: Trace, out: Path, form: str) -> list[str]:
                 else [*d.schema[:2], base64.b64encode(d.schema[2]).decode()],
             }
             info = next(c for c in trace.channels if (c.topic, c.type_name) == (topic, type_name))
-            _export_topic(trace, info, root / name, form, entry, lost)
+            written += _export_topic(trace, info, root / name, form, entry, lost)
             topics.append(entry)
         about = {_KEY: 1, "topics": topics, "metadata": trace.metadata, "lost": lost}
         text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
         (root / _ABOUT).write_bytes(text.encode("utf-8", "backslashreplace"))
-    return lost
+    return written, lost
 
 
 def _export_topic(
     trace: Trace, info: ChannelInfo, path: Path, form: str, entry: dict[str, Any], lost: list[str]
-) -> None:
+) -> int:
+    """Write the table of a topic; return the number of its rows."""
     samples = trace.load([info.topic])[info.topic]
     names: list[str] = list(_TIMES)
     columns: list[_Column]
@@ -156,7 +157,7 @@ def _export_topic(
         names.append(_PAYLOAD)
         _note_late_times(info.topic, columns, lost)
         _write(path, form, names, columns, [m.data for m in found])
-        return
+        return len(found)
     decoded = samples.columns()
     good = decoded.ok
     if not good.all():
@@ -186,6 +187,7 @@ def _export_topic(
         names.append(leaf.path)
         columns.append(_Column(values.astype(leaf.dtype), there))
     _write(path, form, names, columns)
+    return int(np.count_nonzero(good))
 
 
 def _note_late_times(topic: str, times: Sequence[_Column], lost: list[str]) -> None:
