@@ -21,6 +21,7 @@ from dexkit.conformance.layers import layer
 from dexkit.conformance.median import median
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.processor_waits import Starvation
+from dexkit.conformance.provenance import Provenance
 from dexkit.conformance.run_record import RECORD as RUN
 from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.touch import Touch
@@ -198,6 +199,7 @@ class Recording:
     :param run: the run record; empty in a recording that no live run made.
     :param low_rate: the states on the low-rate topics, where there are any.
     :param touch: what tactile areas felt, likewise.
+    :param provenance: what it can hold, by where it comes from.
     """
 
     dialect: Dialect
@@ -213,6 +215,7 @@ class Recording:
     run: Mapping[str, str] = field(default_factory=dict)
     low_rate: Mapping[Subject, States] = field(default_factory=dict)
     touch: Mapping[Subject, Touch] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
 
     layer = "dds"
     """Which layer's requirements it is judged by."""
@@ -403,6 +406,7 @@ class TopicDecoder:
             "stimulus": self.stimulus,
             "usb": self._usb,
             "run": self._trace.metadata.get(RUN, {}),
+            "provenance": Provenance.of(self._trace.metadata),
         }
 
     def knows(self, subject: Subject) -> bool:
@@ -450,7 +454,7 @@ class TopicDecoder:
         return States(
             topic=topic,
             t=_seconds(samples.log_time_ns, self.origin_ns),
-            sent=_sent(samples, self.origin_ns),
+            sent=self._sent(samples),
             length=codec.count(columns, codec.state_sequence),
             q=column("q"),
             dq=column("dq", speeds),
@@ -460,6 +464,18 @@ class TopicDecoder:
             errors={i: str(e) for i, e in columns.errors.items()},
             columns=columns,
         )
+
+    def _sent(self, samples: SampleArray) -> Floats:
+        """Source timestamps, seconds; NaN where they are unknown.
+
+        A format without them has the times of reception there.
+        """
+        sent = _seconds(samples.publish_time_ns, self.origin_ns)
+        received = self.stimulus is None and np.array_equal(
+            samples.publish_time_ns, samples.log_time_ns
+        )
+        sent[(samples.publish_time_ns == 0) | received] = np.nan
+        return sent
 
     def _commands(self, subject: Subject) -> Commands:
         codec = self._codec
@@ -478,7 +494,7 @@ class TopicDecoder:
         return Commands(
             topic=topic,
             t=_seconds(samples.log_time_ns, self.origin_ns),
-            sent=_sent(samples, self.origin_ns),
+            sent=self._sent(samples),
             length=codec.count(columns, codec.command_sequence),
             q=column("q"),
             dq=column("dq"),
@@ -540,13 +556,6 @@ def _publisher_times(t: Floats, sent: Floats) -> Floats:
     if not len(sent) or not np.isfinite(sent).all():
         return t
     return np.asarray(sent + median(t - sent))
-
-
-def _sent(samples: SampleArray, origin: int) -> Floats:
-    """Source timestamps, seconds; NaN where they are unknown."""
-    sent = _seconds(samples.publish_time_ns, origin)
-    sent[samples.publish_time_ns == 0] = np.nan
-    return sent
 
 
 def _left_out(spoken: Dialect, views: Mapping[Side, SideView]) -> tuple[Side, ...]:

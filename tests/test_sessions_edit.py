@@ -19,9 +19,10 @@ from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.traces import Recorder, open_trace, sample_path
 from dexkit.traces.clock_steps import order_of, steps_between
+from dexkit.traces.names import CUT
 from dexkit.traces.sessions.align import Track, align
 from dexkit.traces.sessions.compare import compare
-from dexkit.traces.sessions.edit import CUT, Span, clock_offset, cut, merge
+from dexkit.traces.sessions.edit import Span, clock_offset, cut, merge
 from dexkit.traces.sessions.resample import gap_of, hold, interpolate
 from dexkit.traces.sessions.streams import COMMAND, streams_of
 from dexkit.traces.writer import RecordingWriter, definition

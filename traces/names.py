@@ -12,10 +12,13 @@ from collections.abc import Iterable
 
 from dexkit.messages.layout import ALL
 
-__all__ = ["SESSION", "USB", "dds_topic", "dds_type", "select_topics"]
+__all__ = ["CUT", "RECORDER", "SESSION", "USB", "dds_topic", "dds_type", "select_topics"]
 
 USB = "usb/"
 """Beginning of the channels that hold USB transfers and no DDS samples."""
+
+CUT, RECORDER = "dexkit_cut", "dexkit_recorder"
+"""Names of the metadata records of a cut and of the recorder."""
 
 SESSION = "rt/session/"
 """Prefix of topics with data of an imported session that no DDS topic carries."""

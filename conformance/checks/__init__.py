@@ -14,7 +14,7 @@ servos, and :mod:`~.client` for the client that drives them.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -365,16 +365,29 @@ REGISTRY: dict[str, Check] = {}
 """Checks by requirement id, of those modules that have been imported."""
 
 
-def check(*requirement_ids: str) -> Callable[[CheckT], CheckT]:
-    """Register the decorated function as the check of these requirements, of any layer."""
+_RESTS_ON: dict[Check, tuple[str, ...]] = {}
+
+
+def check(*requirement_ids: str, rests_on: Sequence[str] = ()) -> Callable[[CheckT], CheckT]:
+    """Register the decorated function as the check of these requirements, of any layer.
+
+    :param rests_on: what it judges beside positions: members of a motor, and
+        :data:`~dexkit.conformance.provenance.TIMES`.
+    """
 
     def register(function: CheckT) -> CheckT:
         for name in requirement_ids:
             assert name not in REGISTRY, f"{name} has two checks"
             REGISTRY[name] = function
+        _RESTS_ON[function] = tuple(rests_on)
         return function
 
     return register
+
+
+def rests_on(requirement: Requirement) -> tuple[str, ...]:
+    """What the check of a requirement rests on beside positions."""
+    return _RESTS_ON.get(check_of(requirement), ())
 
 
 def check_of(requirement: Requirement) -> Check:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.provenance import STATES, TIMES
 from dexkit.conformance.results import Evidence
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte, model
@@ -187,7 +188,7 @@ def not_normalised(ctx: Context) -> Outcome:
     return ctx.failed("0 to 1", text, ctx.at(ctx.commands.topic, float(ctx.commands.t[0])))
 
 
-@check("DEX1-CLIENT-09")
+@check("DEX1-CLIENT-09", rests_on=("kp",))
 def gains(ctx: Context) -> Outcome:
     """Kp and kd, compared with those that Unitree's client sends."""
     commands, most = ctx.commands, ctx.tolerance("max_factor")
@@ -218,7 +219,7 @@ def gains(ctx: Context) -> Outcome:
     return ctx.failed(figure, found, *_places(ctx, np.array([row]))).about(joint)
 
 
-@check("DEX1-CLIENT-14")
+@check("DEX1-CLIENT-14", rests_on=("kp",))
 def no_gains(ctx: Context) -> Outcome:
     """Gains where they have no effect."""
     commands = ctx.commands
@@ -229,7 +230,7 @@ def no_gains(ctx: Context) -> Outcome:
     return ctx.failed("not 0", text, *_places(ctx, rows))
 
 
-@check("DEX1-CLIENT-10")
+@check("DEX1-CLIENT-10", rests_on=("mode",))
 def mode(ctx: Context) -> Outcome:
     """The mode byte of each motor's command."""
     kind, modes = ctx.recording.dialect.mode_byte, ctx.commands.mode
@@ -330,7 +331,7 @@ def slow_stretches(
     return float(((last - first) / (t[last] - t[first])).min(initial=math.inf)), []
 
 
-@check("DEX1-CLIENT-05", "DEX1-CLIENT-06")
+@check("DEX1-CLIENT-05", "DEX1-CLIENT-06", rests_on=(TIMES,))
 def rate(ctx: Context) -> Outcome:
     """The least rate of commands in a sliding window."""
     limit, window = ctx.tolerance("min_rate_hz"), ctx.tolerance("window_s")
@@ -357,7 +358,7 @@ def rate(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-CLIENT-07")
+@check("DEX1-CLIENT-07", rests_on=(TIMES,))
 def gap(ctx: Context) -> Outcome:
     """The longest interval between two commands of a session."""
     t, limit = _clock(ctx), ctx.tolerance("max_gap_s")
@@ -405,7 +406,7 @@ def distance_from_states(ctx: Context, joint: int, memory: float) -> Floats:
     return distance
 
 
-@check("DEX1-CLIENT-08")
+@check("DEX1-CLIENT-08", rests_on=(TIMES,))
 def lead(ctx: Context) -> Outcome:
     """Lead of a command over the last states."""
     limit, driven = ctx.requirement.tolerance("max_lead_stroke"), _driven(ctx)
@@ -451,7 +452,7 @@ def returns(q: Floats, least: float) -> Mask:
     return found
 
 
-@check("DEX1-CLIENT-11")
+@check("DEX1-CLIENT-11", rests_on=(TIMES,))
 def one_writer(ctx: Context) -> Outcome:
     """Commands that alternate between two targets, as from two clients."""
     window, fewest = ctx.tolerance("window_s"), round(ctx.tolerance("min_returns"))
@@ -476,7 +477,7 @@ def one_writer(ctx: Context) -> Outcome:
 # -------------------------------------------------------------------------------- begin and end
 
 
-@check("DEX1-CLIENT-12")
+@check("DEX1-CLIENT-12", rests_on=(TIMES, STATES))
 def waits(ctx: Context) -> Outcome:
     """Whether a state came before the first command."""
     first = float(ctx.commands.t[0])
@@ -493,7 +494,13 @@ def waits(ctx: Context) -> Outcome:
     return ctx.passed(f"after {wait:.2f} s", f"{wait:.2f} s after the first state", wait_s=wait)
 
 
-@check("DEX1-CLIENT-13")
+@check(
+    "DEX1-CLIENT-13",
+    rests_on=(
+        TIMES,
+        "kp",
+    ),
+)
 def ends_at_rest(ctx: Context) -> Outcome:
     """The speed of hand and target when the commands end."""
     commands, states = ctx.commands, ctx.states

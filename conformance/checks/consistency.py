@@ -18,6 +18,7 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.excess import Course
 from dexkit.conformance.median import median
+from dexkit.conformance.provenance import TIMES
 from dexkit.conformance.row_selection import Rows, SomeTimes, Times, finite_rows
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
@@ -142,7 +143,7 @@ def _reported_speed(ctx: Context, joint: int) -> float | None:
     return float(np.partition(dq, row)[row])
 
 
-@check("DEX1-FIELD-15", "DEX3-FIELD-15")
+@check("DEX1-FIELD-15", "DEX3-FIELD-15", rests_on=(TIMES,))
 def jumps(ctx: Context) -> Outcome:
     """The largest change of q between two states, relative to the speed limit."""
     states = ctx.states
@@ -213,7 +214,7 @@ _SPREADS = 4.0
 """Median deviations from the median within which 99 % of a cell's noise is."""
 
 
-@check("DEX1-FRESH-03", "DEX3-FRESH-03")
+@check("DEX1-FRESH-03", "DEX3-FRESH-03", rests_on=(TIMES,))
 def alternates(ctx: Context) -> Outcome:
     """Number of cells with a reversal of q, in the worst window."""
     cell, count = (
@@ -278,7 +279,14 @@ def filled(ctx: Context) -> bool:
     return bool(np.nan_to_num(dq[:_FEW]).any() or np.nan_to_num(dq[_FEW:]).any())
 
 
-@check("DEX1-FIELD-16", "DEX3-FIELD-16")
+@check(
+    "DEX1-FIELD-16",
+    "DEX3-FIELD-16",
+    rests_on=(
+        TIMES,
+        "dq",
+    ),
+)
 def slope(ctx: Context) -> Outcome:
     """Relative RMS error between dq and the slope of q, in the worst window."""
     if not filled(ctx):
@@ -378,7 +386,14 @@ def _window_error(
     return float(error[i]), float(ratio), float(grid[at])
 
 
-@check("DEX1-FIELD-17", "DEX3-FIELD-17")
+@check(
+    "DEX1-FIELD-17",
+    "DEX3-FIELD-17",
+    rests_on=(
+        TIMES,
+        "dq",
+    ),
+)
 def keeps_up(ctx: Context) -> Outcome:
     """Motion of q that dq, up to 40 ms earlier or later, does not explain, in the worst window."""
     if not filled(ctx):

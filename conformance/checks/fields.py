@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.conformance.provenance import TIMES
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.row_selection import Times
 from dexkit.hand import Floats
@@ -148,7 +149,7 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
     return None
 
 
-@check("DEX1-FIELD-14")
+@check("DEX1-FIELD-14", rests_on=(TIMES,))
 def plausible_speed(ctx: Context) -> Outcome:
     """The fastest motion of q, relative to the joint's top speed."""
     window = ctx.tolerance("window_s")
@@ -182,7 +183,14 @@ def plausible_speed(ctx: Context) -> Outcome:
     ).about(joint)
 
 
-@check("DEX1-FIELD-04", "DEX3-FIELD-04")
+@check(
+    "DEX1-FIELD-04",
+    "DEX3-FIELD-04",
+    rests_on=(
+        TIMES,
+        "dq",
+    ),
+)
 def velocity(ctx: Context) -> Outcome:
     """Mean of dq over a window against the difference of q over it, in the worst joint."""
     known: dict[bytes, Windows] = {}

@@ -205,7 +205,7 @@ def _modes(ctx: Context, rows: slice = slice(None)) -> NDArray[np.intp]:
     return mode[np.isfinite(mode).all(axis=1)].astype(np.intp)
 
 
-@check("DEX3-MODE-01")
+@check("DEX3-MODE-01", rests_on=("mode",))
 def ids(ctx: Context) -> Outcome:
     """Bits 0 to 3 of each motor's mode byte."""
     states, due = ctx.states.mode, np.arange(len(ctx.joints))
@@ -259,7 +259,7 @@ def status(ctx: Context) -> Outcome:
     return ctx.passed("1, then 0", "1 while driven, 0 while locked")
 
 
-@check("DEX5-MODE-01")
+@check("DEX5-MODE-01", rests_on=("mode",))
 def plain_mode(ctx: Context) -> Outcome:
     """Whether anything moves with mode 1."""
     obeyed, asked = 0, 0

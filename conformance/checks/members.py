@@ -123,7 +123,7 @@ def _finite(ctx: Context, paths: list[str]) -> Outcome:
     return wrong or ctx.passed("all finite", f"{len(paths)} members")
 
 
-@check("DEX1-FIELD-05")
+@check("DEX1-FIELD-05", rests_on=("mode",))
 def mode(ctx: Context) -> Outcome:
     """A gripper's mode: 0, or 1 while it is driven."""
     found = np.unique(ctx.states.mode[np.isfinite(ctx.states.mode)])
@@ -195,7 +195,7 @@ _MEDIANS = 6.0
 """Medians of what q shows beyond which normal noise is once in 20,000 states."""
 
 
-@check("DEX1-FIELD-06", "DEX3-FIELD-05")
+@check("DEX1-FIELD-06", "DEX3-FIELD-05", rests_on=("ddq",))
 def acceleration(ctx: Context) -> Outcome:
     """Compare ddq with the second difference of q over a window."""
     states = ctx.states
@@ -234,13 +234,13 @@ def acceleration(ctx: Context) -> Outcome:
     return outcome.because("its sign is wrong") if ratio < 0 else outcome
 
 
-@check("DEX1-FIELD-07")
+@check("DEX1-FIELD-07", rests_on=("q_raw",))
 def raw(ctx: Context) -> Outcome:
     """Raw values are numbers."""
     return _finite(ctx, _motors(ctx, "q_raw", "dq_raw", "ddq_raw"))
 
 
-@check("DEX1-FIELD-08", "DEX3-FIELD-06")
+@check("DEX1-FIELD-08", "DEX3-FIELD-06", rests_on=("temperature",))
 def temperature(ctx: Context) -> Outcome:
     """Motor temperatures in degrees Celsius."""
     paths = _motors(ctx, "temperature")
@@ -252,7 +252,7 @@ def temperature(ctx: Context) -> Outcome:
     return wrong or ctx.passed(f"{figure} C", f"temperature {figure} C")
 
 
-@check("DEX1-FIELD-09")
+@check("DEX1-FIELD-09", rests_on=("lost",))
 def lost(ctx: Context) -> Outcome:
     """The count of lost messages."""
     path = _motors(ctx, "lost")
@@ -262,7 +262,7 @@ def lost(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-FIELD-10", "DEX3-FIELD-09")
+@check("DEX1-FIELD-10", "DEX3-FIELD-09", rests_on=("reserve",))
 def reserved(ctx: Context) -> Outcome:
     """Number of different values of each reserved word."""
     paths = _motors(ctx, "reserve")
@@ -283,7 +283,7 @@ def reserved(ctx: Context) -> Outcome:
     return outcome.shown_by(Plot.of_member(path), PlotKind.POSITION)
 
 
-@check("DEX1-FIELD-11", "DEX3-FIELD-07")
+@check("DEX1-FIELD-11", "DEX3-FIELD-07", rests_on=("voltage",))
 def voltages(ctx: Context) -> Outcome:
     """The supply, in volts and amperes."""
     volts = [*_motors(ctx, "vol"), "power_v", "system_v", "device_v"]
@@ -295,7 +295,7 @@ def voltages(ctx: Context) -> Outcome:
     return wrong or ctx.passed(f"{figure} V", f"voltages {figure} V")
 
 
-@check("DEX1-FIELD-12", "DEX3-FIELD-08")
+@check("DEX1-FIELD-12", "DEX3-FIELD-08", rests_on=("faults",))
 def no_fault(ctx: Context) -> Outcome:
     """Fault words while a hand moves without contact and obeys its commands."""
     spans = [ctx.span(p) for p in ctx.phases()]

@@ -372,7 +372,7 @@ def reported_machine(ctx: RobotContext) -> Outcome:
     return ctx.failed(reported, f"mode_machine is {reported}")
 
 
-@check("H1-MODE-01")
+@check("H1-MODE-01", rests_on=("mode",))
 def reported_mode(ctx: RobotContext) -> Outcome:
     """Mode bytes of held motors, and of a motor that was turned off."""
     robot = ctx.recording.robot

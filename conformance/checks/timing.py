@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.median import median, percentile
+from dexkit.conformance.provenance import TIMES
 from dexkit.conformance.sums import total
 from dexkit.hand import Floats
 
@@ -213,7 +214,7 @@ def _too_short(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-RATE-01", "DEX3-RATE-01", "H1-RATE-01")
+@check("DEX1-RATE-01", "DEX3-RATE-01", "H1-RATE-01", rests_on=(TIMES,))
 def rate(ctx: Context) -> Outcome:
     """Rate in sliding windows, outside of gaps."""
     clock = ctx.states.clock
@@ -258,7 +259,7 @@ def rate(ctx: Context) -> Outcome:
     return outcome.if_late(*(1 / r - period for r in rates), how="mean", best=best)
 
 
-@check("DEX1-RATE-02", "DEX3-RATE-02", "H1-RATE-02")
+@check("DEX1-RATE-02", "DEX3-RATE-02", "H1-RATE-02", rests_on=(TIMES,))
 def vendor_rate(ctx: Context) -> Outcome:
     """Mean rate compared with the vendor's.
 
@@ -282,7 +283,7 @@ def vendor_rate(ctx: Context) -> Outcome:
     return too_slow(ctx, outcome.rated(rate, least, seconds), rate, np.diff(ctx.states.clock))
 
 
-@check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03")
+@check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03", rests_on=(TIMES,))
 def no_gap(ctx: Context) -> Outcome:
     """Longest interval without a state."""
     limit = ctx.tolerance("max_gap_s")
@@ -316,7 +317,7 @@ def no_gap(ctx: Context) -> Outcome:
     ).timed(longest, limit)
 
 
-@check("DEX1-RATE-04", "DEX3-RATE-04")
+@check("DEX1-RATE-04", "DEX3-RATE-04", rests_on=(TIMES,))
 def regular(ctx: Context) -> Outcome:
     """99th percentile of the intervals in sliding windows, by source timestamp and reception, and
     the number of pauses.
@@ -352,7 +353,7 @@ def regular(ctx: Context) -> Outcome:
     return outcome.timed(late, limit).if_late(late - limit, how="p99")
 
 
-@check("DEX1-RATE-05", "DEX3-RATE-05")
+@check("DEX1-RATE-05", "DEX3-RATE-05", rests_on=(TIMES,))
 def spread(ctx: Context) -> Outcome:
     """The largest number of long intervals in a window, as published and as received."""
     return _long_intervals(
@@ -428,7 +429,7 @@ def _count(which: NDArray[np.bool_], rows: NDArray[np.intp]) -> NDArray[np.intp]
     return np.asarray(passed[rows[1]] - passed[rows[0]])
 
 
-@check("DEX1-ORDER-01", "DEX3-ORDER-01", "H1-ORDER-01")
+@check("DEX1-ORDER-01", "DEX3-ORDER-01", "H1-ORDER-01", rests_on=(TIMES,))
 def order(ctx: Context) -> Outcome:
     """Source timestamps increase from sample to sample."""
     sent = ctx.states.sent
@@ -527,7 +528,7 @@ class Positions:
         return bool((self.changes[chosen] - before >= samples).any())
 
 
-@check("DEX1-FRESH-02", "DEX3-FRESH-02")
+@check("DEX1-FRESH-02", "DEX3-FRESH-02", rests_on=(TIMES,))
 def not_frozen(ctx: Context) -> Outcome:
     """The longest interval of equal positions that ends in an impossible jump."""
     limit = ctx.tolerance("max_frozen_s")
@@ -629,7 +630,7 @@ def _medians(rows: Floats) -> Floats:
     return np.asarray(np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e)))
 
 
-@check("DEX1-FRESH-01", "DEX3-FRESH-01", "DEX1-FRESH-04")
+@check("DEX1-FRESH-01", "DEX3-FRESH-01", "DEX1-FRESH-04", rests_on=(TIMES,))
 def fresh(ctx: Context) -> Outcome:
     """Time without a new position while the hand moves."""
     worst: Outcome | None = None

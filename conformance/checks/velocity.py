@@ -68,7 +68,7 @@ def _rows_from(t: Floats, times: Floats) -> Rows:
     return np.asarray(np.searchsorted(t, times))
 
 
-@check("DEX1-FIELD-22", "DEX3-FIELD-21")
+@check("DEX1-FIELD-22", "DEX3-FIELD-21", rests_on=("dq",))
 def velocity_filled(ctx: Context) -> Outcome:
     """Whether dq of a joint stays 0 while q moves, in a hand that fills it elsewhere."""
     if not filled(ctx):
@@ -102,7 +102,7 @@ def _zeros(t: Floats, dq: Floats) -> Iterator[tuple[int, int]]:
     return ((a, b) for a, b in pairwise(edges) if zero[a])
 
 
-@check("DEX1-FIELD-19", "DEX3-FIELD-18")
+@check("DEX1-FIELD-19", "DEX3-FIELD-18", rests_on=("dq",))
 def one_course(ctx: Context) -> Outcome:
     """Number of cells in which dq alternates by the speed itself, in the worst window."""
     if not filled(ctx):
@@ -146,7 +146,7 @@ def one_course(ctx: Context) -> Outcome:
     return ctx.failed(f"{turns} times", text, place, turns=turns).about(joint)
 
 
-@check("DEX1-FIELD-20", "DEX3-FIELD-19")
+@check("DEX1-FIELD-20", "DEX3-FIELD-19", rests_on=("dq",))
 def at_rest(ctx: Context) -> Outcome:
     """The largest mean of dq of a joint at rest.
 
@@ -240,7 +240,7 @@ def _runs(rows: Rows) -> tuple[Rows, Rows]:
     return rows[np.append(0, behind)], rows[np.append(behind, 0) - 1] + 1
 
 
-@check("DEX1-FIELD-21", "DEX3-FIELD-20")
+@check("DEX1-FIELD-21", "DEX3-FIELD-20", rests_on=("dq",))
 def not_the_command(ctx: Context) -> Outcome:
     """The farthest way that dq shows while q is exactly the commanded q.
 

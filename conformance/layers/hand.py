@@ -140,6 +140,24 @@ def _missing(context: Context) -> str:
     return ""
 
 
+def carried(judgement: Judgement, context: Context) -> Result | None:
+    """A precondition: the source of the recording carries what the check rests on."""
+    from dexkit.conformance.checks import rests_on
+    from dexkit.conformance.provenance import STATES
+
+    requirement, recording = context.requirement, context.recording
+    wanted, states = rests_on(requirement), context.states.topic
+    topic = context.commands.topic if requirement.layer == "client" else states
+    why = recording.provenance.lacking(topic, wanted)
+    about_states = requirement.layer != "client" and not requirement.needs_discovery
+    if (about_states or STATES in wanted) and all(c.topic != states for c in recording.channels):
+        if recording.provenance.leaves_out(states):
+            why = f"the recording is of chosen topics, without {states}"
+        elif recording.stimulus is None and not recording.endpoints:
+            why = f"the recording has no {states}, and does not say who published"
+    return judgement.not_applicable(why) if why else None
+
+
 def with_silence(context: Context, outcome: Outcome) -> Outcome:
     """Name the end of all states as the cause of a failure after it."""
     states, commands = context.states, context.commands
@@ -174,7 +192,7 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     subjects=subjects,
     context=Lazy("dexkit.conformance.checks:Context"),
     preconditions=(
-        *(applies_to_dialect, claimed, recorded, has_torque),
+        *(applies_to_dialect, claimed, recorded, carried, has_torque),
         *(says_something, not_spoiled, not_blocked),
     ),
     refine=with_silence,

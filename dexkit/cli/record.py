@@ -81,6 +81,7 @@ def command(
     from dexkit.dds import DdsNode
     from dexkit.traces import Recorder
     from dexkit.traces.dds_recording import record_topics
+    from dexkit.traces.names import dds_topic
 
     if out.exists() and not out.is_dir() and not force:
         raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
@@ -89,7 +90,10 @@ def command(
     form = "%(levelname)s %(message)s"
     logging.basicConfig(level=logging.WARNING, format=form, handlers=[Stderr()], force=True)
     with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        recorder = Recorder(out, overwrite=force, keep_empty=False, compression=compression)
+        chosen = {"topics": " ".join(map(dds_topic, topics))} if topics else None
+        recorder = Recorder(
+            out, overwrite=force, keep_empty=False, compression=compression, metadata=chosen
+        )
         status = _Status(recorder, started)
         with recorder:
             what = ", ".join(topics) if topics else "every known type"

@@ -15,20 +15,20 @@ import numpy as np
 from dexkit.digests import sha256_of_file
 from dexkit.errors import SessionError, TraceError, UsageError
 from dexkit.traces.clock_steps import refuse_clock_steps
-from dexkit.traces.names import select_topics
+from dexkit.traces.names import CUT, RECORDER, select_topics
 from dexkit.traces.reader import Trace, TraceMessage
 from dexkit.traces.sessions.imported import NOMINAL, import_record
 from dexkit.traces.writer import RecordingWriter
 
 __all__ = ["CUT", "MERGE", "Merged", "Span", "clock_offset", "cut", "merge"]
 
-CUT, MERGE = "dexkit_cut", "dexkit_merge"
-"""Names of the metadata records."""
+MERGE = "dexkit_merge"
+"""Name of the metadata record."""
 
 Metadata = Mapping[str, Mapping[str, str]]
 
 # Totals of the recorder, which apply to the whole recording only.
-_RECORDER, _TOTALS = "dexkit_recorder", ("messages",)
+_TOTALS = ("messages",)
 # ns of recorded time within which a second copy of a message is looked for.
 _WINDOW = 2 * 10**9
 # Fewest common messages for a comparison of two clocks.
@@ -263,7 +263,7 @@ def _copied(metadata: Metadata) -> dict[str, dict[str, str]]:
     """Metadata records without the recorder's totals."""
     found = {name: dict(values) for name, values in metadata.items()}
     for key in _TOTALS:
-        found.get(_RECORDER, {}).pop(key, None)
+        found.get(RECORDER, {}).pop(key, None)
     return found
 
 
