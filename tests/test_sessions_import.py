@@ -16,10 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import zstandard
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from dexkit.cli import cli
 from dexkit.conformance.recording import Recording
 from dexkit.errors import SessionError
 from dexkit.hand import Side
@@ -30,6 +32,7 @@ from dexkit.messages.unitree_hg import HandState_, MotorState_, PressSensorState
 from dexkit.traces import Trace, open_trace, sample_path
 from dexkit.traces.reader import Definition
 from dexkit.traces.sessions import old_layouts, ros_types
+from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.episodes import parse_document
 from dexkit.traces.sessions.imported import RECORD
 from dexkit.traces.sessions.model import REST_TOPIC, picture_topic, reference_topic
@@ -299,8 +302,8 @@ def test_picture_formats_and_sizes_are_read() -> None:
         found = parse_picture(data)
         assert found is not None
         assert (found.form, found.width, found.height, found.channels) == expected
-        for cut in range(20):
-            parse_picture(data[:cut])
+        for size in range(20):
+            parse_picture(data[:size])
     assert parse_picture(b"") is None
 
 
@@ -875,3 +878,52 @@ def test_a_bag_that_can_hold_nothing_is_not_written(tmp_path: Path) -> None:
     code, output = dexkit("export", tmp_path / "a.mcap", "--to", "rosbag2", "--out", tmp_path / "b")
     assert (code, "no message that a bag can hold" in output) == (2, True)
     assert not (tmp_path / "b").exists()
+
+
+@each("kind", ["split mcap", "sqlite3", "packed"])
+def test_check_reads_bags_of_every_kind(tmp_path: Path, kind: str) -> None:
+    source = tmp_path / "bag"
+    plugin = StoragePlugin.SQLITE3 if kind == "sqlite3" else StoragePlugin.MCAP
+    trace = open_trace(sample_path("dex3_pinch"))
+    packer = zstandard.ZstdCompressor()
+    with Writer(source, version=9, storage_plugin=plugin) as writer:
+        mt = message_type(HG)
+        connection = writer.add_connection(
+            "/dex3/left/state", mt.ros_name, msgdef=mt.ros2msg, rihs01="RIHS01_" + "0" * 64
+        )
+        for i, m in enumerate(trace.messages(["rt/dex3/left/state"])):
+            if i == 1000:
+                break
+            data = packer.compress(m.data) if kind == "packed" else m.data
+            writer.write(connection, m.log_time_ns, data)
+    if kind == "split mcap":
+        text = (source / "metadata.yaml").read_text()
+        (file,) = source.glob("*.mcap")
+        halves = [source / f"bag_{n}.mcap" for n in range(2)]
+        middle = trace.first_ns + 10**9
+        for path, (low, high) in zip(halves, [(0, middle), (middle, 2**62)], strict=True):
+            cut(open_trace(file), path, spans=[Span(low, high)])
+        file.unlink()
+        text = re.sub(
+            r"(relative_file_paths:\n).*\n",
+            rf"\1  - {halves[0].name}\n  - {halves[1].name}\n",
+            text,
+        )
+        (source / "metadata.yaml").write_text(text)
+    elif kind == "packed":
+        (source,) = source.glob("*.mcap")
+    result = CliRunner().invoke(cli, ["check", str(source), "--json", str(tmp_path / "r.json")])
+    assert result.exit_code == 0, result.output
+    seconds = json.loads((tmp_path / "r.json").read_text())["duration_s"]
+    assert seconds > 1.5  # of both halves
+
+
+def test_a_dataset_with_other_columns_is_told_which_it_has(tmp_path: Path) -> None:
+    matrix = np.full((5, 2), 0.1)
+    source = dataset(tmp_path / "d", "v2.1", ["a", "b"], matrix)
+    path = source / "data" / "chunk-000" / "episode_000000.parquet"
+    names = {"observation.state": "state", "action": "actions"}
+    table = pq.read_table(path)
+    pq.write_table(table.rename_columns([names.get(n, n) for n in table.column_names]), path)
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert (code, "it has: state, actions, timestamp" in output) == (2, True), output

@@ -90,14 +90,17 @@ def command(
     from dexkit.conformance.robot import robot_in
     from dexkit.conformance.run_record import recorded_claims
     from dexkit.digests import sha256_of_file
-    from dexkit.traces import open_trace
+    from dexkit.traces.sessions.judgeable import judgeable
 
     check_output_paths([json_path, junit_path, html_path], [recording, capabilities])
     view, model_name, also = None, None, ""
     if dialect != "auto":
         model_name = dialect if dialect in ROBOTS else DIALECTS[dialect].model
     if recording is not None:
-        trace = open_trace(recording)
+        context = click.get_current_context()
+        trace, imported = context.with_resource(judgeable(recording))
+        for text in imported or ():
+            click.echo(f"warning: {text}", err=True)
         for text in trace.damage:
             click.echo(f"warning: {text}", err=True)
         wanted = None if dialect == "auto" else dialect
@@ -126,7 +129,9 @@ def command(
         return
     if view is None or recording is None:
         raise UsageError("which recording is to be judged?", hint="dexkit check RECORDING.mcap")
-    subject = {"recording": recording.name, "recording_sha256": sha256_of_file(trace.path)}
+    subject = {"recording": recording.name}
+    if imported is None:  # else it is of several files, or a temporary one
+        subject["recording_sha256"] = sha256_of_file(trace.path)
     result = judge(view, requirements=requirements, claims=claims, subject=subject)
     console = Console()
     print_result(result, console, verbose=verbose, more="-v shows why")

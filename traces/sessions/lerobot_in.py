@@ -190,7 +190,10 @@ class Dataset:
         if not parts:
             raise SessionError(
                 f"{path} has no joints: neither observation.state nor action can be used",
-                hint="; ".join(problems.sentences()[:3]),
+                hint="; ".join(
+                    problems.sentences()[:3]
+                    or ["it has: " + ", ".join(map(one_line, table.column_names[:20]))]
+                ),
             )
         session = Session(
             source=path,
