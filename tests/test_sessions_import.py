@@ -927,3 +927,14 @@ def test_a_dataset_with_other_columns_is_told_which_it_has(tmp_path: Path) -> No
     pq.write_table(table.rename_columns([names.get(n, n) for n in table.column_names]), path)
     code, output = dexkit("import", source, tmp_path / "a.mcap")
     assert (code, "it has: state, actions, timestamp" in output) == (2, True), output
+
+
+def test_a_database_whose_clock_steps_back_is_refused(tmp_path: Path) -> None:
+    """The library gives its rows in order of time."""
+    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
+    source = bag(tmp_path / "bag", StoragePlugin.SQLITE3, topics)
+    (path,) = source.glob("*.db3")
+    with sqlite3.connect(path) as db:
+        db.execute("UPDATE messages SET timestamp = timestamp - 1000000000 WHERE id > 2")
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert (code, "its clock steps back by 0.990 s" in output) == (2, True), output
