@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.messages.packed import Packed
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
+from dexkit.traces.clock_steps import ClockStep
 
 __all__ = ["Broken", "KeptTrace", "pack", "unpack"]
 
@@ -56,6 +57,7 @@ class KeptTrace:
     warnings: list[str] = field(default_factory=list)
     mixed_types: dict[str, str] = field(default_factory=dict)
     truncated: bool = False
+    clock_steps: list[ClockStep] = field(default_factory=list)
 
     @property
     def channels(self) -> list[ChannelInfo]:
