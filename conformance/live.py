@@ -267,6 +267,8 @@ def _require_hand(node: DdsNode, options: LiveOptions) -> None:
         timeout=DISCOVERY_TIMEOUT,
     ):
         return
+    from dexkit.doctor.hand_domains import elsewhere_hint
+
     states = ", ".join(rig.dialect.topics(s)[1] for s in rig.sides)
     others = sorted({e.topic for e in node.endpoints() if not e.own and e.topic.startswith("rt/")})
     speaks = [d.name for d in DIALECTS.values() if any(d.topics(s)[1] in others for s in Side)]
@@ -276,7 +278,8 @@ def _require_hand(node: DdsNode, options: LiveOptions) -> None:
         hint=f"there is {', '.join(others)}"
         + (f": --dialect {' or '.join(speaks)}" if speaks else "")
         if others
-        else f"is it served on this domain, and on the interface {rig.interface}? 0 is the robot's "
+        else elsewhere_hint(node)
+        or f"is it served on this domain, and on the interface {rig.interface}? 0 is the robot's "
         "domain, 1 that of simulated hands; 'dexkit doctor' examines the network",
     )
 

@@ -79,6 +79,7 @@ __all__ = [
     "Writer",
     "cyclone_type",
     "interfaces",
+    "named_peers",
     "type_hash",
 ]
 
@@ -474,7 +475,7 @@ def _trace(verbosity: str, path: str) -> str:
 _DEAF = "<Internal><ControlTopic><Deaf>true</Deaf></ControlTopic></Internal>"
 
 
-def _peers() -> tuple[str, ...]:
+def named_peers() -> tuple[str, ...]:
     """Addresses of the other machines that are called by unicast.
 
     :raises DdsSetupError: a name is not known.
@@ -541,7 +542,7 @@ def _acquire_domain(number: int, interface: str) -> None:
             )
         known.nodes += 1
         return
-    peers = _peers()
+    peers = named_peers()
     path = os.environ.get("DEXKIT_DDS_LOG")
     tracing = _trace("config", path) if path else ""
     before = open_sockets()

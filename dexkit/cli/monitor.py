@@ -25,6 +25,7 @@ from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
+    from dexkit.doctor.hand_domains import HandsElsewhere
     from dexkit.traces import Recorder
     from dexkit.traces.dds_recording import DdsRecording
     from dexkit.watch import Picture
@@ -40,7 +41,7 @@ _PAGE = 10  # lines
 
 @click.command("monitor")
 @topic_option("Listen to", "every topic of a known type, also those that appear later")
-@dds_options()
+@dds_options(default_domain=None, domain_default_text="where hands are: 1, else 0")
 @json_option("Print a line of JSON each period instead (docs/monitor.md).")
 @click.option(
     "--period",
@@ -57,7 +58,7 @@ _PAGE = 10  # lines
 @duration_option()
 def command(
     topics: tuple[str, ...],
-    domain: int,
+    domain: int | None,
     interface: str,
     as_json: bool,
     period: float | None,
@@ -67,6 +68,7 @@ def command(
     """Show hands, robots and topics in the terminal: joints, rates, ages, gaps, faults, events.
 
     Use it over ssh: it needs no display and no browser. It only listens, and publishes nothing.
+    Without --domain it looks where hands are: on 1, that of simulations, or on 0, the robot's.
     Keys: q quits, space freezes the display, r starts and stops a recording (mcap), c clears the
     events, arrows and page keys scroll.
 
@@ -77,6 +79,7 @@ def command(
     if log is not None and log.exists():
         raise UsageError(f"{log} exists", hint="choose another name for the recording")
     from dexkit.dds import DdsNode
+    from dexkit.doctor.hand_domains import HandsElsewhere, listening_domain
     from dexkit.monitor.terminal import has_terminal
     from dexkit.traces.names import dds_topic
     from dexkit.watch import Collector
@@ -86,11 +89,15 @@ def command(
     patterns = [dds_topic(t) for t in topics] or None
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
-        node = stack.enter_context(DdsNode(domain=domain, interface=interface))
+        chosen, remark = listening_domain(domain, interface)
+        node = stack.enter_context(DdsNode(domain=chosen, interface=interface))
         listener = stack.enter_context(Listener(node, Collector(), patterns))
-        recording = stack.enter_context(_Log(log, domain, node.interface, topics))
-        watch = _Watch(listener, recording, period or _PERIODS[mode], duration)
-        where = f"domain {domain} on {node.interface}"
+        recording = stack.enter_context(_Log(log, chosen, node.interface, topics))
+        elsewhere = HandsElsewhere(chosen, node.interface)
+        watch = _Watch(listener, recording, period or _PERIODS[mode], duration, elsewhere)
+        where = f"domain {chosen} on {node.interface}"
+        if remark:
+            watch.note(remark)
         if mode == "terminal":
             watch.draw(where, stop)
         else:
@@ -104,7 +111,12 @@ class _Watch:
     """Polls the listener, and shows the collected state."""
 
     def __init__(
-        self, listener: Listener, recording: _Log, period: float, duration: float | None
+        self,
+        listener: Listener,
+        recording: _Log,
+        period: float,
+        duration: float | None,
+        elsewhere: HandsElsewhere,
     ) -> None:
         from dexkit.watch.events import Events
 
@@ -113,6 +125,8 @@ class _Watch:
         self._period = period
         self._end = None if duration is None else time.monotonic() + duration
         self._events = Events(listener.collector)
+        self._elsewhere = elsewhere
+        self._notes: list[Event] = []
 
     def _over(self, stop: StopRequest) -> bool:
         return bool(stop) or (self._end is not None and time.monotonic() >= self._end)
@@ -121,7 +135,10 @@ class _Watch:
         self._listener.poll()
         collector = self._listener.collector
         picture = collector.picture(max(0.0, collector.seconds(time.time_ns())))
-        return picture, self._events.update(picture)
+        if not picture.topics and (where := self._elsewhere.look()):
+            self.note(where)
+        notes, self._notes = self._notes, []
+        return picture, notes + self._events.update(picture)
 
     def draw(self, where: str, stop: StopRequest) -> None:
         """Draw on the terminal until it is enough."""
@@ -141,7 +158,7 @@ class _Watch:
                     if key == " ":
                         paused = not paused
                     elif key == "r":
-                        self._note(self._recording.toggle())
+                        self.note(self._recording.toggle())
                     elif key == "c":
                         self._events.recent.clear()
                     elif key == "\x0c":  # Ctrl-L
@@ -195,12 +212,13 @@ class _Watch:
                     click.echo(f"{time.strftime('%H:%M:%S')} {summary(view)}")
             sys.stdout.flush()
 
-    def _note(self, text: str) -> None:
+    def note(self, text: str) -> None:
+        """Show a remark among the events."""
         from dexkit.watch.events import Event
 
-        collector = self._listener.collector
-        at = collector.seconds(time.time_ns())
-        self._events.recent.append(Event(at, "info", text))
+        event = Event(self._listener.collector.seconds(time.time_ns()), "info", text)
+        self._events.recent.append(event)
+        self._notes.append(event)
 
     def _clock(self, event: Event) -> str:
         moment = self._listener.collector.origin_ns / 1e9 + event.at

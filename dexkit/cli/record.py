@@ -28,6 +28,7 @@ from dexkit.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
+    from dexkit.doctor.hand_domains import HandsElsewhere
     from dexkit.traces import Recorder
     from dexkit.traces.dds_recording import DdsRecording
 
@@ -37,7 +38,7 @@ __all__ = ["command"]
 @click.command("record")
 @click.argument("out", type=LocalPath(dir_okay=False))
 @topic_option("Record", "every topic of a known type, also those that appear later")
-@dds_options()
+@dds_options(default_domain=None, domain_default_text="where hands are: 1, else 0")
 @duration_option()
 @overwrite_option("OUT, when the first message arrives")
 @click.option(
@@ -58,7 +59,7 @@ __all__ = ["command"]
 def command(
     out: Path,
     topics: tuple[str, ...],
-    domain: int,
+    domain: int | None,
     interface: str,
     duration: float | None,
     force: bool,
@@ -69,7 +70,8 @@ def command(
 
     Payloads are written unchanged, with reception time and source timestamp, and with ros2msg
     schemas for PlotJuggler, Foxglove and readers of ROS 2 bags. A killed recorder loses at most
-    half a second.
+    half a second. Without --domain it records where hands are: on 1, that of simulations, or on 0,
+    the robot's.
 
     With --beside-episodes, each episode written to DIR during the recording is merged with it into
     OUT_NAME.mcap: hands from the wire, arms and pictures at the true times of their frames.
@@ -79,6 +81,7 @@ def command(
     cannot be written.
     """
     from dexkit.dds import DdsNode
+    from dexkit.doctor.hand_domains import HandsElsewhere, listening_domain
     from dexkit.traces import Recorder
     from dexkit.traces.dds_recording import record_topics
     from dexkit.traces.names import dds_topic
@@ -89,15 +92,19 @@ def command(
     started = time.monotonic()
     form = "%(levelname)s %(message)s"
     logging.basicConfig(level=logging.WARNING, format=form, handlers=[Stderr()], force=True)
-    with stop_on_signals() as stop, DdsNode(domain=domain, interface=interface) as node:
-        chosen = {"topics": " ".join(map(dds_topic, topics))} if topics else None
+    chosen, why = listening_domain(domain, interface)
+    with stop_on_signals() as stop, DdsNode(domain=chosen, interface=interface) as node:
+        if why:
+            remark("note", why)
+        elsewhere = HandsElsewhere(chosen, interface)
+        asked = {"topics": " ".join(map(dds_topic, topics))} if topics else None
         recorder = Recorder(
-            out, overwrite=force, keep_empty=False, compression=compression, metadata=chosen
+            out, overwrite=force, keep_empty=False, compression=compression, metadata=asked
         )
-        status = _Status(recorder, started)
+        status = _Status(recorder, started, elsewhere)
         with recorder:
             what = ", ".join(topics) if topics else "every known type"
-            click.echo(f"ready: recording {what} on domain {domain}, {interface}, to {out}")
+            click.echo(f"ready: recording {what} on domain {chosen}, {interface}, to {out}")
             recording = record_topics(
                 node,
                 recorder,
@@ -109,7 +116,7 @@ def command(
         status.clear()
         if not recorder.written:
             threads.check()  # why nothing came is known then
-            _refuse_empty(node, recording, time.monotonic() - started)
+            _refuse_empty(node, recording, time.monotonic() - started, elsewhere)
     for topic, why in recording.unknown.items():
         remark("warning", f"{topic} was not recorded: {why}")
     remarks("warning", filter(None, (*recording.losses.describe(), recorder.displaced)))
@@ -175,15 +182,19 @@ def _describe_losses(recorder: Recorder, recording: DdsRecording) -> str:
     return f"{recorder.dropped} dropped" + (f", {brief}" if brief else "")
 
 
-def _refuse_empty(node: DdsNode, recording: DdsRecording, waited: float) -> None:
-    """Report that nothing was received, and the topics that are on the domain.
+def _refuse_empty(
+    node: DdsNode, recording: DdsRecording, waited: float, elsewhere: HandsElsewhere
+) -> None:
+    """Report that nothing was received, and the topics that are on the domain, or where hands are.
 
     :raises TraceError: always, with exit code 1.
     """
     seen = sorted({f"{e.topic} ({e.type_name})" for e in node.endpoints() if not e.own})
     seen = [one_line(entry) for entry in seen if not entry.startswith("DCPS")]
     others = [p.process or p.key for p in node.discovery.participants() if not p.own]
-    if not others:
+    if where := elsewhere.now():
+        hint = f"there is {where}"
+    elif not others:
         hint = "no other participant was seen there: is it another --domain or --interface?"
     elif not seen:
         hint = f"participants seen: {', '.join(others)}; they publish and subscribe nothing"
@@ -201,8 +212,9 @@ def _refuse_empty(node: DdsNode, recording: DdsRecording, waited: float) -> None
 class _Status:
     """One line that is rewritten on a terminal, or a line every ten seconds elsewhere."""
 
-    def __init__(self, recorder: Recorder, started: float) -> None:
+    def __init__(self, recorder: Recorder, started: float, elsewhere: HandsElsewhere) -> None:
         self._recorder = recorder
+        self._elsewhere = elsewhere
         self._started = started
         self._tty = sys.stderr.isatty()
         self._before: dict[str, int] = {}
@@ -211,6 +223,9 @@ class _Status:
     def tick(self, recording: DdsRecording) -> None:
         now = time.monotonic()
         offered = self._recorder.offered
+        if not offered and (where := self._elsewhere.look()):
+            self.clear()
+            remark("note", where)
         rates = {
             topic: (count - self._before.get(topic, 0)) / (now - self._at)
             for topic, count in sorted(offered.items())

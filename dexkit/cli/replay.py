@@ -490,6 +490,8 @@ class _Waiting:
 
         :raises DdsError: for longer than the user wants to.
         """
+        from dexkit.doctor.hand_domains import elsewhere_hint
+
         live = self._live
         node, missing = live.node, live.machine.missing
         if live.unsubscribed:
@@ -502,7 +504,7 @@ class _Waiting:
         if seconds >= self._patience:
             raise DdsError(
                 f"{lacks} on domain {node.domain}, {node.interface} (waited {self._patience:g} s)",
-                hint=live.advice(),
+                hint=elsewhere_hint(node) or live.advice(),
             )
         if not self._told and seconds > 0.2:
             self._told = True

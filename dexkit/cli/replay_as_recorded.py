@@ -165,10 +165,13 @@ def _wait_for_readers(
         writers[missing[0]].wait_matched(timeout=0.1)
         missing = [t for t, w in writers.items() if not w.matched]
     if missing and not stop:
+        from dexkit.doctor.hand_domains import elsewhere_hint
+
         raise DdsError(
             f"no process subscribes to {', '.join(missing)} on domain {node.domain}, "
             f"{node.interface} (waited {patience:g} s)",
-            hint="start the hand first ('dexkit serve'), check --domain and --interface, or play "
+            hint=elsewhere_hint(node)
+            or "start the hand first ('dexkit serve'), check --domain and --interface, or play "
             "anyway with --no-wait",
         )
 

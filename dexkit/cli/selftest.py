@@ -196,6 +196,7 @@ def _hand(
         return kind.create(BackendOptions(side, given["device"], settings)), None
     from dexkit.conformance.selftest.external import ExternalHand
     from dexkit.dds import DdsNode
+    from dexkit.doctor.hand_domains import elsewhere_hint
 
     spoken = dialect_by_name(given["dialect"])
     node = stack.enter_context(DdsNode(domain=given["domain"], interface=given["interface"]))
@@ -205,7 +206,8 @@ def _hand(
             raise DdsError(
                 f"no {side} hand on {spoken.topics(side)[1]}, domain {node.domain}, "
                 f"{node.interface} (waited {given['wait']:g} s)",
-                hint="start it first ('dexkit serve'); check --domain, --interface and --dialect",
+                hint=elsewhere_hint(node)
+                or "start it first ('dexkit serve'); check --domain, --interface and --dialect",
             )
 
     hand = ExternalHand(node, spoken, side, stop=stop.event, waiting=waiting, force=given["force"])

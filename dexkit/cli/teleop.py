@@ -230,22 +230,27 @@ class _WaitReport:
     """Prints what the client waits for, as xr_teleoperate does, and a hint after a while."""
 
     def __init__(self, node: DdsNode, spoken: Dialect, wait: float | None) -> None:
+        from dexkit.doctor.hand_domains import HandsElsewhere
+
         self._node = node
         self._spoken = spoken
         self._patience = wait
         self._reported: Mapping[Side, str] | None = None
         self._helped = False
+        self._elsewhere = HandsElsewhere(node.domain, node.interface)
 
     def __call__(self, missing: Mapping[Side, str], seconds: float) -> None:
         """Still waiting.
 
         :raises DexkitError: for longer than the user wants to.
         """
+        from dexkit.doctor.hand_domains import elsewhere_hint
+
         what = ", ".join(f"{s} ({why})" if why else str(s) for s, why in missing.items())
         if self._patience is not None and seconds >= self._patience:
             error = DexkitError(
                 f"no usable state of {what} after {seconds:.0f} s on domain {self._node.domain}",
-                hint=self._advice,
+                hint=elsewhere_hint(self._node) or self._advice,
             )
             error.exit_code = 1
             raise error
@@ -255,6 +260,8 @@ class _WaitReport:
         if seconds >= _HINT_AFTER and not self._helped:
             self._helped = True
             _print_to_stderr(f"  {self._advice}")
+        if where := self._elsewhere.look():  # in the background: a wait is a pause to the client
+            _print_to_stderr(f"  there is {where}")
 
     @property
     def _advice(self) -> str:

@@ -20,6 +20,7 @@ from dexkit.cli.options import (
     port_option,
     topic_option,
 )
+from dexkit.cli.remarks import remark
 from dexkit.cli.status_line import StatusLine
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.escaping import REMARK, one_line
@@ -42,7 +43,7 @@ __all__ = ["command", "recorded"]
     "--live", is_flag=True, help="Show the live domain beside a recording, as its baseline."
 )
 @topic_option("Listen to", "every topic of a known type, also those that appear later")
-@dds_options()
+@dds_options(default_domain=None, domain_default_text="where hands are: 1, else 0")
 @host_option(
     "Bind the page to this address. It has no password: anyone on the network could see it."
 )
@@ -92,7 +93,7 @@ def command(
     recordings: tuple[Path, ...],
     live: bool,
     topics: tuple[str, ...],
-    domain: int,
+    domain: int | None,
     interface: str,
     host: str,
     port: int | None,
@@ -106,7 +107,8 @@ def command(
 ) -> None:
     """Show hands and robots on a page in the browser: motion, faults and events.
 
-    Without RECORDING it shows the live DDS domain; it only listens and publishes nothing. For a
+    Without RECORDING it shows the live DDS domain; it only listens and publishes nothing. Without
+    --domain that is where hands are: 1, that of simulations, or 0, the robot's. For a
     RECORDING there is a time line with the phases of a conformance run and the failed requirements;
     two recordings are shown side by side. Ctrl-C ends it.
 
@@ -191,18 +193,22 @@ def _open(url: str, wished: bool | None) -> None:
 
 
 def _live(
-    stack: contextlib.ExitStack, domain: int, interface: str, topics: Sequence[str]
+    stack: contextlib.ExitStack, domain: int | None, interface: str, topics: Sequence[str]
 ) -> Source:
     from dexkit.dds import DdsNode
+    from dexkit.doctor.hand_domains import listening_domain
     from dexkit.traces.names import dds_topic
     from dexkit.view.sources import Live
     from dexkit.watch import Collector
     from dexkit.watch.listener import Listener
 
-    node = stack.enter_context(DdsNode(domain=domain, interface=interface))
+    chosen, why = listening_domain(domain, interface)
+    if why:
+        remark("note", why)
+    node = stack.enter_context(DdsNode(domain=chosen, interface=interface))
     patterns = [dds_topic(t) for t in topics] or None
     listener = stack.enter_context(Listener(node, Collector(), patterns))
-    return Live(f"domain {domain} on {node.interface}", listener)
+    return Live(f"domain {chosen} on {node.interface}", listener)
 
 
 def recorded(path: Path, judge: bool) -> Source:
