@@ -29,6 +29,7 @@ from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.messages.columns import Columns
 from dexkit.models import DIALECTS, Dialect, HandModel, dialect, model
+from dexkit.other_interfaces import TWO_FINGERS, is_two_fingers, other_interface
 from dexkit.robots import RobotModel
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 from dexkit.traces.clock_steps import ClockStep, refuse_clock_steps
@@ -270,6 +271,11 @@ class Recording:
             f"{views[s].states.topic} says nothing of the {s} hand (all 0), and nobody drives it: "
             f"taken for a service of one hand; --side {s} judges it all the same"
             for s in left_out
+        ]
+        notes += [
+            f"{view.commands.topic}: {TWO_FINGERS}"
+            for view in views.values()
+            if len(view.commands) and is_two_fingers(view.commands.q[0], view.commands.kp[0])
         ]
         touch = {s: found.of_type(topic, chosen.touch_type) for s, topic in felt.items()}
         slow = {s: topic for s, topic in slow.items() if topic in found.present}
@@ -525,9 +531,10 @@ def detect_dialect(trace: TraceLike) -> Dialect:
     if score(best) == (0, 0):
         names = ", ".join(sorted(c.topic for c in trace.channels)) or "no topics at all"
         wanted = ", ".join(dict.fromkeys(d.state_topic for d in DIALECTS.values()))
+        others = dict.fromkeys(filter(None, map(other_interface, sorted(topics))))
         raise ConformanceError(
             f"no hand of the Dex family in this recording: it has {names}",
-            hint=f"a hand publishes one of {wanted}",
+            hint="; ".join(others) or f"a hand publishes one of {wanted}",
         )
     return best
 

@@ -370,6 +370,8 @@ CASES: dict[str, Observations] = {
     "DDS-OTHER-STACK": _seen(_legacy()),
     "DDS-OTHER-HAND": _seen(_other_hand()),
     "DDS-NAME": _seen(_renamed(GOOD, "hand", topic="x{0}")),
+    "DDS-PREFIX": _seen(_renamed(GOOD, "hand", topic="rt/r2/dex1/left/state")),
+    "DDS-OTHER-INTERFACE": _seen(_renamed(GOOD, "hand", topic="rt/gripper/left/cmd_direct")),
     "DDS-TYPE": _seen(_renamed(GOOD, "hand", type_name=HAND_STATE)),
     "DDS-LAYOUT": _seen(_pair(state_hash=("aa", "bb"))),
     "DDS-QOS": _seen(_pair(reader=Policies("reliable", "transient_local"))),

@@ -24,7 +24,7 @@ from dexkit.messages.codec import HEADER
 from dexkit.models import DIALECTS
 from dexkit.socket_losses import ReceiveBuffers
 from dexkit.threads import Worker
-from dexkit.topics import HAND_TOPICS
+from dexkit.topics import HAND_TOPICS, split_prefix
 from dexkit.traces.losses import Losses
 from dexkit.traces.names import dds_topic
 from dexkit.traces.recorder import Recorder
@@ -258,7 +258,11 @@ class DdsRecording:
     def _subscribe(self, topic: str, type_name: str) -> None:
         if (topic, type_name) in self._readers or len(self._unknown) >= _MAX_SEEN:
             return
-        named = topic in HAND_TOPICS or topic in (self._patterns or ()) or topic in self._types
+        named = (
+            split_prefix(topic)[1] in HAND_TOPICS
+            or topic in (self._patterns or ())
+            or topic in self._types
+        )
         if not named and len(self._readers) >= self._max_topics:
             self._unknown[topic] = f"no more than {self._max_topics} topics are recorded"
             return

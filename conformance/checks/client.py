@@ -18,6 +18,7 @@ from dexkit.conformance.provenance import STATES, TIMES
 from dexkit.conformance.results import Evidence
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte, model
+from dexkit.other_interfaces import TWO_FINGERS, is_two_fingers
 
 _MOST_PLACES = 5
 _FEWEST = 20
@@ -234,6 +235,8 @@ def no_gains(ctx: Context) -> Outcome:
 def mode(ctx: Context) -> Outcome:
     """The mode byte of each motor's command."""
     kind, modes = ctx.recording.dialect.mode_byte, ctx.commands.mode
+    if len(ctx.commands) and is_two_fingers(ctx.commands.q[0], ctx.commands.kp[0]):
+        return ctx.skipped(f"the commands are for {TWO_FINGERS}")
     whole = np.isfinite(modes)
     value = np.where(whole, modes, 0).astype(np.intp)
     index = np.arange(modes.shape[1])

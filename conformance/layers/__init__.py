@@ -18,13 +18,13 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from dexkit.conformance.plots import Plot
 from dexkit.lazy import Lazy
 from dexkit.robots import ROBOTS
-from dexkit.topics import HAND_TOPICS
+from dexkit.topics import HAND_TOPICS, prefixes_of
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks import BaseContext, Outcome
@@ -112,20 +112,31 @@ def layer_of_model(model_name: str) -> Layer[Any, Any, Any]:
     return layer("robot" if model_name in ROBOTS else "dds")
 
 
-def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
+def recording_of(
+    trace: TraceLike,
+    dialect_name: str | None,
+    sides: Sequence[Subject],
+    prefix: str = "",
+) -> Recording:
     """Decode the DDS part of a recording: hands or a robot.
 
     :param dialect_name: None to take what the run record says, else what the topics show: hands,
         if there are any.
     :param sides: none to take those of the run record, else those that have a topic.
+    :param prefix: of the hands' topics; empty for hands without one, or the only one there is.
     :raises ConformanceError: it has none of their topics.
-    :raises UsageError: sides of a robot.
+    :raises UsageError: sides of a robot; no hand has the prefix, or there are several to choose
+        from.
     :raises TraceUnsupported: its stimulus record cannot be read.
     """
     from dexkit.conformance import run_record
     from dexkit.conformance.recording import Recording
     from dexkit.conformance.robot import robot_in
+    from dexkit.conformance.unprefixed import Unprefixed, choose_prefix
 
+    everything = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
+    chosen = choose_prefix(everything, prefix)
+    trace = Unprefixed(trace, chosen) if chosen else trace
     run = trace.metadata.get(run_record.RECORD, {})
     recorded = run_record.recorded_dialect(run)
     name = dialect_name or recorded
@@ -137,7 +148,11 @@ def recording_of(trace: TraceLike, dialect_name: str | None, sides: Sequence[Sub
         sides = run_record.recorded_subjects(run)
     recording = layer_of_model(name or "").decode(trace, name, sides)
     assert isinstance(recording, Recording), "only USB may be missing from a recording"
-    return recording
+    others = [each or "none" for each in prefixes_of(everything) if each != chosen]
+    notes = [f"the topics are under the prefix {chosen}: rt/{chosen}/..."] if chosen else []
+    if others:
+        notes.append(f"hands under other prefixes are not judged: {', '.join(others)} (--prefix)")
+    return replace(recording, notes=[*recording.notes, *notes]) if notes else recording
 
 
 def claimed(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:

@@ -18,6 +18,7 @@ from dexkit.cli.options import (
     junit_option,
     level_option,
     list_option,
+    prefix_option,
     require_option,
     side_option,
     verbose_option,
@@ -43,6 +44,7 @@ from dexkit.robots import ROBOTS
     default="auto",
     others=("auto", *ROBOTS),
 )
+@prefix_option("Judge the hands under rt/NAME/, where there are several robots.")
 @require_option("DEX1-RATE")
 @level_option()
 @grade_option(option_texts.GRADE)
@@ -61,6 +63,7 @@ def command(
     recording: Path | None,
     sides: tuple[Side, ...] | None,
     dialect: str,
+    prefix: str,
     require: tuple[str, ...],
     level: str | None,
     grade: str | None,
@@ -104,7 +107,7 @@ def command(
         for text in trace.damage:
             click.echo(f"warning: {text}", err=True)
         wanted = None if dialect == "auto" else dialect
-        view = recording_of(trace, wanted, sides or ())
+        view = recording_of(trace, wanted, sides or (), prefix)
         robot = robot_in(trace) if dialect == "auto" and view.layer != "robot" else None
         also = f"there is a robot, too: judge it with --dialect {robot.name}" if robot else ""
         model_name = view.model.name

@@ -17,10 +17,13 @@ from dexkit.cli.options import (
     dds_options,
     duration_option,
     json_option,
+    prefix_option,
+    prefixed_topics,
     topic_option,
 )
 from dexkit.errors import DexkitError, UsageError
 from dexkit.escaping import REMARK, one_line
+from dexkit.other_interfaces import other_interface
 from dexkit.stop_signals import StopRequest, stop_on_signals
 
 if TYPE_CHECKING:
@@ -41,6 +44,7 @@ _PAGE = 10  # lines
 
 @click.command("monitor")
 @topic_option("Listen to", "every topic of a known type, also those that appear later")
+@prefix_option("Only topics under rt/NAME/, as rt/r2/dex3/left/cmd for r2.")
 @dds_options(default_domain=None, domain_default_text="where hands are: 1, else 0")
 @json_option("Print a line of JSON each period instead (docs/monitor.md).")
 @click.option(
@@ -58,6 +62,7 @@ _PAGE = 10  # lines
 @duration_option()
 def command(
     topics: tuple[str, ...],
+    prefix: str,
     domain: int | None,
     interface: str,
     as_json: bool,
@@ -85,6 +90,7 @@ def command(
     from dexkit.watch import Collector
     from dexkit.watch.listener import Listener
 
+    topics = prefixed_topics(topics, prefix)
     mode = "json" if as_json else "terminal" if has_terminal() else "lines"
     patterns = [dds_topic(t) for t in topics] or None
     with contextlib.ExitStack() as stack:
@@ -127,6 +133,7 @@ class _Watch:
         self._events = Events(listener.collector)
         self._elsewhere = elsewhere
         self._notes: list[Event] = []
+        self._seen_unknown: set[str] = set()
 
     def _over(self, stop: StopRequest) -> bool:
         return bool(stop) or (self._end is not None and time.monotonic() >= self._end)
@@ -137,6 +144,10 @@ class _Watch:
         picture = collector.picture(max(0.0, collector.seconds(time.time_ns())))
         if not picture.topics and (where := self._elsewhere.look()):
             self.note(where)
+        for topic in sorted(self._listener.unknown.keys() - self._seen_unknown):
+            self._seen_unknown.add(topic)
+            if what := other_interface(topic):
+                self.note(f"{topic}: {what}")
         notes, self._notes = self._notes, []
         return picture, notes + self._events.update(picture)
 

@@ -63,6 +63,8 @@ __all__ = [
     "overwrite_option",
     "peer_addresses",
     "port_option",
+    "prefix_option",
+    "prefixed_topics",
     "quiet_option",
     "real_time_option",
     "recording_option",
@@ -341,6 +343,29 @@ def topic_option(verb: str, default: str) -> Callable[[F], F]:
         help=f"{verb} this topic, e.g. rt/dex1/left/cmd, /dex1/left/cmd or '/dex1/*'; may be "
         f"repeated.  [default: {default}]",
     )
+
+
+def prefix_option(help: str) -> Callable[[F], F]:
+    """``--prefix``: of topics such as ``rt/r2/dex3/left/cmd``; empty for none."""
+
+    def checked(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
+        if not text or ctx.resilient_parsing:
+            return text
+        from dexkit.topics import checked_prefix
+
+        return checked_prefix(text)
+
+    return click.option("--prefix", default="", metavar="NAME", callback=checked, help=help)
+
+
+def prefixed_topics(topics: Sequence[str], prefix: str) -> tuple[str, ...]:
+    """The topics of ``--topic`` under a prefix; all that are there if none is named."""
+    if not prefix:
+        return tuple(topics)
+    from dexkit.topics import under_prefix
+    from dexkit.traces.names import dds_topic
+
+    return tuple(under_prefix(dds_topic(topic), prefix) for topic in topics or ("*",))
 
 
 def force_option() -> Callable[[F], F]:

@@ -18,6 +18,8 @@ from dexkit.cli.options import (
     dds_options,
     duration_option,
     overwrite_option,
+    prefix_option,
+    prefixed_topics,
     topic_option,
 )
 from dexkit.cli.remarks import remark, remarks
@@ -38,6 +40,7 @@ __all__ = ["command"]
 @click.command("record")
 @click.argument("out", type=LocalPath(dir_okay=False))
 @topic_option("Record", "every topic of a known type, also those that appear later")
+@prefix_option("Only topics under rt/NAME/, as rt/r2/dex3/left/cmd for r2.")
 @dds_options(default_domain=None, domain_default_text="where hands are: 1, else 0")
 @duration_option()
 @overwrite_option("OUT, when the first message arrives")
@@ -59,6 +62,7 @@ __all__ = ["command"]
 def command(
     out: Path,
     topics: tuple[str, ...],
+    prefix: str,
     domain: int | None,
     interface: str,
     duration: float | None,
@@ -88,6 +92,7 @@ def command(
 
     if out.exists() and not out.is_dir() and not force:
         raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
+    topics = prefixed_topics(topics, prefix)
     before = _episodes(episodes) if episodes is not None else {}
     started = time.monotonic()
     form = "%(levelname)s %(message)s"

@@ -21,6 +21,7 @@ from dexkit.cli.options import (
     dialect_option,
     force_option,
     guesses_option,
+    prefix_option,
     quiet_option,
     real_time_option,
     set_option,
@@ -65,6 +66,7 @@ _LONELY = 10.0  # seconds without a client before a hint
     + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())
     + "]",
 )
+@prefix_option("Serve on rt/NAME/..., for one of several robots: rt/r2/dex3/left/cmd for r2.")
 @dds_options(default_domain=None, domain_default_text="0 for a device, else 1")
 @click.option(
     "--state-rate",
@@ -111,6 +113,7 @@ def command(
     usb: str | None,
     accept_guesses: bool,
     dialect: str | None,
+    prefix: str,
     domain: int | None,
     interface: str,
     state_rate: float | None,
@@ -149,6 +152,8 @@ def command(
     # a backend that needs something is a device, even where it finds it by itself
     chosen = domain if domain is not None else (0 if by_side or kind.needs else 1)
     language = _dialect(hands, dialect)
+    if prefix:
+        language = language.under(prefix)
     groups = _groups(hands, language)
 
     from dexkit.dds import DdsNode

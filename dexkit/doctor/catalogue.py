@@ -229,6 +229,23 @@ _ALL = (
         "use the exact name",
     ),
     Diagnosis(
+        "DDS-PREFIX",
+        _N,
+        "hands are under a prefix of their topics",
+        "a client without that prefix waits for ever, though the hand publishes",
+        "several robots on one domain are told apart by a name behind rt/",
+        "give the client the same prefix, or serve without one; dexkit serve, record, monitor and "
+        "check have --prefix",
+    ),
+    Diagnosis(
+        "DDS-OTHER-INTERFACE",
+        _N,
+        "a program uses an interface that is no hand's of the Dex family",
+        "hand and client do not understand each other, though topics look alike or are the same",
+        "drivers and simulations bring interfaces of their own beside Unitree's",
+        "use the same interface on both sides",
+    ),
+    Diagnosis(
         "DDS-TYPE",
         _E,
         "two processes use the same topic with different types",

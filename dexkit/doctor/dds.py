@@ -28,7 +28,8 @@ from dexkit.errors import DdsSetupError, DexkitError
 from dexkit.messages import message_type
 from dexkit.messages.columns import Columns
 from dexkit.messages.earlier import layout_of
-from dexkit.topics import roles
+from dexkit.other_interfaces import is_two_fingers
+from dexkit.topics import roles, split_prefix
 
 __all__ = ["DISCOVERY_SECONDS", "observe_domains"]
 
@@ -74,6 +75,7 @@ class _Watch:
     tau: float = 0.0
     blank: bool = True
     nonzero: bool = False
+    two_fingers: bool | None = None
     undecodable: int = 0
     earlier: str = ""
     decoded_at: float = float("-inf")
@@ -81,7 +83,7 @@ class _Watch:
     delays: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        found = roles(self.endpoint.topic, self.endpoint.type_name)
+        found = roles(split_prefix(self.endpoint.topic)[1], self.endpoint.type_name)
         self.dialects = [role.dialect for role in found if role.kind == "cmd"]
         self.states = any(role.kind == "state" for role in found)
 
@@ -118,6 +120,9 @@ class _Watch:
         if self.states:
             self.tau = max((abs(float(m.tau_est)) for m in motors), default=0.0)
             self.blank = self.blank and Columns(kind.layout, [data]).are_zero
+        if self.dialects:
+            kp = [float(motor.kp) for motor in motors]
+            self.two_fingers = self.two_fingers is not False and is_two_fingers(q, kp)
         for i, motor in enumerate(motors if self.dialects else ()):
             for seen, matches in (
                 *((self.driven, is_driven), (self.asked, is_asked)),
@@ -163,6 +168,7 @@ class _Watch:
             undecodable=self.undecodable,
             earlier=self.earlier,
             lost=gaps + 1 - self.samples if self.samples else 0,
+            two_fingers=bool(self.two_fingers),
             delay_min=percentile(self.delays, 0.0),
             delay_95=percentile(self.delays, 0.95),
         )

@@ -14,7 +14,7 @@ from dexkit.doctor.awaited_topics import AWAITED
 from dexkit.doctor.dds import observe_domains
 from dexkit.errors import DdsSetupError
 from dexkit.threads import Worker
-from dexkit.topics import roles
+from dexkit.topics import roles, split_prefix
 
 if TYPE_CHECKING:
     from dexkit.dds import DdsNode
@@ -60,7 +60,9 @@ def states_on(domains: Sequence[int], interface: str) -> dict[int, tuple[str, ..
 def _is_state(endpoint: _Endpoint) -> bool:
     """Whether an endpoint's topic is the state of a hand or robot."""
     topic, type_name = endpoint.topic, endpoint.type_name
-    return topic in AWAITED or any(r.kind != "cmd" for r in roles(topic, type_name))
+    return topic in AWAITED or any(
+        r.kind != "cmd" for r in roles(split_prefix(topic)[1], type_name)
+    )
 
 
 def listening_domain(domain: int | None, interface: str) -> tuple[int, str]:

@@ -113,6 +113,7 @@ class Stream:
     :param undecodable: samples that do not decode as their type.
     :param earlier: month of the earlier layout that the last of these has, or empty.
     :param lost: sequence numbers that are missing between the first and the last sample.
+    :param two_fingers: of commands: all drive two fingers in metres, as LeRobot's simulation does.
     :param delay_min: least reception time minus time of writing, seconds, each by its own
         machine's clock; NaN when it is not known.
     :param delay_95: the same, that 95 % of the samples are below.
@@ -140,6 +141,7 @@ class Stream:
     undecodable: int = 0
     earlier: str = ""
     lost: int = 0
+    two_fingers: bool = False
     delay_min: float = float("nan")
     delay_95: float = float("nan")
 

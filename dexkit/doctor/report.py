@@ -15,7 +15,7 @@ from dexkit.doctor.rules import Readiness, Verdict
 from dexkit.doctor.topic_spelling import short
 from dexkit.escaping import LONGEST
 from dexkit.robots import ROBOTS
-from dexkit.topics import roles
+from dexkit.topics import roles, split_prefix
 
 __all__ = ["SCHEMA_VERSION", "as_data", "print_report"]
 
@@ -87,7 +87,7 @@ def print_report(
     for state in states:
         does = "a client waits" if state.waiting else "a client would wait"
         text = "a client gets past its wait" if state.ready else f"{does}: {state.missing}"
-        console.print(f"\ndomain {state.domain}, {state.dialect}: {escape(text)}", highlight=False)
+        console.print(f"\ndomain {state.domain}, {state.name}: {escape(text)}", highlight=False)
     lines = _topic_lines(seen)
     if lines:
         console.print()
@@ -142,7 +142,7 @@ def _topic_lines(seen: Observations) -> list[str]:
             topics.setdefault((endpoint.topic, endpoint.type_name), []).append(endpoint)
         for (topic, type_name), ends in topics.items():
             writers, readers = ([e for e in ends if e.kind == k] for k in ("writer", "reader"))
-            known = roles(topic) or topic in _BODY_TOPICS or topic in AWAITED
+            known = roles(split_prefix(topic)[1]) or topic in _BODY_TOPICS or topic in AWAITED
             told = f"{who(view, writers)} > {who(view, readers)}" + ("" if known else "  (unknown)")
             kind = short(type_name).replace("unitree_", "")
             rows.append((str(view.number), topic, kind, _rates(view, writers), told))

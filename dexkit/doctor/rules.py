@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 from dexkit.doctor.awaited_topics import AWAITED, Awaited, awaited
@@ -22,12 +22,14 @@ from dexkit.doctor.observations import (
     Stream,
     UsbDevice,
 )
+from dexkit.doctor.prefixes import by_prefix, renamed
 from dexkit.doctor.topic_spelling import closest_topic, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.messages.earlier import EARLIER, earlier_by_hash
 from dexkit.models import DIALECTS, MODELS, Dialect, ModeByte
-from dexkit.topics import Role, roles
+from dexkit.other_interfaces import TWO_FINGERS, other_interface
+from dexkit.topics import Role, roles, split_prefix, under_prefix
 from dexkit.wire import dex3_usb, mx64
 
 __all__ = ["ROBOT_NETWORK", "Readiness", "Scope", "Verdict", "diagnose", "readiness", "verdict"]
@@ -74,6 +76,7 @@ class Readiness:
 
     :param missing: what it still waits for, or empty.
     :param waiting: there is such a client.
+    :param prefix: of the topics; empty for none.
     """
 
     domain: int
@@ -81,6 +84,12 @@ class Readiness:
     ready: bool
     missing: str = ""
     waiting: bool = False
+    prefix: str = ""
+
+    @property
+    def name(self) -> str:
+        """Dialect and prefix, for people."""
+        return f"{self.dialect} under {self.prefix}" if self.prefix else self.dialect
 
 
 @dataclass(frozen=True)
@@ -104,7 +113,14 @@ def _finding(
 def diagnose(seen: Observations, scope: Scope | None = None) -> list[Finding]:
     """All findings of the observations, causes before their effects."""
     scope = scope or Scope()
-    found = [*_domains(seen, scope), *_network(seen, scope)]
+    # each robot's hands on their own; the domain itself is examined with those without a prefix
+    (_, own), *others = by_prefix(seen)
+    found = [*_prefixes(seen), *_domains(own, scope)]
+    if others:  # somebody is there
+        found = [f for f in found if f.id != "DDS-NOBODY"]
+    for prefix, part in others:
+        found += [renamed(f, prefix) for f in _domains(part, scope) if f.id not in _OF_PARTICIPANTS]
+    found += _network(seen, scope)
     if seen.environment is not None:
         found += _environment(seen.environment)
     if seen.link is not None:
@@ -124,7 +140,7 @@ def verdict(seen: Observations, findings: list[Finding], scope: Scope | None = N
     states = readiness(seen, scope)
     ready = [r for r in states if r.ready]
     good = " and ".join(
-        f"{_title(DIALECTS[r.dialect])} on domain {r.domain} ({r.dialect})" for r in ready
+        f"{_title(DIALECTS[r.dialect])} on domain {r.domain} ({r.name})" for r in ready
     )
     if not problems:
         text = f"Healthy: {good}; a client gets past its wait." if good else "Nothing is wrong."
@@ -211,6 +227,14 @@ def readiness(seen: Observations, scope: Scope | None = None) -> list[Readiness]
     (docs/sources/unitree-dex.md#b1).
     """
     scope = scope or Scope()
+    return [
+        replace(each, prefix=prefix)
+        for prefix, part in by_prefix(seen)
+        for each in _readiness(part, scope)
+    ]
+
+
+def _readiness(seen: Observations, scope: Scope) -> list[Readiness]:
     out = []
     for view in _focus(seen, scope):
         names = {p.role.dialect.name for p in _hands(view, scope) + _clients(view, scope)}
@@ -263,6 +287,55 @@ def _missing(view: DomainView, dialect: Dialect) -> str:
 
 # --- DDS
 
+_OF_PARTICIPANTS = frozenset({"DDS-CYCLONE-11", "DDS-NOBODY"})
+"""Reported once a domain, whatever the prefixes."""
+
+
+def _other_interfaces(view: DomainView) -> Iterator[Finding]:
+    """Topics and commands of drivers and simulations that have an interface of their own."""
+    for endpoint in view.endpoints:
+        what, severity = other_interface(endpoint.topic), Severity.NOTE
+        stream = view.stream(endpoint)
+        if stream is not None and stream.two_fingers:
+            what, severity = TWO_FINGERS, Severity.WARNING
+        if what:
+            yield _finding(
+                "DDS-OTHER-INTERFACE",
+                f"{endpoint.topic} of {view.owner(endpoint)} on domain {view.number}: {what}",
+                severity=severity,
+                domain=view.number,
+                topic=endpoint.topic,
+            )
+
+
+def _prefixes(seen: Observations) -> Iterator[Finding]:
+    """Hands under a prefix, and clients that look for them under another."""
+    for view in seen.domains:
+        whose: dict[str, dict[str, set[str]]] = {}
+        for endpoint in view.endpoints:
+            prefix, bare = split_prefix(endpoint.topic)
+            for role in roles(bare, endpoint.type_name):
+                if role.kind == "state":
+                    ends = whose.setdefault(prefix, {})
+                    ends.setdefault(endpoint.kind, set()).add(bare)
+        for prefix in sorted(filter(None, whose)):
+            served = whose[prefix].get("writer", set())
+            if not served:
+                continue
+            lonely = sorted(
+                under_prefix(topic, other)
+                for other, ends in whose.items()
+                for topic in served & ends.get("reader", set()) - ends.get("writer", set())
+            )
+            states = ", ".join(under_prefix(topic, prefix) for topic in sorted(served))
+            yield _finding(
+                "DDS-PREFIX",
+                f"{states} on domain {view.number}"
+                + (f"; a client waits for {', '.join(lonely)}" if lonely else ""),
+                severity=Severity.ERROR if lonely else Severity.NOTE,
+                domain=view.number,
+            )
+
 
 def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
     focus = _focus(seen, scope)
@@ -271,6 +344,7 @@ def _domains(seen: Observations, scope: Scope) -> Iterator[Finding]:
     found = [f for view in focus for f in _names_and_types(view, scope)]
     yield from found
     for view in focus:
+        yield from _other_interfaces(view)
         yield from _matches(view)
         yield from _earlier_layouts(view)
         yield from _listeners(view, scope)

@@ -9,7 +9,7 @@ from typing import Any
 
 from dexkit.messages import message_types
 from dexkit.models import Dialect, ModeByte
-from dexkit.topics import HAND_TOPICS, roles
+from dexkit.topics import HAND_TOPICS, roles, split_prefix
 
 __all__ = ["closest_topic", "is_asked", "is_driven", "is_hand_topic", "is_limp", "short"]
 
@@ -22,7 +22,7 @@ _OTHERS = re.compile(r"(rt)?/?(lf/)?(dex\d+|inspire\w*|brainco\w*)/")
 
 def is_hand_topic(topic: str, type_name: str) -> bool:
     """Whether a topic is a hand's and its samples hold motors, with the right type or another."""
-    return any(role.kind != "touch" for role in roles(topic, type_name))
+    return any(role.kind != "touch" for role in roles(split_prefix(topic)[1], type_name))
 
 
 def is_driven(motor: Any, dialect: Dialect) -> bool:
@@ -59,7 +59,7 @@ def closest_topic(topic: str, among: Iterable[str] = ()) -> tuple[str, str] | No
 
     :param among: names to choose from; default all hand topics.
     """
-    if topic in HAND_TOPICS:
+    if split_prefix(topic)[1] in HAND_TOPICS:
         return None
     names = sorted(among or HAND_TOPICS)
     plain = _plain(topic)

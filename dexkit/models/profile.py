@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from types import ModuleType
@@ -118,6 +118,20 @@ class Dialect:
     @staticmethod
     def _topic(topic: str, side: Subject) -> str:
         return topic.format(side=side, s=str(side)[0])
+
+    def under(self, prefix: str) -> Dialect:
+        """The same on topics under a prefix: ``rt/r2/dex3/left/cmd`` for ``r2``."""
+
+        def moved(topic: str) -> str:
+            return topic and f"rt/{prefix}/{topic.removeprefix('rt/')}"
+
+        return replace(
+            self,
+            cmd_topic=moved(self.cmd_topic),
+            state_topic=moved(self.state_topic),
+            low_rate_topic=moved(self.low_rate_topic),
+            touch_topic=moved(self.touch_topic),
+        )
 
     @property
     def is_gripper(self) -> bool:

@@ -67,6 +67,7 @@ def _subject(view: SubjectView) -> dict[str, object]:
     near: Sequence[int] = view.near.tolist()
     return {
         "subject": str(view.subject),
+        "prefix": view.prefix,
         "model": view.model.name,
         "dialect": view.dialect,
         "joints": [joint.name for joint in view.joints],

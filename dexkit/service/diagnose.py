@@ -7,7 +7,7 @@ from typing import Protocol
 
 from dexkit.hand import Side
 from dexkit.models import Dialect
-from dexkit.topics import Role, roles, topics_of
+from dexkit.topics import Role, roles, split_prefix, topics_of, under_prefix
 
 __all__ = ["diagnose"]
 
@@ -57,6 +57,15 @@ def diagnose(endpoints: Iterable[_Endpoint], dialect: Dialect, sides: Iterable[S
                     f"a peer is on {topic}, which is not served here."
                     f" Try --dialect {role.dialect.name}"
                 )
+    prefix = split_prefix(ours[0][0])[0]
+    bare = {under_prefix(split_prefix(topic)[1], prefix) for topic, _ in ours}
+    for topic in sorted(types):
+        theirs, plain = split_prefix(topic)
+        if theirs != prefix and under_prefix(plain, prefix) in bare:
+            found.append(
+                f"a peer is on {topic}; this hand is on {under_prefix(plain, prefix)} "
+                "(--prefix, or that of the client)"
+            )
     written = {e.topic for e in foreign if e.kind == "writer"}
     for topic in sorted({e.topic for e in foreign if e.kind == "reader"} - written):
         models = [r.dialect.model for r in roles(topic) if r.kind != "cmd"]

@@ -75,7 +75,7 @@ class _Shown:
     topics_html: GuiHtmlHandle
     strip: GuiHtmlHandle
     slider: GuiSliderHandle[float] | None = None
-    figures: dict[tuple[str, str], Figure] = field(default_factory=dict)
+    figures: dict[tuple[str, str, str], Figure] = field(default_factory=dict)
 
 
 class Page:
@@ -342,7 +342,7 @@ class Page:
         self._arrange(picture, shown)
         many = len(self._shown) > 1
         for view in picture.subjects:
-            key = (view.dialect, str(view.subject))
+            key = (view.prefix, view.dialect, str(view.subject))
             if key in shown.figures:
                 shown.figures[key].update(view)
         if not tables:
@@ -377,7 +377,11 @@ class Page:
 
     def _arrange(self, picture: Picture, shown: _Shown) -> None:
         """Make figures of hands that are new, and put all into their places."""
-        new = [v for v in picture.subjects if (v.dialect, str(v.subject)) not in shown.figures]
+        new = [
+            v
+            for v in picture.subjects
+            if (v.prefix, v.dialect, str(v.subject)) not in shown.figures
+        ]
         if not new:
             return
         for each in self._shown:
@@ -392,12 +396,14 @@ class Page:
         spots = places(len(everything), robots)
         many = len(self._shown) > 1
         for i, (each, view) in enumerate(everything):
-            key = (view.dialect, str(view.subject))
+            key = (view.prefix, view.dialect, str(view.subject))
             each.figures[key] = Figure(
                 self._server,
                 f"/figures/{self._arranged}_{i}",
                 view,
-                f"{view.subject} · {each.source.title}" if many else subject_name(view),
+                f"{view.prefix} {view.subject} · {each.source.title}".lstrip()
+                if many
+                else subject_name(view),
                 spots[i],
                 self._skeletons.get((view.model.name, str(view.subject))),
                 i % 2 if len(everything) > 2 else 0,
@@ -422,7 +428,7 @@ class Page:
         """Offer every number in the choice, and chart the first joint of each hand."""
         many = len(self._shown) > 1
         self._choices = {}
-        first: dict[tuple[str, Subject], dict[str, Curve]] = {}
+        first: dict[tuple[str, str, Subject], dict[str, Curve]] = {}
         for number, shown in enumerate(self._shown, 1):
             fields = shown.source.collector.fields()
             shared = Counter(topic for topic, _ in {(t, part.subject) for t, part, _ in fields})
@@ -433,7 +439,7 @@ class Page:
                 curve = Curve(shown.source.collector, topic, each.path, name)
                 self._choices.setdefault(name, curve)
                 if (each.quantity, each.index) == ("q", 0) and part.kind != "low":
-                    of_hand = first.setdefault((part.model.name, part.subject), {})
+                    of_hand = first.setdefault((part.prefix, part.model.name, part.subject), {})
                     of_hand.setdefault(topic, curve)
         options = tuple(self._choices) or ("-",)
         self._number.options = options

@@ -92,7 +92,9 @@ class _Scene:
 
 def _name(view: SubjectView, picture: Picture) -> str:
     name = view.model.name if view.subject == ROBOT else f"{view.subject}_hand"
-    alike = [v for v in picture.subjects if v.subject == view.subject]
+    if view.prefix:
+        name = f"{view.prefix}/{name}"
+    alike = [v for v in picture.subjects if (v.subject, v.prefix) == (view.subject, view.prefix)]
     return f"{name}_{view.dialect}" if len(alike) > 1 else name
 
 

@@ -109,6 +109,7 @@ class SubjectView:
         areas counts; NaN where it is not known or old, empty without a topic.
     :param commanders: processes that publish the command topic, as far as they say so.
     :param command_timeout: seconds after which a command no longer counts.
+    :param prefix: under which its topics are; empty for none.
     """
 
     subject: Subject
@@ -129,6 +130,7 @@ class SubjectView:
     touch: Floats
     commanders: tuple[str, ...]
     command_timeout: float
+    prefix: str = ""
 
     @property
     def stale(self) -> bool:
@@ -480,10 +482,10 @@ class Collector:
         )
 
     def _subjects(self, at: float) -> Iterable[SubjectView]:
-        by_subject: dict[tuple[str, str], dict[str, tuple[_Topic, Part]]] = {}
+        by_subject: dict[tuple[str, str, str], dict[str, tuple[_Topic, Part]]] = {}
         for _, topic in sorted(self._topics.items()):
             for part in topic.parts:
-                key = (part.dialect, str(part.subject))
+                key = (part.prefix, part.dialect, str(part.subject))
                 by_subject.setdefault(key, {})[part.kind] = (topic, part)
         for _, found in sorted(by_subject.items()):
             view = self._subject_view(found, at)
@@ -544,6 +546,7 @@ class Collector:
             touch=touch,
             commanders=self._processes(command[0].name, "writer") if command else (),
             command_timeout=part.timeout,
+            prefix=part.prefix,
         )
 
 

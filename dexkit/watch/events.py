@@ -94,7 +94,7 @@ class Events:
 
     def _subject(self, view: SubjectView) -> Iterator[tuple[str, str]]:
         name = subject_name(view)
-        known = self._subjects.setdefault(f"{view.dialect} {view.subject}", _Known())
+        known = self._subjects.setdefault(f"{view.prefix} {view.dialect} {view.subject}", _Known())
         if not view.stale and known.stale:
             yield "info", f"{name}: states {'again' if known.seen else 'come'}"
             known.seen = True

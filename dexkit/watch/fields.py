@@ -9,7 +9,7 @@ from dexkit.hand import ROBOT, JointSpec, Side, Subject
 from dexkit.messages import MessageType, message_type
 from dexkit.models import Dialect, HandModel, ModeByte, model
 from dexkit.robots import ROBOTS, RobotModel
-from dexkit.topics import roles
+from dexkit.topics import roles, split_prefix
 
 __all__ = ["Field", "Part", "parts_of"]
 
@@ -78,6 +78,7 @@ class Part:
     :param mode_byte: what the mode byte of a motor holds.
     :param timeout: seconds after which a command no longer counts.
     :param gains_are_used: whether kp and kd of a command have an effect.
+    :param prefix: under which the hand's topics are: ``r2`` of ``rt/r2/dex3/left/cmd``.
     """
 
     subject: Subject
@@ -90,6 +91,7 @@ class Part:
     mode_byte: ModeByte
     timeout: float
     gains_are_used: bool = True
+    prefix: str = ""
 
     def columns(self, quantity: str) -> list[int]:
         """The places of a quantity in :attr:`fields`, by joint or sensor element."""
@@ -98,9 +100,10 @@ class Part:
 
 def parts_of(topic: str, type_name: str) -> list[Part]:
     """The parts of a topic, by its name and type; empty for other topics."""
+    prefix, bare = split_prefix(topic)
     found = [
-        _hand_part(role.dialect, role.kind, side, type_name)
-        for role in roles(topic, type_name)
+        replace(_hand_part(role.dialect, role.kind, side, type_name), prefix=prefix)
+        for role in roles(bare, type_name)
         for side in role.sides
     ]
     return found or list(_robot_parts(topic, type_name))

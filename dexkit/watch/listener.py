@@ -9,13 +9,17 @@ from collections.abc import Iterable
 from dexkit.dds import DdsNode, DiscoveryEvent, Endpoint, Qos, Reader
 from dexkit.errors import DdsError, UsageError
 from dexkit.messages import message_type
-from dexkit.topics import HAND_TOPICS
+from dexkit.topics import HAND_TOPICS, split_prefix
 from dexkit.watch.collector import Collector
 
 __all__ = ["Listener"]
 
 _MOST_WAITING = 20_000  # samples of a topic between two polls
 _MOST_TOPICS = 64  # besides those of hands
+
+
+def _is_hand(topic: str) -> bool:
+    return split_prefix(topic)[1] in HAND_TOPICS
 
 
 class Listener:
@@ -108,8 +112,8 @@ class Listener:
         key = (found.topic, found.type_name)
         if key in self._readers:
             return
-        others = sum(topic not in HAND_TOPICS for topic, _ in self._readers)
-        if found.topic not in HAND_TOPICS and others >= _MOST_TOPICS:
+        others = sum(not _is_hand(topic) for topic, _ in self._readers)
+        if not _is_hand(found.topic) and others >= _MOST_TOPICS:
             self.unknown[found.topic] = f"no more than {_MOST_TOPICS} other topics are read"
             return
         try:

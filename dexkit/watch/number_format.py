@@ -25,5 +25,7 @@ def number(value: float, digits: int = 2) -> str:
 
 
 def subject_name(view: SubjectView) -> str:
-    """A hand or robot for people: ``left Dex3-1 hand``."""
-    return view.model.title if view.subject == ROBOT else f"{view.subject} {view.model.title}"
+    """A hand or robot for people: ``left Dex3-1 hand``; ``r2 left ...`` under a prefix."""
+    if view.subject == ROBOT:
+        return view.model.title
+    return f"{view.prefix} {view.subject} {view.model.title}".lstrip()
