@@ -6,6 +6,7 @@ They are started by their ``dexkit`` commands; no backend runs in the kit's own 
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,6 +35,11 @@ class Tool(child_processes.Tool):
     """
 
     error = ConformanceError
+
+
+def _is_emulated(device: str) -> bool:
+    """Whether a device is a pseudo-terminal, as emulators make: no adapter has one."""
+    return os.path.realpath(device).startswith("/dev/pts/")
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,9 @@ class RigOptions:
     def subject(self) -> dict[str, str]:
         """Backend, device and object, for the run record and a result's ``subject``."""
         about = {"backend": self.backend}
-        if self.devices:
+        if self.devices and all(map(_is_emulated, self.devices.values())):
+            about["device"] = "emulated"
+        elif self.devices:
             about["device"] = ", ".join(f"{s} {redact(d)}" for s, d in self.devices.items())
         elif emulator_of(self.backend) is not None:
             about["device"] = "emulated"

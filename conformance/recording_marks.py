@@ -47,6 +47,6 @@ def _verdicts(results: list[Result]) -> Iterator[Mark]:
             first.log_time_ns,
             first.log_time_ns + round(length * 1e9),
             str(result.verdict),
-            f"{result.requirement.id} {result.side}",
+            f"{result.requirement.id} {result.requirement.title}, {result.side}",
             result.observed,
         )

@@ -352,6 +352,25 @@ def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
     assert "8.0 h" in page
 
 
+def test_the_summary_page_counts_a_file_once_and_does_not_pass_a_part() -> None:
+    summary = Summary()
+    summary.add(FileRecord("a.mcap", state=State.UNREADABLE, error="no recording"))
+    summary.add(
+        FileRecord(
+            "b.mcap",
+            state=State.JUDGED,
+            overall="pass",
+            error="damaged: cut",
+            facts={"damage": ["cut"], "truncated": True},
+        )
+    )
+    page = render(summary, locations=["archive"])
+    assert "1 unreadable" in page
+    assert "0 Inconclusive" in page  # an unreadable file is not counted again
+    assert "Pass, of its readable part" in page
+    assert page.count("white-space:nowrap") >= 2  # "unreadable" is not broken
+
+
 def test_command_writes_tables_page_and_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:

@@ -113,7 +113,7 @@ def test_verdicts_have_same_name_in_all_reports() -> None:
         ((Verdict.PASS, Verdict.PASS), {"backend": "sim-dex1"}, "2/2 pass (simulated)"),
         ((Verdict.PASS, Verdict.PASS), {"backend": ""}, "2/2 pass (recorded)"),
         ((Verdict.PASS, Verdict.WARN), {}, "1/2 pass, 1 warn"),
-        ((Verdict.PASS, Verdict.NOT_APPLICABLE), {}, "1/2 pass, 1 not judged"),
+        ((Verdict.PASS, Verdict.NOT_APPLICABLE), {}, "1/2 pass, 1 not applicable"),
         ((Verdict.PASS, Verdict.NOT_CLAIMED), {}, "1/1 pass"),
         ((Verdict.PASS, Verdict.FAIL), {}, "fail, 1 of 2 not met"),
         ((Verdict.PASS, Verdict.ERROR), {}, "inconclusive, 1 of 2 pass"),

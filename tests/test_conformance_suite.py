@@ -187,7 +187,10 @@ def test_suite_options_have_their_defaults() -> None:
     assert options.domain is None
     assert options.objects == {Side.RIGHT: 37.0}
     assert options.rig(0).subject["device"] == "emulated"
+    pseudo = SuiteOptions.make(backend="ezgripper", devices=["/dev/pts/7"])  # as emulators make
+    assert pseudo.rig(0).subject["device"] == "emulated"
     real = SuiteOptions.make(backend="ezgripper", devices=["/dev/ttyUSB0"])
+    assert real.rig(0).subject["device"] == "left /dev/ttyUSB0"
     assert (real.sides, real.domain, real.objects) == ((Side.LEFT,), 0, {})
     outside = SuiteOptions.make(backend="external", side="right", objects=["right=25"])
     assert (outside.domain, outside.objects) == (0, {Side.RIGHT: 25.0})

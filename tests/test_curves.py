@@ -16,6 +16,7 @@ from dexkit.conformance.layers import recording_of
 from dexkit.conformance.report.curves import page, recorded
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.digests import sha256_of_file
+from dexkit.messages import message_type
 from dexkit.sparkline import ASCII, resampled, sparkline
 from dexkit.traces import Recorder, Trace, open_trace
 from tests.watch_helpers import COMMAND, STATE, dex3_command, dex3_state, ns
@@ -100,6 +101,25 @@ def test_diff_draws_the_largest_differences_first(
     # states differ by 0.1 rad, commands by half of it
     assert text.index("thumb_1</b> state: rms") < text.index("thumb_1</b> command: rms")
     assert "B is +7.0000 s later than A" in text
+
+
+def test_diff_says_why_recordings_without_a_common_joint_differ(
+    traces: tuple[Trace, Trace], tmp_path: Path
+) -> None:
+    """A page without a curve has the reason."""
+    out, other = tmp_path / "diff.html", tmp_path / "other.mcap"
+    kind = message_type("unitree_go::msg::dds_::MotorStates_")
+    payload = kind.encode(kind.of_motors([kind.motor_type.cls()]))
+    with Recorder(other) as recorder:
+        for i in range(100):
+            at = traces[0].first_ns + 10_000_000 * i
+            recorder.put("rt/dex1/left/state", kind.name, payload, at)
+    result = CliRunner().invoke(
+        cli, ["diff", str(traces[0].path), str(other), "--offset", "0", "--html", str(out)]
+    )
+    for text in (result.output, out.read_text()):
+        assert "hey differ: only A has rt/dex3/left/" in text
+        assert "no joint could be compared" in text
 
 
 def test_compare_draws_recordings_that_were_judged(

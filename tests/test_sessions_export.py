@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from dexkit.messages import message_type
@@ -230,3 +231,18 @@ def test_equal_values_are_distinguished(tmp_path: Path) -> None:
         topic_tables.export_tables(open_trace(tmp_path / "a.mcap"), tmp_path / form, form)
         topic_tables.import_tables(tmp_path / form, tmp_path / f"{form}.mcap")
         assert rows(tmp_path / f"{form}.mcap") == rows(tmp_path / "a.mcap")
+
+
+def test_a_bag_counts_the_messages_that_it_holds(tmp_path: Path) -> None:
+    """What has no definition in ROS form is left out, and is not counted."""
+    source = tmp_path / "a.mcap"
+    with open(source, "wb") as out:
+        writer = Writer(out)
+        writer.start()
+        schema = writer.register_schema("nobody/msg/Knows", "protobuf", b"?")
+        channel = writer.register_channel("/x", "protobuf", schema)
+        for i in range(10):
+            writer.add_message(channel, 10**18 + i, b"1234", 10**18 + i)
+        writer.finish()
+    _, said = dexkit("export", source, "--to", "rosbag2", "--out", tmp_path / "bag")
+    assert "bag: 0 messages of 10" in said

@@ -173,6 +173,8 @@ def test_failed_requirements_are_marked_where_they_show() -> None:
     for mark in marks:
         assert trace.first_ns <= mark.time_ns <= mark.end_ns + 1
     assert phase_marks(trace) == []
+    titles = {r.requirement.id: r.requirement.title for r in result.results}
+    assert all(titles[m.title.split()[0]] in m.title for m in marks if m.kind == "fail")
 
 
 # -- the page, without a browser -------------------------------------------------------------------

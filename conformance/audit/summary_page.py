@@ -70,6 +70,7 @@ class _Line:
     where: str
     failed: tuple[tuple[str, str], ...]
     more: int
+    damaged: bool = False
 
 
 class Summary:
@@ -98,7 +99,8 @@ class Summary:
         failed = [name for name, verdict in verdicts.items() if verdict is Verdict.FAIL]
         self.all.add(record, failed)
         self.states[record.state] += 1
-        self.overall[record.overall or str(Overall.INCONCLUSIVE)] += 1
+        if record.overall:  # what could not be judged is counted by its state alone
+            self.overall[record.overall] += 1
         self.truncated += bool(facts.get("truncated"))
         self.damaged += bool(facts.get("damage"))
         if record.client:
@@ -140,6 +142,7 @@ class Summary:
             _where(record.facts),
             tuple(shown[:_MOST]),
             max(0, len(shown) - _MOST),
+            bool(record.facts.get("damage") or record.facts.get("truncated")),
         )
         # the heap's smallest is the least bad, and of equals the last one
         entry = (tuple(-n for n in badness), -self._count, line)
@@ -272,9 +275,12 @@ def _worst(summary: Summary, locations: Sequence[str]) -> str:
     for line in lines:
         if line.overall:
             answer = ANSWERS[Overall(line.overall)]
-            verdict = f'<b class="{answer.css}">{answer.text}</b>'
+            text, css = answer.text, answer.css
+            if line.damaged and css == ANSWERS[Overall.PASS].css:
+                text, css = f"{text}, of its readable part", "open"
+            verdict = f'<b class="{css}">{text}</b>'
         else:
-            verdict = f'<b class="open">{escape(str(line.state))}</b>'
+            verdict = no_wrap(f'<b class="open">{escape(str(line.state))}</b>')
         found = [f"<code>{escape(name)}</code> {escape(text)}" for name, text in line.failed]
         found += [f"and {line.more} more"] if line.more else []
         found += [escape(line.error)] if line.error else []

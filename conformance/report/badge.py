@@ -37,7 +37,8 @@ def badge_text(result: RunResult, kind: Kind = Kind.DROP_IN) -> tuple[str, str]:
             text += f" of {result.catalogue}, partial"
         rest = [
             (found.warned, "warn"),
-            (found.not_judged + found.open, "not judged"),
+            (found.not_judged, "not applicable"),
+            (found.open, "not judged"),
         ]
         text += "".join(f", {n} {what}" for n, what in rest if n)
     real = device_kind(result)

@@ -100,12 +100,16 @@ def _page(found: Comparison, a: Trace, b: Trace) -> str:
     ]
     title = f"{a.path.name} and {b.path.name}"
     head = (
-        f"<h1>{escape(title)}</h1><p>{'The same' if found.equal else 'They differ'}. B is "
+        f"<h1>{escape(title)}</h1><p>T{escape(_conclusion(found))[1:]}. B is "
         f"{found.offset:+.4f} s later than A, and is drawn on A's clock; they have "
         f"{found.overlap:.3f} s in common.</p>"
     )
     notes = "".join(f"<p>{escape(note)}</p>" for note in found.notes)
     return document(title, head + notes + over_each_other(one, other, order) + topics([one, other]))
+
+
+def _conclusion(found: Comparison) -> str:
+    return "the same" if found.equal else f"they differ: {'; '.join(found.reasons)}"
 
 
 def _finite(value: Any) -> Any:
@@ -167,4 +171,4 @@ def _print(found: Comparison) -> None:
     console.print(joints)
     for note in found.notes:
         console.print(f"note: {note}", highlight=False)
-    console.print("the same" if found.equal else "they differ")
+    console.print(escape(_conclusion(found)), highlight=False)

@@ -230,11 +230,13 @@ def _marks(trace: Trace, judge: bool) -> list[Mark]:
     from dexkit.conformance.judge import judge as verdict_on
     from dexkit.conformance.layers import recording_of
     from dexkit.conformance.recording_marks import phase_marks, verdict_marks
+    from dexkit.conformance.run_record import recorded_claims
 
     try:
         marks = phase_marks(trace)
         if judge:
-            marks += verdict_marks(verdict_on(recording_of(trace, None, ())))
+            view = recording_of(trace, None, ())
+            marks += verdict_marks(verdict_on(view, claims=recorded_claims(view.run)))
     except (ConformanceError, TraceUnsupported) as error:
         click.echo(one_line(f"warning: not judged: {error}", REMARK), err=True)
         return []

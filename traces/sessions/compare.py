@@ -81,14 +81,29 @@ class Comparison:
         """Whether both have the same topics and types, and no joint differs by more than the
         tolerance. Without a joint that could be compared they are not.
         """
-        compared = [j for j in self.joints if j.samples]
-        return (
-            not any(self.only)
-            and all(a == b for a, b in (t.types for t in self.topics))
-            and bool(compared)
-            and len(compared) == len(self.joints)
-            and all(j.first_at is None for j in self.joints)
-        )
+        return not self.reasons
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why they are not equal, in sentences without an end; empty if they are."""
+        found = [
+            f"only {name} has {', '.join(topics)}"
+            for name, topics in zip("AB", self.only, strict=True)
+            if topics
+        ]
+        found += [
+            f"{t.topic} has other types: {' and '.join(map(str, t.types))}"
+            for t in self.topics
+            if t.types[0] != t.types[1]
+        ]
+        if not any(j.samples for j in self.joints):
+            found.append("no joint could be compared")
+        elif apart := [j.joint for j in self.joints if not j.samples]:
+            found.append(f"no time in common: {', '.join(apart)}")
+        if wrong := [j for j in self.joints if j.first_at is not None]:
+            names = ", ".join(dict.fromkeys(j.joint for j in wrong))
+            found.append(f"more than {self.tolerance:g} {wrong[0].unit} apart: {names}")
+        return found
 
 
 def compare(
