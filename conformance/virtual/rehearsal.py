@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -133,18 +134,19 @@ class Rehearsal:
 
 
 class _Log:
-    """Rows of one hand."""
+    """Rows of one hand, packed: an hour of it has millions of states."""
 
     def __init__(self, joints: int) -> None:
-        self.t: list[float] = []
-        self.rows: list[tuple[tuple[float, ...], ...]] = []
-        self.playing: list[float] = []
+        self.t = array("d")
+        self.rows = array("d")
+        self.playing = array("d")
         self.command: tuple[float, ...] = (float("nan"),) * joints
 
     def note(self, now: float, seen: DecodedHand, *, playing: bool) -> None:
         """Record a state, and the last command before it."""
         self.t.append(now)
-        self.rows.append((self.command, seen.q, seen.tau))
+        for values in (self.command, seen.q, seen.tau):
+            self.rows.extend(values)
         self.playing.append(float(playing))
 
 
@@ -198,15 +200,15 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
             due = now + 0.01
     _turn(result, now)
     for side, log in logs.items():
-        table = np.array(log.rows, dtype=np.float64).reshape(len(log.rows), 3, joints)
+        table = np.asarray(log.rows).reshape(len(log.t), 3, joints)
         result.hands[side] = Rehearsed(
             side=side,
             names=joint_limits(spoken, side).names,
-            t=np.array(log.t),
+            t=np.asarray(log.t),
             command=table[:, 0],
             q=table[:, 1],
             tau=table[:, 2],
-            playing=np.array(log.playing),
+            playing=np.asarray(log.playing),
         )
     return result
 
