@@ -166,12 +166,14 @@ class _Writer:
         self._at_rest[name] = {p.part: p.at_rest for p in source.pressures if not p.zeroed}
         self.result.problems += [f"{name}: {text}" for text in (*source.problems, *told)]
         self._lost.update(dict.fromkeys(f"{name}: {text}" for text in source.lost))
+        digest = sha256_of_file(trace.path)  # once: a long recording has many runs
         for frames, loaded, found in zip(runs, pictures, seen, strict=True):
-            self._add(source, frames, loaded, found, scheme)
+            self._add(source, digest, frames, loaded, found, scheme)
 
     def _add(
         self,
         source: Source,
+        digest: str,
         frames: Frames,
         pictures: dict[str, list[bytes]],
         seen: dict[str, dict[str, list[Any]]],
@@ -212,7 +214,7 @@ class _Writer:
         self._episodes.append(row)
         self._origins[str(episode)] = {
             "file": source.trace.path.name,
-            "sha256": sha256_of_file(source.trace.path),
+            "sha256": digest,
             "start_ns": str(int(frames.times_ns[0])),
             "clock": source.imported.clock,
         }
