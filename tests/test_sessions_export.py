@@ -12,13 +12,14 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
+from dexkit.digests import sha256_of_file
 from dexkit.messages import message_type
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.traces import Recorder, open_trace, sample_path
-from dexkit.traces.sessions import ros_types, topic_tables
+from dexkit.traces.reader import Definition
+from dexkit.traces.sessions import lerobot_out, ros_types, topic_tables
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.streams import streams_of
 from dexkit.traces.writer import RecordingWriter, definition
@@ -233,16 +234,72 @@ def test_equal_values_are_distinguished(tmp_path: Path) -> None:
         assert rows(tmp_path / f"{form}.mcap") == rows(tmp_path / "a.mcap")
 
 
-def test_a_bag_counts_the_messages_that_it_holds(tmp_path: Path) -> None:
-    """What has no definition in ROS form is left out, and is not counted."""
-    source = tmp_path / "a.mcap"
-    with open(source, "wb") as out:
-        writer = Writer(out)
-        writer.start()
-        schema = writer.register_schema("nobody/msg/Knows", "protobuf", b"?")
-        channel = writer.register_channel("/x", "protobuf", schema)
-        for i in range(10):
-            writer.add_message(channel, 10**18 + i, b"1234", 10**18 + i)
-        writer.finish()
-    _, said = dexkit("export", source, "--to", "rosbag2", "--out", tmp_path / "bag")
-    assert "bag: 0 messages of 10" in said
+@pytest.fixture
+def long(tmp_path: Path, part: Path) -> Path:
+    """The session twice with a gap between, with messages that a table has to tell apart."""
+    out = tmp_path / "long.mcap"
+    trace = open_trace(part)
+    mt = message_type("unitree_hg::msg::dds_::HandState_")
+    other = Definition("rt/other", "cdr", {}, ("other/msg/Other", "ros2msg", b"int32 a"))
+    with RecordingWriter(out) as writer:
+        channels = {key: writer.add_channel(d) for key, d in trace.definitions.items()}
+        unknown = writer.add_channel(other)
+        for shift in (0, 10 * 10**9):
+            for i, m in enumerate(trace.messages()):
+                data = m.data
+                if m.topic == "rt/dex3/left/state" and i % 5 == 0:
+                    data = mt.encode(mt.cls(motor_state=mt.decode(data).motor_state[:3]))
+                elif m.topic == "rt/dex3/right/state" and i % 7 == 3:
+                    data = data[:40]
+                at = m.log_time_ns + shift
+                writer.put(channels[m.topic, m.type_name], data, at, m.publish_time_ns)
+                if i % 10 == 0:
+                    writer.put(unknown, data, at, 0)
+    return out
+
+
+@each("form", ["csv", "parquet"])
+def test_tables_are_the_same_in_pieces_of_any_size(
+    tmp_path: Path, long: Path, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    lost = topic_tables.export_tables(open_trace(long), whole, form)
+    monkeypatch.setattr(topic_tables, "_VALUES_WRITTEN", 1500)
+    monkeypatch.setattr(topic_tables, "_BYTES_WRITTEN", 5000)
+    monkeypatch.setattr(topic_tables, "_ROWS_MEASURED", 7)
+    assert topic_tables.export_tables(open_trace(long), pieces, form) == lost
+    assert any("cannot be decoded" in text for text in lost)
+    assert [p.name for p in sorted(pieces.iterdir())] == [p.name for p in sorted(whole.iterdir())]
+    for path in whole.iterdir():
+        if path.suffix == ".parquet":
+            assert pq.read_table(path).equals(pq.read_table(pieces / path.name)), path.name
+            assert pq.read_metadata(pieces / path.name).num_row_groups > 1
+        else:
+            assert path.read_bytes() == (pieces / path.name).read_bytes()
+
+
+def test_pieces_are_the_samples(long: Path) -> None:
+    trace = open_trace(long)
+    for topic in trace.topics:
+        whole = trace.samples(topic)
+        pieces = list(trace.pieces(topic, 11))
+        assert max(map(len, pieces)) == 11
+        assert [p for piece in pieces for p in piece.payloads] == whole.payloads
+        for name in ("log_time_ns", "publish_time_ns"):
+            found = np.concatenate([getattr(piece, name) for piece in pieces])
+            assert np.array_equal(found, getattr(whole, name))
+
+
+def test_a_recording_of_many_runs_is_hashed_once(
+    tmp_path: Path, long: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed: list[Path] = []
+
+    def digest(path: Path) -> str:
+        hashed.append(path)
+        return sha256_of_file(path)
+
+    monkeypatch.setattr(lerobot_out, "sha256_of_file", digest)
+    result = lerobot_out.export_dataset([open_trace(long)], tmp_path / "set")
+    assert result.episodes > 1
+    assert hashed == [long]

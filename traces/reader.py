@@ -441,9 +441,7 @@ class Trace:
         """
         chosen: dict[str, ChannelInfo] = {}
         wanted = self._select_channels(topics)
-        for info in sorted(
-            (self._info[i] for i in wanted), key=lambda c: (not c.supported, -c.message_count)
-        ):
+        for info in sorted((self._info[i] for i in wanted), key=_preference):
             chosen.setdefault(info.topic, info)
         columns = {
             topic: Columns(STRUCTS[info.type_name])
@@ -467,6 +465,26 @@ class Trace:
                     self._collect(*self._file.read(file, segment), sinks)
         return {topic: _columns(chosen[topic], found) for topic, found in by_topic.items()}
 
+    def pieces(self, topic: str, rows: int) -> Iterator[SampleArray]:
+        """The samples of one topic, some at a time, in bounded memory; at least one piece.
+
+        Of a topic that carries several types, those of the type that :meth:`load` gives.
+
+        :param rows: samples of each piece but the last.
+        :raises UsageError: the topic is not in the recording.
+        """
+        info = self._preferred(topic)
+        some: list[TraceMessage] = []
+        given = False
+        for message in self.messages([topic]):
+            if message.type_name == info.type_name:
+                some.append(message)
+                if len(some) == rows:
+                    yield _piece(info, some)
+                    some, given = [], True
+        if some or not given:
+            yield _piece(info, some)
+
     def samples(self, topic: str) -> SampleArray:
         """The samples of one topic as columns; see :meth:`load`, which does several at once.
 
@@ -480,11 +498,15 @@ class Trace:
         :raises UsageError: the topic is not in the recording.
         :raises TraceUnsupported: its type, layout or encoding cannot be decoded.
         """
-        channels = [self._info[i] for i in self._select_channels([topic])]
-        info = min(channels, key=lambda c: (not c.supported, -c.message_count))
+        info = self._preferred(topic)
         if info.problem:
             raise TraceUnsupported(f"{info.topic}: {info.problem}")
         return message_type(info.type_name)
+
+    def _preferred(self, topic: str) -> ChannelInfo:
+        """The channel whose type :meth:`load` gives."""
+        channels = [self._info[i] for i in self._select_channels([topic])]
+        return min(channels, key=_preference)
 
     def _select_channels(self, topics: Iterable[str] | None) -> list[int]:
         if topics is None:
@@ -621,6 +643,20 @@ def _keep_memory() -> None:
 
 def _remainder_after(parts: Sequence[str], prefix: str) -> str:
     return next((p.removeprefix(prefix) for p in parts if p.startswith(prefix)), "")
+
+
+def _preference(info: ChannelInfo) -> tuple[bool, int]:
+    """Of the channels of one topic, the lowest decides which type is read."""
+    return not info.supported, -info.message_count
+
+
+def _piece(info: ChannelInfo, messages: Sequence[TraceMessage]) -> SampleArray:
+    log = np.array([m.log_time_ns for m in messages], dtype=np.uint64)
+    publish = np.array([m.publish_time_ns for m in messages], dtype=np.uint64)
+    payloads = [m.data for m in messages]
+    return SampleArray(
+        info.topic, info.type_name, _times([log]), _times([publish]), payloads, info.problem
+    )
 
 
 def _columns(info: ChannelInfo, sinks: list[_Sink]) -> SampleArray:

@@ -34,7 +34,9 @@ from dexkit.traces.reader import (
     LATEST_NS,
     ChannelInfo,
     Definition,
+    SampleArray,
     Trace,
+    TraceMessage,
     signed_times,
 )
 from dexkit.traces.sessions.lerobot_format import parquet_library, parquet_pieces
@@ -56,6 +58,10 @@ _LARGEST_ABOUT = 64 * 2**20
 _LONGEST = 256
 _MOST_COLUMNS = 2**16
 _VALUES_AT_ONCE = 2**20
+# Values and bytes of payloads that an export holds at once, and messages while it counts elements.
+_VALUES_WRITTEN = 2**22
+_BYTES_WRITTEN = 2**24
+_ROWS_MEASURED = 2**13
 _LONGEST_LINE = 64 * 2**20  # characters
 
 
@@ -146,53 +152,95 @@ def _export_topic(
     trace: Trace, info: ChannelInfo, path: Path, form: str, entry: dict[str, Any], lost: list[str]
 ) -> int:
     """Write the table of a topic; return the number of its rows."""
-    samples = trace.load([info.topic])[info.topic]
-    names: list[str] = list(_TIMES)
-    columns: list[_Column]
-    if info.problem or samples.type_name != info.type_name:
-        found = [m for m in trace.messages([info.topic]) if m.type_name == info.type_name]
+    rows, late = 0, False
+    if info.problem or trace.message_type(info.topic).name != info.type_name:
         entry["columns"] = _PAYLOAD
-        times = ([m.log_time_ns for m in found], [m.publish_time_ns for m in found])
-        columns = [_Column(signed_times(np.array(t, dtype=np.uint64))) for t in times]
-        names.append(_PAYLOAD)
-        _note_late_times(info.topic, columns, lost)
-        _write(path, form, names, columns, [m.data for m in found])
-        return len(found)
-    decoded = samples.columns()
-    good = decoded.ok
-    if not good.all():
-        lost.append(f"{info.topic}: {np.count_nonzero(~good)} messages that cannot be decoded")
+        with _TableFile(path, form, [*_TIMES, _PAYLOAD]) as file:
+            for some in _payloads(trace, info):
+                times = ([m.log_time_ns for m in some], [m.publish_time_ns for m in some])
+                columns = [_Column(signed_times(np.array(t, dtype=np.uint64))) for t in times]
+                file.write(columns, [m.data for m in some])
+                rows += len(some)
+                late = late or _is_late(columns)
+        if late:
+            lost.append(f"{info.topic}: {LATE_TIMES}")
+        return rows
     layout = message_type(info.type_name).layout
-    sequences = [f.name for f in layout.fields if f.sequence]
-    counts = {s: decoded.count(s)[good] for s in sequences}
-    lengths = {s: int(n.max(initial=0)) for s, n in counts.items()}
+    lengths = _longest(trace, info.topic, layout)
     if too_long := [s for s, n in lengths.items() if n > _LONGEST]:
         raise SessionError(
             f"{info.topic} has {lengths[too_long[0]]} elements of {too_long[0]} in a message: a "
             f"table holds {_LONGEST} at most"
         )
     entry["columns"] = "members"
+    leaves = list(_leaves(layout, lengths))
+    names = [*_TIMES, *(f"len({s})" for s in lengths), *(leaf.path for leaf in leaves)]
+    bad = 0
+    with _TableFile(path, form, names) as file:
+        for samples in trace.pieces(info.topic, max(1, _VALUES_WRITTEN // len(names))):
+            columns, left_out = _members(samples, lengths, leaves)
+            file.write(columns)
+            rows += len(samples) - left_out
+            bad += left_out
+            late = late or _is_late(columns[: len(_TIMES)])
+    if bad:
+        lost.append(f"{info.topic}: {bad} messages that cannot be decoded")
+    if late:
+        lost.append(f"{info.topic}: {LATE_TIMES}")
+    return rows
+
+
+def _payloads(trace: Trace, info: ChannelInfo) -> Iterator[list[TraceMessage]]:
+    """The messages of one type of a topic, some at a time; at least one piece."""
+    some: list[TraceMessage] = []
+    size, given = 0, False
+    for message in trace.messages([info.topic]):
+        if message.type_name == info.type_name:
+            some.append(message)
+            size += len(message.data) + 1
+            if size >= _BYTES_WRITTEN:
+                yield some
+                some, size, given = [], 0, True
+    if some or not given:
+        yield some
+
+
+def _longest(trace: Trace, topic: str, layout: Struct) -> dict[str, int]:
+    """The largest number of elements of each sequence in the messages that can be decoded."""
+    lengths = {f.name: 0 for f in layout.fields if f.sequence}
+    for samples in trace.pieces(topic, _ROWS_MEASURED) if lengths else ():
+        decoded = samples.columns()
+        lengths = {s: max(n, int(decoded.count(s).max(initial=0))) for s, n in lengths.items()}
+    return lengths
+
+
+def _members(
+    samples: SampleArray, lengths: Mapping[str, int], leaves: Sequence[_Leaf]
+) -> tuple[list[_Column], int]:
+    """The columns of the messages that can be decoded, and how many cannot."""
+    decoded = samples.columns()
+    good = decoded.ok
+    counts = {s: decoded.count(s)[good] for s in lengths}
     columns = [_Column(samples.log_time_ns[good]), _Column(samples.publish_time_ns[good])]
-    _note_late_times(info.topic, columns, lost)
-    for s in sequences:
-        names.append(f"len({s})")
-        columns.append(_Column(counts[s].astype(np.int32)))
-    for leaf in _leaves(layout, lengths):
-        values = decoded[leaf.path][good]
-        there = None
+    columns += [_Column(n.astype(np.int32)) for n in counts.values()]
+    for leaf in leaves:
         sequence, place = leaf.steps[0], leaf.steps[1] if len(leaf.steps) > 1 else 0
+        there = None
         if sequence in counts and isinstance(place, int):
             there = counts[str(sequence)] > place
+        if there is not None and not there.any():  # there may be no such column in this piece
+            columns.append(_Column(np.zeros(len(there), leaf.dtype), there))
+            continue
+        values = decoded[leaf.path][good]
+        if there is not None:
             values = np.where(there, values, 0.0)
-        names.append(leaf.path)
         columns.append(_Column(values.astype(leaf.dtype), there))
-    _write(path, form, names, columns)
-    return int(np.count_nonzero(good))
+    return columns, int(np.count_nonzero(~good))
 
 
-def _note_late_times(topic: str, times: Sequence[_Column], lost: list[str]) -> None:
-    if any((c.values == LATEST_NS).any() for c in times):
-        lost.append(f"{topic}: {LATE_TIMES}")
+def _is_late(times: Sequence[_Column]) -> bool:
+    """Whether a time does not fit into the table."""
+    return any(bool((c.values == LATEST_NS).any()) for c in times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,27 +266,57 @@ class _Column:
         return found
 
 
-def _write(
-    path: Path,
-    form: str,
-    names: Sequence[str],
-    columns: Sequence[_Column],
-    payloads: Sequence[bytes] | None = None,
-) -> None:
-    if form == "csv":
+class _TableFile:
+    """A table that is written some rows at a time; a context manager.
+
+    :param form: ``csv`` or ``parquet``.
+    :param names: of its columns; payloads are the last one.
+    :raises ExtraMissing: pyarrow is not installed.
+    """
+
+    def __init__(self, path: Path, form: str, names: Sequence[str]) -> None:
+        self._path, self._names = path, list(names)
+        self._file: Any = None
+        self._csv = form == "csv"
+        if not self._csv:
+            self._arrow, self._parquet = parquet_library()
+
+    def __enter__(self) -> _TableFile:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def write(self, columns: Sequence[_Column], payloads: Sequence[bytes] | None = None) -> None:
+        """Append rows."""
+        if self._csv:
+            self._write_csv(columns, payloads)
+            return
+        arrow = self._arrow
+        arrays = [
+            arrow.array(c.values, mask=None if c.there is None else ~c.there) for c in columns
+        ]
+        if payloads is not None:
+            arrays.append(arrow.array(payloads, type=arrow.binary()))
+        table = arrow.table(arrays, names=self._names)
+        if self._file is None:
+            self._file = self._parquet.ParquetWriter(
+                str(self._path), table.schema, compression="zstd"
+            )
+        self._file.write_table(table)
+
+    def _write_csv(self, columns: Sequence[_Column], payloads: Sequence[bytes] | None) -> None:
         texts = [c.texts() for c in columns]
         if payloads is not None:
             texts.append([base64.b64encode(p).decode() for p in payloads])
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(names)
-            writer.writerows(zip(*texts, strict=True))
-        return
-    arrow, parquet = parquet_library()
-    arrays = [arrow.array(c.values, mask=None if c.there is None else ~c.there) for c in columns]
-    if payloads is not None:
-        arrays.append(arrow.array(payloads, type=arrow.binary()))
-    parquet.write_table(arrow.table(arrays, names=list(names)), str(path), compression="zstd")
+        first = self._file is None
+        if first:
+            self._file = self._path.open("w", newline="", encoding="utf-8")
+        writer = csv.writer(self._file)
+        if first:
+            writer.writerow(self._names)
+        writer.writerows(zip(*texts, strict=True))
 
 
 # -- import
