@@ -173,3 +173,33 @@ def test_damaged_sample_does_not_affect_columns_of_the_others() -> None:
     seen = columns["imu_state.temperature"]
     assert np.isnan(seen[3])
     assert np.delete(seen, 3).tolist() == [0, 1, 2, 4, 5]
+
+
+def test_columns_of_compressed_tables_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    mt = message_type("unitree_hg::msg::dds_::HandState_")
+    random = np.random.default_rng(1)
+    payloads = []
+    for i in range(900):
+        message = mt.cls(motor_state=[mt.motor_type.cls() for _ in range(2)])
+        message.motor_state[0].q = float(random.normal())
+        message.motor_state[1].q = float("nan") if i == 500 else float(i)
+        message.motor_state[0].mode = i % 250
+        message.power_v = float(i > 333)  # a word that begins to change within a table
+        payloads.append(mt.encode(message))
+    plain = mt.columns(payloads)
+    made: list[int] = []
+
+    class Sealed(dexkit.messages.packed._Sealed):
+        def __init__(self, table: np.ndarray[tuple[int, ...], np.dtype[np.uint32]]) -> None:
+            made.append(len(table))
+            super().__init__(table)
+
+    monkeypatch.setattr(dexkit.messages.packed, "_SEGMENT", 64)
+    monkeypatch.setattr(dexkit.messages.packed, "_SEALED", 10)
+    monkeypatch.setattr(dexkit.messages.packed, "_Sealed", Sealed)
+    columns = mt.columns(payloads)
+    assert len(made) > 5
+    for path in ("motor_state[0].q", "motor_state[1].q", "motor_state[].mode", "power_v"):
+        assert np.array_equal(columns[path], plain[path], equal_nan=True), path
+        assert np.array_equal(columns.extremes(path), plain.extremes(path), equal_nan=True), path
+        assert columns.constant(path) is None

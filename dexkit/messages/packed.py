@@ -21,6 +21,9 @@ _COMPARED = 1 << 14
 _FOLDED = 16
 """Rows of changing words that are reduced as one."""
 
+_SEALED = _SEGMENT // 2
+"""Fewest samples of a table that is compressed when no more are added: of recordings of minutes."""
+
 Piece: TypeAlias = "tuple[bytes | NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]"
 """A buffer, where some payloads begin in it, and how long each of them is."""
 
@@ -110,6 +113,33 @@ def pieces(payloads: Sequence[bytes]) -> Iterator[Piece]:
         yield b"".join(some), np.cumsum(sizes) - sizes, sizes
 
 
+class _Sealed:
+    """A finished table of changing words, each column compressed by itself: many of them change
+    seldom, or by little.
+    """
+
+    def __init__(self, table: NDArray[np.uint32]) -> None:
+        from zstandard import ZstdCompressor
+
+        self.shape = table.shape
+        compressor = ZstdCompressor(level=1)
+        # the bytes of equal weight together: those that change little compress well then
+        self._columns = [
+            compressor.compress(
+                np.ascontiguousarray(column).view(np.uint8).reshape(-1, 4).T.tobytes()
+            )
+            for column in table.T
+        ]
+
+    def column(self, at: int) -> NDArray[np.uint32]:
+        """One column, shape (n, 1)."""
+        from zstandard import ZstdDecompressor
+
+        data = ZstdDecompressor().decompress(self._columns[at])
+        planes = np.frombuffer(data, np.uint8).reshape(4, self.shape[0])
+        return np.ascontiguousarray(planes.T).view(np.uint32)
+
+
 class Words:
     """Samples of one length, word by word: the first of them, and columns of what changes.
 
@@ -129,6 +159,8 @@ class Words:
         # than twice the samples take, beyond a first table, and memory that is not touched costs
         # nothing
         self._tables: list[NDArray[np.uint32]] = []
+        # of those, the finished ones of a long recording
+        self._sealed: dict[int, _Sealed] = {}
         self._begins: list[int] = []  # the first sample of each table
         # some samples like the first one, their changing words 0, for comparison
         self._constant = b""
@@ -204,6 +236,7 @@ class Words:
             if at == len(table) or table.shape[1] < kept.shape[1]:
                 first = _FIRST // len(self._row)
                 length = min(max(len(kept), self._n, first), _SEGMENT)
+                self._seal()
                 table = np.empty((length, kept.shape[1]), dtype=np.uint32)
                 self._tables.append(table)
                 self._begins.append(self._n)
@@ -213,6 +246,14 @@ class Words:
                 table[at : at + some] = kept[:some]
             self._n += some
             kept = kept[some:]
+
+    def _seal(self) -> None:
+        """Compress the last table, to which no more is added, if it has many samples."""
+        if not self._tables or (used := self._n - self._begins[-1]) < _SEALED:
+            return
+        last = len(self._tables) - 1
+        self._sealed[last] = _Sealed(self._tables[last][:used])
+        self._tables[last] = self._tables[last][:0].copy()
 
     def varies(self, at: int) -> bool:
         """Whether the word with the byte ``at`` ever changes."""
@@ -257,8 +298,16 @@ class Words:
             least = self._row[self._changing].view(leaf)
             most = least.copy()
             ends = [*self._begins[1:], self._n]
-            for begin, end, table in zip(self._begins, ends, self._tables, strict=True):
+            for number, (begin, end, table) in enumerate(
+                zip(self._begins, ends, self._tables, strict=True)
+            ):
                 k = table.shape[1]
+                if number in self._sealed:
+                    for at in range(k):
+                        column = self._sealed[number].column(at).view(leaf)
+                        np.minimum(least[at], column.min(), out=least[at : at + 1])
+                        np.maximum(most[at], column.max(), out=most[at : at + 1])
+                    continue
                 for rows in _wide(table[: end - begin]):
                     values = rows.view(leaf)
                     for found, of in ((least, np.minimum), (most, np.maximum)):
@@ -274,11 +323,19 @@ class Words:
             yield slice(0, self._n), self.first(leaf, at)
             return
         ends = [*self._begins[1:], self._n]
-        for begin, end, table in zip(self._begins, ends, self._tables, strict=True):
+        for number, (begin, end, table) in enumerate(
+            zip(self._begins, ends, self._tables, strict=True)
+        ):
             if place >= table.shape[1]:
                 yield slice(begin, end), self.first(leaf, at)  # it changed only later
             else:
-                column = table[: end - begin, place : place + 1].view(leaf)
+                sealed = self._sealed.get(number)
+                column = (
+                    table[: end - begin, place : place + 1]
+                    if sealed is None
+                    else sealed.column(place)
+                )
+                column = column.view(leaf)
                 yield slice(begin, end), column[:, at % 4 // leaf.itemsize]
 
 
