@@ -125,7 +125,10 @@ def compare(
     if topics is not None and not (loaded[0] or loaded[1]):
         raise UsageError(f"neither recording has a topic {', '.join(topics)}")
     names = [{t for t, s in one.items() if len(s)} for one in loaded]
-    streams = [streams_of(trace, sorted(some)) for trace, some in zip((a, b), names, strict=True)]
+    streams = [
+        streams_of(trace, sorted(some), positions=True)
+        for trace, some in zip((a, b), names, strict=True)
+    ]
     alignment = None
     if offset is None:
         alignment = _alignment(a, b, streams[0], streams[1])

@@ -216,10 +216,14 @@ def _touch(topic: str, samples: SampleArray, role: Role, side: Side) -> Pressure
     )
 
 
-def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream]:
+def streams_of(
+    trace: Trace, topics: Sequence[str] | None = None, *, positions: bool = False
+) -> list[Stream]:
     """Every stream of a recording, in the order of topics; empty ones are left out.
 
     :param topics: only these, in any spelling, patterns allowed.
+    :param positions: only q, without pressures and samples: a tenth of the memory. The topics are
+        read one at a time then.
     :raises UsageError: a topic is not in the recording.
     :raises SessionError: a group of joints of an import has a message that is none, or the
         recording has a stretch of time twice.
@@ -230,9 +234,10 @@ def streams_of(trace: Trace, topics: Sequence[str] | None = None) -> list[Stream
     found: list[Stream] = []
     absent = absent_fields(trace.metadata.get(RECORD, {}))
     copies = _copies(known)
-    for topic, samples in trace.load(sorted(set(wanted) & set(known)), decode=True).items():
+    fields = ("q",) if positions else None
+    for topic, samples in _loaded(trace, sorted(set(wanted) & set(known)), each=positions):
         try:
-            streams = [] if topic in copies else list(_streams(topic, samples))
+            streams = [] if topic in copies else list(_streams(topic, samples, fields))
         except WireError as error:
             raise SessionError(f"{trace.path}: {topic}: {error}") from error
         for stream in streams:
@@ -259,7 +264,22 @@ def _copies(topics: Sequence[str]) -> set[str]:
     }
 
 
-def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
+def _loaded(
+    trace: Trace, topics: Sequence[str], *, each: bool
+) -> Iterator[tuple[str, SampleArray]]:
+    """The samples of topics; ``each``: one topic after the other, read when it is asked for."""
+    for some in [[t] for t in topics] if each else [topics]:
+        yield from trace.load(some, decode=True).items()
+
+
+def _streams(
+    topic: str, samples: SampleArray, fields: Sequence[str] | None = None
+) -> Iterator[Stream]:
+    """The streams of a topic.
+
+    :param fields: only these, without pressures, and without the samples; None for everything.
+    """
+    kept = samples if fields is None else None
     if samples.type_name == ros_types.JOINT_STATE.dds_name and not samples.decoded:
         yield from _joint_states(topic, samples)
         return
@@ -277,9 +297,10 @@ def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
             slots = range(first, first + len(joints))
             pressure: Floats | None = None
             elements: tuple[str, ...] = ()
-            if kind == STATE and hand.sensors:
+            if kind == STATE and hand.sensors and fields is None:
                 pressure, elements = _pressure(columns, hand.sensors)
-            values = _values(columns, samples.type_name, kind, slots, role.dialect.torque_units)
+            units = role.dialect.torque_units
+            values = _values(columns, samples.type_name, kind, slots, units, fields)
             yield Stream(
                 part=f"{side}{HAND}",
                 kind=kind,
@@ -290,7 +311,7 @@ def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
                 model=hand.name,
                 pressure=pressure,
                 elements=elements,
-                samples=samples,
+                samples=kept,
             )
     for robot in ROBOTS.values():
         directions = {
@@ -306,10 +327,10 @@ def _streams(topic: str, samples: SampleArray) -> Iterator[Stream]:
                 kind=kind,
                 joints=tuple(robot.joint(s).name for s in used),
                 times_ns=samples.log_time_ns,
-                values=_values(_columns(samples), samples.type_name, kind, used, ()),
+                values=_values(_columns(samples), samples.type_name, kind, used, (), fields),
                 topic=topic,
                 model=robot.name,
-                samples=samples,
+                samples=kept,
             )
 
 
@@ -318,13 +339,20 @@ def _columns(samples: SampleArray) -> Columns:
 
 
 def _values(
-    columns: Columns, type_name: str, kind: str, slots: Sequence[int], units: Sequence[float]
+    columns: Columns,
+    type_name: str,
+    kind: str,
+    slots: Sequence[int],
+    units: Sequence[float],
+    fields: Sequence[str] | None,
 ) -> dict[str, Floats]:
     mt = message_type(type_name)
     array = next(f for f in mt.layout.fields if f.name == mt.motor_sequence).array
     values = {}
     with np.errstate(invalid="ignore"):
         for name, member in MEMBERS[kind].items():
+            if fields is not None and name not in fields:
+                continue
             here = [i for i in slots if array is None or i < array]
             if mt.motor_place(member, 0) is not None:
                 values[name] = mt.motor_table(columns, member, here)
