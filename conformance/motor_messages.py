@@ -382,7 +382,12 @@ class MotorCodec:
         if kind.name not in _LISTS:
             # the values of one joint are contiguous: checks read one joint at a time
             sequence, _ = _SEQUENCE[kind.name]
-            return columns.table([f"{sequence}[{i}].{name}" for i in slots])
+            paths = [f"{sequence}[{i}].{name}" for i in slots]
+            rows = [columns.constant(path) for path in paths]
+            same = [row for row in rows if row is not None]
+            if len(same) == len(rows):  # one row for all messages: no memory, however many
+                return np.broadcast_to(np.concatenate(same), (len(columns), len(rows)))
+            return columns.table(paths)
         where, scale = _LISTS[kind.name].get(name, _LISTS[kind.name]["q"])
         table = columns.table([f"{where}[{i}]" for i in slots]) / scale
         return table if name in _LISTS[kind.name] else table * 0.0

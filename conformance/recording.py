@@ -454,7 +454,7 @@ class TopicDecoder:
         def column(name: str, unit: tuple[float, ...] = ()) -> Floats:
             with np.errstate(invalid="ignore"):  # NaN in a message is judged by the checks
                 values = codec.column(columns, subject, codec.state, name)
-                return np.asarray(values * unit) if unit else values
+                return _times_unit(values, unit) if unit else values
 
         speeds, torques = codec.dialect.speed_units, codec.dialect.torque_units
         return States(
@@ -545,6 +545,13 @@ def joints_of(dialect: Dialect, side: Side) -> tuple[JointSpec, ...]:
     if not dialect.is_gripper:
         return joints
     return tuple(replace(j, q_min=0.0, q_max=dialect.q_open) for j in joints)
+
+
+def _times_unit(values: Floats, unit: tuple[float, ...]) -> Floats:
+    """Values in another unit; one row that stands for all stays one."""
+    if len(values) and values.strides[0] == 0:
+        return np.broadcast_to(values[:1] * unit, values.shape)
+    return np.asarray(values * unit)
 
 
 def _seconds(times: NDArray[np.int64], origin: int) -> Floats:

@@ -32,6 +32,7 @@ from dexkit.hand import JointSpec, Side, Subject
 from dexkit.unseen import UNSEEN_S
 
 __all__ = [
+    "KEPT_ROWS",
     "REGISTRY",
     "ROUNDING",
     "BaseContext",
@@ -49,6 +50,9 @@ ROUNDING = 1e-3
 reports it as float32 and in its own counts, which round (docs/sources/unitree-dex.md#g: 15 N m are
 1536 counts of 0.0098 N m, and come back as 15.000001). Used for limits at which the hand itself
 clamps; other limits have their own tolerance."""
+KEPT_ROWS = 2**21
+"""Rows of a result with one for each state that are kept for all joints together: some 100 MB. A
+recording of five minutes of a hand of seven joints has as many."""
 STROKE_S = 1.0
 """Seconds for a full stroke under Unitree's client."""
 
@@ -305,6 +309,19 @@ class Context(BaseContext[Recording, SideView]):
             known[name] = work_out()
         found: T = known[name]
         return found
+
+    def once_of_joint(self, name: str, joint: int, work_out: Callable[[], T]) -> T:
+        """As :meth:`once`, for what has a row for each state: of a long recording only the first
+        joints' is kept, and the newest.
+        """
+        key = (name, joint)
+        kept = self.once((name, "kept"), list[tuple[str, int]])
+        if key not in self.hand.known:
+            if kept and (len(kept) + 1) * len(self.states) > KEPT_ROWS:
+                # joints are gone through in order: an older one is asked for again sooner
+                del self.hand.known[kept.pop()]
+            kept.append(key)
+        return self.once(key, work_out)
 
     def known_states(self, joint: int, *members: str) -> Selected:
         """The states in which these members (``q``, ``dq``) of a joint are numbers."""

@@ -54,7 +54,7 @@ class _Joint:
     @classmethod
     def from_context(cls, ctx: Context, joint: int) -> _Joint:
         """The joint's data, cached for all checks."""
-        return ctx.once(("joint", joint), lambda: cls(ctx, joint))
+        return ctx.once_of_joint("joint", joint, lambda: cls(ctx, joint))
 
     def __init__(self, ctx: Context, joint: int) -> None:
         clock = ctx.once("clock", lambda: Times(ctx.states.clock))

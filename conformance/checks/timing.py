@@ -470,7 +470,7 @@ class Positions:
     @classmethod
     def from_context(cls, ctx: Context, joint: int) -> Positions:
         """A joint's data, cached for all checks."""
-        return ctx.once(("course", joint), lambda: cls._from_states(ctx, joint))
+        return ctx.once_of_joint("course", joint, lambda: cls._from_states(ctx, joint))
 
     @classmethod
     def _from_states(cls, ctx: Context, joint: int) -> Positions:

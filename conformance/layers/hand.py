@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,15 @@ if TYPE_CHECKING:
     from dexkit.conformance.results import Result
     from dexkit.conformance.verdicts import Judgement
 
-__all__ = ["LAYER", "applies_to_dialect", "recorded", "subjects", "whole", "with_silence"]
+__all__ = [
+    "LAYER",
+    "applies_to_dialect",
+    "one_by_one",
+    "recorded",
+    "subjects",
+    "whole",
+    "with_silence",
+]
 
 _SILENT = 0.5
 """Seconds without state, at the end of a failure's place, that are no mere gap."""
@@ -48,6 +56,13 @@ def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]
 def subjects(recording: Recording) -> Iterable[tuple[Subject, SideView]]:
     """The subjects to be judged, each with its part of the recording."""
     return [(subject, recording.sides[subject]) for subject in recording.judged]
+
+
+def one_by_one(recording: Recording) -> Iterator[tuple[Subject, SideView]]:
+    """The same; what checks have worked out of a subject is dropped before the next one."""
+    for subject, view in subjects(recording):
+        yield subject, view
+        view.known.clear()
 
 
 def whole(recording: Recording) -> tuple[float, float]:
@@ -189,7 +204,7 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     ),
     plots=(Plot(PlotKind.POSITION),),
     decode=_decode,
-    subjects=subjects,
+    subjects=one_by_one,
     context=Lazy("dexkit.conformance.checks:Context"),
     preconditions=(
         *(applies_to_dialect, claimed, recorded, carried, has_torque),

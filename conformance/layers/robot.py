@@ -39,7 +39,7 @@ LAYER: Layer[RobotRecording, SideView, RobotContext] = Layer(
     ),
     plots=(Plot(PlotKind.POSITION),),
     decode=_decode,
-    subjects=hand.subjects,
+    subjects=hand.one_by_one,
     context=Lazy("dexkit.conformance.checks.robot:RobotContext"),
     preconditions=(hand.applies_to_dialect, claimed, hand.recorded, hand.carried, not_blocked),
     refine=hand.with_silence,
