@@ -303,3 +303,25 @@ def test_a_recording_of_many_runs_is_hashed_once(
     result = lerobot_out.export_dataset([open_trace(long)], tmp_path / "set")
     assert result.episodes > 1
     assert hashed == [long]
+
+
+def test_streams_without_samples_have_the_same_values(long: Path) -> None:
+    trace = open_trace(long)
+    whole, alone = streams_of(trace), streams_of(trace, keep_samples=False)
+    positions = streams_of(trace, positions=True)
+    assert len(whole) == len(alone) == len(positions) == 4
+    for a, b, c in zip(whole, alone, positions, strict=True):
+        assert a.samples is not None
+        assert b.samples is None
+        assert c.pressure is None
+        assert list(c.values) == ["q"]
+        assert np.array_equal(a.q, c.q, equal_nan=True)
+        assert a.values.keys() == b.values.keys()
+        for name in a.values:
+            assert np.array_equal(a.values[name], b.values[name], equal_nan=True)
+        if a.kind == "state":
+            assert a.pressure is not None
+            assert b.pressure is not None
+            first = a.samples.columns()["press_sensor_state[0].pressure[3]"]
+            assert np.array_equal(a.pressure[:, 0], first, equal_nan=True)  # as in the messages
+            assert np.array_equal(a.pressure, b.pressure, equal_nan=True)

@@ -138,7 +138,8 @@ def open_source(trace: Trace, pictures: Path | None = None) -> Source:
     imported = import_record(trace)
     lost = []
     streams = []
-    for stream in streams_of(trace):
+    # those of an aligned episode say that they are of a DDS recording
+    for stream in streams_of(trace, keep_samples=bool(imported.aligned)):
         if len(stream) >= _LEAST:
             streams.append(stream)
         else:

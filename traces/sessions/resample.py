@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,7 +49,9 @@ def hold(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None
     return out
 
 
-def interpolate(times_ns: Times, values: Floats, at_ns: Times, gap: float | None = None) -> Floats:
+def interpolate(
+    times_ns: Times, values: NDArray[np.floating[Any]], at_ns: Times, gap: float | None = None
+) -> Floats:
     """Linear interpolation; NaN outside of the data and within a gap.
 
     :param values: shape (n, k).

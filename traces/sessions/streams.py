@@ -43,6 +43,7 @@ __all__ = [
 ]
 
 Times = NDArray[np.int64]
+Readings = NDArray[np.floating[Any]]
 
 _MOST_RAD = 4 * np.pi
 
@@ -81,7 +82,7 @@ class Stream:
     values: Mapping[str, Floats]
     topic: str
     model: str = ""
-    pressure: Floats | None = None
+    pressure: Readings | None = None
     elements: tuple[str, ...] = ()
     samples: SampleArray | None = field(default=None, repr=False)
 
@@ -144,7 +145,7 @@ class Pressure:
     part: str
     elements: tuple[str, ...]
     times_ns: Times
-    values: Floats
+    values: Readings
     topic: str
     unusable: int = 0
     zeroed: bool = False
@@ -217,13 +218,18 @@ def _touch(topic: str, samples: SampleArray, role: Role, side: Side) -> Pressure
 
 
 def streams_of(
-    trace: Trace, topics: Sequence[str] | None = None, *, positions: bool = False
+    trace: Trace,
+    topics: Sequence[str] | None = None,
+    *,
+    positions: bool = False,
+    keep_samples: bool = True,
 ) -> list[Stream]:
     """Every stream of a recording, in the order of topics; empty ones are left out.
 
     :param topics: only these, in any spelling, patterns allowed.
-    :param positions: only q, without pressures and samples: a tenth of the memory. The topics are
-        read one at a time then.
+    :param positions: only q, without pressures and samples.
+    :param keep_samples: False to leave out the samples and to read one topic at a time: that takes
+        half of the memory.
     :raises UsageError: a topic is not in the recording.
     :raises SessionError: a group of joints of an import has a message that is none, or the
         recording has a stretch of time twice.
@@ -235,13 +241,11 @@ def streams_of(
     absent = absent_fields(trace.metadata.get(RECORD, {}))
     copies = _copies(known)
     fields = ("q",) if positions else None
-    for topic, samples in _loaded(trace, sorted(set(wanted) & set(known)), each=positions):
-        try:
-            streams = [] if topic in copies else list(_streams(topic, samples, fields))
-        except WireError as error:
-            raise SessionError(f"{trace.path}: {topic}: {error}") from error
-        for stream in streams:
-            lacking = absent.get(topic, frozenset())
+    keep_samples = keep_samples and not positions
+    ordered = sorted((set(wanted) & set(known)) - copies)
+    for some in [ordered] if keep_samples else [[topic] for topic in ordered]:
+        for stream in _read(trace, some, fields, keep_samples=keep_samples):
+            lacking = absent.get(stream.topic, frozenset())
             side = stream.part.removesuffix(HAND)
             values = {
                 f: v
@@ -264,12 +268,17 @@ def _copies(topics: Sequence[str]) -> set[str]:
     }
 
 
-def _loaded(
-    trace: Trace, topics: Sequence[str], *, each: bool
-) -> Iterator[tuple[str, SampleArray]]:
-    """The samples of topics; ``each``: one topic after the other, read when it is asked for."""
-    for some in [[t] for t in topics] if each else [topics]:
-        yield from trace.load(some, decode=True).items()
+def _read(
+    trace: Trace, topics: Sequence[str], fields: Sequence[str] | None, *, keep_samples: bool
+) -> list[Stream]:
+    """The streams of some topics, read together."""
+    found: list[Stream] = []
+    for topic, samples in trace.load(topics, decode=True).items():
+        try:
+            found += _streams(topic, samples, fields)
+        except WireError as error:
+            raise SessionError(f"{trace.path}: {topic}: {error}") from error
+    return found if keep_samples else [replace(stream, samples=None) for stream in found]
 
 
 def _streams(
@@ -277,9 +286,8 @@ def _streams(
 ) -> Iterator[Stream]:
     """The streams of a topic.
 
-    :param fields: only these, without pressures, and without the samples; None for everything.
+    :param fields: only these, without pressures; None for everything.
     """
-    kept = samples if fields is None else None
     if samples.type_name == ros_types.JOINT_STATE.dds_name and not samples.decoded:
         yield from _joint_states(topic, samples)
         return
@@ -295,7 +303,7 @@ def _streams(
             joints = hand.joints[side]
             first = role.dialect.index[side]
             slots = range(first, first + len(joints))
-            pressure: Floats | None = None
+            pressure: Readings | None = None
             elements: tuple[str, ...] = ()
             if kind == STATE and hand.sensors and fields is None:
                 pressure, elements = _pressure(columns, hand.sensors)
@@ -311,7 +319,7 @@ def _streams(
                 model=hand.name,
                 pressure=pressure,
                 elements=elements,
-                samples=kept,
+                samples=samples,
             )
     for robot in ROBOTS.values():
         directions = {
@@ -330,7 +338,7 @@ def _streams(
                 values=_values(_columns(samples), samples.type_name, kind, used, (), fields),
                 topic=topic,
                 model=robot.name,
-                samples=kept,
+                samples=samples,
             )
 
 
@@ -361,7 +369,7 @@ def _values(
     return values
 
 
-def _pressure(columns: Columns, sensors: Sequence[Any]) -> tuple[Floats | None, tuple[str, ...]]:
+def _pressure(columns: Columns, sensors: Sequence[Any]) -> tuple[Readings | None, tuple[str, ...]]:
     """The sensor elements of the states; None if no state has sensor packets."""
     if not len(columns) or columns.count("press_sensor_state").max() < len(sensors):
         return None, ()
@@ -370,7 +378,11 @@ def _pressure(columns: Columns, sensors: Sequence[Any]) -> tuple[Floats | None, 
         for slot in sensor.slots:
             parts.append(f"press_sensor_state[{i}].pressure[{slot}]")
             names.append(f"{sensor.place.replace(' ', '_')}_{slot}")
-    return columns.table(parts), tuple(names)
+    # as in the message, float32: there are a hundred columns
+    table = np.empty((len(parts), len(columns)), dtype=np.float32)
+    for row, part in zip(table, parts, strict=True):
+        row[:] = columns.table([part])[:, 0]
+    return table.T, tuple(names)
 
 
 def _joint_states(topic: str, samples: SampleArray) -> Iterator[Stream]:
