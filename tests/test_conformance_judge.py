@@ -52,6 +52,20 @@ def test_second_type_on_command_topic_is_noted_unless_kit_sent_it(
 # ------------------------------------------------------------------------- genuine recordings
 
 
+def test_long_recordings_are_judged_as_short_ones_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is held of a long recording changes no result: few rows, small compressed tables."""
+    path = sample_path("dex3_pinch")
+    results = judge(Recording.decode(open_trace(path))).results
+    monkeypatch.setattr("dexkit.conformance.checks.KEPT_ROWS", 1)
+    monkeypatch.setattr("dexkit.messages.packed._SEGMENT", 1000)
+    monkeypatch.setattr("dexkit.messages.packed._SEALED", 100)
+    recording = Recording.decode(open_trace(path))
+    assert judge(recording).results == results
+    for view in recording.sides.values():
+        assert not view.known
+        assert view.states.ddq.strides[0] == 0  # 0 throughout
+
+
 @pytest.mark.parametrize("name", ["dex1_pick_place", "dex1_idle_then_startle"])
 def test_genuine_recordings_pass(name: str) -> None:
     result = judge(Recording.decode(open_trace(sample_path(name))))
