@@ -162,7 +162,8 @@ class Pressure:
     def at_rest(self) -> list[float | None]:
         """What each element reads at rest, by :mod:`dexkit.pressure`; None without a value."""
         seconds = (self.times_ns - self.times_ns[:1]) / 1e9
-        found = resting_pressure(np.maximum.accumulate(seconds), self.values)
+        values = self.values.astype(np.float64, copy=False)
+        found = resting_pressure(np.maximum.accumulate(seconds), values)
         return [round(v, 3) if math.isfinite(v) else None for v in found.tolist()]
 
     def at(self, times_ns: Times) -> Floats:
