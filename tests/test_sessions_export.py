@@ -263,11 +263,11 @@ def test_tables_are_the_same_in_pieces_of_any_size(
     tmp_path: Path, long: Path, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, pieces = tmp_path / "whole", tmp_path / "pieces"
-    lost = topic_tables.export_tables(open_trace(long), whole, form)
+    written, lost = topic_tables.export_tables(open_trace(long), whole, form)
     monkeypatch.setattr(topic_tables, "_VALUES_WRITTEN", 1500)
     monkeypatch.setattr(topic_tables, "_BYTES_WRITTEN", 5000)
     monkeypatch.setattr(topic_tables, "_ROWS_MEASURED", 7)
-    assert topic_tables.export_tables(open_trace(long), pieces, form) == lost
+    assert topic_tables.export_tables(open_trace(long), pieces, form) == (written, lost)
     assert any("cannot be decoded" in text for text in lost)
     assert [p.name for p in sorted(pieces.iterdir())] == [p.name for p in sorted(whole.iterdir())]
     for path in whole.iterdir():

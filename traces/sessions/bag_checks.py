@@ -364,7 +364,9 @@ def _check_tables(database: sqlite3.Connection, name: Path, size: int) -> None:
             _limit(name, table.replace("_", " "), count)
     (back,) = database.execute(
         "SELECT max(before - timestamp) FROM (SELECT timestamp, lag(timestamp) OVER "
-        "(PARTITION BY topic_id ORDER BY id) AS before FROM messages)"
+        "(PARTITION BY topic_id ORDER BY id) AS before FROM messages "
+        # others are no times, and are left out when the messages are copied
+        "WHERE typeof(timestamp) = 'integer' AND timestamp >= 0)"
     ).fetchone()
     if isinstance(back, int) and back > LIMIT_NS:
         raise refuse(f"its clock steps back by {back / 1e9:.3f} s: it has a stretch of time twice")
