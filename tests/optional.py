@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,7 @@ __all__ = [
     "UNSHARE",
     "UV",
     "Optional",
+    "access_times",
     "chromium",
     "header",
     "minisign",
@@ -64,6 +66,15 @@ def namespaces() -> bool:
 
 
 @functools.cache
+def access_times() -> bool:
+    """Whether reading a file is noted in its times here."""
+    with tempfile.NamedTemporaryFile() as file:
+        os.utime(file.name, ns=(1, 1))
+        Path(file.name).read_bytes()
+        return os.stat(file.name).st_atime_ns > 1
+
+
+@functools.cache
 def python(version: str) -> str | None:
     """A Python of this machine."""
     return find_python(version)
@@ -101,6 +112,7 @@ OPTIONAL = (
     Optional("ssh-keygen", ssh_keygen, ("signing",)),
     Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
+    Optional("access times of files", access_times, ("campaign_fuzzers",)),
     Optional("root", lambda: os.geteuid() == 0, ("files", "install_service")),
     Optional("pyzmq", _package("zmq"), ("lerobot_ports",)),
     Optional("pyte", _package("pyte"), ("monitor_terminal",)),

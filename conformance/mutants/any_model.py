@@ -82,11 +82,11 @@ class SilentUntilCommanded(Service):
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
 @wrong_hand("BRAINCO-RATE-02", also=("FTP-RATE-04",))
 class SlowPublisher(Service):
-    """Publishes at 125 Hz, or at 1.6 times the least rate where that is less."""
+    """Publishes at 125 Hz, or at 1.5 times the least rate where that is less."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
-        self.period = max(0.008, 0.625 / model(self.dialect.model).min_state_rate)
+        self.period = max(0.008, 1 / 1.5 / model(self.dialect.model).min_state_rate)
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))

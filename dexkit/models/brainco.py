@@ -68,7 +68,7 @@ BRAINCO_REVO2 = HandModel(
     requirements=("brainco.toml",),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.brainco:BrainCoService"),
-    quick_phases=("burst", "empty", "joint", "late-joiner", "single", "speeds"),
+    quick_phases=("burst", "empty", "joint", "late-joiner", "speeds"),
     roles=JointRoles(driven=(), slow=(0, 3)),
     objects={Side.RIGHT: 60.0},
     simulator="sim-brainco",

@@ -56,7 +56,7 @@ INSPIRE_DFX = HandModel(
     requirements=("inspire_dfx.toml",),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.inspire:InspireService"),
-    quick_phases=("burst", "empty", "joint", "late-joiner", "single"),
+    quick_phases=("burst", "empty", "joint", "late-joiner"),
     roles=JointRoles(driven=(), slow=(1, 3)),
     objects={Side.RIGHT: 60.0},
     simulator="sim-inspire-dfx",

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from dexkit.command_age import PAUSE
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
-from dexkit.models import DEX3_1, Dialect, HandModel, dialect, model
+from dexkit.models import Dialect, HandModel, dialect, model
 from dexkit.traces.replay.commands import Flags, HandCommands, RecordedCommands, counted
-from dexkit.traces.sessions.finger_order import Order, finger_order
+from dexkit.traces.sessions.finger_order import Order, finger_order, like_fingers
 from dexkit.traces.sessions.resample import gap_of
 
 __all__ = [
@@ -360,11 +360,12 @@ class _Preparation:
 
     def _order(self) -> None:
         """Note fingers that moved for each other: played, the commands do that again."""
-        if self.model is not DEX3_1:
+        fingers = like_fingers(self.model) if isinstance(self.model, HandModel) else None
+        if fingers is None:
             return
         for side, c in self.session.commands.items():
-            t, q = self.session.states.get(side, (np.zeros(0), np.zeros((0, 7))))
-            found = finger_order(c.t, c.q, t, q)
+            t, q = self.session.states.get(side, (np.zeros(0), np.zeros((0, c.q.shape[1]))))
+            found = finger_order(fingers, c.t, c.q, t, q)
             if found.order is Order.EXCHANGED:
                 self.note("order", found.text, str(side))
 

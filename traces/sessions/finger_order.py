@@ -13,14 +13,14 @@ from enum import Enum
 
 import numpy as np
 
-from dexkit.hand import Floats
-from dexkit.models import DEX3_1
+from dexkit.hand import Floats, Side
+from dexkit.models import HandModel, model
+from dexkit.topics import roles
 from dexkit.traces.reader import Trace
 from dexkit.traces.sessions.streams import COMMAND, HAND, Stream, streams_of
 
-__all__ = ["Order", "OrderFound", "finger_order", "finger_orders"]
+__all__ = ["Order", "OrderFound", "finger_order", "finger_orders", "like_fingers"]
 
-_PAIRS = ((3, 5), (4, 6))  # joints of the one finger and of the other
 _APART = 0.2  # rad RMS by which the fingers' commands must differ
 _CLEARER = 3.0  # how many times better one order must fit than the other
 
@@ -44,11 +44,32 @@ class OrderFound:
     text: str
 
 
+def like_fingers(hand: HandModel) -> tuple[list[int], list[int]] | None:
+    """The joints of the two fingers that positions cannot tell apart; None where there are not just
+    two: their joints have the same limits.
+    """
+    fingers: dict[str, list[int]] = {}
+    joints = hand.joints[Side.LEFT]
+    for i, joint in enumerate(joints):
+        fingers.setdefault(joint.name.partition("_")[0], []).append(i)
+    alike: dict[tuple[tuple[float, float], ...], list[list[int]]] = {}
+    for found in fingers.values():
+        limits = tuple((joints[i].q_min, joints[i].q_max) for i in found)
+        alike.setdefault(limits, []).append(found)
+    several = [f for f in alike.values() if len(f) > 1]
+    return (several[0][0], several[0][1]) if list(map(len, several)) == [2] else None
+
+
 def finger_order(
-    command_t: Floats, command_q: Floats, state_t: Floats, state_q: Floats
+    fingers: tuple[list[int], list[int]],
+    command_t: Floats,
+    command_q: Floats,
+    state_t: Floats,
+    state_q: Floats,
 ) -> OrderFound:
     """Compare states with commands, and with commands whose two fingers are exchanged.
 
+    :param fingers: their joints (:func:`like_fingers`).
     :param command_t: seconds, ascending, shape (n,); ``command_q`` rad, shape (n, 7); likewise the
         states.
     """
@@ -59,7 +80,7 @@ def finger_order(
     seen = state_q[within]
     whole = np.isfinite(asked).all(axis=1) & np.isfinite(seen).all(axis=1)
     asked, seen = asked[whole], seen[whole]
-    first, second = (list(joints) for joints in zip(*_PAIRS, strict=True))
+    first, second = fingers
     if not len(seen) or _rms(asked[:, first] - asked[:, second]) < _APART:
         return OrderFound(
             Order.UNKNOWN, "cannot be told: middle and index finger are commanded alike"
@@ -83,21 +104,26 @@ def finger_order(
 
 
 def finger_orders(trace: Trace) -> dict[str, OrderFound]:
-    """What motion says about each Dex3-1 of a recording, by part (``right_hand``)."""
-    (spoken,) = DEX3_1.dialects
-    types = (spoken.cmd_type, spoken.state_type)
-    topics = [c.topic for c in trace.channels if c.message_count and c.type_name in types]
+    """What motion says about each hand with two like fingers, by part (``right_hand``)."""
+    topics = [
+        c.topic
+        for c in trace.channels
+        if c.message_count
+        and any(like_fingers(model(r.dialect.model)) for r in roles(c.topic, c.type_name))
+    ]
     parts: dict[str, dict[str, Stream]] = {}
     for stream in streams_of(trace, topics) if topics else []:
-        if stream.model == DEX3_1.name and stream.part.endswith(HAND):
+        if stream.model and stream.part.endswith(HAND):
             parts.setdefault(stream.part, {}).setdefault(stream.kind, stream)
     found = {}
     for part, kinds in parts.items():
-        if len(kinds) > 1:
+        fingers = like_fingers(model(next(iter(kinds.values())).model))
+        if fingers is not None and len(kinds) > 1:
             state = next(s for kind, s in kinds.items() if kind != COMMAND)
             command = kinds[COMMAND]
             begin = int(command.times_ns[0])
             found[part] = finger_order(
+                fingers,
                 (command.times_ns - begin) / 1e9,
                 command.q,
                 (state.times_ns - begin) / 1e9,
