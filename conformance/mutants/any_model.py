@@ -80,13 +80,13 @@ class SilentUntilCommanded(Service):
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
-@wrong_hand("BRAINCO-RATE-02", also=("FTP-RATE-04",))
+@wrong_hand("BRAINCO-RATE-02", also=("DFX-RATE-04",))
 class SlowPublisher(Service):
-    """Publishes at 125 Hz, or at 1.5 times the least rate where that is less."""
+    """Publishes at 125 Hz, or at 1.15 times the least rate where that is less."""
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)  # type: ignore[arg-type]
-        self.period = max(0.008, 1 / 1.5 / model(self.dialect.model).min_state_rate)
+        self.period = max(0.008, 1 / 1.15 / model(self.dialect.model).min_state_rate)
 
 
 @wrong_hand(("DEX1-RATE-01", "DEX3-RATE-01"))
@@ -216,10 +216,14 @@ class RepeatsOldStates(Service):
         return samples
 
 
-@wrong_hand(("DEX1-FRESH-01", "DEX3-FRESH-01"), also=("DEX3-GAIN-03", "DEX3-GAIN-04"), whole=True)
+@wrong_hand(
+    ("DEX1-FRESH-01", "DEX3-FRESH-01"),
+    also=("DEX3-FIELD-21", "DEX3-GAIN-03", "DEX3-GAIN-04"),
+    whole=True,
+)
 @wrong_hand("BRAINCO-FRESH-01", also=("BRAINCO-LIFE-02",), whole=True)
-@wrong_hand("DFX-FRESH-01", whole=True)
-@wrong_hand("FTP-FRESH-01", whole=True)
+@wrong_hand("DFX-FRESH-01", also=("DFX-FIELD-15", "DFX-SIDE-01"), whole=True)
+@wrong_hand("FTP-FRESH-01", also=("FTP-ABUSE-01", "FTP-FIELD-15"), whole=True)
 class StaleState(Service):
     """Measures five times a second and publishes the same values in between."""
 
@@ -234,8 +238,10 @@ class StaleState(Service):
         return self.measured[sides][1]
 
 
-@wrong_hand("DEX3-FRESH-01", also=("DEX3-GAIN-04",), whole=True)
+@wrong_hand("DEX3-FRESH-01", also=("DEX3-FIELD-21", "DEX3-GAIN-04"), whole=True)
 @wrong_hand(("DEX1-FRESH-01", "BRAINCO-FRESH-01"), whole=True)
+@wrong_hand("DFX-FRESH-01", also=("DFX-FIELD-15",), whole=True)
+@wrong_hand("FTP-FRESH-01", also=("FTP-FIELD-15", "FTP-ORDER-02", "FTP-WDOG-03"), whole=True)
 class StaleLater(StaleState):
     """Measures five times a second from 12 s on."""
 
@@ -383,10 +389,13 @@ class EmptyNowAndThen(Service):
     ),
     sides=BOTH,
 )
-@wrong_hand("DFX-SIDE-01", also=("DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"), sides=BOTH)
+@wrong_hand(
+    "DFX-SIDE-01", also=("DFX-LIFE-02", "DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"), sides=BOTH
+)
 @wrong_hand(
     "FTP-SIDE-01",
     also=(
+        "FTP-LIFE-02",
         *("FTP-PATH-01", "FTP-SENS-04", "FTP-SIDE-02", "FTP-STILL-01"),
         *("FTP-WDOG-01", "FTP-WDOG-03"),
     ),
@@ -403,7 +412,7 @@ class Swapped(Service):
 @wrong_hand(
     "DEX3-SIDE-01",
     also=(
-        *("DEX3-FORCE-08", "DEX3-GUARD-02", "DEX3-GUARD-03", "DEX3-HOLD-01"),
+        *("DEX3-FORCE-08", "DEX3-GUARD-02", "DEX3-GUARD-03"),
         *("DEX3-LIFE-03", "DEX3-MODE-05", "DEX3-PATH-01", "DEX3-STILL-01"),
     ),
     sides=BOTH,
@@ -438,7 +447,7 @@ class SwappedWhenRestarted(Service):
 )
 @wrong_hand("BRAINCO-MOVE-06", also=("BRAINCO-PATH-01", "BRAINCO-WDOG-03"))
 # slower: it does not come far meanwhile
-@wrong_hand("DFX-MOVE-06", also=("DFX-WDOG-03",))
+@wrong_hand("DFX-MOVE-06", also=("DFX-LIFE-02", "DFX-WDOG-03"))
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 

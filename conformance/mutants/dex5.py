@@ -224,7 +224,9 @@ wrong_hand("DEX5-PATH-01", also=("DEX5-WDOG-03",))(fingers.BeginsAtZero)
 wrong_hand("DEX5-MOVE-02")(fingers.OtherScale)
 wrong_hand("DEX5-MOVE-03", whole=True)(fingers.Hunts)
 wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))(fingers.Slow)
-wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-SAFE-02", "DEX5-PATH-01"))(fingers.Undamped)
+wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-GAIN-05", "DEX5-SAFE-02", "DEX5-PATH-01"))(
+    fingers.Undamped
+)
 wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)(fingers.Coupled)
 wrong_hand("DEX5-SIDE-03", also=("DEX5-GAIN-03",), sides=BOTH, whole=True)(
     any_model.WaitsForTheOtherGrip

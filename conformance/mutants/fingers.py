@@ -220,7 +220,9 @@ class VelocityOfTheLastDrive(_Timed):
         motors["dq"] = np.where(hand.driven, motors["dq"], last)
 
 
-@wrong_hand("DEX3-FIELD-17", also=("DEX3-FRESH-02", "DEX3-PATH-01", "DEX3-STILL-01"))
+@wrong_hand(
+    "DEX3-FIELD-17", also=("DEX3-FIELD-21", "DEX3-FRESH-02", "DEX3-PATH-01", "DEX3-STILL-01")
+)
 class ShiftsForAWhile(_Timed):
     """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
 
@@ -683,7 +685,7 @@ class _Creeps(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04", "DFX-CMD-01"))
+@wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04",))
 class Creeps(FingerService):
     """One joint moves the last part of the way to its goal slowly."""
 
@@ -714,7 +716,7 @@ class _OwnStiffness(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02")
+@wrong_hand("DEX3-GAIN-02", also=("DEX5-GAIN-05",))
 class OwnStiffness(FingerService):
     """Uses its own gains wherever kp is not 0."""
 
@@ -1175,7 +1177,10 @@ class ThumbGivesIn(Dex3Service):
 
 @wrong_hand(
     ("DEX3-FORCE-11", "BRAINCO-FORCE-11"),
-    also=("BRAINCO-FIELD-04", "DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-17"),
+    also=(
+        *("BRAINCO-FIELD-04", "DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-17"),
+        "DEX3-FIELD-21",
+    ),
     sides=BOTH,
 )
 class ReportsGoalsWhenStalled(FingerService):
@@ -1617,7 +1622,10 @@ class _FedByNews(FingerHand):
 
 @wrong_hand(
     "DEX3-GUARD-02",
-    also=("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-10", "DEX3-SIDE-03"),
+    also=(
+        *("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-08", "DEX3-FORCE-10"),
+        "DEX3-SIDE-03",
+    ),
     sides=BOTH,
 )
 class DropsEqualCommands(Dex3Service):
@@ -1681,7 +1689,7 @@ class _Dead(FingerHand):
 
 @wrong_hand(
     "DEX3-GUARD-04",
-    also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-MODE-02", "DEX3-WDOG-03"),
+    also=("DEX3-GUARD-02", "DEX3-MODE-02", "DEX3-WDOG-03"),
     whole=True,
 )
 class NeverClears(FingerService):
@@ -1710,7 +1718,7 @@ class _ForEver(FingerHand):
 
 
 # what it ignores in that time is not driven in the silence that follows
-@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-HOLD-01", "DEX3-WDOG-03"), whole=True)
+@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-WDOG-03"), whole=True)
 class SlowToClear(FingerService):
     """Stays tripped for 2 s after it was cleared."""
 

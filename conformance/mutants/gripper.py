@@ -552,7 +552,6 @@ class _IgnoresGains(ReferenceHand):
     also=(
         "DEX1-SAFE-05",
         "DEX1-GAIN-02",
-        "DEX1-FORCE-12",
     ),
     whole=True,
 )

@@ -55,12 +55,13 @@ class Thousandths(ServoService):
 )
 @wrong_hand(
     "DFX-SIDE-01",
-    also=("DFX-MOVE-09", "DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"),
+    also=("DFX-LIFE-02", "DFX-MOVE-09", "DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"),
     sides=BOTH,
 )
 @wrong_hand(
     "FTP-SIDE-01",
     also=(
+        "FTP-LIFE-02",
         *("FTP-MOVE-09", "FTP-PATH-01", "FTP-SIDE-02", "FTP-STILL-01"),
         *("FTP-WDOG-01", "FTP-WDOG-03"),
     ),
@@ -379,7 +380,7 @@ class _SlowAfterNan(ServoHand):
 
 @wrong_hand(
     "BRAINCO-ABUSE-01",
-    also=("BRAINCO-SPEED-03", "DFX-MOVE-08", "DFX-SIDE-03", "DFX-WDOG-03"),
+    also=("BRAINCO-SPEED-03", "DFX-SIDE-03"),
     where=takes_floats,
 )
 class SlowAfterNan(ServoService):
@@ -806,7 +807,7 @@ class SwapsAfterRestart(_SwapsSome):
         return self.restarted
 
 
-@wrong_hand("BRAINCO-WDOG-03", whole=True)
+@wrong_hand("BRAINCO-WDOG-03", also=("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"), whole=True)
 @wrong_hand("DFX-WDOG-03", also=("DFX-MOVE-09", "DFX-PATH-01"), whole=True)
 class SwapsAfterSilence(_SwapsSome):
     """Mixes two joints up in commands for three seconds after a silence."""
