@@ -96,7 +96,9 @@ OPTIONAL = (
     Optional("Python 3.11", lambda: python("3.11"), ("package", "setup_dds")),
     Optional("Python 3.13", lambda: python("3.13"), ("package", "setup_dds")),
     Optional(
-        "CycloneDDS 0.10", _package("cyclonedds"), ("campaign", "demo", "ros2", "everything on DDS")
+        "CycloneDDS 0.10",
+        _package("cyclonedds"),
+        ("campaign", "demo", "prefixes", "ros2", "everything on DDS"),
     ),
     Optional(
         "the package unitree-sdk2",
@@ -117,8 +119,9 @@ OPTIONAL = (
     Optional("pyzmq", _package("zmq"), ("lerobot_ports",)),
     Optional("pyte", _package("pyte"), ("monitor_terminal",)),
     Optional("viser", _package("viser"), ("view", "view_browser", "view_soak", "web_pages")),
-    Optional("aiohttp", _package("aiohttp"), ("audit_objects",)),
+    Optional("aiohttp", _package("aiohttp"), ("audit_objects", "redaction")),
     Optional("ray", _package("ray"), ("audit_ray",)),
+    Optional("pyarrow", _package("pyarrow"), ("sessions_round_trips",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 
