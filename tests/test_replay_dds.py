@@ -85,6 +85,13 @@ def note_sent(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return sent
 
 
+@pytest.fixture(autouse=True)
+def stalls_are_no_suspension(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that stalls for seconds is not the subject here."""
+    for module in ("dexkit.cli.consent", "dexkit.traces.replay.live"):
+        monkeypatch.setattr(f"{module}.LONG_PAUSE", PATIENCE)
+
+
 def clip(tmp_path: Path, q: np.ndarray = WAVE) -> Path:
     return write(tmp_path / "clip.mcap", mcap_bytes(gripper(q), types={CMD: CMD_TYPE}))
 

@@ -224,6 +224,7 @@ wrong_hand("DEX5-PATH-01", also=("DEX5-WDOG-03",))(fingers.BeginsAtZero)
 wrong_hand("DEX5-MOVE-02")(fingers.OtherScale)
 wrong_hand("DEX5-MOVE-03", whole=True)(fingers.Hunts)
 wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))(fingers.Slow)
+wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-05",))(fingers.OwnStiffness)
 wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-GAIN-05", "DEX5-SAFE-02", "DEX5-PATH-01"))(
     fingers.Undamped
 )

@@ -716,7 +716,7 @@ class _OwnStiffness(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX5-GAIN-05",))
+@wrong_hand("DEX3-GAIN-02")
 class OwnStiffness(FingerService):
     """Uses its own gains wherever kp is not 0."""
 
