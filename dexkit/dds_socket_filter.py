@@ -18,12 +18,12 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 from dexkit import interface_filter
 from dexkit.errors import DdsSetupError
 
-__all__ = ["DomainSockets", "open_sockets"]
+__all__ = ["DomainSockets", "copies_of_sockets", "open_sockets"]
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +45,23 @@ def open_sockets() -> dict[int, int]:
                 if stat.S_ISSOCK(status.st_mode):
                     found[status.st_ino] = int(name)
     return found
+
+
+def copies_of_sockets(besides: Container[int] = ()) -> Iterator[socket.socket]:
+    """A copy of each open socket of this process; the caller closes it.
+
+    :param besides: inodes that are left out.
+    """
+    for inode, descriptor in open_sockets().items():
+        if inode in besides:
+            continue
+        try:
+            sock = socket.socket(fileno=os.dup(descriptor))
+        except OSError as error:
+            if error.errno == errno.EBADF:
+                continue  # another thread's, and closed meanwhile
+            raise
+        yield sock
 
 
 class DomainSockets:
@@ -91,15 +108,7 @@ class DomainSockets:
     def _find(self, before: dict[int, int]) -> None:
         # CycloneDDS takes any of its interface's addresses
         addresses = interface_filter.interface_addresses(self.interface)
-        for inode, descriptor in open_sockets().items():
-            if inode in before:
-                continue
-            try:
-                sock = socket.socket(fileno=os.dup(descriptor))
-            except OSError as error:
-                if error.errno == errno.EBADF:
-                    continue  # another thread's, and closed meanwhile
-                raise
+        for sock in copies_of_sockets(before):
             ours: list[socket.socket] | None = None
             if sock.type == socket.SOCK_DGRAM and sock.family in _INTERNET:
                 # by address and port: another thread may have opened one meanwhile

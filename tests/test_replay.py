@@ -11,16 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.cli import cli
 from dexkit.cli.replay import command
 from dexkit.command_age import PAUSE, SETTLE
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.virtual.rehearsal import rehearse
-from dexkit.errors import DexkitError, SessionError, UsageError
+from dexkit.errors import SessionError, UsageError
 from dexkit.hand import MotorError, Side
 from dexkit.messages import message_type
 from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, MotorStates_
@@ -51,7 +49,7 @@ from dexkit.traces.replay.prepare import (
 from dexkit.traces.replay.states import DecodedHand, HandStateCodec
 from dexkit.traces.sessions.finger_order import Order, finger_orders
 from tests.each import each
-from tests.session_helpers import document, episode, hand_waves, whole
+from tests.session_helpers import dexkit, document, episode, hand_waves, whole
 from tests.test_sessions_import import NAMES, dataset
 from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE, T0, Row, mcap_bytes, write
 
@@ -59,16 +57,6 @@ LEFT, RIGHT = Side.LEFT, Side.RIGHT
 GO, DEX3 = dialect("unitree_go"), dialect("dex3")
 HAND_CMD, HAND_STATE = DEX3.cmd_type, DEX3.state_type
 DEX3_LEFT, DEX3_STATE = DEX3.topics(LEFT)
-
-
-def dexkit(*arguments: object) -> tuple[int, str]:
-    """Exit code and everything printed; of an error, its message and hint."""
-    result = CliRunner().invoke(cli, [str(a) for a in arguments], standalone_mode=False)
-    if isinstance(result.exception, DexkitError):
-        error = result.exception
-        return error.exit_code, f"{result.output}{error.message} {error.hint}"
-    assert result.exception is None, result.exception
-    return int(result.return_value or 0), result.output
 
 
 # -- small sessions

@@ -16,14 +16,13 @@ import asyncio
 import contextlib
 import errno
 import logging
-import os
 import secrets
 import socket
 import threading
 from types import TracebackType
 
 from dexkit import interface_filter
-from dexkit.dds_socket_filter import open_sockets
+from dexkit.dds_socket_filter import copies_of_sockets
 from dexkit.errors import UsageError
 from dexkit.tcp_listener import listen
 from dexkit.view.web_origins import Allowed, Refused, read_request
@@ -71,13 +70,7 @@ class HiddenAddress:
             _log.warning("%s", why)
 
     def _listener(self) -> socket.socket:
-        for descriptor in open_sockets().values():
-            try:
-                sock = socket.socket(fileno=os.dup(descriptor))
-            except OSError as error:
-                if error.errno == errno.EBADF:
-                    continue  # another thread's, and closed meanwhile
-                raise
+        for sock in copies_of_sockets():
             if sock.family == socket.AF_INET and sock.type == socket.SOCK_STREAM:
                 listening = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
                 if listening and sock.getsockname() == (self.host, self.port):
