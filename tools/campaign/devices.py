@@ -192,8 +192,8 @@ class Dex3(DeviceBench):
         return Dex3Usb(SIDE, Dex3Settings(server=Server("127.0.0.1", self._port)))
 
     def options(self, device: Any) -> list[str]:
-        """Its server."""
-        return ["--usb", device.url]
+        """Its server; nobody has brought up an emulated hand, whose wiring is dexkit's guess."""
+        return ["--usb", device.url, "--accept-guesses"]
 
     def position(self, device: Any) -> float:
         """Sum of the joints' positions without sign, rad."""
