@@ -1,4 +1,4 @@
-"""Read a result file: validate it against its schema, and convert version 2."""
+"""Read a result file, and validate it against its schema."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from dexkit.conformance.measured_q import MeasuredQ
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
-from dexkit.conformance.result_file_v2 import converted
 from dexkit.conformance.results import (
     FORMAT,
     VERSION,
@@ -56,10 +55,12 @@ def parse_result(data: Any, path: object) -> RunResult:
             f"{path} is not a result file of dexkit",
             hint="'dexkit check --json FILE' and the suite's '--json FILE' write them",
         )
-    if about.get("version") == 2:
-        data = converted(about)
-    elif about.get("version") != VERSION:
-        raise UsageError(f"{path} is version {one_line(about.get('version'), 40)} of {FORMAT}")
+    if about.get("version") != VERSION:
+        version = one_line(about.get("version"), 40)
+        raise UsageError(
+            f"{path}: version {version} of {FORMAT} is not read by this dexkit, but {VERSION}",
+            hint="judge the recording again: dexkit check RECORDING.mcap --json RESULT.json",
+        )
     validate(data, path)
     # files of the first programs that wrote version 3 have no score, and none of a client
     score = {"score": Score.from_dict(data["score"])} if "score" in data else {}
