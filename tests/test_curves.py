@@ -122,6 +122,28 @@ def test_diff_says_why_recordings_without_a_common_joint_differ(
         assert "no joint could be compared" in text
 
 
+def test_diff_of_recordings_years_apart_draws_each_on_its_own_time(
+    traces: tuple[Trace, Trace], tmp_path: Path
+) -> None:
+    """And not a curve of the years between them."""
+    out, later = tmp_path / "diff.html", tmp_path / "later.mcap"
+    years = 20 * 365 * 86_400 * 10**9
+    with Recorder(later) as recorder:
+        for topic, some in traces[0].load().items():
+            for at, payload in zip(some.log_time_ns, some.payloads, strict=True):
+                recorder.put(topic, some.type_name, payload, int(at) + years)
+    result = CliRunner().invoke(
+        cli, ["diff", str(traces[0].path), str(later), "--offset", "0", "--html", str(out)]
+    )
+    assert "no joint could be compared" in result.output
+    assert out.stat().st_size < 1_000_000
+
+
+def test_compare_of_recordings_names_diff(traces: tuple[Trace, Trace]) -> None:
+    result = CliRunner().invoke(cli, ["compare", *(str(t.path) for t in traces)])
+    assert "is a recording, not a result" in str(result.exception)
+
+
 def test_compare_draws_recordings_that_were_judged(
     traces: tuple[Trace, Trace], tmp_path: Path
 ) -> None:

@@ -44,6 +44,13 @@ def _command(text: str) -> list[str]:
     return shlex.split(line.removeprefix("ExecStart="))
 
 
+def test_a_masked_unit_is_not_written_through(tmp_path: Path) -> None:
+    (tmp_path / "dexkit-left.service").symlink_to(os.devnull)
+    with pytest.raises(OutputError, match="is masked: it leads to /dev/null"):
+        _install("sim-dex1", "--side", "both", "--user", "root", "--directory", str(tmp_path))
+    assert [p.name for p in tmp_path.iterdir()] == ["dexkit-left.service"]
+
+
 def test_one_unit_a_hand_is_written_and_a_dry_run_writes_nothing(tmp_path: Path) -> None:
     words = ("sim-dex1", "--side", "both", "--interface", "192.168.123.0/24", "--user", "root")
     more = ("--set", "object=40", "--set", "left.start=10", "--directory", str(tmp_path))

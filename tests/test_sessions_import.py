@@ -938,3 +938,11 @@ def test_a_database_whose_clock_steps_back_is_refused(tmp_path: Path) -> None:
         db.execute("UPDATE messages SET timestamp = timestamp - 1000000000 WHERE id > 2")
     code, output = dexkit("import", source, tmp_path / "a.mcap")
     assert (code, "its clock steps back by 0.990 s" in output) == (2, True), output
+
+
+def test_a_table_of_plotjuggler_is_named(tmp_path: Path) -> None:
+    (tmp_path / "curves.csv").write_text("__time,/rt/dex1/left/state/states[0]/q\n1.0,0.5\n")
+    code, output = dexkit("import", tmp_path / "curves.csv", tmp_path / "out.mcap")
+    assert code == 2
+    assert "as PlotJuggler writes it" in output
+    assert not (tmp_path / "out.mcap").exists()

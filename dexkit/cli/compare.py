@@ -15,6 +15,7 @@ from dexkit.cli.options import (
 from dexkit.cli.report import recording_beside, write_text
 from dexkit.digests import sha256_of_file
 from dexkit.documents import check_output_paths
+from dexkit.errors import UsageError
 
 if TYPE_CHECKING:
     from dexkit.conformance.report.compare import Comparison
@@ -46,6 +47,12 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     )
     from dexkit.conformance.result_file import read_json
 
+    if other := [path for path in results if path.suffix in (".mcap", ".bag", ".db3")]:
+        raise UsageError(
+            f"{other[0]} is a recording, not a result",
+            hint="dexkit diff A B compares two recordings; dexkit check RECORDING --json FILE "
+            "writes the result of one",
+        )
     check_output_paths([html_path, markdown_path], results)
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
     if html_path:

@@ -87,7 +87,9 @@ def _page(found: Comparison, a: Trace, b: Trace) -> str:
 
     names = (f"A: {a.path.name}", f"B: {b.path.name}")
     one = recorded(a, names[0])
-    other = recorded(b, names[1], begin_ns=a.first_ns + round(found.offset * 1e9))
+    # recordings without a second in common, perhaps years apart, each have their own time line
+    begin = a.first_ns + round(found.offset * 1e9) if found.overlap else None
+    other = recorded(b, names[1], begin_ns=begin)
     order = [
         (
             j.part,
@@ -99,10 +101,11 @@ def _page(found: Comparison, a: Trace, b: Trace) -> str:
         if j.samples
     ]
     title = f"{a.path.name} and {b.path.name}"
+    drawn = ", and is drawn on A's clock" if found.overlap else ""
     head = (
         f"<h1>{escape(title)}</h1><p>T{escape(_conclusion(found))[1:]}. B is "
-        f"{found.offset:+.4f} s later than A, and is drawn on A's clock; they have "
-        f"{found.overlap:.3f} s in common.</p>"
+        f"{found.offset:+.4f} s later than A{drawn}; they have {found.overlap:.3f} s in "
+        "common.</p>"
     )
     notes = "".join(f"<p>{escape(note)}</p>" for note in found.notes)
     return document(title, head + notes + over_each_other(one, other, order) + topics([one, other]))

@@ -128,6 +128,12 @@ def command(
         rules += kind.udev_rules.load()()
     if rules:
         files[(directory or _RULES) / "71-dexkit.rules"] = rules
+    for path in files:
+        if path.exists() and not path.is_file():  # systemctl mask makes it a link to /dev/null
+            raise OutputError(
+                f"{path} is masked: it leads to {path.resolve()}",
+                hint=f"sudo systemctl unmask {path.name}",
+            )
     for path, text in files.items():
         if dry_run:
             click.echo(f"# {path}\n{text}")

@@ -117,8 +117,7 @@ DEX3_1 = HandModel(
         Side.RIGHT: tuple(q if i == 0 else -q for i, q in enumerate(_REST)),
     },
     sensors=_SENSORS,
-    # inferred: the sources give a topic and no rate (docs/sources/unitree-dex.md#a1)
-    low_rate=20.0,
+    low_rate=9.1,  # as a real robot's copy comes (docs/sources/real-hands.md#dex3-low-rate)
     requirements=("dex3.toml", "dex3_usb.toml"),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.fingers:Dex3Service"),

@@ -140,7 +140,20 @@ def _format(source: Path) -> str:
         return "rosbag2"
     if source.suffix in (".jsonl", ".ndjson"):
         return "jsonl"
+    if _is_plotjuggler(source):
+        raise SessionError(
+            f"{source} is a table of curves, as PlotJuggler writes it, which holds no messages",
+            hint="import the recording or the bag from which the curves were drawn",
+        )
     return "episodes"
+
+
+def _is_plotjuggler(source: Path) -> bool:
+    """Whether it is a CSV file whose first column is PlotJuggler's time."""
+    if source.suffix.lower() != ".csv" or not source.is_file():
+        return False
+    with source.open("rb") as file:
+        return file.read(16).lstrip(b'\xef\xbb\xbf"').startswith(b"__time")
 
 
 def _below(folder: Path, source: Path) -> str:
