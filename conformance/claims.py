@@ -13,9 +13,6 @@ which this one has::
     force = true
     velocity = false
 
-    [manual_test]
-    q_is_measured = "2026-11-20: index finger held at half travel; q stayed within 0.01 rad"
-
 What is claimed must pass: its SHOULDs count as MUSTs, unless they are inferred, for then no source
 says that the unit is broken without them. What is not, false or left out, is reported as not
 claimed. Without a file every unit is judged at the catalogue's level.
@@ -44,13 +41,10 @@ class Claims:
 
     :param units: by unit, whether it is claimed; None without a file: nothing is said.
     :param hand: ``name``, ``vendor``, ``firmware``, ``model``, as far as they are given.
-    :param manual_test: when and how the manual test was made that shows a measured q, and what it
-        gave (docs/capabilities.md); empty if it was not made.
     """
 
     units: Mapping[str, bool] | None = None
     hand: Mapping[str, str] = field(default_factory=dict)
-    manual_test: str = ""
 
     @classmethod
     def parse(cls, text: str, origin: str = "capabilities.toml") -> Claims:
@@ -65,11 +59,11 @@ class Claims:
     def of_document(cls, document: Mapping[str, Any], origin: str) -> Claims:
         """The claims of a document that was parsed; raises as :meth:`parse`."""
         hand, units = document.get("hand", {}), document.get("claims", {})
-        unknown = sorted(set(document) - {"hand", "claims", "manual_test"})
+        unknown = sorted(set(document) - {"hand", "claims"})
         if unknown or not isinstance(hand, dict) or not isinstance(units, dict):
             raise UsageError(
                 f"{origin}: {', '.join(unknown) or 'hand or claims'} is not understood",
-                hint="its tables are [hand], [claims] and [manual_test]",
+                hint="its tables are [hand] and [claims]",
             )
         for key, value in hand.items():
             if key not in _HAND or not isinstance(value, str):
@@ -87,7 +81,7 @@ class Claims:
         if "model" in hand:
             model(hand["model"])
         claimed = {unit: units.get(unit, False) for unit in CAPABILITIES}
-        return cls(claimed, hand, _manual_test(document.get("manual_test", {}), origin))
+        return cls(claimed, hand)
 
     @classmethod
     def load(cls, path: Path | None, model_name: str | None) -> Claims:
@@ -127,15 +121,3 @@ class Claims:
     def subject(self) -> dict[str, str]:
         """The hand's name, vendor and firmware, for a result's ``subject``."""
         return {("hand" if k == "name" else k): v for k, v in self.hand.items() if k != "model"}
-
-
-def _manual_test(table: Any, origin: str) -> str:
-    if isinstance(table, dict) and set(table) <= {"q_is_measured"}:
-        text = table.get("q_is_measured", "")
-        if isinstance(text, str):
-            return text.strip()
-    raise UsageError(
-        f"{origin}: [manual_test] is not understood",
-        hint='it has one text, for example q_is_measured = "2026-11-20: held at half travel, '
-        'q stayed within 0.01 rad"; docs/capabilities.md describes the test',
-    )

@@ -17,7 +17,6 @@ import numpy as np
 from dexkit.conformance.checks import Outcome, check_of
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
-from dexkit.conformance.measured_q import measured_q
 from dexkit.conformance.measurement_error import Measure, weigh
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
@@ -78,8 +77,6 @@ def judge(
         recorded_at=when.isoformat(timespec="seconds"),
         run=dict(recording.run),
         score=_score(recording, chosen),
-        measured_q=measured_q(recording) if recording.run else (),
-        manual_test=claims.manual_test,
     )
 
 

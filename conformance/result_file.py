@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import documents
-from dexkit.conformance.measured_q import MeasuredQ
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
@@ -64,7 +63,6 @@ def parse_result(data: Any, path: object) -> RunResult:
     validate(data, path)
     # files of the first programs that wrote version 3 have no score, and none of a client
     score = {"score": Score.from_dict(data["score"])} if "score" in data else {}
-    measured = data.get("measured_q", {"hands": [], "manual_test": ""})  # likewise
     return RunResult(
         subject=data["subject"],
         stage={side: Stage(stage) for side, stage in data["stage"].items()},
@@ -78,8 +76,6 @@ def parse_result(data: Any, path: object) -> RunResult:
         recorded_at=data["recorded_at"],
         results=[_result_of(entry) for entry in data["results"]],
         client=[_result_of(entry) for entry in (data.get("client") or {"results": []})["results"]],
-        measured_q=tuple(MeasuredQ.from_dict(found) for found in measured["hands"]),
-        manual_test=measured["manual_test"],
         **score,
     )
 

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 from dexkit import __version__, documents
-from dexkit.conformance.measured_q import MeasuredQ
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
@@ -57,7 +56,7 @@ __all__ = [
 ]
 
 FORMAT = "dexkit-conformance-result"
-VERSION = 3
+VERSION = 4
 
 
 class Verdict(str, Enum):
@@ -354,8 +353,6 @@ class RunResult:
         the kit, which is its own client.
     :param run: the run record (:mod:`~.run_record`); empty where no live run was made.
     :param score: how many wrong hands a run like this catches.
-    :param measured_q: for each hand, whether q is measured; empty where the kit made no live run.
-    :param manual_test: what the vendor says of the manual test of q; empty if nothing.
     """
 
     subject: dict[str, str]
@@ -371,8 +368,6 @@ class RunResult:
     client: list[Result] = field(default_factory=list)
     run: dict[str, str] = field(default_factory=dict)
     score: Score = NO_SCORE
-    measured_q: tuple[MeasuredQ, ...] = ()
-    manual_test: str = ""
 
     @property
     def hands(self) -> tuple[Side, ...]:
@@ -512,10 +507,6 @@ class RunResult:
             if self.client
             else None,
             "score": self.score.as_dict(),
-            "measured_q": {
-                "hands": [found.as_dict() for found in self.measured_q],
-                "manual_test": self.manual_test,
-            },
         }
 
     def write_json(self, path: Path) -> None:

@@ -79,11 +79,7 @@ def run_record(
         "claims": json.dumps(
             None
             if claims.units is None
-            else {
-                "claims": dict(claims.units),
-                "hand": dict(claims.hand),
-                "manual_test": {"q_is_measured": claims.manual_test} if claims.manual_test else {},
-            }
+            else {"claims": dict(claims.units), "hand": dict(claims.hand)}
         ),
     }
 
@@ -130,8 +126,9 @@ def recorded_claims(run: Mapping[str, str]) -> Claims:
     found = _parsed(run, "claims")
     if not isinstance(found, dict):
         return Claims()
+    about = {name: found[name] for name in ("claims", "hand") if name in found}
     try:
-        return Claims.of_document(found, "the run record")
+        return Claims.of_document(about, "the run record")
     except DexkitError:  # of another dexkit, whose units are not known here
         return Claims()
 

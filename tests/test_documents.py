@@ -220,7 +220,7 @@ def test_error_names_the_place_and_the_expected_value(tmp_path: Path) -> None:
         (("claims",), [], "claims must be"),
         (("notes",), {}, "notes must be a list, not an object"),
         (("format",), "other", "is not a result file of dexkit"),
-        (("version",), 4, "version 4 of dexkit-conformance-result is not read"),
+        (("version",), 5, "version 5 of dexkit-conformance-result is not read"),
         ((), [], "is not a result file of dexkit"),
     ):  # fmt: skip
         (tmp_path / "r.json").write_text(json.dumps(hostile.replaced(good, place, value)))

@@ -388,7 +388,6 @@ def test_failures_that_were_taken_out_are_found(signed: Signed, tmp_path: Path) 
 
 FORGED_TEXTS = {
     "score": lambda d: d["score"].update(sentence="In a trial it caught 99 % of wrong hands."),
-    "manual_test": lambda d: d["measured_q"].update(manual_test="held; q stayed"),
     "notes": lambda d: d["notes"].append("inspected by the vendor"),
     "observed": lambda d: d["results"][0].update(observed="perfect"),
     "certified": lambda d: d["subject"].update(certified="yes"),

@@ -121,7 +121,6 @@ def render(
         _areas(result),
         _troubles(result, view, link),
         _operator(result),
-        _measured_q(result),
         run_plots(result, view) if view is not None else "",
         _requirements(result, link, catalogue),
         _client(result, link, catalogue),
@@ -419,36 +418,6 @@ def _operator(result: RunResult) -> str:
         "<h2>What an operator would notice</h2><p>A model of Unitree's teleoperation client drove "
         "the hand: it sends no command further than 0.18 rad from the last state, so that a hand "
         f"which reports late is slow.</p>{_definitions(rows)}"
-    )
-
-
-def _measured_q(result: RunResult) -> str:
-    """Whether q is measured: the observations of each hand."""
-    if not result.measured_q:
-        return ""
-    names = dict.fromkeys(o.what for found in result.measured_q for o in found.observations)
-    head = "".join(f'<th scope="col">{escape(found.side)}</th>' for found in result.measured_q)
-    rows = []
-    for what in names:
-        cells = []
-        for found in result.measured_q:
-            seen = next((o for o in found.observations if o.what == what), None)
-            said = () if seen is None else (str(seen.finding), seen.figure)
-            cells.append(f"<td>{escape('; '.join(text for text in said if text))}</td>")
-        rows.append(f'<tr><th scope="row">{escape(what)}</th>{"".join(cells)}</tr>')
-    items = "".join(f"<li>{escape(found.sentence())}</li>" for found in result.measured_q)
-    claim = (
-        f"<p>The vendor's manual test: {escape(result.manual_test)}</p>"
-        if result.manual_test
-        else ""
-    )
-    return (
-        "<h2>Is q measured?</h2><p class='dim'>A service can compute q from the commands instead "
-        "of measuring it. These observations are of what the commands do not tell. They count in "
-        "no verdict; a service that models the hand and its object cannot be distinguished from a "
-        f"hand by its topics.</p><ul>{items}</ul>{claim}"
-        f'<table class="measured"><thead><tr><th scope="col">observation</th>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table>"
     )
 
 

@@ -79,9 +79,6 @@ def render_markdown(result: RunResult) -> str:
     ]
     if harness := about_harness(result):
         lines.append(f"- test machine: {harness}")
-    lines += [f"- {plain(found.sentence())}" for found in result.measured_q]
-    if result.manual_test:
-        lines.append(f"- the vendor's manual test of q: {plain(result.manual_test)}")
     lines += ["", plain(result.score.sentence())]
     lines += ["", *_areas(result), ""]
     lines += _troubles(result)

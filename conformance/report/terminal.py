@@ -79,11 +79,6 @@ def print_result(
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
     # one line each at any width, so that logs can be searched for them
-    for found in result.measured_q:
-        console.print(f"[dim]{escape(found.sentence())}[/dim]", highlight=False, soft_wrap=True)
-    if result.manual_test:
-        text = f"the vendor's manual test of q: {result.manual_test}"
-        console.print(f"[dim]{escape(text)}[/dim]", highlight=False, soft_wrap=True)
     console.print(f"[dim]{escape(result.score.sentence())}[/dim]", highlight=False, soft_wrap=True)
     if result.client and not result.client_only:
         console.print(escape(result.client_sentence()), highlight=False, soft_wrap=True)

@@ -45,13 +45,7 @@ __all__ = [
 
 STATED = ("subject.recording", "environment.python", "environment.system")
 """Members of a result that no recording tells: the name its file had, and where it was judged."""
-STATED_WITHOUT_RUN = (
-    "claims",
-    "subject.hand",
-    "subject.vendor",
-    "subject.firmware",
-    "measured_q.manual_test",
-)
+STATED_WITHOUT_RUN = ("claims", "subject.hand", "subject.vendor", "subject.firmware")
 """What is taken from the result where the recording has no run record: the vendor's claims."""
 
 _ABSENT = object()
@@ -280,7 +274,6 @@ def _stated_claims(found: RunResult) -> Claims:
         {
             "hand": {key: found.subject[n] for n, key in about.items() if n in found.subject},
             "claims": found.claims,
-            "manual_test": {"q_is_measured": found.manual_test},
         },
         "the claims of the result",
     )
