@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import ast
+import os
+import shutil
+import subprocess
+import sys
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
+import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import Number
 
 COMMANDS = Path(__file__).parent.parent / "dexkit" / "cli"
@@ -71,6 +79,69 @@ def test_options_of_several_commands_are_written_once() -> None:
     assert found == {name: modules for name, (modules, _) in DIFFERENT.items()}, (
         "write it in dexkit/cli/options.py, or say here how the meanings differ"
     )
+
+
+def commands(group: click.Group = cli, *words: str) -> Iterator[tuple[str, click.Command]]:
+    """Every command, with its name."""
+    for name in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), name)
+        if isinstance(command, click.Group):
+            yield from commands(command, *words, name)
+        elif command is not None:
+            yield " ".join((*words, name)), command
+
+
+def test_help_shows_every_command_in_its_section() -> None:
+    shown = CliRunner().invoke(cli, ["--help"], prog_name="dexkit").output
+    for heading, names in cli.sections.items():
+        section = shown.split(f"\n{heading}:\n")[1].split("\n\n")[0]
+        assert [line.split()[0] for line in section.splitlines() if line[2] != " "] == [*names]
+
+
+def test_help_of_every_command_ends_with_its_exit_codes() -> None:
+    for name, command in commands():
+        shown = CliRunner().invoke(cli, [*name.split(), "--help"]).output
+        if name in ("sign", "verify"):
+            continue
+        assert isinstance(command, Command), name
+        codes = shown.split("\nExit codes:\n")[1]
+        assert [line.split()[0] for line in codes.splitlines() if line[2] != " "] == [
+            *map(str, command.exit_codes)
+        ], name
+        assert {0, 1, 2} <= {*command.exit_codes}, name
+
+
+COMPLETED = {
+    "dexkit re": {"record", "replay", "report"},
+    "dexkit emulate dex": {"dex1-motor", "dex3-usb"},
+    "dexkit check --ju": {"--junit"},
+    "dexkit teleop --side l": {"left"},
+}
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is needed")
+def test_bash_completes_commands_options_and_values(tmp_path: Path) -> None:
+    """As docs/install.md says: the script is sourced, and its function called as by the Tab key."""
+    script = 'eval "$(_DEXKIT_COMPLETE=bash_source dexkit)"\n'
+    for typed in COMPLETED:
+        words = typed.split(" ")
+        script += (
+            f"COMP_WORDS=({' '.join(words)}); COMP_CWORD={len(words) - 1}; COMPREPLY=()\n"
+            '_dexkit_completion dexkit; echo "${COMPREPLY[@]}"\n'
+        )
+    folder = Path(sys.executable).parent
+    environment = {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "--norc", "-e"],
+        input=script,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
+        cwd=tmp_path,
+    )
+    assert [set(line.split()) for line in done.stdout.splitlines()] == [*COMPLETED.values()]
+    assert done.stderr == ""
 
 
 def test_number_without_bounds_has_no_range_in_the_help() -> None:

@@ -7,58 +7,65 @@ emulators, traces and conformance.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
-import importlib
 import os
 import sys
 
 import click
 
 from dexkit import __version__, threads
+from dexkit.cli.lazy_group import LazyGroup, Sections
 from dexkit.errors import DexkitError, OutputError, ResourceError
 from dexkit.escaping import REMARK, guarded, one_line
 
 __all__ = ["cli", "main"]
 
-# name -> (module, one-line help); the help is here so that `dexkit --help` imports nothing
-_COMMANDS: dict[str, tuple[str, str]] = {
-    "audit": ("dexkit.cli.audit", "Judge every session of an archive."),
-    "backends": ("dexkit.cli.backends", "List the backends that can be served."),
-    "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
-    "bridge": ("dexkit.cli.bridge", "Translate between Dex1 dialects."),
-    "bringup": ("dexkit.cli.bringup", "Find out how a hand is wired, a joint at a time."),
-    "calibrate": ("dexkit.cli.calibrate", "Measure and store a gripper's zero and speed."),
-    "check": ("dexkit.cli.check", "Check a recording against the requirements."),
-    "compare": ("dexkit.cli.compare", "Compare several results."),
-    "cut": ("dexkit.cli.cut", "Write a part of a recording."),
-    "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (90 s)."),
-    "diff": ("dexkit.cli.diff", "Compare two recordings of one session."),
-    "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
-    "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
-    "export": ("dexkit.cli.export", "Write recordings in another format."),
-    "import": ("dexkit.cli.import_", "Write sessions of other formats as recordings."),
-    "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
-    "install-service": (
-        "dexkit.cli.install_service",
-        "Write systemd units and udev rules that serve hands.",
-    ),
-    "merge": ("dexkit.cli.merge", "Write several recordings as one."),
-    "monitor": ("dexkit.cli.monitor", "Show hands and topics in the terminal, live."),
-    "models": ("dexkit.cli.models", "Print hands and robots: joints, limits, topics, rates."),
-    "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
-    "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
-    "replay": ("dexkit.cli.replay", "Publish the commands of a recording."),
-    "report": ("dexkit.cli.report", "Write the reports of a result."),
-    "selftest": ("dexkit.cli.selftest", "Test a hand's joints and sensors; compare for wear."),
-    "serve": ("dexkit.cli.serve", "Publish and subscribe Unitree's topics for a hand."),
-    "setup-dds": ("dexkit.cli.setup_dds", "Find or build CycloneDDS 0.10 for this Python."),
-    "sign": ("dexkit.cli.sign", "Sign a result with its recording as one archive."),
-    "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
-    "verify": ("dexkit.cli.verify", "Verify a signed result, and judge it again."),
-    "view": ("dexkit.cli.view", "Show hands on a page in the browser, live or recorded."),
+_SECTIONS: Sections = {
+    "Serve and emulate": {
+        "serve": ("dexkit.cli.serve", "Publish and subscribe Unitree's topics for a hand."),
+        "emulate": ("dexkit.cli.emulate", "Emulate a device, a robot, or a robot with hands."),
+        "bridge": ("dexkit.cli.bridge", "Translate between Dex1 dialects."),
+        "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
+    },
+    "Judge": {
+        "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (90 s)."),
+        "check": ("dexkit.cli.check", "Check a recording against the requirements."),
+        "audit": ("dexkit.cli.audit", "Judge every session of an archive."),
+        "report": ("dexkit.cli.report", "Write the reports of a result."),
+        "compare": ("dexkit.cli.compare", "Compare several results."),
+        "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
+        "sign": ("dexkit.cli.sign", "Sign a result with its recording as one archive."),
+        "verify": ("dexkit.cli.verify", "Verify a signed result, and judge it again."),
+        "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
+    },
+    "Sessions": {
+        "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
+        "replay": ("dexkit.cli.replay", "Publish the commands of a recording."),
+        "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
+        "cut": ("dexkit.cli.cut", "Write a part of a recording."),
+        "merge": ("dexkit.cli.merge", "Write several recordings as one."),
+        "diff": ("dexkit.cli.diff", "Compare two recordings of one session."),
+        "import": ("dexkit.cli.import_", "Write sessions of other formats as recordings."),
+        "export": ("dexkit.cli.export", "Write recordings in another format."),
+    },
+    "Diagnose": {
+        "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
+        "monitor": ("dexkit.cli.monitor", "Show hands and topics in the terminal, live."),
+        "view": ("dexkit.cli.view", "Show hands on a page in the browser, live or recorded."),
+        "selftest": ("dexkit.cli.selftest", "Test a hand's joints and sensors; compare for wear."),
+    },
+    "Set up": {
+        "setup-dds": ("dexkit.cli.setup_dds", "Find or build CycloneDDS 0.10 for this Python."),
+        "backends": ("dexkit.cli.backends", "List the backends that can be served."),
+        "models": ("dexkit.cli.models", "Print hands and robots: joints, limits, topics, rates."),
+        "bringup": ("dexkit.cli.bringup", "Find out how a hand is wired, a joint at a time."),
+        "calibrate": ("dexkit.cli.calibrate", "Measure and store a gripper's zero and speed."),
+        "install-service": (
+            "dexkit.cli.install_service",
+            "Write systemd units and udev rules that serve hands.",
+        ),
+    },
 }
-
 
 _NO_READER = 141
 # What the dynamic linker says when a library does not fit into memory.
@@ -72,42 +79,19 @@ _HINTS = {
 }
 
 
-class _LazyGroup(click.Group):
+class _Dexkit(LazyGroup):
     def invoke(self, ctx: click.Context) -> object:
         threads.forget()
         result = super().invoke(ctx)
         threads.check()  # a command that lost a thread has failed, whatever it returned
         return result
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(_COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        entry = _COMMANDS.get(cmd_name)
-        if entry is None:
-            return None
-        command = importlib.import_module(entry[0]).command
-        assert isinstance(command, click.Command)
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        try:
-            return super().resolve_command(ctx, args)
-        except click.UsageError as error:
-            if close := difflib.get_close_matches(args[0], _COMMANDS, n=1):
-                raise click.UsageError(
-                    f"{error.message.rstrip('.')}. Did you mean {close[0]!r}?", ctx
-                ) from None
-            raise
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, _COMMANDS[name][1]) for name in sorted(_COMMANDS)])
-
-
-@click.command(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(
+    cls=_Dexkit,
+    sections=_SECTIONS,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__, prog_name="dexkit")
 def cli() -> None:
     """Serve any gripper or hand on Unitree's Dex topics, and test that it is a drop-in

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import Number, jobs_option, out_option, quiet_option
 from dexkit.cli.status_line import StatusLine
 from dexkit.console import Console
@@ -23,7 +24,15 @@ _STATUS_PERIOD = 0.2  # seconds
 _FAIL_ON = ("never", "fail", "unusable", "warn")
 
 
-@click.command("audit")
+@click.command(
+    "audit",
+    cls=Command,
+    exit_codes={
+        0: "every MUST that could be judged is met in every file",
+        1: "one is not met",
+        2: "a file is not usable, damaged or inconclusive, or there is none; see --fail-on",
+    },
+)
 @click.argument("locations", nargs=-1, required=True, metavar="PATH|URL...")
 @out_option(
     "audit-out", "Folder for journal, tables and page. Results of unchanged files are reused."
@@ -106,9 +115,6 @@ def command(
     Writes a row for each file, and for each requirement and side, as Parquet or JSON lines, and a
     summary page. A faulty file becomes a row and does not stop the audit. Run the same command
     again to continue a stopped audit (docs/audit.md).
-
-    Exit code: 0 every MUST that could be judged is met in every file, 1 one is not, 2 a file is
-    not usable, damaged or inconclusive, or there is none; see --fail-on. 130 interrupted.
     """
     from dexkit.conformance.audit.audit import FAIL_ON, Audit, Limits
     from dexkit.conformance.audit.examine import LABELS

@@ -8,13 +8,17 @@ import click
 from rich.text import Text
 
 from dexkit.backends import BackendInfo, list_backends
+from dexkit.cli.exit_codes import Command
 from dexkit.console import Console
 from dexkit.escaping import one_line
 
 _WIDEST = 100  # columns; longer lines are hard to read
 
 
-@click.command("backends")
+@click.command(
+    "backends",
+    cls=Command,
+)
 def command() -> None:
     """List the backends that can be served: name, model, origin, device and settings."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     grade_option,
@@ -15,7 +16,13 @@ from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
 
 
-@click.command("badge")
+@click.command(
+    "badge",
+    cls=Command,
+    exit_codes={
+        0: "the badge is written, whatever the verdict",
+    },
+)
 @click.argument("result", type=LocalPath(exists=True), metavar="RESULT.json")
 @output_option("FILE.svg", "Where to write it; - prints it.", "badge.svg")
 @grade_option(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     DOMAIN,
     dds_options,
@@ -41,7 +42,14 @@ _LONELY = 5.0  # seconds without a peer before a hint
 _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
 
 
-@click.command("bridge")
+@click.command(
+    "bridge",
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "it failed while it ran, or another program publishes the same topics",
+    },
+)
 @click.option("--from", "source", type=_DIALECTS, required=True, help="Dialect of the client.")
 @click.option("--to", "target", type=_DIALECTS, required=True, help="Dialect of the gripper.")
 @side_option("Grippers to translate for.", default="both")

@@ -14,6 +14,7 @@ from dexkit import documents
 from dexkit.backends import BackendOptions, backend, list_backends
 from dexkit.bringup import Bench, BringupSession, Drive, Effort, Findings, Question, Snapshot
 from dexkit.bringup.script import describe
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.held_key import Terminal
 from dexkit.cli.options import (
     FILE,
@@ -39,7 +40,14 @@ _RATE = 100.0
 _LOST_ANSWERS = 3
 
 
-@click.command("bringup")
+@click.command(
+    "bringup",
+    cls=Command,
+    exit_codes={
+        0: "everything is found and stored",
+        1: "the hand is gone or has a fault; what was found is stored",
+    },
+)
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Hand to bring up.", required=True)
 @device_option("Serial number, address or port of the device.")

@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     Number,
@@ -77,7 +78,14 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
         self.fail(f"{one_line(value, 40)!r} is not two servo ids, such as 1,2", param, ctx)
 
 
-@click.command()
+@click.command(
+    "calibrate",
+    cls=Command,
+    exit_codes={
+        0: "measured and stored",
+        1: "the measurement failed; nothing is stored",
+    },
+)
 @click.argument("gripper", type=click.Choice(["ezgripper", "dex1-serial"]), default="ezgripper")
 @device_option("Serial port, or its USB serial number.")
 @one_side_option(

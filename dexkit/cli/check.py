@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from dexkit import option_texts
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     LocalPath,
@@ -31,7 +32,16 @@ from dexkit.models import DIALECTS
 from dexkit.robots import ROBOTS
 
 
-@click.command("check")
+@click.command(
+    "check",
+    cls=Command,
+    exit_codes={
+        0: "every MUST that could be judged is met; with --grade, those of that grade",
+        1: "one is not met",
+        2: "the recording is not usable or damaged (what is left is judged all the same), "
+        "nothing in it could be judged, or the client did not allow to judge a MUST",
+    },
+)
 @click.argument(
     "recording",
     type=LocalPath(exists=True),
@@ -78,12 +88,8 @@ def command(
 
     IN.mcap is a session recorded with 'dexkit record', a ROS 2 bag, or the recording of a
     conformance run with all its stimuli. In a session the client's commands are judged too; errors
-    of the client do not fail the hand.
-
-    Exit code, about the hands: 0 every MUST that could be judged is met, 1 one is not, 2 the
-    recording is not usable or damaged (what is left is judged all the same), nothing in it could
-    be judged, or the client did not allow to judge a MUST. With --require DEX1-CLIENT (DEX3-,
-    DEX5-) it is about the client. With --grade, only the requirements of that kind decide.
+    of the client do not fail the hand. With --require DEX1-CLIENT (DEX3-, DEX5-) the verdict is
+    about the client.
     """
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     html_option,
@@ -21,7 +22,15 @@ if TYPE_CHECKING:
     from dexkit.conformance.report.compare import Comparison
 
 
-@click.command("compare")
+@click.command(
+    "compare",
+    cls=Command,
+    exit_codes={
+        0: "no regression",
+        1: "there is one",
+        2: "the results cannot be compared",
+    },
+)
 @click.argument(
     "results",
     nargs=-1,
@@ -37,8 +46,6 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     Runs of the same hand (its name in capabilities.toml, else the backend) are compared in order of
     time; a worse verdict is listed as a regression. The page also shows the curves of their
     recordings side by side, if these are in the folders of the results.
-
-    Exit code: 0 no regression, 1 there is one, 2 the results cannot be compared.
     """
     from dexkit.conformance.report.compare import (
         Comparison,

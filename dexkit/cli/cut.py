@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import FILE, OUTPUT_FILE, Number, overwrite_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
@@ -18,7 +19,15 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command("cut")
+@click.command(
+    "cut",
+    cls=Command,
+    exit_codes={
+        0: "written",
+        1: "the recording is damaged; its readable part is cut",
+        2: "wrong usage, nothing left, or an unusable file",
+    },
+)
 @click.argument("file", type=FILE)
 @click.argument("out", type=OUTPUT_FILE)
 @click.option(
@@ -73,9 +82,6 @@ def command(
 
     Times count from the first message; negative times from the last. Payloads, times, schemas and
     metadata are unchanged; OUT names the recording that it was cut from.
-
-    Exit code: 0 written, 1 the recording is damaged (its readable part is cut), 2 wrong usage,
-    nothing left, or an unusable file.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.edit import cut

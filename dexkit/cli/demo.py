@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import domain_option, out_option, view_option
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
@@ -26,7 +27,15 @@ _INTRO = (
 )
 
 
-@click.command("demo")
+@click.command(
+    "demo",
+    cls=Command,
+    exit_codes={
+        0: "the hands passed",
+        1: "they did not",
+        2: "they could not be judged",
+    },
+)
 @out_option("demo-out", "Where to write report.html, recording.mcap and result.json.")
 @click.option(
     "--backend",
@@ -39,8 +48,7 @@ _INTRO = (
 def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
     """Run the conformance suite on two emulated EZGrippers; takes about 90 seconds.
 
-    Traffic stays on this machine, on a DDS domain of its own. Exit code: 0 the hands passed,
-    1 they did not, 2 they could not be judged.
+    Traffic stays on this machine, on a DDS domain of its own.
     """
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.suite_run import SuiteOptions, run_suite

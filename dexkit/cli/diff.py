@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import FILE, Number, html_option, json_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.cli.report import write_text
@@ -22,7 +23,15 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command("diff")
+@click.command(
+    "diff",
+    cls=Command,
+    exit_codes={
+        0: "equal topics and positions",
+        1: "they differ, or a recording is damaged",
+        2: "they cannot be compared",
+    },
+)
 @click.argument("a", type=FILE)
 @click.argument("b", type=FILE)
 @click.option(
@@ -57,9 +66,6 @@ def command(
 
     B is aligned to A by the correlation of the commands (without commands, of the states), and each
     joint is compared at A's times where both have values.
-
-    Exit code: 0 equal topics and positions, 1 they differ or a recording is damaged, 2 they cannot
-    be compared.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.compare import compare

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     Number,
     devices_option,
@@ -57,7 +58,15 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
     return found
 
 
-@click.command("doctor")
+@click.command(
+    "doctor",
+    cls=Command,
+    exit_codes={
+        0: "healthy; Ctrl-C ends --watch with the code of the last complete examination",
+        1: "problems found",
+        2: "the examination failed",
+    },
+)
 @domain_option(
     "Domain of the client: 0 is the robot, 1 xr_teleoperate's simulation.  [default: any]"
 )
@@ -110,9 +119,6 @@ def command(
     publishing any topic and without CycloneDDS, checks this Python environment, and checks the
     device if one is named. Traffic stays on this machine unless --interface names a network. On a
     named serial port only ids and models of servos are read.
-
-    Exit codes: 0 healthy, 1 problems found, 2 the examination failed, 130 interrupted. Ctrl-C ends
-    --watch with the code of the last complete examination.
     """
     from dexkit.doctor import Scope, diagnose, readiness, verdict
     from dexkit.doctor.environment import environment

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import FILE
 from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, SessionError, UsageError
@@ -14,7 +15,16 @@ from dexkit.escaping import REMARK, one_line
 __all__ = ["command"]
 
 
-@click.command("export")
+@click.command(
+    "export",
+    cls=Command,
+    exit_codes={
+        0: "everything is exported",
+        1: "a recording is damaged or was refused, or something in it is left out (it is listed, "
+        "and all else is exported)",
+        2: "wrong usage, or nothing could be exported",
+    },
+)
 @click.argument("sessions", type=FILE, nargs=-1, required=True, metavar="SESSION...")
 @click.option(
     "--to",
@@ -58,10 +68,6 @@ def command(
 
     lerobot writes one dataset (v3.0), and episodes one task folder, for all recordings. The other
     formats write one folder for each recording.
-
-    Exit code: 0 everything is exported, 1 a recording is damaged or was refused, or something in
-    it is left out (it is listed, and all else is exported), 2 wrong usage, or nothing could be
-    exported.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions import rosbag, topic_tables

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import FILE, overwrite_option, session_options
 from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, SessionError, UsageError
@@ -20,7 +21,16 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command("import")
+@click.command(
+    "import",
+    cls=Command,
+    exit_codes={
+        0: "everything is imported",
+        1: "something is left out (it is listed, also in the recording), or a session is refused "
+        "(it is named, and the others are imported)",
+        2: "wrong usage, or nothing can be imported",
+    },
+)
 @click.argument("source", type=FILE)
 @click.argument("out", type=FILE)
 @session_options()
@@ -49,10 +59,6 @@ def command(
     SOURCE is an episode of xr_teleoperate or a folder of them, a file of JSON lines, a LeRobot
     dataset (v2.0, v2.1, v3.0), a ROS 2 bag (sqlite3 or mcap), or tables of dexkit export. OUT is
     an mcap file for one session, and a folder for several.
-
-    Exit code: 0 everything is imported, 1 something is left out (it is listed, also in the
-    recording) or a session is refused (it is named, and the others are imported), 2 wrong usage, or
-    nothing can be imported.
     """
     from dexkit.models import model
     from dexkit.traces.sessions.episodes import Options

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import FILE, html_option, json_option
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths
@@ -93,7 +94,15 @@ def _orders(trace: Trace) -> list[str]:
     ]
 
 
-@click.command("info")
+@click.command(
+    "info",
+    cls=Command,
+    exit_codes={
+        0: "the files agree with their checksums and counts",
+        1: "one is damaged; its readable part is shown, and losses are listed",
+        2: "one is not a recording",
+    },
+)
 @click.argument("files", type=FILE, nargs=-1, required=True, metavar="FILE...")
 @json_option("Print JSON: an object, or a list of them for several files.")
 @click.option(
@@ -107,9 +116,6 @@ def command(files: tuple[Path, ...], as_json: bool, plot: bool, html_path: Path 
 
     FILE is an mcap file (or the directory of a ROS 2 bag with one in it). An unfinished file is
     read up to its end.
-
-    Exit code: 0 the files agree with their checksums and counts, 1 one is damaged (the readable
-    part is shown, losses are listed), 2 one is not a recording.
     """
     from dexkit.traces import open_trace
 

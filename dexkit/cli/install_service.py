@@ -19,6 +19,7 @@ import platformdirs
 
 from dexkit.backends import Backend, backend
 from dexkit.child_processes import code_line, command_line
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     devices_by_side,
@@ -43,7 +44,13 @@ _ROOT = str(Path(__file__).resolve().parents[2])
 _PATIENCE = 120.0  # seconds for a plug-in to be imported
 
 
-@click.command("install-service")
+@click.command(
+    "install-service",
+    cls=Command,
+    exit_codes={
+        0: "the files are written or printed",
+    },
+)
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Which hand; both writes one unit for each.", required=True)
 @devices_option(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import FILE, overwrite_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
@@ -13,7 +14,15 @@ from dexkit.errors import UsageError
 __all__ = ["command"]
 
 
-@click.command("merge")
+@click.command(
+    "merge",
+    cls=Command,
+    exit_codes={
+        0: "written",
+        1: "a recording is damaged; its readable part is merged",
+        2: "wrong usage, or an unusable file",
+    },
+)
 @click.argument("files", type=FILE, nargs=-1, required=True, metavar="FILE FILE... OUT")
 @click.option(
     "--shift",
@@ -41,9 +50,6 @@ def command(
 
     Messages that occur in several files are written once. If metadata differ, those of later files
     are stored under the file's name.
-
-    Exit code: 0 written, 1 a recording is damaged (its readable part is merged), 2 wrong usage, or
-    an unusable file.
     """
     from dexkit.traces import open_trace
     from dexkit.traces.sessions.edit import clock_offset, merge

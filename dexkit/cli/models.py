@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import json_option
 
 if TYPE_CHECKING:
@@ -22,7 +23,10 @@ _WIDEST = 100  # columns; longer lines are hard to read
 _SIDES = ("left", "right")
 
 
-@click.command("models")
+@click.command(
+    "models",
+    cls=Command,
+)
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="Print every detail of every model.")
 @json_option("Print JSON, always with every detail.")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     Number,
@@ -42,7 +43,14 @@ _PERIODS = {"terminal": 0.2, "json": 1.0, "lines": 10.0}
 _PAGE = 10  # lines
 
 
-@click.command("monitor")
+@click.command(
+    "monitor",
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C, SIGTERM or --duration",
+        1: "a recording is incomplete",
+    },
+)
 @topic_option("Listen to", "every topic of a known type, also those that appear later")
 @prefix_option("Only topics under rt/NAME/, as rt/r2/dex3/left/cmd for r2.")
 @dds_options(default_domain=None, domain_default_text="where hands are: 1, else 0")
@@ -78,8 +86,6 @@ def command(
     events, arrows and page keys scroll.
 
     Without a terminal it prints events as lines, and every ten seconds a line for each hand.
-
-    Exit code: 0; 1 a recording is incomplete; 2 wrong usage.
     """
     if log is not None and log.exists():
         raise UsageError(f"{log} exists", hint="choose another name for the recording")

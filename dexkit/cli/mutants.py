@@ -11,6 +11,7 @@ import click
 from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     dialect_option,
@@ -83,7 +84,17 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     sys.exit(0 if all(v.right for v in found) else 1)
 
 
-@click.command("mutants")
+@click.command(
+    "mutants",
+    cls=Command,
+    exit_codes={
+        0: "every requirement detects its wrong hand; with --generated and --from, every wrong "
+        "hand is caught, and no good one fails or gets a warning",
+        1: "a wrong hand is missed or fails another requirement, a requirement has none, or a "
+        "good hand is blamed",
+        2: "no hand is selected",
+    },
+)
 @click.option(
     "--model",
     type=click.Choice([*MODELS, *ROBOTS]),
@@ -149,10 +160,6 @@ def command(
     With --generated, hands are combined from faults, places and conditions, and judged in default,
     quick or thorough runs like those of the conformance suite. With --from, the hands are your own
     (docs/mutants.md).
-
-    Exit code: 0 every requirement detects its wrong hand, 1 a wrong hand is missed or fails
-    another requirement, or a requirement has none, 2 no hand is selected. With --generated and
-    --from: 0 every wrong hand is caught and no good one fails or gets a warning, 1 otherwise.
     """
     if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:
         raise UsageError("--generated, --hand, --from and --require cannot be combined")

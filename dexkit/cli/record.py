@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit import threads
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     LocalPath,
@@ -37,7 +38,16 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command("record")
+@click.command(
+    "record",
+    cls=Command,
+    exit_codes={
+        0: "no loss was detected",
+        1: "nothing was received, something is missing (it is reported), OUT was renamed "
+        "meanwhile, or an episode could not be merged",
+        2: "wrong usage, or OUT cannot be written",
+    },
+)
 @click.argument("out", type=LocalPath(dir_okay=False))
 @topic_option("Record", "every topic of a known type, also those that appear later")
 @prefix_option("Only topics under rt/NAME/, as rt/r2/dex3/left/cmd for r2.")
@@ -79,10 +89,6 @@ def command(
 
     With --beside-episodes, each episode written to DIR during the recording is merged with it into
     OUT_NAME.mcap: hands from the wire, arms and pictures at the true times of their frames.
-
-    Exit codes: 0 no loss was detected; 1 nothing was received, something is missing (it is
-    reported), OUT was renamed meanwhile, or an episode could not be merged; 2 wrong usage, or OUT
-    cannot be written.
     """
     from dexkit.dds import DdsNode
     from dexkit.doctor.hand_domains import HandsElsewhere, listening_domain

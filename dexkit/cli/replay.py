@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     Number,
@@ -70,7 +71,17 @@ _AS_RECORDED = {
 _STYLES = {"note": "dim", "cured": "green", "accepted": "yellow", "refused": "bold red"}
 
 
-@click.command("replay")
+@click.command(
+    "replay",
+    cls=Command,
+    exit_codes={
+        0: "played, or a loop was stopped, or nothing is refused with --check and --rehearse",
+        1: "refused, stopped by the supervision, suspended without a terminal, damaged, or not "
+        "free",
+        2: "it cannot be read",
+        130: "stopped",
+    },
+)
 @click.argument("source", type=FILE)
 @click.option("--check", "check_only", is_flag=True, help="Only check the session.")
 @click.option(
@@ -206,10 +217,6 @@ def command(ctx: click.Context, /, source: Path, **given: Any) -> int:
 
     If this program was suspended for more than a second, it asks before it moves the hands on;
     without a terminal it ends.
-
-    Exit code: 0 played (or a loop was stopped, or nothing is refused with --check and --rehearse),
-    1 refused, stopped by the supervision, suspended without a terminal, damaged, or not free, 2 it
-    cannot be read, 130 stopped.
     """
     if given["as_recorded"] or given["no_wait"] or given["topics"]:
         return _as_recorded(ctx, source, given)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     html_option,
@@ -46,7 +47,14 @@ def _address(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
     return text
 
 
-@click.command("report")
+@click.command(
+    "report",
+    cls=Command,
+    exit_codes={
+        0: "the reports are written, whatever the verdict",
+        2: "the result, or the recording, cannot be used",
+    },
+)
 @click.argument("result", type=LocalPath(exists=True), metavar="RESULT.json")
 @recording_option(": the page then shows plots")
 @html_option()
@@ -74,9 +82,6 @@ def command(
 
     A result file comes from 'dexkit check --json FILE' or from the conformance suite with
     '--json FILE'. Without an option the result is printed as a table.
-
-    Exit code: 0 the reports are written, whatever the verdict; 2 the result, or the recording,
-    cannot be used.
     """
     from dexkit.conformance.report.html import write_html
     from dexkit.conformance.report.junit import write_junit

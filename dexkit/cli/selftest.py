@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.consent import Consent
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     Number,
@@ -51,7 +52,16 @@ _SPEED = 0.25
 whose client asks for all of it, are tried at it."""
 
 
-@click.command("selftest")
+@click.command(
+    "selftest",
+    cls=Command,
+    exit_codes={
+        0: "no fault found",
+        1: "a fault, a failed measurement, or suspended without a terminal",
+        2: "the test cannot begin",
+        130: "stopped",
+    },
+)
 @click.argument("backend_name", metavar="[BACKEND]", required=False)
 @click.option("--external", is_flag=True, help="Test a hand that is already served on DDS.")
 @one_side_option("Hand to test.", required=True)
@@ -107,9 +117,6 @@ def command(backend_name: str | None, **given: Any) -> int:
     goes on; without a terminal it ends.
 
     Writes a page and a JSON file. With --baseline it reports what has become worse since.
-
-    Exit code: 0 no fault found, 1 a fault, a change for the worse, a failed measurement, or
-    suspended without a terminal, 2 the test cannot begin, 130 stopped.
     """
     if (backend_name is None) == (not given["external"]):
         raise UsageError(

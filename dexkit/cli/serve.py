@@ -13,6 +13,7 @@ from types import FrameType
 import click
 
 from dexkit.backends import BackendOptions, backend
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     Number,
     dds_options,
@@ -51,7 +52,14 @@ _PHASE = 0.15  # of a period: publishing has ended, exchanges may begin
 _LONELY = 10.0  # seconds without a client before a hint
 
 
-@click.command("serve")
+@click.command(
+    "serve",
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "it failed while it ran, or another program publishes the same topics",
+    },
+)
 @click.argument("backend_name", metavar="BACKEND")
 @side_option("Hand to serve; both needs a device for each.", required=True)
 @devices_option("Path or serial number of the device; with --side both left=PATH and right=PATH.")

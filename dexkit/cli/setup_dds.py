@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     dry_run_option,
@@ -28,7 +29,15 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command("setup-dds")
+@click.command(
+    "setup-dds",
+    cls=Command,
+    exit_codes={
+        0: "DDS works",
+        1: "a step failed",
+        2: "not possible on this machine",
+    },
+)
 @click.option(
     "--from-source",
     "source",
@@ -72,8 +81,6 @@ def command(
     Installs into dexkit's own environment, after a test message to another process and back. Needs
     no root, and refuses the system's own Python. A failure or interruption leaves the environment
     unchanged.
-
-    Exit code: 0 DDS works, 1 a step failed, 2 not possible on this machine, 130 interrupted.
     """
     from dexkit.setup_dds.execute import carry_out
     from dexkit.setup_dds.plan import Options, make_plan

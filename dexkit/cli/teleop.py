@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dexkit.cli.consent import Consent
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     dds_options,
@@ -55,7 +56,15 @@ _SLOW = 0.9
 _MS = 1e3
 
 
-@click.command("teleop")
+@click.command(
+    "teleop",
+    cls=Command,
+    exit_codes={
+        0: "done",
+        1: "the hand gave no state, fell silent, or is commanded by another program, or this "
+        "program was suspended without a terminal",
+    },
+)
 @click.argument("profile_name", metavar="PROFILE", required=False)
 @list_option("List the profiles and exit.")
 @dialect_option(
@@ -119,9 +128,6 @@ def command(
 
     At the end, on Ctrl-C too, the hands are commanded to hold their position. If this program was
     suspended for more than a second, it asks before it moves them on; without a terminal it ends.
-
-    Exit codes: 0 done, 1 the hand gave no state, fell silent, or is commanded by another program,
-    or this program was suspended without a terminal, 2 wrong usage, 130 interrupted.
     """
     if list_only:
         _list()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     dds_options,
@@ -37,7 +38,14 @@ if TYPE_CHECKING:
 __all__ = ["command", "recorded"]
 
 
-@click.command("view")
+@click.command(
+    "view",
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        2: "wrong usage, an unusable recording, or a missing package",
+    },
+)
 @click.argument("recordings", type=FILE, nargs=-1, metavar="[RECORDING]...")
 @click.option(
     "--live", is_flag=True, help="Show the live domain beside a recording, as its baseline."
@@ -114,8 +122,6 @@ def command(
 
     Needs the extra 'view': pip install 'dexkit[view]'. The page loads nothing from the network.
     --to rerun and --to foxglove need the extra of that name instead.
-
-    Exit code: 0; 2 wrong usage, an unusable recording, or a missing package.
     """
     if len(recordings) + live > 2:
         raise UsageError("at most two recordings can be shown at once")

@@ -16,6 +16,7 @@ import click
 
 from dexkit.child_processes import READY_TIMEOUT, Tool
 from dexkit.cli.emulate.lerobot import LOOPBACK, parse_ports, ports_option
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     dds_options,
     dialect_option,
@@ -40,7 +41,15 @@ _XR, _LEROBOT = "xr_teleoperate", "lerobot"
 _XR_HANDS, _LEROBOT_HANDS = DEX3_1.short_name, DEX1_1.short_name  # each client's own default
 
 
-@click.command("all", context_settings={"show_default": True})
+@click.command(
+    "all",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C, SIGTERM or --duration",
+        1: "a part failed, or its own exit code",
+    },
+)
 @click.option(
     "--for",
     "client",

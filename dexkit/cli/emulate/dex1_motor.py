@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, serve
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     Number,
     links_option,
@@ -23,7 +24,15 @@ from dexkit.wire import m4010
 __all__ = ["emulate_dex1_motor"]
 
 
-@click.command("dex1-motor", context_settings={"show_default": True})
+@click.command(
+    "dex1-motor",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "the emulator failed",
+    },
+)
 @side_option("Motor to emulate: id 0 is the right one, 1 the left one.", default="left")
 @links_option(
     "Link that clients open. With --side both, one for a line with both motors, or "

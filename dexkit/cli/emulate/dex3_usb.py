@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     fault_options,
@@ -42,7 +43,15 @@ def _endpoint(ctx: click.Context, param: click.Parameter, value: str) -> int:
     return found
 
 
-@click.command("dex3-usb", context_settings={"show_default": True})
+@click.command(
+    "dex3-usb",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "the emulator failed",
+    },
+)
 @side_option("Hand to emulate.", default="left")
 @click.option(
     "--serial",

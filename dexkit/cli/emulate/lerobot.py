@@ -8,6 +8,7 @@ import time
 
 import click
 
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import domain_option, duration_option, quiet_option
 from dexkit.cli.status_line import StatusLine, log_to_stderr
 from dexkit.errors import EmulatorError, UsageError
@@ -28,7 +29,15 @@ ports_option = click.option(
 )
 
 
-@click.command("lerobot-g1", context_settings={"show_default": True})
+@click.command(
+    "lerobot-g1",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "the emulator failed",
+    },
+)
 @domain_option("DDS domain of the emulated G1, on loopback.", 0)
 @click.option(
     "--address",

@@ -13,6 +13,7 @@ import click
 
 from dexkit import documents
 from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     any_baudrate_option,
@@ -34,7 +35,15 @@ from dexkit.wire import mx64
 __all__ = ["emulate_mx64"]
 
 
-@click.command("mx64", context_settings={"show_default": True})
+@click.command(
+    "mx64",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "the emulator failed",
+    },
+)
 @link_option(
     "Link that clients open; usbip://HOST:PORT for an FTDI adapter (FT232R) on USB/IP, which "
     "has a latency timer of its own."

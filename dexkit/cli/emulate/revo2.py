@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import id_option, link_option, object_option, side_option, start_option
 from dexkit.hand import Side
 from dexkit.stop_signals import stop_on_signals
@@ -15,7 +16,15 @@ from dexkit.wire import revo2
 __all__ = ["emulate_revo2"]
 
 
-@click.command("revo2", context_settings={"show_default": True})
+@click.command(
+    "revo2",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "the emulator failed",
+    },
+)
 @side_option("Hand to emulate.", default="right")
 @link_option("Link that clients open.")
 @object_option("Percent of closing at which the joints touch an object")

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import id_option, link_option, object_option, side_option, start_option
 from dexkit.errors import UsageError
 from dexkit.hand import Side
@@ -18,7 +19,15 @@ __all__ = ["emulate_rh56"]
 _SERIAL_ONLY = ("number", "baudrate", "line_time", "latency_timer", "any_baudrate")
 
 
-@click.command("rh56", context_settings={"show_default": True})
+@click.command(
+    "rh56",
+    context_settings={"show_default": True},
+    cls=Command,
+    exit_codes={
+        0: "stopped by Ctrl-C or SIGTERM",
+        1: "the emulator failed",
+    },
+)
 @side_option("Hand to emulate.", default="right")
 @link_option("Link that clients open: the hand's serial line.", required=False)
 @click.option(

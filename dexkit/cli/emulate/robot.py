@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.emulate.stdin import read_faults
+from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     Number,
     dds_options,
@@ -123,7 +124,14 @@ def _command(model: RobotModel) -> click.Command:
             show_default=True,
             help="mode_machine of the state, the kind of robot (the table is in unitree_ros).",
         )(decorated)
-    return click.command(model.name)(dds_options()(decorated))
+    return click.command(
+        model.name,
+        cls=Command,
+        exit_codes={
+            0: "stopped by Ctrl-C, SIGTERM or --duration",
+            1: "it failed while it ran, or another program publishes the same topics",
+        },
+    )(dds_options()(decorated))
 
 
 _OPTIONS = [
