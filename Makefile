@@ -104,7 +104,7 @@ format: $(STAMP) ## put the code in ruff's format
 	$(RUN) ruff check --fix .
 	$(RUN) ruff format .
 
-docs: $(STAMP) ## write the generated pages, drawings and message modules (ARGS=--check compares)
+docs: $(STAMP) ## write the generated files, and into build/docs the pages of requirements and models (ARGS=--check compares)
 	$(RUN) python -m tools.generate $(ARGS)
 
 docs-site: $(STAMP) ## the documentation as a site in build/site, with search, requirements and API; checks every link

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,14 @@ from pathlib import Path
 import pytest
 
 import tools.generate
-from tools.generate import ROOT, generated_files, stale_files
+from tools.generate import (
+    BUILT,
+    ROOT,
+    built_pages,
+    generated_files,
+    stale_files,
+    write_pages,
+)
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -22,19 +30,24 @@ def test_every_generator_contributes() -> None:
     assert made >= {
         "dexkit/messages/unitree_go.py",
         "dexkit/messages/unitree_hg.py",
-        "docs/conformance.md",
-        "docs/conformance-robots.md",
-        "docs/conformance-usb.md",
-        "docs/conformity.md",
         "docs/dex3-protocol.md",
         "docs/doctor.md",
         "docs/images/model-dex3-1.svg",
         "docs/layouts/foxglove-dex3-1.json",
         "docs/layouts/plotjuggler-dex3-1.xml",
-        "docs/models.md",
-        "docs/mutants.md",
         "docs/sources/real-hands.md",
     }
+
+
+def test_pages_of_the_site_lead_to_files_of_the_checkout() -> None:
+    write_pages()
+    lost = []
+    for name in built_pages():
+        path = BUILT / name
+        for target in re.findall(r"\]\(([^()\s#]+)", path.read_text(encoding="utf-8")):
+            if "://" not in target and not (path.parent / target).exists():
+                lost.append(f"{name}: {target}")
+    assert not lost, "\n".join(lost)
 
 
 def test_a_changed_or_missing_file_is_stale(

@@ -1,4 +1,4 @@
-"""Test ``dexkit models``, docs/models.md and its drawings."""
+"""Test ``dexkit models`` and the drawings."""
 
 from __future__ import annotations
 

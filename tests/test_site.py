@@ -25,6 +25,7 @@ def test_every_document_is_in_the_navigation() -> None:
     listed = {name for name in NAV.findall(text) if "/index" not in name} - {"index.md"}
     listed |= set(hooks.hand_pages())
     docs = {str(p.relative_to(ROOT / "docs")) for p in (ROOT / "docs").rglob("*.md")}
+    docs |= {name for name in hooks.pages() if "/" not in name} - {"index.md"}
     assert docs - listed == set()
     assert {name for name in listed - docs if not name.startswith(("api", "requirements"))} == set()
 
@@ -73,6 +74,14 @@ def test_links_that_leave_docs_become_text() -> None:
     )
     assert hooks.local_links("[a](../traces.md)", "sources/x.md") == "[a](../traces.md)"
     assert hooks.local_links("```\n[a](../x)\n```\n", "page.md") == "```\n[a](../x)\n```\n"
+
+
+def test_ids_of_requirements_become_links() -> None:
+    assert hooks.requirement_links("DEX1-RATE-01, `DEX1-RATE-01`", "sources/x.md") == (
+        "[DEX1-RATE-01](../requirements/DEX1-RATE-01.md), `DEX1-RATE-01`"
+    )
+    for text in ("# DEX1-RATE-01", "[DEX1-RATE-01](x.md)", "DEX1-RATE-99"):
+        assert hooks.requirement_links(text, "page.md") == text
 
 
 def test_reports_link_to_the_pages_of_requirements(tmp_path: Path) -> None:

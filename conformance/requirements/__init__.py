@@ -8,7 +8,7 @@ names no source of its own, it is an inference from the other's. It is of the ot
 its file names one, so that one file holds what a hand and what its client must do.
 
 All other parts take them from here: checks (which read their tolerances), pytest ids,
-selection, reports and the catalogue in docs/conformance.md.
+selection, reports and the pages of the site.
 """
 
 from __future__ import annotations

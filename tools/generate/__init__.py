@@ -1,52 +1,59 @@
-"""Write every generated file of the repository: ``make docs`` (``python -m tools.generate``).
+"""Write every generated file: ``make docs`` (``python -m tools.generate``).
 
 =============================  ==================================================================
+in the repository
+-------------------------------------------------------------------------------------------------
 :mod:`~.message_modules`       dexkit/messages/unitree_*.py, from dexkit/messages/idl/*.idl
-:mod:`~.models_page`           docs/models.md and docs/images/model-*.svg, from the model profiles
-:mod:`~.requirement_pages`     the catalogues in docs/conformance*.md and the areas in
-                               docs/mutants.md, from the requirement files
+:mod:`~.models_page`           docs/images/model-*.svg, from the model profiles
 :mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
 :mod:`~.doctor_page`           the table of docs/doctor.md, from the doctor's diagnoses
-:mod:`~.conformity_page`       docs/conformity.md, from conformity.toml
 :mod:`~.real_hands_page`       docs/sources/real-hands.md, from real_hands.toml
 :mod:`~.layouts`               docs/layouts, for Foxglove and PlotJuggler, from the model profiles
+in build/docs and on the site
+-------------------------------------------------------------------------------------------------
+:mod:`~.models_page`           models.md: joints, limits, topics and rates
+:mod:`~.requirement_pages`     requirements/: a page for each requirement
+:mod:`~.conformity_page`       conformity.md, from conformity.toml
 =============================  ==================================================================
 
-Each has a function ``files()``: the content of its files by path.
+What is in the repository is the function ``files()`` of a module: content by path.
 """
 
 from __future__ import annotations
 
+import posixpath
+import re
+import shutil
 from pathlib import Path
 
-__all__ = ["DOCS", "ROOT", "generated_files", "stale_files"]
+__all__ = ["BUILT", "DOCS", "ROOT", "built_pages", "generated_files", "stale_files", "write_pages"]
 
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout."""
 DOCS = ROOT / "docs"
+BUILT = ROOT / "build" / "docs"
+"""Of the pages that are not in the repository."""
+
+_LINK = re.compile(r"(?<=\]\()[^()\s#:]+(?=[)#])")
 
 
 def generated_files() -> dict[Path, str]:
-    """Content of every generated file, by path."""
+    """Content of every generated file of the repository, by path."""
     # the generators import ROOT and DOCS from here
     from tools.generate import (
-        conformity_page,
         dex3_protocol_page,
         doctor_page,
         layouts,
         message_modules,
         models_page,
         real_hands_page,
-        requirement_pages,
     )
 
     return {
         **message_modules.files(),
         **models_page.files(),
-        **requirement_pages.files(),
         **dex3_protocol_page.files(),
         **doctor_page.files(),
-        **conformity_page.files(),
         **real_hands_page.files(),
         **layouts.files(),
     }
@@ -59,3 +66,34 @@ def stale_files() -> dict[Path, str]:
         for path, content in generated_files().items()
         if not path.exists() or path.read_text(encoding="utf-8") != content
     }
+
+
+def built_pages() -> dict[str, str]:
+    """Markdown of the pages that are not in the repository, by the path that they have on the site:
+    their links are seen from docs/.
+    """
+    from tools.generate import conformity_page, models_page, requirement_pages
+
+    return {
+        "models.md": models_page.page(),
+        "conformity.md": conformity_page.page(),
+        **requirement_pages.pages(),
+    }
+
+
+def write_pages() -> None:
+    """Write :func:`built_pages` to :data:`BUILT`, with their links seen from there."""
+    made = built_pages()
+    shutil.rmtree(BUILT, ignore_errors=True)  # pages of requirements that are gone
+    for name, text in made.items():
+        path = BUILT / name
+        folder = posixpath.dirname(name)
+
+        def seen_from_there(match: re.Match[str], folder: str = folder) -> str:
+            target = posixpath.normpath(posixpath.join(folder, match[0]))
+            if target in made:
+                return match[0]
+            return posixpath.relpath(f"docs/{target}", f"build/docs/{folder}")
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(_LINK.sub(seen_from_there, text), encoding="utf-8")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tools.generate import ROOT, stale_files
+from tools.generate import BUILT, ROOT, stale_files, write_pages
 
 
 def main() -> int:
@@ -23,6 +23,9 @@ def main() -> int:
         print(f"{'out of date' if options.check else 'written'}: {path.relative_to(ROOT)}")
     if not stale:
         print("all generated files are up to date")
+    if not options.check:
+        write_pages()
+        print(f"pages: {BUILT.relative_to(ROOT)}")
     return 1 if options.check and stale else 0
 
 

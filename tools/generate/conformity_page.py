@@ -1,4 +1,4 @@
-"""docs/conformity.md: what dexkit does about each statement of the documents it was built for.
+"""conformity.md: what dexkit does about each statement of the documents it was built for.
 
 The statements are in conformity.toml beside this module, which says how a row is written.
 """
@@ -14,16 +14,13 @@ from pathlib import Path
 from dexkit import documents
 from dexkit.conformance.requirements import catalogue
 from dexkit.errors import UsageError
-from tools.generate import DOCS, ROOT
-from tools.generate.requirement_pages import PAGES
+from tools.generate import ROOT
+from tools.generate.requirement_pages import REQUIREMENT
 
-__all__ = ["STATUSES", "TABLE", "Document", "Row", "Section", "files", "read", "reference_error"]
+__all__ = ["STATUSES", "TABLE", "Document", "Row", "Section", "page", "read", "reference_error"]
 
 TABLE = Path(__file__).with_name("conformity.toml")
 STATUSES = ("done", "otherwise", "open", "fact")
-PAGE = DOCS / "conformity.md"
-
-_REQUIREMENT = re.compile(r"[A-Z0-9]+(-[A-Z]+)+-\d+")
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ def read(path: Path = TABLE) -> tuple[Document, ...]:
 
 def reference_error(reference: str) -> str | None:
     """Why ``reference`` leads nowhere; None if it does not. Anchors of pages are not looked up."""
-    if _REQUIREMENT.fullmatch(reference):
+    if REQUIREMENT.fullmatch(reference):
         return None if reference in _requirements() else "there is no such requirement"
     path, _, name = reference.partition("#")[0].partition("::")
     if not (ROOT / path).exists():
@@ -106,14 +103,13 @@ def reference_error(reference: str) -> str | None:
 
 
 @cache
-def _requirements() -> dict[str, str]:
-    """The page of each requirement, by id."""
-    return {r.id: PAGES[layer] for layer in PAGES for r in catalogue(layer=layer)}
+def _requirements() -> frozenset[str]:
+    return frozenset(r.id for r in catalogue(None, None))
 
 
 def _link(reference: str) -> str:
-    if _REQUIREMENT.fullmatch(reference):
-        return f"[{reference}]({_requirements().get(reference, 'conformance.md')})"
+    if REQUIREMENT.fullmatch(reference):
+        return reference
     target, _, name = reference.partition("::")
     page, _, anchor = target.partition("#")
     if page.startswith("docs/"):
@@ -132,7 +128,7 @@ def _cell(text: str) -> str:
 
 
 def page() -> str:
-    """The Markdown of docs/conformity.md."""
+    """The Markdown of the page, in docs/."""
     every = read()
     lines = [
         "# Conformity with the user's documents",
@@ -146,7 +142,7 @@ def page() -> str:
         "than one statement are in the [decisions](decisions.md); who wrote what is in the"
         " [sources](sources/README.md).",
         "",
-        "Made from `tools/generate/conformity.toml` by `make docs`; do not edit this page.",
+        "Made from `tools/generate/conformity.toml`.",
         "",
         "| status | meaning |",
         "| --- | --- |",
@@ -176,8 +172,3 @@ def page() -> str:
                 lines.append(f"| {_cell(row.says)} | {status} | {_cell(row.does)} | {where} |")
         lines.append("")
     return "\n".join(lines)
-
-
-def files() -> dict[Path, str]:
-    """The page by its path."""
-    return {PAGE: page()}

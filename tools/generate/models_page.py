@@ -1,4 +1,4 @@
-"""docs/models.md and its drawings: joints, limits, topics and rates of every model."""
+"""models.md and its drawings: joints, limits, topics and rates of every model."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from tools.generate.model_drawing import draw_hand, draw_robot
 __all__ = ["drawing", "files", "page"]
 
 _INTRO = """\
-<!-- made by python -m tools.generate, do not edit -->
-
 # The models
 
 Every hand and robot that dexkit knows, as it is on DDS. This page and its drawings are made from
@@ -46,7 +44,7 @@ def drawing(name: str) -> str:
 
 
 def page() -> str:
-    """The page as Markdown."""
+    """The page as Markdown, in docs/."""
     models = [describe(name, plugins=False) for name in names()]
     lines = [_INTRO, *_overview(models), _JOINTS, ""]
     for data in models:
@@ -55,11 +53,8 @@ def page() -> str:
 
 
 def files() -> dict[Path, str]:
-    """Every file that is made, with its content."""
-    made = {DOCS / "models.md": page()}
-    for name in names():
-        made[DOCS / "images" / f"model-{name}.svg"] = drawing(name)
-    return made
+    """The drawings, with their content."""
+    return {DOCS / "images" / f"model-{name}.svg": drawing(name) for name in names()}
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:

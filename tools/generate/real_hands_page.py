@@ -17,7 +17,6 @@ from dexkit import documents
 from dexkit.conformance.requirements import Level, Requirement, catalogue
 from dexkit.errors import UsageError
 from tools.generate import DOCS
-from tools.generate.requirement_pages import PAGES
 
 __all__ = ["TABLE", "VERDICTS", "Fact", "Hand", "Source", "basis", "files", "read", "verdicts"]
 
@@ -150,16 +149,6 @@ def _place(reference: str) -> str:
     return f"[`{page}`](../../{page})"
 
 
-def _requirement(name: str) -> str:
-    return f"[{name}](../{_pages()[name]})"
-
-
-@cache
-def _pages() -> dict[str, str]:
-    """The page of each requirement, by id."""
-    return {r.id: PAGES[layer] for layer in PAGES for r in catalogue(layer=layer)}
-
-
 def _facts(hand: Hand, numbers: dict[str, int]) -> list[str]:
     lines = [
         f'<a id="{hand.id}"></a>',
@@ -176,7 +165,7 @@ def _facts(hand: Hand, numbers: dict[str, int]) -> list[str]:
             f'| <a id="{fact.anchor}"></a>{_cell(fact.name)}'
             f" | {_cell(fact.assumes)} ({', '.join(map(_place, fact.where))})"
             f" | {_cell(fact.shows)}{seen} | {verdict}"
-            f" | {', '.join(map(_requirement, fact.requirements)) or '-'} |"
+            f" | {', '.join(fact.requirements) or '-'} |"
         )
     return [*lines, ""]
 

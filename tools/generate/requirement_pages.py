@@ -1,5 +1,4 @@
-"""The requirement catalogues in docs/conformance*.md, one page per layer, and the table of areas in
-docs/mutants.md.
+"""A page for each requirement, and the list of them.
 
 Of a requirement that is like another one, only the differences are written.
 """
@@ -9,60 +8,43 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Iterable
-from pathlib import Path
 
+from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue, renamed
 from dexkit.models import BUILT_IN
-from tools.generate import DOCS
 
-__all__ = ["PAGES", "area_table", "catalogue_entry", "catalogue_page", "files"]
+__all__ = ["REQUIREMENT", "area_table", "pages"]
 
-_BEGIN = "<!-- catalogue: made from conformance/requirements, do not edit -->"
-_END = "<!-- end of catalogue -->"
-_AREAS = "<!-- areas: made from conformance/requirements, do not edit -->"
-_END_AREAS = "<!-- end of areas -->"
-
+REQUIREMENT = re.compile(r"\b[A-Z0-9]+(?:-[A-Z]+)+-\d+\b")
+"""The id of a requirement."""
 
 _CITED = re.compile(r"docs/(sources/[\w-]+\.md#([a-z][\w-]*))")
-
-PAGES = {
-    "dds": "conformance.md",
-    "robot": "conformance-robots.md",
-    "usb": "conformance-usb.md",
-    "client": "conformance-client.md",
-}
-"""The page of each layer, in docs."""
-
-
-def catalogue_page(layer: str) -> str:
-    """Markdown of a layer's requirements, by area."""
-    wrong_hands = mutants(layer)
-    lines: list[str] = []
-    area = ""
-    every = catalogue(layer=layer)
-    derived = {r.model for r in every if r.like}  # they come after what they are like
-    for requirement in sorted(every, key=lambda r: r.model in derived):
-        heading = requirement.area
-        if layer == "robot":
-            heading = f"{requirement.model.upper()}: {heading}"
-        elif layer == "usb":
-            heading = heading.removeprefix("USB: ").capitalize()
-        if heading != area:
-            area = heading
-            lines += ["", f"### {area}", ""]
-        killers = [m.name for m in wrong_hands if m.kills == requirement.id]
-        lines += _entry(requirement, _judged_from(requirement), killers)
-    return "\n".join(lines)
-
 
 _wrong_hands = functools.cache(mutants)
 
 
-def catalogue_entry(requirement: Requirement, layer: str) -> str:
-    """Markdown of one requirement; its citations are seen from docs/."""
-    killers = [m.name for m in _wrong_hands(layer) if m.kills == requirement.id]
-    return "\n".join(_entry(requirement, _judged_from(requirement), killers))
+def pages() -> dict[str, str]:
+    """Markdown of the list and of each requirement, by its path as seen from docs/."""
+    made: dict[str, str] = {}
+    index = ["# Requirements", "", "Each has a page of its own, whose address stays.", ""]
+    area = ""
+    for layer in LAYERS:
+        for requirement in catalogue(layer=layer):
+            heading = f"{requirement.model}: {requirement.area}"
+            if heading != area:
+                area = heading
+                index += ["", f"## {heading}", ""]
+            index.append(f"- {requirement.id} ({requirement.level}) {requirement.title}")
+            made[f"requirements/{requirement.id}.md"] = _page(requirement)
+    index += ["", "## Areas that a model has not", *area_table()]
+    return {"requirements/index.md": "\n".join(index) + "\n", **made}
+
+
+def _page(requirement: Requirement) -> str:
+    killers = [m.name for m in _wrong_hands(requirement.layer) if m.kills == requirement.id]
+    lines = [f"# {requirement.id}: {requirement.title}", ""]
+    return "\n".join([*lines, *_entry(requirement, _judged_from(requirement), killers)])
 
 
 def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list[str]:
@@ -110,7 +92,7 @@ def _linked(text: str) -> str:
         target, anchor = match.groups()
         # a letter with a number is a section, all else the name of a fact
         section = re.sub(r"^([a-z])(?=\d)", lambda m: f"{m[1].upper()}.", anchor)
-        return f"[{section.upper() if len(anchor) == 1 else section}]({target})"
+        return f"[{section.upper() if len(anchor) == 1 else section}](../{target})"
 
     return _CITED.sub(link, text)
 
@@ -135,8 +117,8 @@ def _judged_from(requirement: Requirement) -> str:
     return f"{where}, in {' and '.join(requirement.dialects)}"
 
 
-def area_table() -> str:
-    """Markdown of the areas that each model has not, of those in which a hand can fail or warn."""
+def area_table() -> list[str]:
+    """Lines of the areas that each model has not, of those in which a hand can fail or warn."""
     has = {
         hand.name: dict.fromkeys(
             r.id.split("-")[1] for r in catalogue(hand.name) if r.level is not Level.INFO
@@ -149,20 +131,4 @@ def area_table() -> str:
         prefix = catalogue(name)[0].id.partition("-")[0]
         absent = ", ".join(area for area in every if area not in areas)
         lines.append(f"| {name} | {prefix} | {absent} |")
-    return "\n".join([*lines, ""])
-
-
-def files() -> dict[Path, str]:
-    """The pages with their catalogues and tables generated."""
-    made = {
-        DOCS / name: _filled(name, _BEGIN, catalogue_page(layer), _END)
-        for layer, name in PAGES.items()
-    }
-    return {**made, DOCS / "mutants.md": _filled("mutants.md", _AREAS, area_table(), _END_AREAS)}
-
-
-def _filled(name: str, begin: str, content: str, end: str) -> str:
-    """The text of a page with this content between two lines of it."""
-    text = (DOCS / name).read_text(encoding="utf-8")
-    head, tail = text[: text.index(begin) + len(begin)], text[text.index(end) :]
-    return f"{head}\n{content}\n{tail}"
+    return lines

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import posixpath
 import re
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.models import BUILT_IN
-from tools.generate.requirement_pages import PAGES, catalogue_entry
+from tools.generate import built_pages
+from tools.generate.requirement_pages import REQUIREMENT
 
 __all__ = ["on_config", "on_files", "on_page_content", "on_page_markdown"]
 
@@ -31,6 +32,11 @@ API = {
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 _ROLE = re.compile(r":(?:class|mod|func|meth|data|attr|exc):<code>~?(\.?[\w.]*\.)?~?([^<]*)</code>")
 _CODE = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
+_OTHER_OR_ID = re.compile(
+    r"^#.*$|!?\[(?:[^\[\]]|\[[^\]]*\])*\]\([^()\s]*\)|`[^`]*`|<[^>]*>"
+    rf"|(?P<id>{REQUIREMENT.pattern})",
+    re.MULTILINE,
+)
 
 
 def on_config(config: Any) -> Any:
@@ -56,8 +62,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **more: object) -> str:
-    """Make text of links that leave docs/."""
-    return local_links(markdown, page.file.src_uri)
+    """Make text of links that leave docs/, and links of the ids of requirements."""
+    path = page.file.src_uri
+    return requirement_links(local_links(markdown, path), path)
 
 
 def on_page_content(html: str, **more: object) -> str:
@@ -86,21 +93,28 @@ def local_links(markdown: str, path: str) -> str:
     return "".join(parts)
 
 
+def requirement_links(markdown: str, path: str) -> str:
+    """Link ids of requirements to their pages; headings, links and code are left alone.
+
+    :param path: of the page in docs/.
+    """
+    known = pages()
+
+    def replace(match: re.Match[str]) -> str:
+        page = f"requirements/{match['id']}.md"
+        if match["id"] is None or page not in known or page == path:
+            return match[0]
+        return f"[{match['id']}]({posixpath.relpath(page, posixpath.dirname(path) or '.')})"
+
+    parts = _CODE.split(markdown)
+    parts[::2] = [_OTHER_OR_ID.sub(replace, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+@functools.cache
 def pages() -> dict[str, str]:
     """Markdown of every page that is made, by its path."""
-    made = {"index.md": home(), "requirements/index.md": "", "api/index.md": ""}
-    index = ["# Requirements", "", "Each has a page of its own, whose address stays.", ""]
-    area = ""
-    for layer in PAGES:
-        for requirement in catalogue(layer=layer):
-            heading = f"{requirement.model}: {requirement.area}"
-            if heading != area:
-                area = heading
-                index += ["", f"## {heading}", ""]
-            name = requirement.id
-            index.append(f"- [{name}]({name}.md) ({requirement.level}) {requirement.title}")
-            made[f"requirements/{name}.md"] = requirement_page(requirement, layer)
-    made["requirements/index.md"] = "\n".join(index) + "\n"
+    made = {"index.md": home(), **built_pages()}
     listed = "\n".join(f"- [`{name}`]({name}.md): {title}" for name, title in API.items())
     made["api/index.md"] = f"# API\n\nMade from the docstrings.\n\n{listed}\n"
     for name, title in API.items():
@@ -124,17 +138,3 @@ def home() -> str:
 
 def _outside(target: str) -> str:
     return target if "://" in target or target.startswith("#") else f"../{target}"
-
-
-def requirement_page(requirement: Requirement, layer: str) -> str:
-    """The page of one requirement."""
-    entry = catalogue_entry(requirement, layer)
-    # sources are cited as seen from docs/
-    entry = re.sub(r"\]\((sources/)", r"](../\1", entry)
-    like = requirement.like
-    if like:
-        entry = entry.replace(f"Like {like}.", f"Like [{like}]({like}.md).")
-    return (
-        f"# {requirement.id}: {requirement.title}\n\n{entry}\n\n"
-        f"All requirements of this layer: [{PAGES[layer]}](../{PAGES[layer]}).\n"
-    )
