@@ -1,46 +1,17 @@
-"""Measure a file as it will be named in a manifest or a result: size, SHA-256 and CRC-32.
-
-The file is read in pieces, so that a recording of any size needs little memory.
-"""
+"""Read a file in pieces, and its SHA-256: a recording of any size needs little memory."""
 
 from __future__ import annotations
 
 import hashlib
-import zlib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 from dexkit.documents import open_ordinary
 from dexkit.errors import DexkitError, UsageError
 
-__all__ = ["Digest", "digest_of", "file_pieces", "sha256_of_file"]
+__all__ = ["file_pieces", "sha256_of_file"]
 
 _PIECE = 1 << 20  # bytes
-
-
-@dataclass(frozen=True)
-class Digest:
-    """Size and checksums of a content.
-
-    :param size: bytes.
-    :param sha256: 64 hexadecimal digits, lower case.
-    :param crc: CRC-32 as zip archives have it.
-    """
-
-    size: int
-    sha256: str
-    crc: int
-
-
-def digest_of(pieces: Iterable[bytes]) -> Digest:
-    """The digest of a content that comes in pieces."""
-    size, crc, sha = 0, 0, hashlib.sha256()
-    for piece in pieces:
-        size += len(piece)
-        crc = zlib.crc32(piece, crc)
-        sha.update(piece)
-    return Digest(size, sha.hexdigest(), crc)
 
 
 def file_pieces(path: Path, *, error: type[DexkitError] = UsageError) -> Iterator[bytes]:
@@ -64,4 +35,7 @@ def sha256_of_file(path: Path) -> str:
 
     :raises UsageError: it cannot be read.
     """
-    return digest_of(file_pieces(path)).sha256
+    digest = hashlib.sha256()
+    for piece in file_pieces(path):
+        digest.update(piece)
+    return digest.hexdigest()

@@ -36,8 +36,6 @@
     ├── ModelBroken                     a hand model of another package cannot be used
     ├── EmulatorError                   an emulated device cannot be set up as asked
     ├── ConformanceError                the kit itself cannot judge (not a verdict on the hand)
-    ├── ArchiveError                    not an archive as 'dexkit sign' writes it
-    ├── SigningError                    the tool that signs is missing, or cannot use the key
     ├── OutputError (OSError)           a file or stream cannot be written: disk full, pipe closed
     ├── ResourceError                   memory or threads do not suffice
     └── UsageError (ValueError)         arguments or configuration that make no sense
@@ -51,7 +49,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 __all__ = [
-    "ArchiveError",
     "BackendBroken",
     "BackendConflict",
     "BackendError",
@@ -80,7 +77,6 @@ __all__ = [
     "OversizeError",
     "ResourceError",
     "SessionError",
-    "SigningError",
     "TopicConflict",
     "TraceError",
     "TraceUnreadable",
@@ -265,18 +261,6 @@ class EmulatorError(DexkitError):
 
 class ConformanceError(DexkitError):
     """The kit itself cannot judge; this is no result about the hand."""
-
-    exit_code = 2
-
-
-class ArchiveError(DexkitError):
-    """Not an archive as ``dexkit sign`` writes it: cut short, compressed, with unsafe names, ..."""
-
-    exit_code = 2
-
-
-class SigningError(DexkitError):
-    """A signature cannot be made or checked: no tool, or it cannot use the key."""
 
     exit_code = 2
 

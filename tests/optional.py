@@ -24,10 +24,8 @@ __all__ = [
     "access_times",
     "chromium",
     "header",
-    "minisign",
     "namespaces",
     "python",
-    "ssh_keygen",
 ]
 
 UNSHARE = ["unshare", "--user", "--map-root-user", "--net"]
@@ -44,16 +42,6 @@ class Optional(NamedTuple):
     name: str
     there: Callable[[], object]
     tests: tuple[str, ...]
-
-
-def ssh_keygen() -> str | None:
-    """OpenSSH's tool that signs."""
-    return shutil.which("ssh-keygen")
-
-
-def minisign() -> str | None:
-    """The other tool that signs."""
-    return shutil.which("minisign")
 
 
 @functools.cache
@@ -111,8 +99,6 @@ OPTIONAL = (
     Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
     Optional("the package rerun-sdk", _package("rerun"), ("view_forward",)),
     Optional("the package foxglove-sdk", _package("foxglove"), ("view_forward",)),
-    Optional("ssh-keygen", ssh_keygen, ("signing",)),
-    Optional("minisign", minisign, ("signing",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
     Optional("access times of files", access_times, ("campaign_fuzzers",)),
     Optional("root", lambda: os.geteuid() == 0, ("files", "install_service")),

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from tools.campaign.case import Batch, Case, Skip
-from tools.campaign.fuzz import Difference, archives, devices, drivers, recordings, sources
+from tools.campaign.fuzz import Difference, devices, drivers, recordings, sources
 from tools.campaign.fuzz.ground import ELSEWHERE, Ground
 
-FOLDERS = [*sources.cases(), *archives.cases()]
+FOLDERS = sources.cases()
 CASES = [*devices.cases(), *drivers.cases(), *recordings.cases(), *FOLDERS]
 _SLOW = {"fuzz:mcap"}  # 'make campaign-sample' runs it, too
 

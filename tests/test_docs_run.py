@@ -25,7 +25,6 @@ from dexkit.emulators.mx64 import emulated_ezgripper
 from dexkit.traces import sample_path
 from tests.docs_commands import ROOT, Shown, shown_commands
 from tests.namespaces import Host, Link, network, unavailable
-from tests.optional import ssh_keygen
 from tests.patience import PATIENCE
 
 pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10: dexkit setup-dds")
@@ -72,7 +71,7 @@ def host() -> Iterator[Host]:
 
 @pytest.fixture(scope="module")
 def files(host: Host, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What readers have: recordings, results, and a key."""
+    """What readers have: recordings and results."""
     folder = tmp_path_factory.mktemp("reader")
     dexkit = [*host.enter, sys.executable, "-m", "dexkit"]
     suite = [*host.enter, sys.executable, "-m", "pytest", "-q", "--pyargs", "dexkit.conformance"]
@@ -99,8 +98,6 @@ def files(host: Host, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("before", "after", "v1.0", "v1.1", "a", "b", "c"):
         shutil.copy(folder / "result.json", folder / f"{name}.json")
     (folder / "capabilities.toml").write_text("[claims]\nforce = true\n")
-    if ssh_keygen():
-        run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / "key")
     return folder
 
 

@@ -19,7 +19,6 @@ from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.result_file import read_json
-from dexkit.conformance.signed.verify import verify_archive
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.doctor.environment import uri_problem
@@ -28,7 +27,6 @@ from dexkit.emulators.simulated_hand import Mechanics, SimulatedHand
 from dexkit.errors import DexkitError, OutputError, UsageError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1
-from dexkit.signatures import SSH_KEYGEN, PublicKey, sign
 from dexkit.traces import open_trace
 from dexkit.traces.sessions.lerobot_format import read_parquet
 from dexkit.traces.sessions.rosbag import import_bag
@@ -91,9 +89,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "urdf": lambda path: read_urdf(path, DEX1_1.joints[Side.LEFT]),
     "recording": open_trace,
     "digest": digests.sha256_of_file,
-    "archive": lambda path: verify_archive(path, PublicKey(SSH_KEYGEN, "")),
-    "key": PublicKey.read,
-    "private key": lambda path: sign(SSH_KEYGEN, b"", path),
     "settings, to be changed": lambda path: documents.update_file(path, lambda text: text or ""),
     "pose": lambda path: SimulatedHand(
         DEX1_1.spec(Side.LEFT, io_rate=100.0), cast(Mechanics, None), 0.01

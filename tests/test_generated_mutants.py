@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from dataclasses import replace
@@ -22,7 +23,6 @@ from dexkit.conformance.mutants.generated.times import WHENS
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
-from dexkit.digests import digest_of
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.hand import Side
 from dexkit.models import Dialect, dialect, model
@@ -483,7 +483,7 @@ def digest_of_the_code() -> str:
     folders = ("conformance", "dexkit", "drivers", "emulators", "traces")
     files = (f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file())
     code = sorted(f for f in files if f.suffix in {".py", ".toml"})
-    return digest_of(piece for f in code for piece in (f.name.encode(), f.read_bytes())).sha256
+    return hashlib.sha256(b"".join(f.name.encode() + f.read_bytes() for f in code)).hexdigest()
 
 
 def test_the_digest_of_the_code_depends_on_the_requirements(

@@ -43,11 +43,9 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("record",): ["<new>"],
     ("replay",): [_SAMPLE],
     ("report",): ["<result>"],
-    ("sign",): ["<result>", "--key", "<result>"],
     ("selftest",): ["--external", "--dialect", "unitree_go", "--side", "left"],
     ("serve",): ["sim-dex1", "--side", "left"],
     ("teleop",): ["full-stroke"],
-    ("verify",): ["<result>", "--public-key", "<result>"],
 }
 """What a command needs so that it comes to look at the rest."""
 _SLOW = {("demo",), ("mutants",), ("emulate", "all")}

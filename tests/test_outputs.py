@@ -33,6 +33,7 @@ _WRITERS: dict[tuple[str, ...], list[str]] = {
 """Commands that write files by options, with what they need for it."""
 _INPUTS = {
     "--pictures",
+    "--against",
     "--capabilities",
     "--recording",
     "--eeprom",
@@ -40,9 +41,6 @@ _INPUTS = {
     "--answers",
     "--baseline",
     "--from-source",
-    "--key",
-    "--page",
-    "--public-key",
     "--wire",
     "--beside-episodes",
 }
@@ -58,7 +56,6 @@ _ELSEWHERE = {
     ("monitor", "--log"),  # a key begins it: tests/test_monitor_terminal.py
     ("setup-dds", "--wheel"),  # tests/test_setup_dds.py
     ("setup-dds", "--log"),
-    ("sign", "-o"),  # tests/test_signing.py, which has a key
     ("teleop", "--record"),  # as 'record' writes
 }
 

@@ -10,17 +10,17 @@ from typing import Any
 
 import pytest
 
+from dexkit.conformance import rejudge
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
+from dexkit.conformance.rejudge import Comparison, compare_with_recording
 from dexkit.conformance.requirements import CAPABILITIES, Kind, catalogue
 from dexkit.conformance.result_file import parse_result
 from dexkit.conformance.results import Evidence, Overall, Verdict
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.run_record import RECORD, run_record
 from dexkit.conformance.selection import RunKind
-from dexkit.conformance.signed import rejudge
-from dexkit.conformance.signed.rejudge import Comparison, compare_with_recording
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.robot import ReferenceRobot
@@ -29,6 +29,7 @@ from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import ROBOT, Side
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.recorder import Recorder
+from tests import hostile
 from tests.each import each
 from tests.reproduction_helpers import CLAIMS, write_run, write_trace
 
@@ -321,3 +322,85 @@ def test_difference_shows_no_control_characters(of_run: Document) -> None:
     (found,) = rejudge.document_differences(forged, judged)
     assert str(found).isprintable()
     assert len(str(found)) < 600
+
+
+# -------------------------------------------------------------------------- the command
+
+
+def against(recording: Path, result: object, *more: object) -> tuple[int, str, str]:
+    """Exit code and output of ``dexkit check RECORDING --against RESULT``."""
+    words = ("check", recording, "--against", result, *more)
+    code, out, err = hostile.run_command([str(w) for w in words])
+    assert "Traceback" not in err
+    return code, out, err
+
+
+@pytest.fixture
+def result(tmp_path: Path, session: Path) -> Path:
+    """The result file that ``dexkit check`` writes of the session."""
+    path = tmp_path / "result.json"
+    code, out, _ = hostile.run_command(["check", str(session), "--json", str(path)])
+    assert code == 1  # a hand that drops out
+    assert sha256_of_file(session) in out
+    return path
+
+
+def test_command_finds_an_unchanged_result_the_same(result: Path, session: Path) -> None:
+    code, out, err = against(session, result)
+    assert (code, err) == (0, "")
+    assert "the same: " in out
+    assert "drop-in: FAIL: a MUST is not met" in out
+    assert "as stated, not compared: environment.python " in out
+    assert "as stated, not compared: subject.recording " in out
+
+
+@each("name", ("score", "note"))
+def test_command_names_a_forged_member(
+    name: str, tmp_path: Path, of_session: Document, session: Path
+) -> None:
+    change, path = FORGED[name]
+    forged = tmp_path / "result.json"
+    forged.write_text(json.dumps(changed(of_session, change)))
+    code, out, err = against(session, forged)
+    assert (code, err) == (1, "")
+    assert out.rstrip().splitlines()[-1].startswith(f"  {path}: ")
+
+
+def test_command_finds_removed_failures(result: Path, session: Path) -> None:
+    result.write_text(json.dumps(without_failures(json.loads(result.read_text()))))
+    code, out, _ = against(session, result)
+    assert code == 1
+    assert "a part only: " in out
+    assert "left out, fail when judged: " in out
+    assert "all requirements together: FAIL: a MUST is not met" in out
+    assert "\n  grades.drop-in.sentence: " in out
+
+
+def test_command_names_an_honest_part(tmp_path: Path, session: Path) -> None:
+    part = tmp_path / "part.json"
+    words = ["check", str(session), "--require", "DEX1-TOPIC", "--json", str(part)]
+    assert hostile.run_command(words)[0] == 0
+    code, out, _ = against(session, part)
+    assert code == 0
+    assert "a part only: " in out
+    assert "all requirements together: FAIL" in out
+    assert "PASS:" not in out
+
+
+def test_command_refuses_another_recording(result: Path) -> None:
+    other = sample_path("dex3_pinch")
+    code, out, err = against(other, result)
+    assert (code, err) == (1, "")
+    assert "is not the recording that" in out
+    assert sha256_of_file(other) in out
+
+
+def test_command_needs_two_usable_files_and_no_options(result: Path, session: Path) -> None:
+    assert against(session, session)[0] == 2
+    code, _, err = against(session, result, "--side", "left")
+    assert (code, "takes no other options" in err) == (2, True)
+    text = result.read_text()
+    for bad in (text + "{}", text.replace("{", '{"format": 1,', 1), '{"format": "another"}'):
+        result.write_text(bad)
+        code, out, _ = against(session, result)
+        assert (code, out) == (2, "")

@@ -34,8 +34,6 @@ _SECTIONS: Sections = {
         "report": ("dexkit.cli.report", "Write the reports of a result."),
         "compare": ("dexkit.cli.compare", "Compare several results."),
         "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
-        "sign": ("dexkit.cli.sign", "Sign a result with its recording as one archive."),
-        "verify": ("dexkit.cli.verify", "Verify a signed result, and judge it again."),
         "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
     },
     "Sessions": {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -27,17 +28,22 @@ from dexkit.cli.options import (
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
 from dexkit.errors import ConformanceError, UsageError
+from dexkit.escaping import REMARK, one_line
 from dexkit.hand import Side
 from dexkit.models import DIALECTS
 from dexkit.robots import ROBOTS
+
+_MOST = 40
+"""Differences from a result that are printed."""
 
 
 @click.command(
     "check",
     cls=Command,
     exit_codes={
-        0: "every MUST that could be judged is met; with --grade, those of that grade",
-        1: "one is not met",
+        0: "every MUST that could be judged is met; with --grade, those of that grade; with "
+        "--against, nothing differs, whatever the verdict",
+        1: "one is not met; with --against, something differs, or it is another recording",
         2: "the recording is not usable or damaged (what is left is judged all the same), "
         "nothing in it could be judged, or the client did not allow to judge a MUST",
     },
@@ -64,6 +70,12 @@ from dexkit.robots import ROBOTS
     metavar="FILE.toml",
     help=f"{option_texts.CAPABILITIES}. Default: what the recording of a run says",
 )
+@click.option(
+    "--against",
+    type=FILE,
+    metavar="RESULT.json",
+    help="Judge again and compare with this result, without any other option.",
+)
 @list_option(option_texts.LIST)
 @json_file_option(option_texts.RESULT)
 @junit_option()
@@ -78,6 +90,7 @@ def command(
     level: str | None,
     grade: str | None,
     capabilities: Path | None,
+    against: Path | None,
     list_only: bool,
     json_path: Path | None,
     junit_path: Path | None,
@@ -90,7 +103,14 @@ def command(
     conformance run with all its stimuli. In a session the client's commands are judged too; errors
     of the client do not fail the hand. With --require DEX1-CLIENT (DEX3-, DEX5-) the verdict is
     about the client.
+
+    With --against, the recording is judged with all requirements, and everything that the result
+    file states is compared: requirements, verdicts, grades, figures and texts. What no recording
+    tells is printed as stated.
     """
+    if against is not None:
+        _compare(recording, against)
+        return
     from dexkit.conformance.claims import Claims
     from dexkit.conformance.judge import judge
     from dexkit.conformance.layers import recording_of
@@ -137,7 +157,7 @@ def command(
         print_selection(requirements)
         return
     if view is None or recording is None:
-        raise UsageError("which recording is to be judged?", hint="dexkit check RECORDING.mcap")
+        raise _no_recording()
     subject = {"recording": recording.name}
     if imported is None:  # else it is of several files, or a temporary one
         subject["recording_sha256"] = sha256_of_file(trace.path)
@@ -169,3 +189,54 @@ def command(
             hint="'dexkit info' names all of the damage; record again, or copy the file again",
         )
     sys.exit(result.exit_code(None if grade is None else Kind(grade)))
+
+
+def _no_recording() -> UsageError:
+    return UsageError("which recording is to be judged?", hint="dexkit check RECORDING.mcap")
+
+
+def _compare(recording: Path | None, result: Path) -> None:
+    """Judge a recording again, and print what differs from a result.
+
+    :raises click.exceptions.Exit: something does.
+    """
+    from dexkit import __version__, documents
+    from dexkit.conformance.rejudge import compare_with_recording
+    from dexkit.conformance.requirements import Kind
+    from dexkit.conformance.result_file import parse_result
+    from dexkit.digests import sha256_of_file
+
+    context = click.get_current_context()
+    for name in context.params.keys() - {"recording", "against"}:
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            raise UsageError("--against takes no other options: it judges as the result says")
+    if recording is None:
+        raise _no_recording()
+    document = documents.read_json(result)
+    stated = parse_result(document, result)
+    named, real = stated.subject.get("recording_sha256"), sha256_of_file(recording)
+    if named is not None and named != real:
+        click.echo(f"DIFFERS: {recording} is not the recording that {result} was judged from")
+        click.echo(f"  SHA-256 {one_line(named)} in the result, {real} of the recording")
+        raise click.exceptions.Exit(1)
+    found = compare_with_recording(document, recording)
+    for line in [*found.remarks, *found.part()]:
+        click.echo(one_line(line, REMARK))
+    for path, value in found.stated.items():
+        shown = one_line(json.dumps(value, ensure_ascii=False), REMARK)
+        click.echo(f"as stated, not compared: {path} {shown}")
+    if not found.differences:
+        click.echo(f"the same: {recording}, judged by dexkit {__version__}, gives {result}")
+        # the last line of a part is the verdict of all requirements together
+        for kind in () if found.is_part else Kind:
+            click.echo(f"  {one_line(stated.grade(kind).sentence(), REMARK)}")
+        return
+    click.echo(f"DIFFERS: {result} is not what {recording} gives")
+    for difference in found.differences[:_MOST]:
+        click.echo(f"  {difference}")
+    if len(found.differences) > _MOST:
+        click.echo(f"  and {len(found.differences) - _MOST} more differences")
+    made_by = stated.environment.get("dexkit", "of an unknown version")
+    if made_by != __version__:
+        click.echo(f"  dexkit {one_line(made_by)} judged, and this is {__version__}: use that one")
+    raise click.exceptions.Exit(1)

@@ -15,8 +15,8 @@ __all__ = ["all_cases", "case", "select"]
 def all_cases() -> tuple[Case, ...]:
     """Every case, fuzzers first."""
     from tools.campaign import devices, disk, options, peers, programs, soak
+    from tools.campaign.fuzz import devices as fuzzed_devices
     from tools.campaign.fuzz import (
-        archives,
         drivers,
         files,
         messages,
@@ -25,12 +25,10 @@ def all_cases() -> tuple[Case, ...]:
         sessions,
         sources,
     )
-    from tools.campaign.fuzz import devices as fuzzed_devices
 
     found: list[Case] = []
     fuzzers = (packet_codecs, messages, fuzzed_devices, drivers, recordings, sessions, files)
-    untrusted = (sources, archives)
-    for module in (*fuzzers, *untrusted, devices, programs, peers, disk, options, soak):
+    for module in (*fuzzers, sources, devices, programs, peers, disk, options, soak):
         found += module.cases()
     return tuple(found)
 

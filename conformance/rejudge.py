@@ -40,7 +40,6 @@ __all__ = [
     "Difference",
     "compare_with_recording",
     "document_differences",
-    "self_differences",
 ]
 
 STATED = ("subject.recording", "environment.python", "environment.system")
@@ -173,15 +172,6 @@ def compare_with_recording(document: Mapping[str, Any], recording: Path) -> Comp
         kind=_kind(every, listed),
         remarks=tuple(remarks),
     )
-
-
-def self_differences(document: Mapping[str, Any], found: RunResult) -> list[Difference]:
-    """Where a result contradicts itself: summaries and sentences that its own verdicts do not give,
-    and members that no result has. The recording is not needed.
-
-    :param found: the result that was read from ``document``.
-    """
-    return list(document_differences(document, found))
 
 
 def document_differences(

@@ -1,1 +1,0 @@
-"""Signed archives of results: :mod:`~.manifest`, :mod:`~.sign`, :mod:`~.verify`."""
