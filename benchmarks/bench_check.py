@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks import Result
+from dexkit.conformance.hands.dex1 import DEX1_1
+from dexkit.conformance.hands.dex3 import DEX3_1
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
-from dexkit.models import DEX1_1, DEX3_1
 from dexkit.traces import Recorder, open_trace, sample_path
 
 _TARGET = 200.0
@@ -39,7 +40,7 @@ def run() -> list[Result]:
         try:
             floor = _process(folder, "-c", "import numpy").seconds
             for hand in _HANDS:
-                title, sample = hand.title.partition(" ")[0], str(hand.session)
+                title, sample = hand.model.title.partition(" ")[0], str(hand.session)
                 judge(Recording.decode(open_trace(sample_path(sample))))  # loads what it needs
                 for wanted in _LENGTHS:
                     path = Path(folder) / f"{sample}_{wanted:g}.mcap"

@@ -45,13 +45,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     environment has the short name, so that pytest does not fail there.
     """
     from dexkit import option_texts as texts
-    from dexkit.models import BUILT_IN, DIALECTS
+    from dexkit.conformance.hands import BUILT_IN
+    from dexkit.models import DIALECTS
     from dexkit.robots import ROBOTS
 
     objects = "; ".join(
-        f"{model.name} {side}={percent:g}"
-        for model in BUILT_IN
-        for side, percent in model.objects.items()
+        f"{each.model.name} {side}={percent:g}"
+        for each in BUILT_IN
+        for side, percent in each.objects.items()
     )
     group = parser.getgroup("dexkit conformance", "judge a hand on Unitree's topics")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.requirements import Level, Requirement
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
@@ -62,7 +63,7 @@ def quick(requirements: Sequence[Requirement]) -> tuple[Requirement, ...]:
 
 
 def _quick_phases(model_name: str) -> frozenset[str]:
-    return frozenset((ROBOTS.get(model_name) or model(model_name)).quick_phases)
+    return frozenset(under_test(model_name).quick_phases)
 
 
 def print_selection(requirements: Sequence[Requirement]) -> None:

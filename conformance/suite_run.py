@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.known_backends import (
     EXTERNAL,
@@ -181,7 +182,7 @@ class SuiteOptions:
                 )
         started = backend in SIMULATED or emulator_of(backend) is not None
         if not objects and started and not devices:
-            by_side = {s: p for s, p in model(chosen.model).objects.items() if s in sides}
+            by_side = {s: p for s, p in under_test(chosen.model).objects.items() if s in sides}
         if domain is None and (backend == EXTERNAL or devices):
             domain = 0
         if domain is not None and not 0 <= domain <= 230:

@@ -14,11 +14,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 from dexkit.errors import UsageError
-from dexkit.hand import JointSpec, RobotSubject
+from dexkit.hand import JointSpec
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
-    from dexkit.conformance.stimuli.script import Script
     from dexkit.kinematics import Skeleton
     from dexkit.robot_layout import RobotLayout
 
@@ -31,9 +30,6 @@ DQ_STOP = 16000.0
 """A ``dq`` that means "no velocity" (docs/sources/unitree-dex.md#a8)."""
 
 
-_SCRIPT: Lazy[type[Script[RobotSubject]]] = Lazy("dexkit.conformance.stimuli.robot:RobotScript")
-
-
 @dataclass(frozen=True)
 class RobotModel:
     """One robot.
@@ -44,9 +40,6 @@ class RobotModel:
     :param battery_cells: of the battery, in series.
     :param teleop_name: its name in xr_teleoperate (``--arm``).
     :param lerobot_name: its name in LeRobot (``--robot.type``), or empty.
-    :param requirements: its requirement files, in dexkit's own folder.
-    :param script: its stimulus script in the conformance kit.
-    :param quick_phases: phases of a quick conformance run.
     :param layout: how it is drawn in the docs.
     :param skeleton: makes the joint axes and origins, for the viewer.
     :param joints: by motor slot; None where the slot is not used.
@@ -72,8 +65,6 @@ class RobotModel:
     has_battery: bool
     battery_cells: int
     teleop_name: str
-    requirements: tuple[str, ...]
-    quick_phases: tuple[str, ...]
     layout: Lazy[RobotLayout]
     skeleton: Lazy[Callable[[], Skeleton]]
     joints: tuple[JointSpec | None, ...]
@@ -96,7 +87,6 @@ class RobotModel:
     # inferred: the sources are silent; the protection of the hands' motors trips after 1 s
     # (docs/sources/unitree-dex.md#b4)
     command_timeout: float = 1.0
-    script: Lazy[type[Script[RobotSubject]]] = _SCRIPT
     lerobot_name: str = ""
     unit: ClassVar[str] = "rad"
     torque_unit: ClassVar[str] = "N m"
@@ -217,8 +207,6 @@ H1 = RobotModel(
     has_battery=True,
     battery_cells=15,  # as many as its state has fields for (docs/sources/unitree-dex.md#a2)
     teleop_name="H1",
-    requirements=("h1.toml",),
-    quick_phases=("joint", "late-joiner"),
     layout=Lazy("dexkit.robot_layout:H1"),
     skeleton=Lazy("dexkit.models.skeletons:h1"),
     joints=_h1_joints,
@@ -288,8 +276,6 @@ G1 = RobotModel(
     battery_cells=13,  # the G1's datasheet
     teleop_name="G1_29",
     lerobot_name="unitree_g1",
-    requirements=("g1.toml",),
-    quick_phases=("joint", "late-joiner"),
     layout=Lazy("dexkit.robot_layout:G1"),
     skeleton=Lazy("dexkit.models.skeletons:g1"),
     joints=_g1_joints,

@@ -9,6 +9,7 @@ import pytest
 
 from dexkit.conformance import requirements
 from dexkit.conformance.checks import REGISTRY, check_of
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Level, catalogue, models, parse, select
@@ -150,7 +151,7 @@ def test_needed_stimuli_exist(name: str) -> None:
     script.length()
     # there is no session here
     assert needed - {p.name for p in script.phases} == (
-        {"replay"} if model(name).session else set()
+        {"replay"} if under_test(name).session else set()
     )
 
 

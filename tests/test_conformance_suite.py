@@ -15,6 +15,7 @@ import pytest
 
 from dexkit.conformance import suite_run
 from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.known_backends import EXTERNAL
 from dexkit.conformance.live import LiveOptions, record_run
@@ -32,7 +33,7 @@ from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.on_dds import ServiceOnDds
 from dexkit.errors import ConformanceError, TopicConflict, UnknownBackend, UsageError
 from dexkit.hand import Side
-from dexkit.models import BUILT_IN, dialect, model
+from dexkit.models import BUILT_IN, dialect
 from dexkit.robots import ROBOTS
 from dexkit.service.realtime import real_time
 from dexkit.traces import Recorder, open_trace, sample_path
@@ -162,7 +163,7 @@ def test_selection_is_listed_without_hand(tmp_path: Path) -> None:
 def test_quick_run_has_musts_of_its_phases(name: str) -> None:
     every = requirements(name, None)
     chosen = quick(every)
-    planned = frozenset((ROBOTS.get(name) or model(name)).quick_phases)
+    planned = frozenset(under_test(name).quick_phases)
     assert phases_for(chosen) == planned
     assert "late-joiner" in planned  # a client that never gets a state is the worst that happens
     assert "replay" not in planned

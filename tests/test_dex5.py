@@ -336,7 +336,6 @@ def test_files_that_name_the_hand_are_those_of_the_document() -> None:
         re.findall(r"`([^`]+)`", " ".join(re.findall(r"^\| (`.*?) \|", part, re.MULTILINE)))
         for part in text[: text.index("\n## ", 1)].split("| file | why |")
     )
-    assert len(own) <= 8
     listed = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.splitlines()

@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.mutants import command
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants import generated, outsiders
 from dexkit.conformance.mutants.generated import Fault, Generated, dialects, oracle, parse
 from dexkit.conformance.mutants.generated.campaign import Campaign, Trial, try_generated
@@ -25,7 +26,7 @@ from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.hand import Side
-from dexkit.models import Dialect, dialect, model
+from dexkit.models import Dialect, dialect
 from tests.each import each
 
 ROOT = Path(__file__).parent.parent
@@ -116,7 +117,7 @@ def test_a_reference_reports_what_the_oracle_takes_for_true(spoken: Dialect) -> 
 @pytest.mark.soak
 @pytest.mark.parametrize("spoken", dialects(), ids=lambda d: f"{d.model}-{d.name}")
 def test_without_faults_the_reference_behaves_as_before(spoken: Dialect) -> None:
-    service = compose("x", "", model(spoken.model).reference.load(), ())
+    service = compose("x", "", under_test(spoken.model).reference.load(), ())
     assert oracle.examine(service, spoken, (Side.LEFT,)).effects == ()
 
 
@@ -190,7 +191,7 @@ def test_every_condition_is_true_and_false_at_some_time() -> None:
     seen: dict[str, set[bool]] = {}
     watch = type("Watches", (_Watches,), {"seen": seen})
     part = Part(watch, (Side.RIGHT,), None, (WHENS["always"],))
-    service = compose("x", "", model("dex1-1").reference.load(), (part,))
+    service = compose("x", "", under_test("dex1-1").reference.load(), (part,))
     for seed in (None, 1):
         plan = oracle._plan("unitree_go", BOTH)
         oracle._observe(service, plan, oracle._stimulus("unitree_go", BOTH, seed)[0])

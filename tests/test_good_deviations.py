@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants import generated
 from dexkit.conformance.mutants.generated import Fault, Generated, dialects, parse
 from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
@@ -125,7 +126,7 @@ def test_states_leave_in_order_and_often_enough(spoken: Dialect, one_in: int) ->
 def test_a_late_state_is_late_once(spoken: Dialect, what: str, late: float) -> None:
     """Also where one message holds both hands."""
     seen: list[float] = []
-    reference = model(spoken.model).reference.load()
+    reference = under_test(spoken.model).reference.load()
 
     class Measures(reference):  # type: ignore[misc, valid-type]
         def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
@@ -198,7 +199,7 @@ def test_a_hand_has_no_noise_on_what_it_does_not_measure(what: str) -> None:
 
 def test_no_hand_of_a_sample_has_noise_on_what_it_does_not_measure() -> None:
     for hand in generated.sample_good(1000, 4, dialects()):
-        measured = model(hand.dialect.model).reference.load().measured_members
+        measured = under_test(hand.dialect.model).reference.load().measured_members
         assert all(not f.made.needs or f.made.needs in measured for f in hand.faults), hand.name
     needs = {w.needs for w in DEVIATIONS.values()}
     assert needs == {"", "dq", "tau_est"}
@@ -216,7 +217,7 @@ class _Adds(What):
 
 def test_what_is_added_to_an_unmeasured_value_is_not_added_to_the_next_state() -> None:
     spoken = dialect("inspire_dfx")
-    reference = model(spoken.model).reference.load()
+    reference = under_test(spoken.model).reference.load()
     always = Part(_Adds, tuple(Side), None, (WHENS["always"],))
     service = compose("x", "", reference, [always])(spoken, tuple(Side), {})
     service.advance(service.tick)

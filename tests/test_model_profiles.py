@@ -20,6 +20,7 @@ from click.testing import CliRunner
 
 import dexkit.models
 from dexkit.cli import cli
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants import mutants, plan_for, run_mutant
 from dexkit.conformance.mutants.matrix import chosen, cost, try_one
 from dexkit.conformance.requirements import catalogue
@@ -42,6 +43,8 @@ STATE_TYPE = "unitree_hg::msg::dds_::HandState_"
 ENTRIES = """\
 [dexkit.models]
 twofinger-1 = twofinger_hand.profile:TWOFINGER_1
+[dexkit.conformance_hands]
+twofinger-1 = twofinger_hand.under_test:UNDER_TEST
 [dexkit.backends]
 sim-twofinger = twofinger_hand.simulated:sim_twofinger
 """
@@ -187,7 +190,7 @@ def forget() -> None:
     ]
     for cached in (
         *(requirements.catalogue, requirements._files, requirements._requirements),
-        *(requirements._document, mutants, lazy._load),
+        *(requirements._document, mutants, lazy._load, dexkit.models.registered_record),
     ):
         cached.cache_clear()
 
@@ -239,7 +242,7 @@ def test_a_model_of_another_package_is_listed(example: Packages) -> None:
 
 
 def test_the_reference_of_the_example_meets_every_requirement(example: Packages) -> None:
-    result = run_mutant(model(NAME).reference.load(), plan_for(DIALECT))
+    result = run_mutant(under_test(NAME).reference.load(), plan_for(DIALECT))
     bad = [r.explain() for r in result.results if str(r.verdict) not in ("pass", "n/a")]
     assert result.overall is Overall.PASS, "\n".join(bad)
     assert {r.requirement.id for r in result.results} == {r.id for r in catalogue(NAME)}
@@ -331,10 +334,11 @@ REQUIREMENTS = """
 from dataclasses import replace
 from pathlib import Path
 from twofinger_hand.profile import TWOFINGER_1
+from twofinger_hand.under_test import UNDER_TEST as FIRST
 dialect = replace(TWOFINGER_1.dialects[0], name="second", model="second-1",
     cmd_topic="rt/second/{side}/cmd", state_topic="rt/second/{side}/state")
-MODEL = replace(TWOFINGER_1, name="second-1", dialects=(dialect,),
-    requirements=(Path(__file__).with_name("second.toml"),))
+MODEL = replace(TWOFINGER_1, name="second-1", dialects=(dialect,))
+UNDER_TEST = replace(FIRST, model=MODEL, requirements=(Path(__file__).with_name("second.toml"),))
 """
 
 
@@ -351,12 +355,38 @@ def test_a_broken_requirement_file_affects_no_other_model(
     example: Packages, text: str | None, why: str
 ) -> None:
     entries = "[dexkit.models]\nsecond-1 = second_hand:MODEL\n"
+    entries += "[dexkit.conformance_hands]\nsecond-1 = second_hand:UNDER_TEST\n"
     example.install("second-hand", entries, second_hand=REQUIREMENTS)
     if text is not None:
         (example.path / "second.toml").write_text(text)
     assert {r.model for r in catalogue()} == {*(m.name for m in BUILT_IN), NAME}
     with pytest.raises(UsageError, match=why):
         catalogue("second-1")
+
+
+def test_a_model_that_its_package_does_not_judge_has_no_requirements(example: Packages) -> None:
+    example.install("second-hand", "[dexkit.models]\nsecond-1 = second_hand:MODEL\n",
+                    second_hand=REQUIREMENTS)  # fmt: skip
+    assert "second-1" in MODELS
+    assert {r.model for r in catalogue()} == {*(m.name for m in BUILT_IN), NAME}
+    with pytest.raises(UsageError, match="no requirements for second-1"):
+        catalogue("second-1")
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("x = 1", "there is no 'UNDER_TEST'"),
+        ("UNDER_TEST = 1", "is a int, not a ModelUnderTest"),
+        ("from twofinger_hand.under_test import UNDER_TEST", "is about twofinger-1, not second-1"),
+        (REQUIREMENTS + "UNDER_TEST = replace(UNDER_TEST, roles=None)", "needs joint roles"),
+    ],
+)
+def test_a_broken_record_for_the_kit_says_why(example: Packages, code: str, why: str) -> None:
+    entries = "[dexkit.conformance_hands]\nsecond-1 = second_hand:UNDER_TEST\n"
+    example.install("second-hand", entries, second_hand=code)
+    with pytest.raises(ModelBroken, match=why):
+        under_test("second-1")
 
 
 # ------------------------------------------------------------------------------- as a vendor would

@@ -16,6 +16,7 @@ import pytest
 from rich.console import Console
 
 from dexkit.conformance import scores
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants import plan_for, run_mutant
@@ -46,7 +47,6 @@ from dexkit.conformance.virtual import run_virtual
 from dexkit.errors import TraceUnsupported, UsageError
 from dexkit.escaping import html
 from dexkit.hand import Side
-from dexkit.models import model
 from dexkit.traces import open_trace, sample_path
 from tests.report_helpers import result_of_every_kind
 from tools.scores import (
@@ -311,7 +311,7 @@ def test_a_long_list_of_requirements_is_cut() -> None:
 )
 def test_a_good_gripper_in_a_complete_run_has_the_score_of_the_file(run: RunKind) -> None:
     wanted = run.requirements(catalogue("dex1-1"))
-    result = run_mutant(model("dex1-1").reference.load(), plan_for(run=run), wanted)
+    result = run_mutant(under_test("dex1-1").reference.load(), plan_for(run=run), wanted)
     (expected,) = (
         e.score()
         for e in entries()
@@ -323,7 +323,7 @@ def test_a_good_gripper_in_a_complete_run_has_the_score_of_the_file(run: RunKind
 
 def test_a_selection_of_a_run_has_the_score_of_its_requirements() -> None:
     plan = plan_for(run=RunKind.QUICK)
-    trace = run_virtual(plan, model("dex1-1").reference.load())
+    trace = run_virtual(plan, under_test("dex1-1").reference.load())
     recording = recording_of(trace, "unitree_go", plan.sides)
     wanted = RunKind.QUICK.requirements(catalogue("dex1-1"))
     score = judge(recording, requirements=wanted[1:]).score

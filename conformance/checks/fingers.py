@@ -21,11 +21,12 @@ from dexkit.conformance.checks.motion import (
     steps_of,
 )
 from dexkit.conformance.checks.safety import arrival, stays, stopped
+from dexkit.conformance.hands import JointRoles, under_test
 from dexkit.conformance.median import medians
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
-from dexkit.models import HandModel, JointRoles, ModeByte, model
+from dexkit.models import ModeByte, model
 
 _SLOTS = 12  # of a PressSensorState_
 
@@ -192,11 +193,9 @@ def attitude(ctx: Context) -> Outcome:
 
 def _roles(ctx: Context) -> JointRoles:
     """The joints that the stimulus uses."""
-    hand = ctx.recording.model
-    # every profile with several joints has roles
-    assert isinstance(hand, HandModel)
-    assert hand.roles is not None
-    return hand.roles
+    roles = under_test(ctx.recording.model.name).roles
+    assert roles is not None  # every hand of several joints has them
+    return roles
 
 
 def _modes(ctx: Context, rows: slice = slice(None)) -> NDArray[np.intp]:

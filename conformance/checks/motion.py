@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
-from dexkit.models import HandModel
 
 
 @dataclass(frozen=True)
@@ -926,8 +926,7 @@ def _driven(ctx: Context) -> list[tuple[int, int]]:
     """The joints that the stimulus drives by velocity, with direction: a gripper opens, fingers
     close.
     """
-    hand = ctx.recording.model
-    roles = hand.roles if isinstance(hand, HandModel) else None
+    roles = under_test(ctx.recording.model.name).roles
     if roles is None:
         return [(0, 1)]
     return [(i, 1 if ctx.joints[i].closing > 0 else -1) for i in roles.driven]

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import Layer, claimed, not_blocked, not_spoiled
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
 from dexkit.lazy import Lazy
-from dexkit.models import model
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks import Context, Outcome
@@ -212,7 +212,7 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     ),
     refine=with_silence,
     whole=whole,
-    script=lambda name: model(name).script.load(),
-    reference=lambda name: model(name).reference.load(),
+    script=lambda name: under_test(name).script.load(),
+    reference=lambda name: under_test(name).reference.load(),
     trial=Lazy("dexkit.conformance.mutants.trials:HandTrial"),
 )

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import Layer, claimed, hand, not_blocked
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import ROBOT, Subject
 from dexkit.lazy import Lazy
-from dexkit.robots import H1, robot
+from dexkit.robots import H1
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks.robot import RobotContext
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from dexkit.conformance.robot import RobotRecording
 
 __all__ = ["LAYER"]
-
-_REFERENCE: Lazy[type[Any]] = Lazy("dexkit.conformance.virtual.robot:ReferenceRobot")
 
 
 def _decode(trace: TraceLike, name: str | None, sides: Sequence[Subject]) -> RobotRecording:
@@ -44,7 +43,7 @@ LAYER: Layer[RobotRecording, SideView, RobotContext] = Layer(
     preconditions=(hand.applies_to_dialect, claimed, hand.recorded, hand.carried, not_blocked),
     refine=hand.with_silence,
     whole=hand.whole,
-    script=lambda name: robot(name).script.load(),
-    reference=lambda name: _REFERENCE.load(),
+    script=lambda name: under_test(name).script.load(),
+    reference=lambda name: under_test(name).reference.load(),
     trial=Lazy("dexkit.conformance.mutants.trials:RobotTrial"),
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from functools import cache
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants import (
     any_model,
     clients,
@@ -22,7 +23,7 @@ from dexkit.conformance.mutants import (
 )
 from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
-from dexkit.models import MODELS
+from dexkit.conformance.requirements import models
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
@@ -32,14 +33,14 @@ MODULES = (any_model, gripper, fingers, servos, touch, operator, clients, robot,
 
 @cache
 def mutants(layer: str | None = None) -> tuple[Mutant, ...]:
-    """Every wrong hand: of the modules here, and of those that the models' profiles name.
+    """Every wrong hand: of the modules here, and of those of single models.
 
     :param layer: only those of that layer.
     :raises ModelBroken: the wrong hands of another package's model cannot be loaded.
     """
     if layer is None:
-        for model in MODELS.values():
-            if model.wrong_hands:
-                model.wrong_hands.load()
+        for name in models():
+            if own := under_test(name).wrong_hands:
+                own.load()
         return expand()
     return tuple(m for m in mutants() if m.layer == layer)

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from rich.markup import escape
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants.matrix import ignore_interrupts
 from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.mutants.trials import plan_for, run_mutant
@@ -33,7 +34,7 @@ from dexkit.console import Console
 from dexkit.documents import write_file
 from dexkit.errors import ConformanceError, DexkitError, ModelBroken, UsageError
 from dexkit.hand import Side
-from dexkit.models import MODELS, Dialect, dialect, model
+from dexkit.models import MODELS, Dialect, dialect
 from dexkit.plugins import import_object, where
 
 __all__ = [
@@ -215,15 +216,15 @@ def _outsiders(made: type[Any]) -> Iterator[Outsider]:
                 hint=f"it has {', '.join(areas)}",
             )
         name = made.__name__ if len(spoken) == 1 else f"{made.__name__} ({each.name})"
-        reference: type[Any] = model(each.model).reference.load()
+        reference: type[Any] = under_test(each.model).reference.load()
         yield Outsider(name, mix(made, reference), each, declared.grade, declared.expects)
 
 
 def _fits(made: type[Any], model_name: str) -> bool:
     """Whether a class changes that model's reference service, or a base of it."""
     try:
-        reference = model(model_name).reference.load()
-    except ModelBroken:
+        reference = under_test(model_name).reference.load()
+    except (ModelBroken, UsageError):
         return False
     base = next(c for c in made.__mro__[1:] if c.__module__.startswith("dexkit.") or c is reference)
     return issubclass(reference, base) or issubclass(made, reference)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Protocol
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import layer, recording_of
 from dexkit.conformance.mutants.registry import Mutant
@@ -72,7 +73,7 @@ def blamed(mutant: Mutant, *, short: bool = False) -> set[str]:
 
 @cache
 def _session(model_name: str) -> CommandSession | None:
-    if not model(model_name).session:
+    if not under_test(model_name).session:
         return None
     return CommandSession.default(model_name).first_seconds(SESSION_SECONDS)
 

@@ -22,12 +22,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.hands import BUILT_IN, under_test
 from dexkit.conformance.layers import LAYERS, layer
 from dexkit.conformance.plots import Plot
 from dexkit.documents import parse_toml, read_toml
-from dexkit.errors import ConformanceError, UsageError
-from dexkit.models import BUILT_IN, DIALECTS, HandModel, model, model_plugins
-from dexkit.robots import ROBOTS, RobotModel, robot
+from dexkit.errors import ConformanceError, ModelBroken, UsageError
+from dexkit.models import DIALECTS, HandModel, model, model_plugins
+from dexkit.robots import RobotModel, robot
 
 __all__ = [
     "CAPABILITIES",
@@ -487,22 +488,22 @@ def _files() -> dict[str, tuple[str, str]]:
     found = {name: _head(name) for name in _own_files()}
     for plugin in model_plugins():
         if plugin.model is not None:
-            with contextlib.suppress(UsageError):
+            with contextlib.suppress(UsageError, ModelBroken):
                 found |= _plugin_files(plugin.model)
     return found
 
 
 def _own_files() -> list[str]:
-    hands = [str(file) for hand in BUILT_IN for file in hand.requirements]
-    return sorted([*hands, *(file for robot in ROBOTS.values() for file in robot.requirements)])
+    return sorted(str(file) for each in BUILT_IN for file in each.requirements)
 
 
 def _plugin_files(hand: HandModel) -> dict[str, tuple[str, str]]:
     """The same of a model of another package.
 
-    :raises UsageError: a file cannot be read, or is wrong.
+    :raises UsageError: it has none, or a file cannot be read, or is wrong.
+    :raises ModelBroken: what its package registers for the kit cannot be used.
     """
-    files = [str(file) for file in hand.requirements]
+    files = [str(file) for file in under_test(hand.name).requirements]
     for name in files:
         for r in _requirements(name):
             if not r.like or r.model != hand.name:
@@ -589,7 +590,8 @@ def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requ
 
     :param model: only those of that hand model; None for all.
     :param layer: only those judged there; None for all.
-    :raises UsageError: the requirement file of that model, of another package, is wrong.
+    :raises UsageError: that model, of another package, has no requirements, or a file is wrong.
+    :raises ModelBroken: what its package registers for the kit cannot be used.
     """
     for plugin in model_plugins():
         if plugin.name == model and plugin.model is not None:

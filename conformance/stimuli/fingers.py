@@ -75,12 +75,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from dexkit.conformance.hands import JointRoles, under_test
 from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Pose, Steps
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointMode, Side
-from dexkit.models import JointRoles
 
 __all__ = ["FingerScript"]
 
@@ -241,8 +241,9 @@ class FingerScript(HandScript):
 
     @property
     def _roles(self) -> JointRoles:
-        assert self._model.roles is not None  # a profile of several joints has them
-        return self._model.roles
+        roles = under_test(self._model.name).roles
+        assert roles is not None  # every hand of several joints has them
+        return roles
 
     # -- places -----------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.recording import Commands, Recording
 from dexkit.errors import ConformanceError, TraceError
@@ -81,7 +82,7 @@ class CommandSession:
 
         :raises ConformanceError: it has none.
         """
-        session = model(hand_model).session
+        session = under_test(hand_model).session
         if not session:
             raise ConformanceError(
                 f"there is no session of a {model(hand_model).title} to replay",

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, TypeVar
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.phased_script import PhasedScript, play
 from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
-from dexkit.models import Dialect, model
+from dexkit.models import Dialect
 
 __all__ = [
     "NOT_FINITE",
@@ -158,7 +159,7 @@ def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Subj
 
 def default_objects(dialect: Dialect, sides: Sequence[Subject]) -> dict[Subject, float]:
     """The default objects of a pair of hands, as the script takes them."""
-    percents = model(dialect.model).objects
+    percents = under_test(dialect.model).objects
     return object_places(dialect, {s: p for s, p in percents.items() if s in sides})
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dexkit.conformance.hands import under_test
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, model
@@ -163,7 +164,7 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
         )
     machine = ReplayMachine(plan, Guards(**{**vars(guards), "loop": False}))
     spoken: Dialect = plan.dialect
-    service = model(spoken.model).reference.load()(spoken, plan.sides, {})
+    service = under_test(spoken.model).reference.load()(spoken, plan.sides, {})
     encode, states = ClientCodec(spoken), HandStateCodec(spoken)
     topics = {states.topics[s] for s in plan.sides}
     joints = len(model(spoken.model).joints[Side.LEFT])

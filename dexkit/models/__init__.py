@@ -15,6 +15,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeVar
 
 from dexkit.errors import ModelBroken, UsageError
@@ -29,10 +30,8 @@ from dexkit.models.profile import (
     Finger,
     HandLayout,
     HandModel,
-    JointRoles,
     ModeByte,
     PressureSensor,
-    ScoredHands,
     TouchArea,
 )
 from dexkit.plugins import entry_points, import_object, origin
@@ -52,15 +51,14 @@ __all__ = [
     "Finger",
     "HandLayout",
     "HandModel",
-    "JointRoles",
     "ModeByte",
     "ModelPlugin",
     "PressureSensor",
-    "ScoredHands",
     "TouchArea",
     "dialect",
     "model",
     "model_plugins",
+    "registered_record",
 ]
 
 GROUP = "dexkit.models"
@@ -176,10 +174,7 @@ def _checked(value: object, name: str) -> HandModel:
             f"{', or '.join(' and '.join(pair) for pair in pairs)}",
         )
     if not value.dialects[0].is_gripper:
-        require(value.roles is not None, "it has no joint roles")
         require(len(value.fingers) == count, "fingers has to name a finger for each joint")
-    for file in value.requirements:
-        require(bool(file), "a requirement file has no name")
     return value
 
 
@@ -238,6 +233,27 @@ def model(name: str) -> HandModel:
             if plugin.name == name and plugin.error is not None:
                 raise plugin.error from None
         raise UsageError(f"no hand model {name!r}", hint=f"known: {', '.join(MODELS)}") from None
+
+
+@cache
+def registered_record(group: str, model_name: str, kind: type[T]) -> T | None:
+    """What another package registers about its model in an entry-point group, under the model's
+    name; None if nothing.
+
+    :param kind: of the object, which has the model as ``model``.
+    :raises ModelBroken: it cannot be loaded, or is not about that model.
+    """
+    for entry in entry_points(group):
+        if entry.name != model_name:
+            continue
+        found = import_object(entry.value, ModelBroken, hint=f"name a {kind.__name__}")
+        if not isinstance(found, kind):
+            raise ModelBroken(f"{entry.value} is a {type(found).__name__}, not a {kind.__name__}")
+        about: HandModel = found.model  # type: ignore[attr-defined]
+        if about.name != model_name:
+            raise ModelBroken(f"{entry.value} is about {about.name}, not {model_name}")
+        return found
+    return None
 
 
 def dialect(name: str) -> Dialect:

@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles
+from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel
 
 __all__ = ["BRAINCO_REVO2"]
 
@@ -65,12 +65,6 @@ BRAINCO_REVO2 = HandModel(
     client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j1, as client_dq
     client_dq=1.0,
     rest_q=dict.fromkeys(Side, (0.1, 0.1, 0.15, 0.15, 0.15, 0.15)),
-    requirements=("brainco.toml",),
-    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
-    reference=Lazy("dexkit.conformance.virtual.brainco:BrainCoService"),
-    quick_phases=("burst", "empty", "joint", "late-joiner", "speeds"),
-    roles=JointRoles(driven=(), slow=(0, 3)),
-    objects={Side.RIGHT: 60.0},
     simulator="sim-brainco",
     simulated_by=Lazy("dexkit.emulators.sim_brainco:sim_brainco"),
     # ring and little finger move as the middle one does

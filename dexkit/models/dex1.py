@@ -8,7 +8,7 @@ from functools import cache
 from dexkit.hand import JointSpec, Side
 from dexkit.kinematics import BASE, Box, Segment, Skeleton, Vector
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel, ScoredHands
+from dexkit.models.profile import Dialect, HandModel
 
 __all__ = ["DEX1_1", "skeleton"]
 
@@ -81,16 +81,8 @@ DEX1_1 = HandModel(
     client_gains=(5.0, 0.05),  # docs/sources/unitree-dex.md#b1
     rest_q=dict.fromkeys(Side, (0.2 * _JOINT.stroke,)),
     vendor_ids={Side.LEFT: 1, Side.RIGHT: 0},  # docs/sources/unitree-dex.md#b2
-    requirements=("dex1.toml", "dex1_client.toml"),
-    script=Lazy("dexkit.conformance.stimuli.gripper:GripperScript"),
-    reference=Lazy("dexkit.conformance.virtual.gripper:ReferenceService"),
-    quick_phases=("late-joiner", "load", "soft", "squeeze", "step"),
-    # 2.0 rad of opening, where the session closes on an object
-    objects={Side.RIGHT: 37.0},
-    session="dex1_pick_place",
     simulator="sim-dex1",
     simulated_by=Lazy("dexkit.emulators.sim_dex1:sim_dex1"),
-    scored_hands=ScoredHands(quick=100, default=100, thorough=20, external=60),
     client=Lazy("dexkit.teleop.client:Dex1Client"),
     operator_profiles=Lazy("dexkit.teleop.profiles:gripper_profiles"),
     skeleton=Lazy("dexkit.models.dex1:skeleton"),

@@ -13,10 +13,8 @@ from dexkit.models.profile import (
     Finger,
     HandLayout,
     HandModel,
-    JointRoles,
     ModeByte,
     PressureSensor,
-    ScoredHands,
 )
 
 __all__ = ["DEX3_1", "skeleton"]
@@ -118,17 +116,8 @@ DEX3_1 = HandModel(
     },
     sensors=_SENSORS,
     low_rate=9.1,  # as a real robot's copy comes (docs/sources/real-hands.md#dex3-low-rate)
-    requirements=("dex3.toml", "dex3_usb.toml"),
-    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
-    reference=Lazy("dexkit.conformance.virtual.fingers:Dex3Service"),
-    quick_phases=("burst", "drive", "joint", "late-joiner", "single"),
-    roles=JointRoles(driven=(3, 4), slow=(5, 6), crossed=(4, 6)),
-    # nearly as far as the session closes
-    objects={Side.RIGHT: 60.0},
-    session="dex3_pinch",
     simulator="sim-dex3",
     simulated_by=Lazy("dexkit.emulators.sim_dex3:sim_dex3"),
-    scored_hands=ScoredHands(quick=40, default=40, thorough=10, external=20),
     fingers=3 * ("thumb",) + 2 * ("middle",) + 2 * ("index",),
     client_forks=True,
     layout=HandLayout(

@@ -8,7 +8,7 @@ from functools import cache
 from dexkit.hand import JointSpec, Side
 from dexkit.kinematics import BASE, Box, Segment, Skeleton
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles, ModeByte
+from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, ModeByte
 
 __all__ = ["DEX5_1", "skeleton"]
 
@@ -112,16 +112,6 @@ DEX5_1 = HandModel(
     # and fingers less one in each finger, and what a finger of four joints shares is its two outer
     # ones. Uncertain.
     shared_motors=((2, 3), (6, 7), (10, 11), (14, 15)),
-    requirements=("dex5.toml",),
-    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
-    reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
-    wrong_hands=Lazy("dexkit.conformance.mutants.dex5"),
-    quick_phases=("drive", "joint", "late-joiner"),
-    # first flexing joints of four fingers: none of them shares its motor
-    roles=JointRoles(driven=(1, 5), slow=(9, 13)),
-    # nearly as far as the session closes
-    objects={Side.RIGHT: 60.0},
-    session="dex5_synthetic",
     simulator="sim-dex5",
     simulated_by=Lazy("dexkit.emulators.sim_dex5:sim_dex5"),
     # ring and little finger move as the middle one does

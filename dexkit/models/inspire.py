@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, JointRoles, TouchArea
+from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, TouchArea
 
 __all__ = ["INSPIRE_DFX", "INSPIRE_FTP"]
 
@@ -53,12 +53,6 @@ INSPIRE_DFX = HandModel(
     client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j2
     client=Lazy("dexkit.teleop.client:RightHandClient"),
     rest_q=dict.fromkeys(Side, (0.85, 0.85, 0.85, 0.85, 0.9, 0.9)),
-    requirements=("inspire_dfx.toml",),
-    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
-    reference=Lazy("dexkit.conformance.virtual.inspire:InspireService"),
-    quick_phases=("burst", "empty", "joint", "late-joiner"),
-    roles=JointRoles(driven=(), slow=(1, 3)),
-    objects={Side.RIGHT: 60.0},
     simulator="sim-inspire-dfx",
     simulated_by=Lazy("dexkit.emulators.sim_inspire:sim_inspire_dfx"),
     # ring and little finger move as the middle one does
@@ -98,7 +92,6 @@ INSPIRE_FTP = replace(
     name="inspire-ftp",
     title="Inspire FTP hand",
     other_short_name="inspire-ftp",
-    quick_phases=("burst", "joint", "late-joiner", "squeeze"),
     dialects=(
         Dialect(
             name="inspire_ftp",
@@ -121,8 +114,6 @@ INSPIRE_FTP = replace(
     areas=_AREAS,
     touch_rate=50.0,  # more than the 30 Hz that clients record
     client=Lazy("dexkit.teleop.client:EitherHandClient"),
-    requirements=("inspire_ftp.toml",),
-    reference=Lazy("dexkit.conformance.virtual.inspire:FtpService"),
     simulator="sim-inspire-ftp",
     simulated_by=Lazy("dexkit.emulators.sim_inspire:sim_inspire_ftp"),
     client_option="inspire_ftp",

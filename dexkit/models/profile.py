@@ -1,8 +1,7 @@
 """The profile of a hand model: joints, dialects, rates, and references to its other data.
 
 Facts are values: joints, topics, types, rates, poses. Code that works for one model only (codec,
-client, stimulus script, reference service, wrong hands) is named by a
-:class:`~dexkit.lazy.Lazy` reference, so that a profile loads none of it.
+client) is named by a :class:`~dexkit.lazy.Lazy` reference, so that a profile loads none of it.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from dexkit.errors import UsageError
@@ -21,8 +18,6 @@ from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
     from dexkit.backends import Backend
-    from dexkit.conformance.stimuli.script import Script
-    from dexkit.conformance.virtual import Service
     from dexkit.kinematics import Skeleton
     from dexkit.service.dialects import DialectMap
     from dexkit.teleop.client import TeleopClient
@@ -33,10 +28,8 @@ __all__ = [
     "Finger",
     "HandLayout",
     "HandModel",
-    "JointRoles",
     "ModeByte",
     "PressureSensor",
-    "ScoredHands",
     "TouchArea",
 ]
 
@@ -216,21 +209,6 @@ class TouchArea:
 
 
 @dataclass(frozen=True)
-class JointRoles:
-    """Joints that the conformance stimulus uses, by index, for a hand of several joints.
-
-    :param driven: driven by a velocity when the commands stop.
-    :param slow: slowly on their way to a position when the commands stop.
-    :param crossed: two joints that get each other's id in the mode byte; the first is commanded to
-        move. Their limits are equal, so that a hand that goes by the id can move the other one.
-    """
-
-    driven: tuple[int, ...]
-    slow: tuple[int, ...]
-    crossed: tuple[int, int] = (0, 0)
-
-
-@dataclass(frozen=True)
 class Finger:
     """Joints of a drawn finger, one behind the other; lengths in px, y downward.
 
@@ -278,20 +256,6 @@ class HandLayout:
     width: float
     fingers: tuple[Finger, ...]
     palm_sensors: tuple[tuple[float, float], ...] = ()
-
-
-@dataclass(frozen=True)
-class ScoredHands:
-    """Number of generated wrong hands that ``python -m tools.scores`` tries in runs of each kind.
-    A run for which it is 0 has no score.
-
-    :param external: in quick and in default runs of a service that the kit does not start.
-    """
-
-    quick: int
-    default: int
-    thorough: int = 0
-    external: int = 0
 
 
 _FINGER_CLIENT: Lazy[type[TeleopClient]] = Lazy("dexkit.teleop.client:FingerClient")
@@ -345,23 +309,7 @@ class HandModel:
     :param client_note: what a user of its client has to know, or empty.
     :param client_option: its name in the client's ``--ee``; empty if that is the short name.
 
-    **Conformance kit.**
-
-    :param requirements: its requirement files; a relative path is one of dexkit's own.
-    :param script: its stimulus script.
-    :param roles: joints that the script uses; None for a gripper.
-    :param objects: where the hands of a pair that the kit starts have an object; percent of
-        opening for a gripper, of closing for others.
-    :param quick_phases: phases of a quick run, some eleven seconds: those by which most known wrong
-        hands fail. A MUST that needs any other phase is not judged in it.
-    :param session: the recorded session to replay: name of a sample of dexkit, or path of a
-        recording; empty where there is none.
-    :param reference: service on a virtual clock that does everything right.
-    :param scored_hands: how many generated wrong hands its runs are scored by; only the models of
-        dexkit itself are scored.
-    :param wrong_hands: the module with the wrong hands of this model alone, which have the
-        decorator ``dexkit.conformance.mutants.wrong_hand``; None where the shared ones prove its
-        requirements.
+    **Drawing.**
 
     :param layout: how it is drawn; None for a gripper, and where no drawing is needed.
     :param skeleton: makes the joint axes and origins of a side; None where they are not known, and
@@ -378,10 +326,6 @@ class HandModel:
     command_timeout: float
     client_gains: tuple[float, float]
     rest_q: dict[Side, tuple[float, ...]]
-    requirements: tuple[str | Path, ...]
-    script: Lazy[type[Script[Side]]]
-    reference: Lazy[type[Service]]
-    quick_phases: tuple[str, ...]
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
     areas: tuple[TouchArea, ...] = ()
@@ -402,11 +346,6 @@ class HandModel:
     client_forks: bool = False
     client_note: str = ""
     client_option: str = ""
-    roles: JointRoles | None = None
-    objects: Mapping[Side, float] = field(default_factory=dict)
-    session: str | Path = ""
-    scored_hands: ScoredHands = ScoredHands(quick=40, default=40, external=30)
-    wrong_hands: Lazy[ModuleType] | None = None
     layout: HandLayout | None = None
     skeleton: Lazy[Callable[[Side], Skeleton]] | None = None
 

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants import plan_for, run_mutant
 from dexkit.conformance.mutants.generated import dialects, parse, sample
 from dexkit.conformance.mutants.generated.campaign import Trial, graded, judged
@@ -27,7 +28,7 @@ from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan, phases_for
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
-from dexkit.models import BUILT_IN, model
+from dexkit.models import BUILT_IN
 
 __all__ = [
     "SEED",
@@ -58,7 +59,7 @@ def counts_of(model_name: str) -> Counts:
 
     ``--hands`` tries fewer; the file says how many each entry has.
     """
-    number = model(model_name).scored_hands
+    number = under_test(model_name).scored_hands
     found = {
         (RunKind.QUICK, Setting.WHOLE): number.quick,
         (RunKind.QUICK, Setting.EXTERNAL): number.external,
@@ -115,7 +116,7 @@ def _fewer(task: Task, dialect: str) -> dict[str, int]:
     # rounds do not change what can be judged
     plan = replace(task.plan(dialect, tuple(Side)), rounds=1)
     wanted = task.run.requirements(catalogue(task.model))
-    results = run_mutant(model(task.model).reference.load(), plan, wanted).results
+    results = run_mutant(under_test(task.model).reference.load(), plan, wanted).results
     found = Counter(r.requirement.id for r in results if r.verdict.judged)
     return {r.id: found[r.id] for r in wanted if found[r.id] != len(Side)}
 

@@ -17,6 +17,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
 from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.mutants.generated.rig import Faulty, Part, What, When, compose
@@ -128,7 +129,7 @@ class Generated:
 
         :raises ModelBroken: the model's reference has no place for faults.
         """
-        reference = model(self.dialect.model).reference.load()
+        reference = under_test(self.dialect.model).reference.load()
         name = re.sub(r"\W+", "_", self.name)
         return compose(name, self.summary, reference, [f.part() for f in self.faults])
 
@@ -263,7 +264,7 @@ def _suits(what: type[What], of: HandModel) -> bool:
         return False
     if what.position_servo and not any(d.position_servo for d in of.dialects):
         return False
-    return not what.needs or what.needs in of.reference.load().measured_members
+    return not what.needs or what.needs in under_test(of.name).reference.load().measured_members
 
 
 def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:

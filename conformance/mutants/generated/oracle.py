@@ -17,6 +17,7 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.mutants.generated import Generated
 from dexkit.conformance.mutants.generated.rig import Faulty, compose
@@ -214,7 +215,7 @@ class _Compare:
             [dialect.q_open] if dialect.is_gripper else [j.stroke for j in joints]
         )
         self.grip = 0.05 * self.spans * np.array([kp for kp, _ in profile.gains])
-        self.measured = profile.reference.load().measured_members
+        self.measured = under_test(profile.name).reference.load().measured_members
         self.rate = profile.command_rate
         self.least_rate = min(SLOW * profile.command_rate, profile.min_state_rate)
         self.side = side
@@ -400,7 +401,9 @@ def _plan(dialect_name: str, sides: tuple[Side, ...]) -> Plan[Side]:
 @cache
 def _reference(dialect_name: str, sides: tuple[Side, ...]) -> type[Faulty]:
     plan = _plan(dialect_name, sides)
-    return compose("Reference", "The reference.", model(plan.dialect.model).reference.load(), ())
+    return compose(
+        "Reference", "The reference.", under_test(plan.dialect.model).reference.load(), ()
+    )
 
 
 @cache

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.mutants.trials import plan_for
 from dexkit.conformance.recording import joints_of
@@ -75,7 +76,7 @@ def conformance(
     """The kit's commands to the reference in a run of every phase, and the phases."""
     plan = plan_for(dialect_name, sides=sides)
     events: list[Event] = []
-    reference = model(plan.dialect.model).reference.load()
+    reference = under_test(plan.dialect.model).reference.load()
 
     def receive(self: Service, topic: str, payload: bytes, client: int) -> None:
         age = self.now - self.stamp

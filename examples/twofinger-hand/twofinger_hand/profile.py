@@ -1,13 +1,12 @@
-"""The profile of the hand: six joints, one dialect, and where the rest of it is."""
+"""The profile of the hand: six joints, one dialect."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel, JointRoles, ModeByte
+from dexkit.models.profile import Dialect, HandModel, ModeByte
 
 __all__ = ["TWOFINGER_1"]
 
@@ -58,11 +57,4 @@ TWOFINGER_1 = HandModel(
     rest_q={Side.LEFT: 2 * (0.3, 0.4, 0.4), Side.RIGHT: 2 * (-0.3, -0.4, -0.4)},
     simulator="sim-twofinger",
     fingers=3 * ("thumb",) + 3 * ("index",),
-    requirements=(Path(__file__).with_name("requirements.toml"),),
-    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
-    roles=JointRoles(driven=(0, 1), slow=(3, 4)),
-    objects={Side.RIGHT: 60.0},
-    quick_phases=("burst", "joint", "late-joiner", "single"),
-    reference=Lazy("twofinger_hand.reference:TwoFingerService"),
-    wrong_hands=Lazy("twofinger_hand.wrong"),
 )

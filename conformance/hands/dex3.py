@@ -1,0 +1,23 @@
+"""How the kit judges the Dex3-1 hand, on DDS and on USB."""
+
+from __future__ import annotations
+
+from dexkit import models
+from dexkit.conformance.hands.record import JointRoles, ModelUnderTest, ScoredHands
+from dexkit.hand import Side
+from dexkit.lazy import Lazy
+
+__all__ = ["DEX3_1"]
+
+DEX3_1 = ModelUnderTest(
+    model=models.DEX3_1,
+    requirements=("dex3.toml", "dex3_usb.toml"),
+    script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
+    reference=Lazy("dexkit.conformance.virtual.fingers:Dex3Service"),
+    quick_phases=("burst", "drive", "joint", "late-joiner", "single"),
+    roles=JointRoles(driven=(3, 4), slow=(5, 6), crossed=(4, 6)),
+    # nearly as far as the session closes
+    objects={Side.RIGHT: 60.0},
+    session="dex3_pinch",
+    scored_hands=ScoredHands(quick=40, default=40, thorough=10, external=20),
+)
