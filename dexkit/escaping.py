@@ -51,14 +51,6 @@ _CONTROL = re.compile(
     "\U000e0000-\U000e0fff]"
 )
 _BREAK = re.compile("[\t\n]")
-# What a runner of GitHub Actions takes for a command: "::NAME" where a line begins, which is where
-# any part of a text may come to be when it is folded, and "##[" anywhere. Other words behind "::"
-# are names of DDS types.
-_COMMAND = re.compile(
-    r"::(?=add-|debug|echo|endgroup|error|group|internal-|notice|remove-|save-|set-|stop-|warning)"
-    r"|##\[",
-    re.IGNORECASE,
-)
 _CLEAR_LINE = "\r\x1b[K"
 """Begin of a status line: it overwrites the one before."""
 
@@ -76,14 +68,13 @@ def visible(text: str) -> str:
 
 
 def one_line(text: object, longest: int = LONGEST) -> str:
-    """A name or a remark in one line: tabs and line feeds as escapes, too, no longer than
-    ``longest`` characters, and no command to a runner of GitHub Actions (``::error::``).
+    """A name or a remark in one line: tabs and line feeds as escapes, too, and no longer than
+    ``longest`` characters.
     """
     shown = str(text)
     if len(shown) > longest:
         shown = f"{shown[: longest - 1]}…"
-    shown = shown if shown.isprintable() else _BREAK.sub(_escaped, visible(shown))
-    return _COMMAND.sub(lambda found: f"\\x{ord(found[0][0]):x}{found[0][1:]}", shown)
+    return shown if shown.isprintable() else _BREAK.sub(_escaped, visible(shown))
 
 
 def html(text: object, quote: bool = True) -> str:

@@ -237,7 +237,11 @@ def test_success_without_a_result_file_fails(pretended: Runner) -> None:
     ran = pretended("Judge the hand", backend="acme", arguments="--list")
     assert ran.returncode == 2
     assert pretended.outputs == {"exit-code": "2", "result": "", "report": ""}
-    assert "::error" in ran.stdout
+    _, head, rest = ran.stdout.partition("::stop-commands::")
+    token, _, printed = rest.partition("\n")
+    assert head
+    assert len(token) == 32
+    assert "::error" in printed.partition(f"::{token}::\n")[2]
     assert "the suite ended without a result" in pretended.summary
 
 
