@@ -53,7 +53,7 @@ def test_the_counts_of_the_page_are_those_of_the_catalogue() -> None:
     carried = Counter(map(basis, must))
     judged = Counter(verdicts().get(r.id, "") for r in must)
     assert set(carried) <= set(BASES)
-    [total] = re.findall(r"(?m)^\| all \| ((?:\d+ \| ){10}\d+) \|$", real_hands_page.page())
+    [total] = re.findall(r"(?m)^\| all \| ((?:\d+ \| ){10}\d+) \|$", real_hands_page.bases())
     assert list(map(int, total.split(" | "))) == [
         len(must),
         *(carried[name] for name in BASES),

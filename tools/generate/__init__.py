@@ -14,6 +14,7 @@ in build/docs and on the site
 :mod:`~.models_page`           models.md: joints, limits, topics and rates
 :mod:`~.requirement_pages`     requirements/: a page for each requirement
 :mod:`~.conformity_page`       conformity.md, from conformity.toml
+:mod:`~.real_hands_page`       bases.md: what carries the MUSTs of each model
 =============================  ==================================================================
 
 What is in the repository is the function ``files()`` of a module: content by path.
@@ -72,11 +73,12 @@ def built_pages() -> dict[str, str]:
     """Markdown of the pages that are not in the repository, by the path that they have on the site:
     their links are seen from docs/.
     """
-    from tools.generate import conformity_page, models_page, requirement_pages
+    from tools.generate import conformity_page, models_page, real_hands_page, requirement_pages
 
     return {
         "models.md": models_page.page(),
         "conformity.md": conformity_page.page(),
+        "bases.md": real_hands_page.bases(),
         **requirement_pages.pages(),
     }
 

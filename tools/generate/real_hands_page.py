@@ -1,7 +1,7 @@
 """docs/sources/real-hands.md: what dexkit takes for granted about hands, and what real ones show.
 
-The facts are in real_hands.toml beside this module, which says how a row is written. The counts of
-requirements are made from the requirement files: what carries each MUST, and what real hands say.
+The facts are in real_hands.toml beside this module, which says how a row is written. bases.md
+counts from the requirement files what carries each MUST, and what real hands say.
 """
 
 from __future__ import annotations
@@ -18,7 +18,18 @@ from dexkit.conformance.requirements import Level, Requirement, catalogue
 from dexkit.errors import UsageError
 from tools.generate import DOCS
 
-__all__ = ["TABLE", "VERDICTS", "Fact", "Hand", "Source", "basis", "files", "read", "verdicts"]
+__all__ = [
+    "TABLE",
+    "VERDICTS",
+    "Fact",
+    "Hand",
+    "Source",
+    "bases",
+    "basis",
+    "files",
+    "read",
+    "verdicts",
+]
 
 TABLE = Path(__file__).with_name("real_hands.toml")
 PAGE = DOCS / "sources" / "real-hands.md"
@@ -223,23 +234,7 @@ def page() -> str:
         counted = Counter(fact.verdict for fact in own)
         figures = " | ".join(str(counted[verdict]) for verdict in VERDICTS)
         lines.append(f"| {title} | {len(own)} | {figures} |")
-    lines += [
-        "",
-        "What carries each MUST of the catalogue, by its `confidence` and `source`; and what the"
-        " facts below say",
-        "about it, the worst of those that name it. *Vendor's software* was run and measured; a"
-        " *genuine client*",
-        "is a program that drives real hands. *No row*: the requirement is about messages, order,"
-        " time or safety of",
-        "a driver, for which no fact about a hand is needed, or it has not been looked at. No MUST"
-        " rests on a",
-        "hand that this project measured.",
-        "",
-        "| catalogue | MUST | " + " | ".join((*BASES, *VERDICTS)) + " | no row |",
-        "| --- | --- |" + " --- |" * (len(BASES) + len(VERDICTS) + 1),
-        *_count_rows(catalogue(None, None)),
-        "",
-    ]
+    lines.append("")
     for hand in hands:
         lines += _facts(hand, numbers)
     lines += [
@@ -261,6 +256,25 @@ def page() -> str:
             f" | {source.revision} | {source.kind} |"
         )
     lines.append("")
+    return "\n".join(lines)
+
+
+def bases() -> str:
+    """The Markdown of bases.md: what carries the MUSTs of each model, and what hands say."""
+    lines = [
+        "# What the requirements rest on",
+        "",
+        "What carries each MUST, by its `confidence` and `source`; and the worst that the facts"
+        " about [real hands](sources/real-hands.md) say about it. *Vendor's software* was run and"
+        " measured; a *genuine client* is a program that drives real hands. *No row*: no fact about"
+        " a hand is needed for it, or it has not been looked at. No MUST rests on a hand that this"
+        " project measured.",
+        "",
+        "| catalogue | MUST | " + " | ".join((*BASES, *VERDICTS)) + " | no row |",
+        "| --- | --- |" + " --- |" * (len(BASES) + len(VERDICTS) + 1),
+        *_count_rows(catalogue(None, None)),
+        "",
+    ]
     return "\n".join(lines)
 
 
