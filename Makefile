@@ -50,7 +50,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test soak pins platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
+.PHONY: help setup demo test mutants soak pins platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -68,6 +68,9 @@ $(COLLECTED): $(STAMP) $(wildcard tests/*.py)
 
 test: $(STAMP) $(COLLECTED) ## the tests, six workers for two cores (ARGS="-k name" is passed on)
 	$(RUN) pytest -n auto --dist worksteal -m "not soak" $(ARGS)
+
+mutants: $(STAMP) ## the conformance checks on deliberately wrong hands (ARGS="--model h1"; docs/mutants.md)
+	$(RUN) python -m dexkit.conformance.faults $(ARGS)
 
 soak: $(STAMP) ## the long tests
 	$(RUN) pytest -m soak $(ARGS)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
+from dexkit.conformance.faults import plan_for
 from dexkit.conformance.layers import layer
-from dexkit.conformance.mutants import plan_for
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Load, Result, RunResult, Verdict
 from dexkit.conformance.stimulus_record import RECORD, Beats, Stall, Stimulus

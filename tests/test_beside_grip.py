@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.stimuli import phases_for

@@ -18,9 +18,9 @@ from dexkit.backends import BackendOptions, backend
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
 from dexkit.conformance.checks.servos import _repeats, _turns
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.registry import mix
-from dexkit.conformance.mutants.servos import StatesSwapped, Vibrates
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.registry import mix
+from dexkit.conformance.faults.servos import StatesSwapped, Vibrates
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.brainco import BrainCoService

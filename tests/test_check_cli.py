@@ -142,7 +142,7 @@ _UNUSED = (
     # np.unique of numpy 2.4 needs it
     *(("numpy.ma",) if _NUMPY < (2, 4) else ()),
     *("dexkit.teleop", "dexkit.drivers", "dexkit.emulators", "dexkit.backends"),
-    *("dexkit.conformance.mutants", "dexkit.conformance.stimuli", "dexkit.conformance.live"),
+    *("dexkit.conformance.faults", "dexkit.conformance.stimuli", "dexkit.conformance.live"),
     *(
         "dexkit.conformance.usb.recording",
         "dexkit.conformance.report.html",

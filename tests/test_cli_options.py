@@ -29,17 +29,15 @@ DIFFERENT = {
     ),
     "--force": ({SHARED, "calibrate"}, "calibrate measures a force"),
     "--from": (
-        {SHARED, "bridge", "cut", "mutants"},
-        "a format, a dialect, a time, a file of hands",
+        {SHARED, "bridge", "cut"},
+        "a format, a dialect, a time",
     ),
-    "--hand": ({SHARED, "mutants"}, "a model, and the name of a generated hand"),
     "--id": (
         {SHARED, "calibrate", "emulate/mx64"},
         "the id of one device, one or auto, and several on one line",
     ),
     "--link": ({SHARED, "doctor"}, "a path, and the host at the other end of a network"),
     "--log": ({"monitor", "setup_dds"}, "a recording, and the output of programs"),
-    "--model": ({"doctor", "mutants"}, "short names of hands, and hands and robots"),
     "--out": (
         {SHARED, "export", "view"},
         "a folder with a default, a folder that must be named, a file or an address",

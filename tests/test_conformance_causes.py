@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.checks.causes import of_positions, of_scale, of_type
-from dexkit.conformance.mutants import mutants, run_mutant
-from dexkit.conformance.mutants.trials import HandTrial
+from dexkit.conformance.faults import mutants, run_mutant
+from dexkit.conformance.faults.trials import topic_plan
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.results import Verdict
 from dexkit.hand import Side
@@ -80,7 +80,7 @@ def test_cause_names_types_of_another_hand() -> None:
 )
 def test_cause_names_mistake_of_wrong_hand(mutant: str, requirement: str, expected: str) -> None:
     wrong = next(m for m in mutants() if m.name == mutant and m.kills == requirement)
-    result = run_mutant(wrong.made, HandTrial().plan(wrong, short=True))
+    result = run_mutant(wrong.made, topic_plan(wrong, short=True))
     found = next(
         r for r in result.results if (r.requirement.id, r.verdict) == (requirement, Verdict.FAIL)
     )

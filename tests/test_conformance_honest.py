@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks.after_disturbances import fastest
 from dexkit.conformance.checks.motion import Step
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.faults import gripper, plan_for
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import gripper, plan_for
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Load, Overall, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual

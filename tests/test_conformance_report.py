@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dexkit.conformance.faults import gripper, mutants, plan_for
+from dexkit.conformance.faults import usb as wrong_usb
 from dexkit.conformance.judge import judge, judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.mutants import gripper, mutants, plan_for
-from dexkit.conformance.mutants import usb as wrong_usb
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.labels import VERDICTS

@@ -15,10 +15,10 @@ from rich.console import Console
 
 from dexkit.cli import cli
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.faults import plan_for
+from dexkit.conformance.faults.robot import NoCrc
+from dexkit.conformance.faults.usb import StaleCrc
 from dexkit.conformance.judge import judge
-from dexkit.conformance.mutants import plan_for
-from dexkit.conformance.mutants.robot import NoCrc
-from dexkit.conformance.mutants.usb import StaleCrc
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import badge_text, render_badge
 from dexkit.conformance.report.compare import (

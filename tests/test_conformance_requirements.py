@@ -9,9 +9,9 @@ import pytest
 
 from dexkit.conformance import requirements
 from dexkit.conformance.checks import REGISTRY, check_of
+from dexkit.conformance.faults import mutants
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Level, catalogue, models, parse, select
 from dexkit.conformance.selection import quick
 from dexkit.conformance.stimuli import Plan, phases_for, script_class

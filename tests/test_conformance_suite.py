@@ -15,12 +15,12 @@ import pytest
 
 from dexkit.conformance import suite_run
 from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.faults import any_model, plan_for
+from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.known_backends import EXTERNAL
 from dexkit.conformance.live import LiveOptions, record_run
-from dexkit.conformance.mutants import any_model, plan_for
-from dexkit.conformance.mutants.registry import mix
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Level, select
 from dexkit.conformance.requirements import catalogue as requirements

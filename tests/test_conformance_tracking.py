@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.any_model import WaitsForRest
-from dexkit.conformance.mutants.gripper import Slow
-from dexkit.conformance.mutants.registry import mix
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.any_model import WaitsForRest
+from dexkit.conformance.faults.gripper import Slow
+from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.gripper import ReferenceService

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.backend_processes import Tool
 from dexkit.conformance.checks import check_of
+from dexkit.conformance.faults import mutants
+from dexkit.conformance.faults.matrix import WrongHandResult, try_one
+from dexkit.conformance.faults.trials import judge_usb, play_usb
 from dexkit.conformance.judge import judge_layer
 from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.mutants import mutants
-from dexkit.conformance.mutants.matrix import WrongHandResult, try_one
-from dexkit.conformance.mutants.runs import judge_usb, play_usb
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Load, Verdict
 from dexkit.conformance.run_queue import Watched

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.faults import plan_for
+from dexkit.conformance.faults.operator import LateState
 from dexkit.conformance.heartbeat import Heartbeat
 from dexkit.conformance.judge import judge
 from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.mutants import plan_for
-from dexkit.conformance.mutants.operator import LateState
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Evidence, Load, Result, Verdict

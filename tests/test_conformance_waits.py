@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 
 from dexkit.conformance import run_queue
 from dexkit.conformance.checks import Outcome
+from dexkit.conformance.faults import plan_for
+from dexkit.conformance.faults.gripper import Inverted, NanVelocity, Percent
 from dexkit.conformance.judge import judge
 from dexkit.conformance.lateness import IDLE, Lateness
-from dexkit.conformance.mutants import plan_for
-from dexkit.conformance.mutants.gripper import Inverted, NanVelocity, Percent
 from dexkit.conformance.processor_waits import ProcessWaits, Starvation, Waits
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue

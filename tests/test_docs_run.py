@@ -40,7 +40,6 @@ ELSEWHERE = (
     (r"^setup-dds", "downloads, or needs sources: tests/test_setup_dds.py"),
     (r"^install-service ezgripper", "as root: tests/test_install_service.py"),
     (r"--peer|--interface (wlan0|192)", "other machines: tests/test_networks.py"),
-    (r"^mutants", "minutes: tests/test_mutants.py"),
     (
         r"ttyUSB1|(dex1|inspire|revo2)-serial .*--device /dev|--device 192|"
         r"(calibrate|selftest) dex1",

@@ -12,15 +12,15 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.mutants import command
+from dexkit.conformance.faults import generated, outsiders
+from dexkit.conformance.faults.generated import Fault, Generated, dialects, oracle, parse
+from dexkit.conformance.faults.generated.campaign import Campaign, Trial, try_generated
+from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
+from dexkit.conformance.faults.generated.good import DEVIATIONS, GROUPS
+from dexkit.conformance.faults.generated.rig import Part, What, compose
+from dexkit.conformance.faults.generated.stimulus import play_order, random_segments
+from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants import generated, outsiders
-from dexkit.conformance.mutants.generated import Fault, Generated, dialects, oracle, parse
-from dexkit.conformance.mutants.generated.campaign import Campaign, Trial, try_generated
-from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
-from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
-from dexkit.conformance.mutants.generated.rig import Part, What, compose
-from dexkit.conformance.mutants.generated.stimulus import play_order, random_segments
-from dexkit.conformance.mutants.generated.times import WHENS
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
@@ -381,7 +381,7 @@ def test_the_documented_example_is_tried(tmp_path: Path) -> None:
 
 
 _HEAD = """
-from dexkit.conformance.mutants.outsiders import hand
+from dexkit.conformance.faults.outsiders import hand
 from dexkit.conformance.virtual.gripper import ReferenceService
 """
 

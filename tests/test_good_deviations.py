@@ -8,12 +8,12 @@ from itertools import product
 import numpy as np
 import pytest
 
+from dexkit.conformance.faults import generated
+from dexkit.conformance.faults.generated import Fault, Generated, dialects, parse
+from dexkit.conformance.faults.generated.good import DEVIATIONS, GROUPS
+from dexkit.conformance.faults.generated.rig import Faulty, Part, Report, What, compose
+from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants import generated
-from dexkit.conformance.mutants.generated import Fault, Generated, dialects, parse
-from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
-from dexkit.conformance.mutants.generated.rig import Faulty, Part, Report, What, compose
-from dexkit.conformance.mutants.generated.times import WHENS
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.virtual import Sample
 from dexkit.errors import UsageError

@@ -48,7 +48,7 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("teleop",): ["full-stroke"],
 }
 """What a command needs so that it comes to look at the rest."""
-_SLOW = {("demo",), ("mutants",), ("emulate", "all")}
+_SLOW = {("demo",), ("emulate", "all")}
 """Commands that do their work in processes; only what they refuse at once is tried."""
 _CODES = {0, 1, 2, 130}
 

@@ -18,10 +18,10 @@ from dexkit.cli import cli
 from dexkit.cli.emulate.all import _for_xr
 from dexkit.clock import ManualClock
 from dexkit.conformance.backend_processes import RigOptions
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.registry import mix
+from dexkit.conformance.faults.servos import ReversedScale
 from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.registry import mix
-from dexkit.conformance.mutants.servos import ReversedScale
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.fingers import Ints

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from dexkit.backends import backend
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.registry import mix
+from dexkit.conformance.faults.servos import ReversedScale
 from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.registry import mix
-from dexkit.conformance.mutants.servos import ReversedScale
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpHand, FtpService

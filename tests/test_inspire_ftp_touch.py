@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
 from dexkit.conformance.checks.touch import _longest_gap
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.touch import CountsFromTheThumb, NoPalm, NoTouch
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.touch import CountsFromTheThumb, NoPalm, NoTouch
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from dexkit.conformance.checks import REGISTRY, check_of
 from dexkit.conformance.layers import LAYERS, layer
-from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import catalogue
 from dexkit.models import BUILT_IN
 from dexkit.robots import ROBOTS
@@ -27,8 +26,6 @@ def test_every_layer_is_complete() -> None:
             assert found.reference(model).fault_sides, (name, model)
             if name != "client":  # which the kit plays nothing to
                 assert found.script(model).run, (name, model)
-        trial = found.trial.load()()
-        assert all(trial.cost(m) > 0 for m in mutants(name)), name
 
 
 def test_each_check_is_in_a_module_of_its_layer() -> None:
@@ -50,7 +47,7 @@ def test_requirements_are_read_without_checks() -> None:
     loaded = subprocess.run(
         [sys.executable, "-c", text], check=True, capture_output=True, text=True
     ).stdout.split()
-    parts = ("checks", "recording", "stimuli", "virtual", "mutants", "usb")
+    parts = ("checks", "recording", "stimuli", "virtual", "faults", "usb")
     unwanted = [m for m in loaded if m.split(".")[2] in parts]
     assert not unwanted
 

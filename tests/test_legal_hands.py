@@ -16,11 +16,11 @@ import pytest
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.faults.generated import Fault, Generated
+from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.motor_messages import Motor, state_member
-from dexkit.conformance.mutants.generated import Fault, Generated
-from dexkit.conformance.mutants.trials import plan_for
 from dexkit.conformance.requirements import CAPABILITIES, catalogue
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.conformance.verdicts import Excuse, Judgement

@@ -20,9 +20,9 @@ from click.testing import CliRunner
 
 import dexkit.models
 from dexkit.cli import cli
+from dexkit.conformance.faults import mutants, plan_for, run_mutant
+from dexkit.conformance.faults.matrix import chosen, cost, try_one
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants import mutants, plan_for, run_mutant
-from dexkit.conformance.mutants.matrix import chosen, cost, try_one
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Overall
 from dexkit.dds import DdsNode
@@ -66,7 +66,7 @@ CONSTANTS = {
 NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
 HOMES = ("dexkit/models/", "dexkit/robots.py")
 # wrong hands are declared for the models on which they are tried
-WRONG_HANDS = "conformance/mutants/"
+WRONG_HANDS = "conformance/faults/"
 # names of subcommands, with the module or the arguments of each
 COMMANDS = ("dexkit/cli/emulate/__init__.py", "tools/campaign/options.py")
 # the lab's cases are about its own devices, one of each kind
@@ -181,7 +181,7 @@ def forget() -> None:
     """What was found out about installed packages."""
     from dexkit import lazy
     from dexkit.conformance import requirements
-    from dexkit.conformance.mutants import registry
+    from dexkit.conformance.faults import registry
 
     importlib.invalidate_caches()
     dexkit.models._plugins = None
@@ -454,5 +454,5 @@ def test_the_installed_example_is_served_and_judged(tmp_path: Path) -> None:
     )
     assert suite.returncode == 0, suite.stdout + suite.stderr
     assert "Two-finger hand" in report.read_text(encoding="utf-8")
-    matrix = live(str(python), "-m", "dexkit", "mutants", "--model", NAME, "--jobs", "2")
+    matrix = live(str(python), "-m", "dexkit.conformance.faults", "--model", NAME, "--jobs", "2")
     assert matrix.returncode == 0, matrix.stdout + matrix.stderr

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from dexkit.cli.mutants import command
 from dexkit.conformance.checks import check_of
-from dexkit.conformance.layers import layer
-from dexkit.conformance.mutants import Mutant, mutants, plan_for, run_mutant
-from dexkit.conformance.mutants.matrix import (
+from dexkit.conformance.faults import Mutant, mutants, plan_for, run_mutant
+from dexkit.conformance.faults.__main__ import command
+from dexkit.conformance.faults.matrix import (
     Score,
     WrongHandResult,
     chosen,
-    cost,
     essential,
     try_one,
 )
+from dexkit.conformance.faults.trials import cost
+from dexkit.conformance.layers import layer
 from dexkit.conformance.requirements import Level, catalogue, select
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.errors import UsageError

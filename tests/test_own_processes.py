@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.child_processes import END_WITH_PARENT, Tool, command_line
+from dexkit.child_processes import END_WITH_PARENT, Tool, command_line, module_line
 from dexkit.emulators.mx64 import EmulatedProcess
 from dexkit.errors import DexkitError
 from dexkit.open_file_limit import require_open_files
@@ -65,7 +65,8 @@ def test_programs_import_nothing_from_the_working_directory(hostile_folder: Path
 
 @pytest.mark.soak
 def test_workers_import_nothing_from_the_working_directory(hostile_folder: Path) -> None:
-    command = command_line("mutants", "--require", "DEX1-RATE-03", "--jobs", "1", "--json", "out")
+    arguments = ("--require", "DEX1-RATE-03", "--jobs", "1", "--json", "out")
+    command = module_line("dexkit.conformance.faults", *arguments)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr
     assert (hostile_folder / "out").exists()

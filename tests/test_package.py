@@ -95,10 +95,16 @@ def test_wheel_holds_every_package_completely_and_once(wheel: Path) -> None:
         path.resolve().relative_to(ROOT)
         for folder in ("dexkit", *PACKAGES)
         for path in (ROOT / folder).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
+        if path.is_file() and not {"__pycache__", "faults"} & set(path.parts)
     }
     expected = {str(p if p.parts[0] == "dexkit" else "dexkit" / p) for p in sources}
     assert set(packed) == expected
+
+
+def test_the_wheel_has_no_wrong_hands(installed: Installed) -> None:
+    """They are for the work on the checks, in a checkout."""
+    found = installed("python", "-c", "import dexkit.conformance.faults", check=False)
+    assert "No module named 'dexkit.conformance.faults'" in found.stderr
 
 
 def test_command_line_of_the_wheel(installed: Installed) -> None:

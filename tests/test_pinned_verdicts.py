@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from dexkit.conformance.mutants import Mutant, mutants
-from dexkit.conformance.mutants.matrix import cost, try_one
+from dexkit.conformance.faults import Mutant, mutants
+from dexkit.conformance.faults.trials import blamed, cost
 from dexkit.traces.samples import SAMPLES, sample_path
 from tools.pins.matrix import found_pins, tasks, tried
-from tools.pins.pinned import Pins, blamed, figures_of, name_of
+from tools.pins.pinned import Pins, figures_of
 from tools.pins.store import default_folder
 from tools.pins.verdicts import judge_sample, verdicts_of
 
@@ -23,9 +23,10 @@ def test_samples_get_the_pinned_verdicts() -> None:
     assert found == Pins.load().samples, WHERE
 
 
-def test_every_wrong_hand_is_pinned_with_the_requirements_that_it_breaks() -> None:
-    declared = {name_of(m): sorted({m.kills, *m.also}) for m in mutants()}
-    assert declared == Pins.load().hands, WHERE
+def test_every_wrong_hand_is_pinned_with_the_requirement_that_it_breaks() -> None:
+    pinned = Pins.load().hands
+    assert {m.pin for m in mutants()} == set(pinned), WHERE
+    assert all(m.kills in pinned[m.pin] for m in mutants()), WHERE
 
 
 def one_of_each_layer() -> list[Mutant]:
@@ -39,7 +40,7 @@ def one_of_each_layer() -> list[Mutant]:
 def test_one_wrong_hand_of_each_layer_gets_the_pinned_blame() -> None:
     pinned = Pins.load().hands
     for mutant in one_of_each_layer():
-        assert blamed(try_one(mutant)) == pinned[name_of(mutant)], f"{name_of(mutant)}: {WHERE}"
+        assert sorted(blamed(mutant)) == pinned[mutant.pin], f"{mutant.pin}: {WHERE}"
 
 
 @pytest.mark.soak

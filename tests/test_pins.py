@@ -18,10 +18,10 @@ from click.testing import CliRunner
 
 from dexkit.conformance import judge as judge_module
 from dexkit.conformance.checks import Check, Outcome, check_of
+from dexkit.conformance.faults import Mutant, mutants
+from dexkit.conformance.faults.trials import cost, run_of
 from dexkit.conformance.judge import judge_layer
 from dexkit.conformance.layers import layer
-from dexkit.conformance.mutants import Mutant, mutants
-from dexkit.conformance.mutants.matrix import cost
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.hand import Side
 from tests.each import each
@@ -36,11 +36,10 @@ from tools.pins.keys import (
     judging,
     played_by,
     recording_key,
-    run_of,
     sources,
 )
 from tools.pins.matrix import tasks
-from tools.pins.pinned import Pins, name_of
+from tools.pins.pinned import Pins
 from tools.pins.recordings import Broken, pack, unpack
 from tools.pins.sources import WHOLE, Place, Sources
 from tools.pins.store import Store
@@ -165,7 +164,7 @@ EDITS = [
     ("dexkit/traces/reader.py", "1024", "1025", None, True),
     # neither
     ("dexkit/conformance/report/html.py", "import html", "import html, math", False, False),
-    ("dexkit/conformance/mutants/robot.py", "class ", "class X", False, False),
+    ("dexkit/conformance/faults/robot.py", "class ", "class X", False, False),
     ("dexkit/dds.py", "import threading", "import threading, math", False, False),
 ]
 
@@ -209,8 +208,8 @@ def test_a_changed_check_is_judged_anew_and_no_other() -> None:
 def test_a_changed_wrong_hand_is_played_anew_and_no_other() -> None:
     given = [m for m in mutants("dds") if m.model == "dex1-1"]
     chosen = given[7]
-    file = sys.modules[next(c for c in chosen.made.__mro__ if "mutants" in c.__module__).__module__]
-    name = str(file.__file__).removeprefix(f"{ROOT}/")
+    module = next(c.__module__ for c in chosen.made.__mro__ if ".faults." in c.__module__)
+    name = str(sys.modules[module].__file__).removeprefix(f"{ROOT}/")
     after = EditedHere(
         (name, f"class {chosen.name}", f"class More:\n    pass\nclass {chosen.name}")
     )
@@ -385,7 +384,7 @@ def test_a_requirement_alone_is_judged_as_among_all(layer_name: str, model: str)
 
 
 def task_for(folder: Path, layer_name: str = "usb", model: str = "dex3-1") -> Task:
-    (task,) = tasks(folder, [name_of(cheapest(layer_name, model))])
+    (task,) = tasks(folder, [cheapest(layer_name, model).pin])
     return task
 
 
@@ -500,7 +499,7 @@ def test_what_is_gone_is_named_only_where_all_was_tried() -> None:
 
 def test_command_compares_and_writes(tmp_path: Path) -> None:
     mutant = cheapest("usb", "dex3-1")
-    name, folder = name_of(mutant), tmp_path / "pinned"
+    name, folder = mutant.pin, tmp_path / "pinned"
     folder.mkdir()
     wrong = Pins({name: ["DEX3USB-DESC-99"], "usb x Y (Z-01)": []}, {})
     wrong.save(folder)
@@ -513,7 +512,7 @@ def test_command_compares_and_writes(tmp_path: Path) -> None:
     assert "1 of those played" in run.output
     run = CliRunner().invoke(main, [*arguments, "--update"])
     assert run.exit_code == 0, run.output
-    assert Pins.load(folder).hands == {name: [mutant.kills, *mutant.also], "usb x Y (Z-01)": []}
+    assert Pins.load(folder).hands == {name: sorted(mutant.pinned or ()), "usb x Y (Z-01)": []}
     run = CliRunner().invoke(main, arguments)
     assert run.exit_code == 0, run.output
     assert "0 of them judged" in run.output

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.mutants import plan_for, run_mutant
+from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.stimuli import phases_for, script_class

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dexkit.conformance.faults import mutants
+from dexkit.conformance.faults.fingers import FingerService, MilliNewtonMetres
+from dexkit.conformance.faults.matrix import try_one
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
-from dexkit.conformance.mutants import mutants
-from dexkit.conformance.mutants.fingers import FingerService, MilliNewtonMetres
-from dexkit.conformance.mutants.matrix import try_one
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Result, Verdict
 from dexkit.traces import open_trace, sample_path

@@ -16,11 +16,11 @@ import pytest
 from rich.console import Console
 
 from dexkit.conformance import scores
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.generated.campaign import Trial
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.generated.campaign import Trial
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.html import render

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.conformance.mutants import plan_for
+from dexkit.conformance.faults import plan_for
 from dexkit.conformance.stimuli import Send
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.topic_run import ORIGIN_NS, _Player

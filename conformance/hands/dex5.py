@@ -14,7 +14,6 @@ DEX5_1 = ModelUnderTest(
     requirements=("dex5.toml",),
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
-    wrong_hands=Lazy("dexkit.conformance.mutants.dex5"),
     quick_phases=("drive", "joint", "late-joiner"),
     # first flexing joints of four fingers: none of them shares its motor
     roles=JointRoles(driven=(1, 5), slow=(9, 13)),

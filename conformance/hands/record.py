@@ -60,8 +60,8 @@ class ModelUnderTest:
         opening for a gripper, of closing for others.
     :param session: the recorded session to replay: name of a sample of dexkit, or path of a
         recording; empty where there is none.
-    :param wrong_hands: the module with the wrong hands of this model alone, which have the
-        decorator ``dexkit.conformance.mutants.wrong_hand``; None where the shared ones prove its
+    :param wrong_hands: the module with the wrong hands of another package's model, which have the
+        decorator ``dexkit.conformance.faults.wrong_hand``; None where the shared ones prove its
         requirements.
     :param scored_hands: how many generated wrong hands its runs are scored by; only the hands of
         dexkit itself are scored.

@@ -2,16 +2,15 @@
 
 A :class:`Layer` is the data by which the kit goes from a device to verdicts: how a recording is
 decoded (:func:`recording_of`), what is judged by which checks (:mod:`dexkit.conformance.judge`),
-which script is played to which reference, and how a wrong one is tried
-(:mod:`dexkit.conformance.mutants.matrix`). Each layer is in a module of its own:
+and which script is played to which reference. Each layer is in a module of its own:
 
 * :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
 * :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands;
 * :mod:`~dexkit.conformance.layers.robot`: ``robot``, the low-level DDS topics of robots;
 * :mod:`~dexkit.conformance.layers.client`: ``client``, the commands that a client sends to hands.
 
-These modules are imported with the requirements, and load checks, decoders, scripts, references and
-trials on first use.
+These modules are imported with the requirements, and load checks, decoders, scripts and references
+on first use.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from dexkit.topics import HAND_TOPICS, prefixes_of
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks import BaseContext, Outcome
-    from dexkit.conformance.mutants.trials import Trial
     from dexkit.conformance.recording import Recording, TraceLike
     from dexkit.conformance.requirements import Requirement
     from dexkit.conformance.results import Result
@@ -78,7 +76,6 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     :param script: the stimulus script of a model, by the model's name.
     :param reference: the simulated device or client of a model that meets every requirement,
         likewise.
-    :param trial: how a wrong device or client is run and judged.
     """
 
     name: str
@@ -92,7 +89,6 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     whole: Callable[[RecordingT], tuple[float, float] | None]
     script: Callable[[str], type[Any]]
     reference: Callable[[str], type[Any]]
-    trial: Lazy[type[Trial]]
 
 
 _MODULES = {"dds": "hand", "usb": "usb", "robot": "robot", "client": "client"}

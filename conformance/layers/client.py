@@ -48,5 +48,4 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     whole=hand.whole,
     script=_no_script,
     reference=lambda name: _REFERENCE.load(),
-    trial=Lazy("dexkit.conformance.mutants.trials:ClientTrial"),
 )

@@ -214,5 +214,4 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
     whole=whole,
     script=lambda name: under_test(name).script.load(),
     reference=lambda name: under_test(name).reference.load(),
-    trial=Lazy("dexkit.conformance.mutants.trials:HandTrial"),
 )

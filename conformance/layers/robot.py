@@ -45,5 +45,4 @@ LAYER: Layer[RobotRecording, SideView, RobotContext] = Layer(
     whole=hand.whole,
     script=lambda name: under_test(name).script.load(),
     reference=lambda name: under_test(name).reference.load(),
-    trial=Lazy("dexkit.conformance.mutants.trials:RobotTrial"),
 )

@@ -57,5 +57,4 @@ LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     whole=lambda recording: None,
     script=lambda name: _SCRIPT.load(),
     reference=lambda name: _REFERENCE.load(),
-    trial=Lazy("dexkit.conformance.mutants.trials:UsbTrial"),
 )

@@ -4,7 +4,7 @@ The same script drives them and the same checks judge them as in a live run; hal
 takes a fraction of a second. They prove the checks: the references
 (:mod:`~dexkit.conformance.virtual.gripper`, :mod:`~dexkit.conformance.virtual.fingers`,
 :mod:`~dexkit.conformance.virtual.robot`, :mod:`~dexkit.conformance.virtual.usb`) meet every
-requirement, and each wrong hand in :mod:`dexkit.conformance.mutants` changes one thing.
+requirement, and each wrong hand in :mod:`dexkit.conformance.faults` changes one thing.
 """
 
 from dexkit.conformance.virtual.memory_trace import MemoryTrace

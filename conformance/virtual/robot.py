@@ -2,7 +2,7 @@
 
 It shares no code with the emulated robots that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
-friction. The wrong robots in :mod:`dexkit.conformance.mutants.robot` override its methods.
+friction. The wrong robots in :mod:`dexkit.conformance.faults.robot` override its methods.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 It shares no code with the emulated device that dexkit ships, so that neither is judged by itself.
 Its mechanics are the simplest that show every requirement: joints without mass that creep against
-friction. The wrong devices in :mod:`dexkit.conformance.mutants.usb` override its methods.
+friction. The wrong devices in :mod:`dexkit.conformance.faults.usb` override its methods.
 """
 
 from __future__ import annotations

@@ -34,7 +34,6 @@ _SECTIONS: Sections = {
         "report": ("dexkit.cli.report", "Write the reports of a result."),
         "compare": ("dexkit.cli.compare", "Compare several results."),
         "badge": ("dexkit.cli.badge", "Draw a badge of a result (SVG)."),
-        "mutants": ("dexkit.cli.mutants", "Test the checks on deliberately wrong hands."),
     },
     "Sessions": {
         "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),

@@ -9,8 +9,8 @@ import functools
 import re
 from collections.abc import Iterable
 
+from dexkit.conformance.faults import mutants
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.mutants import mutants
 from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue, renamed
 from dexkit.models import BUILT_IN
 

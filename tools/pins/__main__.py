@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from dexkit.conformance.mutants.matrix import in_processes
+from dexkit.conformance.faults.matrix import in_processes
 from dexkit.console import Console
 from dexkit.errors import DexkitError
 from dexkit.stop_signals import StopRequest, stop_on_signals

@@ -29,11 +29,10 @@ import numpy as np
 from dexkit import messages
 from dexkit.conformance import layers
 from dexkit.conformance.checks import check_of
+from dexkit.conformance.faults import Mutant, trials
+from dexkit.conformance.faults.trials import run_of
 from dexkit.conformance.judge import deciding
 from dexkit.conformance.layers import layer
-from dexkit.conformance.mutants import Mutant, runs
-from dexkit.conformance.mutants.runs import Run
-from dexkit.conformance.mutants.trials import trial_of
 from dexkit.conformance.requirements import Requirement, catalogue
 from tools.pins.sources import WHOLE, Place, Sources
 
@@ -52,7 +51,7 @@ __all__ = [
 ROOT = Path(__file__).parents[2]
 SPLIT = (
     "dexkit.conformance.checks",
-    "dexkit.conformance.mutants",
+    "dexkit.conformance.faults",
     "dexkit.conformance.recording",
     "dexkit.conformance.usb.checks",
 )
@@ -170,12 +169,6 @@ def played_by(mutant: Mutant) -> frozenset[Place]:
     return frozenset(found | _messages())
 
 
-@cache
-def run_of(mutant: Mutant) -> Run:
-    """The whole run of a wrong hand."""
-    return trial_of(mutant).run(mutant)
-
-
 def recording_key(mutant: Mutant) -> str:
     """The key of a wrong hand's recording."""
     bases = [f"{c.__module__}.{c.__qualname__}" for c in mutant.made.__mro__]
@@ -194,7 +187,7 @@ def sample_key(path: Path) -> str:
 @cache
 def judging(judged_by: tuple[str, ...]) -> frozenset[Place]:
     """The places of the code that judges by some layers, apart from the checks."""
-    judges = (runs.judge_topics, runs.judge_usb, runs.judge_client)
+    judges = (trials.judge_topics, trials.judge_usb, trials.judge_client)
     found = {sources().place(judge.__module__, judge.__qualname__) for judge in judges}
     found |= {("tools.pins.recordings", WHOLE), ("tools.pins.verdicts", WHOLE)}
     found |= {sources().place(*layer(name).context.target.split(":")) for name in judged_by}

@@ -6,14 +6,15 @@ import fnmatch
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
-from dexkit.conformance.mutants import mutants
-from dexkit.conformance.mutants.matrix import cost, in_processes
+from dexkit.conformance.faults import mutants
+from dexkit.conformance.faults.matrix import in_processes
+from dexkit.conformance.faults.trials import cost
 from dexkit.conformance.recording import detect_dialect
 from dexkit.errors import UsageError
 from dexkit.traces import open_trace
 from dexkit.traces.samples import SAMPLES, sample_path
 from tools.pins.keys import recording_key, sample_key, verdict_keys
-from tools.pins.pinned import Pins, blamed_of, figures_of, name_of
+from tools.pins.pinned import Pins, blamed_of, figures_of
 from tools.pins.trial import Done, Task, known, work
 from tools.pins.verdicts import Verdicts
 
@@ -30,7 +31,7 @@ def tasks(folder: Path, only: Collection[str] = ()) -> list[Task]:
     :param only: parts of the names, or patterns with ``*``, of those that are wanted; none for all.
     :raises UsageError: one of them fits no name.
     """
-    hands = {name_of(m): m for m in mutants()}
+    hands = {m.pin: m for m in mutants()}
     chosen = _chosen([*hands, *SAMPLES], only)
     found = []
     for name in chosen:
@@ -57,7 +58,7 @@ def _chosen(names: Sequence[str], only: Collection[str]) -> list[str]:
         if not fits:
             raise UsageError(
                 f"no wrong hand and no sample is called {text!r}",
-                hint="'dexkit mutants --list' and 'dexkit samples' name them",
+                hint="'python -m dexkit.conformance.faults --list' and 'dexkit samples' name them",
             )
         wanted.update(fits)
     return [name for name in names if name in wanted or not only]

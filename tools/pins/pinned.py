@@ -14,31 +14,18 @@ from pathlib import Path
 
 import msgspec
 
-from dexkit.conformance.mutants import Mutant
-from dexkit.conformance.mutants.matrix import WrongHandResult
-from dexkit.conformance.mutants.trials import BLAMES
+from dexkit.conformance.faults.trials import BLAMES
 from dexkit.documents import read_bytes, write_file
 from dexkit.errors import UsageError
 from tools.pins.verdicts import Verdicts
 
-__all__ = ["FOLDER", "Pins", "blamed", "blamed_of", "figures_of", "name_of"]
+__all__ = ["FOLDER", "Pins", "blamed_of", "figures_of"]
 
 FOLDER = Path(__file__).parents[2] / "tests" / "pinned"
 
 
-def name_of(mutant: Mutant) -> str:
-    """The name of a wrong hand in the file."""
-    return f"{mutant.layer} {mutant.model} {mutant.name} ({mutant.kills})"
-
-
-def blamed(outcome: WrongHandResult) -> list[str]:
-    """The requirements that find fault with a wrong hand."""
-    due = {outcome.mutant.kills, *outcome.mutant.also}
-    return sorted(due - set(outcome.missed) | set(outcome.wrongly))
-
-
 def blamed_of(verdicts: Verdicts) -> list[str]:
-    """The same of verdicts."""
+    """The requirements that find fault with a wrong hand."""
     blames = {str(verdict) for verdict in BLAMES}
     return sorted(
         name for name, sides in verdicts.items() if any(v in blames for v, _ in sides.values())

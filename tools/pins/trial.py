@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from dexkit.conformance.mutants.matrix import with_key
-from dexkit.conformance.mutants.trials import trial_of
+from dexkit.conformance.faults.matrix import with_key
+from dexkit.conformance.faults.trials import run_of
 from dexkit.conformance.results import Result
 from dexkit.traces.samples import sample_path
 from tools.pins.recordings import pack
@@ -73,7 +73,7 @@ def _judged(task: Task, only: Collection[str]) -> tuple[list[Result], bool]:
     if task.mutant is None:
         return judge_sample(sample_path(task.name), only), False
     mutant = with_key(task.mutant)
-    run = trial_of(mutant).run(mutant)
+    run = run_of(mutant)
     store = Store(task.folder)
     trace = store.recording(task.recording)
     if trace is not None:
@@ -89,5 +89,5 @@ def same_again(task: Task) -> bool | None:
     if task.mutant is None or kept is None:
         return None
     mutant = with_key(task.mutant)
-    run = trial_of(mutant).run(mutant)
+    run = run_of(mutant)
     return pack(run.play(run.made, run.about)) == kept

@@ -17,11 +17,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.faults import plan_for, run_mutant
+from dexkit.conformance.faults.generated import dialects, parse, sample
+from dexkit.conformance.faults.generated.campaign import Trial, graded, judged
+from dexkit.conformance.faults.generated.oracle import Severity
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants import plan_for, run_mutant
-from dexkit.conformance.mutants.generated import dialects, parse, sample
-from dexkit.conformance.mutants.generated.campaign import Trial, graded, judged
-from dexkit.conformance.mutants.generated.oracle import Severity
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.scores import FORMAT, Entry, Setting, catalogue_digest
 from dexkit.conformance.selection import RunKind

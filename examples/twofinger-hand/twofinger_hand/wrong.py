@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dexkit.conformance.mutants import wrong_hand
+from dexkit.conformance.faults import wrong_hand
 from dexkit.conformance.virtual.fingers import FingerHand
 from twofinger_hand.reference import TwoFingerService
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dexkit.conformance.mutants.registry import BOTH, wrong_hand
+from dexkit.conformance.faults.registry import BOTH, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand
 from dexkit.conformance.virtual.inspire import FtpService
@@ -57,7 +57,7 @@ class RareTouch(FtpService):
     touch_period = 0.1
 
 
-@wrong_hand("FTP-SENS-04", also=("FTP-TOUCH-05",), sides=BOTH)
+@wrong_hand("FTP-SENS-04", sides=BOTH)
 class CountsFromTheThumb(FtpService):
     """Publishes the areas of the fingers in the opposite order, the thumb's first."""
 

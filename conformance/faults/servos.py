@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.faults.any_model import ChokesOnThousands
+from dexkit.conformance.faults.registry import BOTH, has_speeds, takes_floats, wrong_hand
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.any_model import ChokesOnThousands
-from dexkit.conformance.mutants.registry import BOTH, has_speeds, takes_floats, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
 from dexkit.conformance.virtual.inspire import FtpService
@@ -45,28 +45,9 @@ class Thousandths(ServoService):
 
 
 # with an object in one hand, the other one shows that it is held back
-@wrong_hand(
-    "BRAINCO-SIDE-01",
-    also=(
-        *("BRAINCO-MOVE-09", "BRAINCO-PATH-01", "BRAINCO-SAFE-01", "BRAINCO-SPEED-02"),
-        *("BRAINCO-SPEED-03", "BRAINCO-STILL-01", "BRAINCO-WDOG-01", "BRAINCO-WDOG-03"),
-    ),
-    sides=BOTH,
-)
-@wrong_hand(
-    "DFX-SIDE-01",
-    also=("DFX-LIFE-02", "DFX-MOVE-09", "DFX-PATH-01", "DFX-STILL-01", "DFX-WDOG-03"),
-    sides=BOTH,
-)
-@wrong_hand(
-    "FTP-SIDE-01",
-    also=(
-        "FTP-LIFE-02",
-        *("FTP-MOVE-09", "FTP-PATH-01", "FTP-SIDE-02", "FTP-STILL-01"),
-        *("FTP-WDOG-01", "FTP-WDOG-03"),
-    ),
-    sides=BOTH,
-)
+@wrong_hand("BRAINCO-SIDE-01", sides=BOTH)
+@wrong_hand("DFX-SIDE-01", sides=BOTH)
+@wrong_hand("FTP-SIDE-01", sides=BOTH)
 class StatesSwapped(ServoService):
     """Publishes each side's state as the other's."""
 
@@ -87,7 +68,7 @@ def _one_in_twelve_is_too_few(hand: HandModel) -> bool:
     return hand.min_state_rate > 1.0 / (12 * ChokesOnThousands.period)
 
 
-@wrong_hand("BRAINCO-LOAD-01", also=("BRAINCO-RATE-04",), where=_one_in_twelve_is_too_few)
+@wrong_hand("BRAINCO-LOAD-01", where=_one_in_twelve_is_too_few)
 class ChokesOnThousandsOfCommands(ChokesOnThousands, ServoService):
     """Publishes one state in twelve while more than 1000 commands a second arrive."""
 
@@ -112,7 +93,7 @@ class _Reversed(ServoHand):
         super().take(turned, mode)
 
 
-@wrong_hand("BRAINCO-MOVE-01", also=("DFX-JOINT-01",))
+@wrong_hand("BRAINCO-MOVE-01")
 class ReversedScale(ServoService):
     """Takes the q of commands the other way round: 0 closed, 1 open."""
 
@@ -161,7 +142,7 @@ class _Wobbles(ServoHand):
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-MOVE-03", also=("BRAINCO-STILL-02",), whole=True)
+@wrong_hand("BRAINCO-MOVE-03", whole=True)
 class Wobbles(ServoService):
     """One joint oscillates about its goal."""
 
@@ -174,7 +155,7 @@ class _Lazy(ServoHand):
         self.reach = [0.4 * r for r in self.reach]
 
 
-@wrong_hand("BRAINCO-MOVE-04", also=("BRAINCO-SPEED-03",))
+@wrong_hand("BRAINCO-MOVE-04")
 class SlowServos(ServoService):
     """Takes 0.4 of each speed that is commanded."""
 
@@ -202,7 +183,7 @@ class _Overshoots(ServoHand):
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-MOVE-05", also=("BRAINCO-SAFE-08", "DFX-WDOG-01", "FTP-WDOG-01"))
+@wrong_hand("BRAINCO-MOVE-05")
 class Overshoots(ServoService):
     """Overshoots a large step by 8 % of the travel, and returns after 0.4 s."""
 
@@ -216,7 +197,7 @@ class _Fast(ServoHand):
         super().take(fast, mode)
 
 
-@wrong_hand("BRAINCO-SPEED-01", also=("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"))
+@wrong_hand("BRAINCO-SPEED-01")
 class AlwaysFast(ServoService):
     """Moves at full speed, whatever dq is."""
 
@@ -241,19 +222,14 @@ class _LetsGo(ServoHand):
         super().step(dt)
 
 
-@wrong_hand(
-    "BRAINCO-GRIP-01",
-    also=("BRAINCO-PATH-01", "BRAINCO-STILL-01", "FTP-SENS-09", "FTP-FORCE-06"),
-    sides=BOTH,
-    whole=True,
-)
+@wrong_hand("BRAINCO-GRIP-01", sides=BOTH, whole=True)
 class LetsGo(ServoService):
     """Opens after a second of full current, like a protection that trips."""
 
     hand_fault = _LetsGo
 
 
-@wrong_hand("BRAINCO-GRIP-01", also=("BRAINCO-RATE-03",), sides=BOTH, whole=True)
+@wrong_hand("BRAINCO-GRIP-01", sides=BOTH, whole=True)
 class SilentUnderLoad(ServoService):
     """Publishes nothing for half a second while it grips: its device does not answer."""
 
@@ -289,12 +265,7 @@ class _Vanishes(ServoHand):
         super().move(dt, [0.05 * p for p in pull] if self.pressed > 1.0 else pull)
 
 
-@wrong_hand(
-    "FTP-FORCE-06",
-    also=("FTP-FORCE-01", "FTP-SENS-09", "FTP-TOUCH-05"),
-    sides=BOTH,
-    whole=True,
-)
+@wrong_hand("FTP-FORCE-06", sides=BOTH, whole=True)
 class ForceVanishes(FtpService):
     """Presses with a twentieth of the force after a second of contact, and does not open."""
 
@@ -310,7 +281,7 @@ class _Opens(ServoHand):
         self.goal = np.array([j.straight for j in self.model.joints[self.side]])
 
 
-@wrong_hand("BRAINCO-WDOG-01", also=("DFX-PATH-01", "FTP-PATH-01"))
+@wrong_hand("BRAINCO-WDOG-01")
 class OpensInSilence(ServoService):
     """Opens a second after the last command."""
 
@@ -378,11 +349,7 @@ class _SlowAfterNan(ServoHand):
             self.reach = [0.33 * r for r in self.reach]
 
 
-@wrong_hand(
-    "BRAINCO-ABUSE-01",
-    also=("BRAINCO-SPEED-03", "DFX-SIDE-03"),
-    where=takes_floats,
-)
+@wrong_hand("BRAINCO-ABUSE-01", where=takes_floats)
 class SlowAfterNan(ServoService):
     """Moves with a third of each speed since it has got a command that is not finite."""
 
@@ -468,8 +435,8 @@ class FullSpeedInContact(ServoService):
             motors["dq"][np.abs(hand.contact[: len(motors)]) > 0.05] = 1.0
 
 
-@wrong_hand("BRAINCO-FORCE-01", also=("BRAINCO-FORCE-05",), sides=BOTH)
-@wrong_hand("FTP-FORCE-01", also=("FTP-FORCE-06",), sides=BOTH)
+@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
+@wrong_hand("FTP-FORCE-01", sides=BOTH)
 class ForceZeroedInGrip(_FeelingService):
     """Sets its forces to zero half a second after it has touched."""
 
@@ -479,8 +446,8 @@ class ForceZeroedInGrip(_FeelingService):
             motors["tau_est"] = 0.0
 
 
-@wrong_hand("BRAINCO-FORCE-01", also=("BRAINCO-FORCE-04", "BRAINCO-FORCE-05"), sides=BOTH)
-@wrong_hand("FTP-FORCE-01", also=("FTP-FORCE-04",), sides=BOTH)
+@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
+@wrong_hand("FTP-FORCE-01", sides=BOTH)
 class ForceOfNextJoint(ServoService):
     """Reports each force as its neighbour's."""
 
@@ -525,7 +492,7 @@ class _BacksOff(_Feels):
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
-@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-06",), sides=BOTH)
+@wrong_hand("FTP-FORCE-05", sides=BOTH)
 class ForceBacksOff(_FeelingService):
     """Takes its goals back to a seventh of the force as soon as it touches."""
 
@@ -557,15 +524,15 @@ class _GivesUp(_WeakAgain):
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
-@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-07",), sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
 class ForceGivesUp(_FeelingService):
     """Presses with a seventh of its force after a second of a grip."""
 
     hand_fault = _GivesUp
 
 
-@wrong_hand("BRAINCO-FORCE-05", also=("BRAINCO-MOVE-09",), sides=BOTH, whole=True)
-@wrong_hand("FTP-FORCE-05", also=("FTP-FORCE-07",), sides=BOTH, whole=True)
+@wrong_hand("BRAINCO-FORCE-05", sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
 class WeakAfterRestart(_FeelingService):
     """Presses with a seventh of its force after a restart of the service."""
 
@@ -610,7 +577,7 @@ class _FeelingFtp(FtpService):
         return hand.grip > seconds
 
 
-@wrong_hand("FTP-TOUCH-05", also=("FTP-TOUCH-03",), sides=BOTH)
+@wrong_hand("FTP-TOUCH-05", sides=BOTH)
 class TouchStopsInGrip(_FeelingFtp):
     """Publishes no touch from 0.4 s of a grip on."""
 
@@ -619,7 +586,7 @@ class TouchStopsInGrip(_FeelingFtp):
         return [sample for sample in super().touch() if sample.topic not in quiet]
 
 
-@wrong_hand("FTP-TOUCH-05", also=("FTP-SENS-04",), sides=BOTH)
+@wrong_hand("FTP-TOUCH-05", sides=BOTH)
 class TouchZeroedInGrip(_FeelingFtp):
     """Sets its tactile areas to zero 0.3 s after it has touched."""
 
@@ -633,7 +600,7 @@ class TouchZeroedInGrip(_FeelingFtp):
         return message
 
 
-@wrong_hand("FTP-TOUCH-05", also=("FTP-SENS-04",), sides=BOTH)
+@wrong_hand("FTP-TOUCH-05", sides=BOTH)
 class TouchKept(FtpService):
     """Keeps the largest reading of each element for ever."""
 
@@ -669,7 +636,7 @@ class ZeroIsFullSpeed(ServoService):
     hand_fault = _speed_fault(lambda dq: np.where(dq == 0.0, 1.0, dq))
 
 
-@wrong_hand("BRAINCO-SPEED-03", also=("BRAINCO-SPEED-02",))
+@wrong_hand("BRAINCO-SPEED-03")
 class SpeedOfTheFirst(ServoService):
     """Moves all joints with the speed of the first one."""
 
@@ -725,7 +692,7 @@ class _SwapsSome(ServoService):
         super().motors(side, motors)
 
 
-@wrong_hand("BRAINCO-LIFE-02", also=("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"), whole=True)
+@wrong_hand("BRAINCO-LIFE-02", whole=True)
 class SwapsForNewClients(_SwapsSome):
     """Mixes two joints up in the commands of a restarted client."""
 
@@ -739,22 +706,9 @@ class SwapsForNewClients(_SwapsSome):
         return 0 < self.client < 1000 and not self.restarted
 
 
-@wrong_hand(
-    "BRAINCO-STILL-01",
-    also=(
-        *("BRAINCO-PATH-01", "BRAINCO-SAFE-03", "BRAINCO-SAFE-05"),
-        *("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"),
-    ),
-    sides=BOTH,
-    whole=True,
-)
-@wrong_hand(
-    "DFX-STILL-01",
-    also=("DFX-PATH-01", "DFX-SAFE-03", "DFX-SAFE-04", "DFX-SAFE-05"),
-    sides=BOTH,
-    whole=True,
-)
-@wrong_hand("FTP-STILL-01", also=("FTP-PATH-01",), sides=BOTH, whole=True)
+@wrong_hand("BRAINCO-STILL-01", sides=BOTH, whole=True)
+@wrong_hand("DFX-STILL-01", sides=BOTH, whole=True)
+@wrong_hand("FTP-STILL-01", sides=BOTH, whole=True)
 class OldClientReturns(ServoService):
     """Obeys the earlier client's last goals on the left for a quarter of each second."""
 
@@ -778,7 +732,7 @@ class OldClientReturns(ServoService):
         super().motors(side, motors)
 
 
-@wrong_hand("BRAINCO-SPEED-03", also=("BRAINCO-SPEED-01", "BRAINCO-SPEED-02"), whole=True)
+@wrong_hand("BRAINCO-SPEED-03", whole=True)
 class OneSpeedForNewClients(ServoService):
     """Moves all joints with the largest speed of a restarted client's command."""
 
@@ -795,11 +749,7 @@ class OneSpeedForNewClients(ServoService):
         super().motors(side, motors)
 
 
-@wrong_hand(
-    "BRAINCO-LIFE-03",
-    also=("BRAINCO-WDOG-03", "DFX-MOVE-09", "DFX-PATH-01", "FTP-MOVE-09", "FTP-PATH-01"),
-    whole=True,
-)
+@wrong_hand("BRAINCO-LIFE-03", whole=True)
 class SwapsAfterRestart(_SwapsSome):
     """Mixes two joints up in commands after a restart of the service."""
 
@@ -807,8 +757,8 @@ class SwapsAfterRestart(_SwapsSome):
         return self.restarted
 
 
-@wrong_hand("BRAINCO-WDOG-03", also=("BRAINCO-SPEED-02", "BRAINCO-SPEED-03"), whole=True)
-@wrong_hand("DFX-WDOG-03", also=("DFX-MOVE-09", "DFX-PATH-01"), whole=True)
+@wrong_hand("BRAINCO-WDOG-03", whole=True)
+@wrong_hand("DFX-WDOG-03", whole=True)
 class SwapsAfterSilence(_SwapsSome):
     """Mixes two joints up in commands for three seconds after a silence."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import MappingProxyType
 
-from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.faults.registry import wrong_hand
 from dexkit.conformance.usb.frames import Motor, Scale
 from dexkit.conformance.virtual.usb import FOC, ReferenceDevice
 from dexkit.hand import Side
@@ -227,7 +227,7 @@ class SixMotors(ReferenceDevice):
         return b"" if joint == 6 and self.count % 40 == 0 else super().motor_packet(joint)
 
 
-@wrong_hand("DEX3USB-PACK-04", also=("DEX3USB-SENS-01",))
+@wrong_hand("DEX3USB-PACK-04")
 class EightSensors(ReferenceDevice):
     """Lacks one sensor packet of the palm."""
 
@@ -334,7 +334,7 @@ class ZeroElsewhere(ReferenceDevice):
         return round(self.shift * Scale(self.joints[joint].gear_ratio).q) if joint == 1 else 0
 
 
-@wrong_hand("DEX3USB-UNIT-01", also=("DEX3USB-UNIT-02",))
+@wrong_hand("DEX3USB-UNIT-01")
 class RadiansASecond(ReferenceDevice):
     """Reports speed in a unit a hundred times finer."""
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
+from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.mutants.trials import plan_for
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.stimulus_record import RECORD, Stimulus

@@ -2,7 +2,7 @@
 
 Sizes are those of plausible mistakes: a tenth of the range, a factor of the unit, a fraction of a
 second. Whether one of them matters is not decided here but by
-:mod:`~dexkit.conformance.mutants.generated.oracle`.
+:mod:`~dexkit.conformance.faults.generated.oracle`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TypeVar
 
+from dexkit.conformance.faults.generated.rig import Faulty, Motors, Report, What
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.generated.rig import Faulty, Motors, Report, What
 from dexkit.conformance.virtual import Sample
 from dexkit.hand import Side
 

@@ -9,8 +9,8 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from dexkit.conformance.faults.registry import BOTH, LEFT, wrong_hand
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.registry import BOTH, LEFT, wrong_hand
 from dexkit.conformance.virtual import TopicDevice
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
@@ -37,11 +37,7 @@ class NanVelocity(_Fields):
         return fields if fields["dq"] else {**fields, "dq": math.nan}
 
 
-@wrong_hand(
-    "DEX1-FIELD-21",
-    also=("DEX1-FIELD-18", "DEX1-FIELD-20", "DEX1-GAIN-03"),
-    whole=True,
-)
+@wrong_hand("DEX1-FIELD-21", whole=True)
 class ShowsTheGoalNearIt(_Fields):
     """Publishes the commanded q within 3.5 % of the stroke from it."""
 
@@ -83,7 +79,7 @@ class Percent(_InUnit):
     takes = False
 
 
-@wrong_hand("DEX1-MOVE-01", also=("DEX1-FIELD-19",))
+@wrong_hand("DEX1-MOVE-01")
 class PercentCommands(_InUnit):
     """Obeys q as percent of the stroke instead of radians."""
 
@@ -149,7 +145,7 @@ class Normalised(_InUnit):
     takes = False
 
 
-@wrong_hand("DEX1-MOVE-02", also=("DEX1-MOVE-01",))
+@wrong_hand("DEX1-MOVE-02")
 class NormalisedCommands(_InUnit):
     """Obeys q as 0 to 1 instead of radians."""
 
@@ -171,7 +167,7 @@ class Metres(_InUnit):
     full = 0.09
 
 
-@wrong_hand("DEX1-FIELD-04", also=("DEX1-FIELD-16",))
+@wrong_hand("DEX1-FIELD-04")
 class TurnedVelocity(_Fields):
     """Publishes dq with the wrong sign."""
 
@@ -179,7 +175,7 @@ class TurnedVelocity(_Fields):
         return {**fields, "dq": -fields["dq"]}
 
 
-@wrong_hand("DEX1-FIELD-22", also=("DEX1-FIELD-04", "DEX1-FIELD-17"))
+@wrong_hand("DEX1-FIELD-22")
 class VelocityWhileOpening(_Fields):
     """Fills dq only while it opens."""
 
@@ -190,7 +186,7 @@ class VelocityWhileOpening(_Fields):
 # --------------------------------------------------------------------- consistency of the state
 
 
-@wrong_hand("DEX1-FIELD-15", also=("DEX1-PATH-01", "DEX1-STILL-01"))
+@wrong_hand("DEX1-FIELD-15")
 class JumpsOnce(_Fields):
     """Has no dq, and publishes one q that is 30 % of the stroke off."""
 
@@ -199,7 +195,7 @@ class JumpsOnce(_Fields):
         return {**fields, "q": fields["q"] + off, "dq": 0.0, "ddq": 0.0}
 
 
-@wrong_hand("DEX1-FIELD-16", also=("DEX1-FIELD-20",))
+@wrong_hand("DEX1-FIELD-16")
 class ShakenVelocity(_Fields):
     """For some seconds has an oscillation on dq that q does not make."""
 
@@ -259,7 +255,7 @@ class VelocityOfTheLastDrive(_Fields):
         return fields
 
 
-@wrong_hand("DEX1-FIELD-17", also=("DEX1-FRESH-02", "DEX1-STILL-01"))
+@wrong_hand("DEX1-FIELD-17")
 class ShiftsForAWhile(_Fields):
     """Publishes q with an offset of 8 % of the stroke for 0.4 s; its dq stays true."""
 
@@ -268,14 +264,7 @@ class ShiftsForAWhile(_Fields):
         return {**fields, "q": fields["q"] + off, "ddq": 0.0}
 
 
-@wrong_hand(
-    "DEX1-FIELD-18",
-    also=(
-        "DEX1-TRACK-02",
-        "DEX1-SIDE-02",
-    ),
-    whole=True,
-)
+@wrong_hand("DEX1-FIELD-18", whole=True)
 class GoesThroughTheObject(_Fields):
     """In contact the published q, and dq with it, continues to the command."""
 
@@ -446,7 +435,7 @@ class _Hunts(ReferenceHand):
         return super().motor_torque() + shake
 
 
-@wrong_hand("DEX1-MOVE-03", also=("DEX1-FORCE-10",), whole=True)
+@wrong_hand("DEX1-MOVE-03", whole=True)
 class Hunts(ReferenceService):
     """Oscillates about its goal."""
 
@@ -467,7 +456,7 @@ class _Slow(ReferenceHand):
 
 
 # it lags in a session that is judged with the speed that DEX1-MOVE-04 asks
-@wrong_hand("DEX1-MOVE-04", also=("DEX1-TRACK-02",))
+@wrong_hand("DEX1-MOVE-04")
 class Slow(ReferenceService):
     """Moves at 2.6 rad/s at most."""
 
@@ -508,10 +497,7 @@ class _Creeps(ReferenceHand):
         return 0.5 * (wanted - self.dq) + friction
 
 
-@wrong_hand(
-    "DEX1-MOVE-07",
-    also=("DEX1-ABUSE-01", "DEX1-FORCE-11", "DEX1-FORCE-06"),
-)
+@wrong_hand("DEX1-MOVE-07")
 class Creeps(ReferenceService):
     """Moves the last 3 mm to its goal slowly."""
 
@@ -528,7 +514,7 @@ class ShortStroke(ReferenceService):
         super().command(side, replace(motor, q=q))
 
 
-@wrong_hand("DEX1-SIDE-01", also=("DEX1-SIDE-03", "DEX1-FORCE-12"))
+@wrong_hand("DEX1-SIDE-01")
 class Coupled(ReferenceService):
     """The left hand's goal leaks into the right hand's."""
 
@@ -547,14 +533,7 @@ class _IgnoresGains(ReferenceHand):
         return super().accept(Motor(q=motor.q))
 
 
-@wrong_hand(
-    "DEX1-GAIN-01",
-    also=(
-        "DEX1-SAFE-05",
-        "DEX1-GAIN-02",
-    ),
-    whole=True,
-)
+@wrong_hand("DEX1-GAIN-01", whole=True)
 class IgnoresGains(ReferenceService):
     """Moves to q with any gains."""
 
@@ -580,7 +559,7 @@ class _TurnedVelocityCommand(ReferenceHand):
         return accepted if accepted.kp > 0 else replace(accepted, dq=-accepted.dq)
 
 
-@wrong_hand("DEX1-GAIN-06", also=("DEX1-GAIN-02",))
+@wrong_hand("DEX1-GAIN-06")
 class TurnedVelocityCommand(ReferenceService):
     """Obeys dq with the wrong sign where there is no position gain."""
 
@@ -611,7 +590,7 @@ class _TorqueLimit(ReferenceHand):
         return min(max(tau, -most), most)
 
 
-@wrong_hand("DEX1-GAIN-08", also=("DEX1-GAIN-03",))
+@wrong_hand("DEX1-GAIN-08")
 class LimitsByTau(ReferenceService):
     """Takes tau of a command for the limit of its torque."""
 
@@ -627,7 +606,7 @@ class _KeepsGains(ReferenceHand):
         return accepted
 
 
-@wrong_hand("DEX1-FORCE-15", also=("DEX1-GAIN-02",), sides=BOTH, whole=True)
+@wrong_hand("DEX1-FORCE-15", sides=BOTH, whole=True)
 class KeepsGainsAtTheSamePlace(ReferenceService):
     """Ignores gains of 0 if q has not changed."""
 
@@ -647,7 +626,7 @@ class _HardReflex(ReferenceHand):
         return max(min((2.0 if self.gripped else 1.0) * tau, self.tau_max), -self.tau_max)
 
 
-@wrong_hand("DEX1-FORCE-14", also=("DEX1-FORCE-12",), sides=BOTH)
+@wrong_hand("DEX1-FORCE-14", sides=BOTH)
 class GripsHarderWhenSoft(ReferenceService):
     """Mistakes a softer grip for slip, and doubles its force until it lets go."""
 
@@ -671,7 +650,7 @@ class _UnsignedTorque(ReferenceHand):
         return replace(super().accept(motor), tau=abs(motor.tau))
 
 
-@wrong_hand("DEX1-GAIN-03", also=("DEX1-GAIN-07",))
+@wrong_hand("DEX1-GAIN-03")
 class UnsignedTorque(ReferenceService):
     """Opens with the torque of a command, whatever its sign is."""
 
@@ -684,7 +663,7 @@ class _TurnedTorque(ReferenceHand):
         return replace(accepted, tau=-accepted.tau)
 
 
-@wrong_hand("DEX1-GAIN-07", also=("DEX1-GAIN-03",), dialect="unitree_actuator")
+@wrong_hand("DEX1-GAIN-07", dialect="unitree_actuator")
 class TurnedTorque(ReferenceService):
     """Obeys the torque of a command with the wrong sign, in one dialect."""
 
@@ -704,7 +683,7 @@ class TurnedTorqueWhileHeld(ReferenceService):
     hand = _TurnedWhileHeld
 
 
-@wrong_hand("DEX1-GAIN-07", also=("DEX1-FORCE-09", "DEX1-FORCE-10", "DEX1-GAIN-03"), sides=BOTH)
+@wrong_hand("DEX1-GAIN-07", sides=BOTH)
 class TorqueOfTheOtherSide(ReferenceService):
     """Adds the torque that the other gripper is commanded."""
 
@@ -738,7 +717,7 @@ class ForceAtRest(_Fields):
         return {**fields, "tau_est": fields["tau_est"] - 0.4}
 
 
-@wrong_hand("DEX1-FORCE-03", also=("DEX1-FORCE-08", "DEX1-FORCE-16"))
+@wrong_hand("DEX1-FORCE-03")
 class UnsignedForce(_Fields):
     """Reports the magnitude of the force."""
 
@@ -754,11 +733,7 @@ class MirroredForce(_Fields):
         return {**fields, "tau_est": -fields["tau_est"]} if side is Side.LEFT else fields
 
 
-@wrong_hand(
-    "DEX1-FORCE-20",
-    also=("DEX1-FORCE-03", "DEX1-FORCE-08", "DEX1-FORCE-16"),
-    whole=True,
-)
+@wrong_hand("DEX1-FORCE-20", whole=True)
 class SignTurns(_Fields):
     """Publishes tau_est with the other sign from 5 s on: its motor was enabled again."""
 
@@ -800,19 +775,14 @@ class _LimitsLater(ReferenceHand):
         self.held = self.held + dt if pressing else 0.0
 
 
-@wrong_hand(
-    "DEX1-FORCE-17",
-    also=("DEX1-FORCE-09", "DEX1-FORCE-12", "DEX1-ABUSE-01"),
-    sides=BOTH,
-    whole=True,
-)
+@wrong_hand("DEX1-FORCE-17", sides=BOTH, whole=True)
 class SecondGripWeak(ReferenceService):
     """Pushes with 0.4 N m at most towards closing after the first long grip has ended."""
 
     hand = _LimitsLater
 
 
-@wrong_hand("DEX1-FORCE-04", also=("DEX1-FORCE-02",))
+@wrong_hand("DEX1-FORCE-04")
 class MilliNewtonMetres(_Fields):
     """Publishes tau_est in mN m."""
 
@@ -836,7 +806,7 @@ class SignedForce(_Fields):
         return {**fields, "tau_est": self.hands[side].tau}
 
 
-@wrong_hand("DEX1-FORCE-06", also=("DEX1-FORCE-10",))
+@wrong_hand("DEX1-FORCE-06")
 class FeelsLate(_Fields):
     """Reports the force of a contact only when it has lasted for 0.9 s."""
 
@@ -852,13 +822,7 @@ class FeelsLate(_Fields):
         return fields if late else {**fields, "tau_est": 0.0}
 
 
-@wrong_hand(
-    "DEX1-FORCE-07",
-    also=(
-        "DEX1-FORCE-13",
-        "DEX1-START-03",
-    ),
-)
+@wrong_hand("DEX1-FORCE-07")
 class ForceBeforeCommands(_Fields):
     """Reports a force until it gets its first command."""
 
@@ -866,7 +830,7 @@ class ForceBeforeCommands(_Fields):
         return fields if self.hands[side].goal else {**fields, "tau_est": -0.6}
 
 
-@wrong_hand("DEX1-FORCE-08", also=("DEX1-FORCE-16",))
+@wrong_hand("DEX1-FORCE-08")
 class AlwaysClosing(_Fields):
     """Has an unsigned sensor of the current: its torque is always that of closing."""
 
@@ -888,7 +852,7 @@ class _Saturates(ReferenceHand):
         return replace(accepted, kp=min(accepted.kp, 2.0))
 
 
-@wrong_hand("DEX1-FORCE-09", also=("DEX1-GAIN-05",))
+@wrong_hand("DEX1-FORCE-09")
 class StiffnessSaturates(ReferenceService):
     """Has a kp of 2 N m/rad at most."""
 
@@ -956,7 +920,7 @@ class _WeakAgain(ReferenceHand):
         return 0.4 * tau if touches and self.contacts > 1 else tau
 
 
-@wrong_hand("DEX1-FORCE-09", also=("DEX1-FORCE-17",))
+@wrong_hand("DEX1-FORCE-09")
 class WeakAgain(ReferenceService):
     """Presses with 40 % of the force from its second contact on."""
 
@@ -971,7 +935,7 @@ class _NegativeGains(ReferenceHand):
         return replace(super().accept(motor), kp=motor.kp, kd=motor.kd)
 
 
-@wrong_hand("DEX1-SAFE-05", also=("DEX1-SAFE-10",))
+@wrong_hand("DEX1-SAFE-05")
 class NegativeGains(ReferenceService):
     """Applies negative gains."""
 
@@ -984,7 +948,7 @@ class _NegativeStiffness(ReferenceHand):
         return replace(accepted, kp=motor.kp) if motor.kd >= 0.0 else accepted
 
 
-@wrong_hand("DEX1-SAFE-10", also=("DEX1-SAFE-05",))
+@wrong_hand("DEX1-SAFE-10")
 class NegativeStiffnessAlone(ReferenceService):
     """Clamps gains that are both negative, and applies a negative kp beside a good kd."""
 
@@ -1011,14 +975,7 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
-@wrong_hand(
-    "DEX1-SAFE-02",
-    also=(
-        "DEX1-FIELD-19",
-        "DEX1-PATH-01",
-    ),
-    whole=True,
-)
+@wrong_hand("DEX1-SAFE-02", whole=True)
 class NoLimits(ReferenceService):
     """Follows a q far outside the stroke."""
 
@@ -1030,7 +987,7 @@ class _NoWatchdog(ReferenceHand):
 
 
 # its mode byte is correct, but equals a constant one
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+@wrong_hand("DEX1-WDOG-01")
 class NoWatchdog(ReferenceService):
     """Follows the last command without end."""
 
@@ -1041,7 +998,7 @@ class _Tardy(ReferenceHand):
     timeout = 1.38 * ReferenceHand.timeout
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",), sides=BOTH)
+@wrong_hand("DEX1-WDOG-01", sides=BOTH)
 class BrakesLate(ReferenceService):
     """Brakes 1.38 s after the last command: its watchdog counts a slower clock's ticks."""
 
@@ -1083,20 +1040,14 @@ class _BrakesOnce(ReferenceHand):
         return self.now - self.braked < 2.0
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+@wrong_hand("DEX1-WDOG-01")
 class BrakesOnce(ReferenceService):
     """Brakes at the first time-out and at none after it."""
 
     hand = _BrakesOnce
 
 
-@wrong_hand(
-    "DEX1-WDOG-01",
-    also=(
-        "DEX1-FIELD-05",
-        "DEX1-WDOG-04",
-    ),
-)
+@wrong_hand("DEX1-WDOG-01")
 class NoWatchdogWhenRestarted(ReferenceService):
     """Follows the last command without end after a restart of its service."""
 
@@ -1161,7 +1112,7 @@ class _Latches(ReferenceHand):
         return self.tripped or super().braking
 
 
-@wrong_hand("DEX1-WDOG-03", also=("DEX1-FORCE-06",))
+@wrong_hand("DEX1-WDOG-03")
 class LatchesTheBrake(ReferenceService):
     """Brakes after a silence and never releases."""
 
@@ -1332,7 +1283,7 @@ class _Wraps(ReferenceHand):
         return (self.now - self.heard) % self.wraps > self.timeout
 
 
-@wrong_hand("DEX1-WDOG-01", also=("DEX1-FIELD-05",))
+@wrong_hand("DEX1-WDOG-01")
 class WatchdogWraps(ReferenceService):
     """Releases the brake for a second every three seconds: its counter wraps."""
 
@@ -1373,7 +1324,7 @@ class _OldGoalFirst(ReferenceHand):
         super().command(self.old if self.old and self.now < self.until else motor)
 
 
-@wrong_hand("DEX1-WDOG-03", also=("DEX1-WDOG-05",))
+@wrong_hand("DEX1-WDOG-03")
 class OldGoalFirst(ReferenceService):
     """Carries out the command from before a silence for 0.3 s when the next ones come."""
 
@@ -1391,13 +1342,7 @@ class _BeginsAtZero(ReferenceHand):
         super().command(motor)
 
 
-@wrong_hand(
-    "DEX1-PATH-01",
-    also=(
-        "DEX1-WDOG-05",
-        "DEX1-WDOG-03",
-    ),
-)
+@wrong_hand("DEX1-PATH-01")
 class BeginsAtZero(ReferenceService):
     """Goes towards 0 for 0.2 s when the commands come again after a silence."""
 
@@ -1421,7 +1366,7 @@ class LosesTheFirstAfterSilence(ReferenceService):
     hand = _LosesTheFirst
 
 
-@wrong_hand("DEX1-SIDE-03", also=("DEX1-GAIN-01",), dialect="unitree_actuator")
+@wrong_hand("DEX1-SIDE-03", dialect="unitree_actuator")
 class GainsOfTheOtherSide(ReferenceService):
     """Drives the left hand by the gains of the right one."""
 
@@ -1432,7 +1377,7 @@ class GainsOfTheOtherSide(ReferenceService):
             left.goal = replace(left.goal, kp=right.goal.kp, kd=right.goal.kd)
 
 
-@wrong_hand("DEX1-STILL-01", also=("DEX1-SAFE-01",))
+@wrong_hand("DEX1-STILL-01")
 class TakesTheOtherSides(ReferenceService):
     """When commands arrive together, the left hand sometimes gets the right hand's command."""
 

@@ -9,9 +9,9 @@ import math
 from dataclasses import replace
 from typing import Any
 
+from dexkit.conformance.faults.any_model import Delayed
+from dexkit.conformance.faults.registry import has_speeds, obeys_gains, wrong_hand
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.any_model import Delayed
-from dexkit.conformance.mutants.registry import has_speeds, obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.fingers import FingerService
 from dexkit.conformance.virtual.gripper import ReferenceService
@@ -57,25 +57,14 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand(
-    "DEX1-OPER-06",
-    also=("DEX1-LOAD-03", "DEX1-OPER-01", "DEX1-OPER-02", "DEX1-OPER-04"),
-    whole=True,
-)
+@wrong_hand("DEX1-OPER-06", whole=True)
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a goal nearer than 0.16 rad: the client waits there and never moves on."""
 
     band = 0.16 / 5.4
 
 
-@wrong_hand(
-    "DEX1-OPER-01",
-    also=(
-        "DEX1-OPER-02",
-        "DEX1-FORCE-09",
-        "DEX1-GAIN-05",
-    ),
-)
+@wrong_hand("DEX1-OPER-01")
 class SaturatingGain(ReferenceService):
     """Takes no kp above 2: with the client's small lead it has 40 % of the force."""
 
@@ -86,16 +75,7 @@ class SaturatingGain(ReferenceService):
 
 
 # what it leaves of each step shows in steps of every kind
-@wrong_hand(
-    "DEX3-OPER-02",
-    also=(
-        "DEX3-CMD-01",
-        "DEX3-LOAD-03",
-        "DEX3-MODE-07",
-        "DEX3-SAFE-06",
-    ),
-    where=obeys_gains,
-)
+@wrong_hand("DEX3-OPER-02", where=obeys_gains)
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
 
@@ -111,14 +91,14 @@ class _Coarse(_PerJoint):
         return round(q / grid) * grid
 
 
-@wrong_hand("DEX1-OPER-04", also=("DEX1-FORCE-12",))
+@wrong_hand("DEX1-OPER-04")
 class CoarseTargets(_Coarse, ReferenceService):
     """Moves to the nearest of 19 positions."""
 
     grid = 1 / 18
 
 
-@wrong_hand("DEX3-OPER-04", also=("DEX3-MOVE-04",))
+@wrong_hand("DEX3-OPER-04")
 @wrong_hand("BRAINCO-OPER-04", brief=True)
 class CoarseFingers(_Coarse, FingerService):
     """Moves to the nearest of 21 positions."""
@@ -126,7 +106,7 @@ class CoarseFingers(_Coarse, FingerService):
     grid = 1 / 20
 
 
-@wrong_hand("DEX1-OPER-02", also=("DEX1-OPER-01",))
+@wrong_hand("DEX1-OPER-02")
 class LateState(ReferenceService):
     """Publishes the position of 60 ms ago in fresh messages."""
 
@@ -145,7 +125,7 @@ class LateState(ReferenceService):
         return {**found, **past[0][1]}
 
 
-@wrong_hand("DEX1-OPER-03", also=("DEX1-OPER-02",))
+@wrong_hand("DEX1-OPER-03")
 class RunsAhead(_PerJoint, ReferenceService):
     """Extrapolates moving goals by 70 ms, and overshoots when they stop."""
 
@@ -192,7 +172,7 @@ class _SlowToWake(_PerJoint):
 
 
 # nothing wakes it but a second command
-@wrong_hand("DEX1-OPER-05", also=("DEX1-CMD-01", "DEX1-PATH-01", "DEX1-WDOG-03"))
+@wrong_hand("DEX1-OPER-05")
 class SlowToWake(_SlowToWake, ReferenceService):
     """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
 
@@ -216,8 +196,8 @@ class _OpenEnd(_PerJoint):
         raise AssertionError  # overridden
 
 
-@wrong_hand("DEX3-OPER-01", also=("DEX3-OPER-05", "DEX3-MOVE-08", "DEX3-MODE-05", "DEX3-TRACK-01"))
-@wrong_hand("BRAINCO-OPER-01", also=("BRAINCO-OPER-05",))
+@wrong_hand("DEX3-OPER-01")
+@wrong_hand("BRAINCO-OPER-01")
 class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range per second."""
 
@@ -232,7 +212,7 @@ class SlowToLeave(_OpenEnd, FingerService):
         return taken
 
 
-@wrong_hand("DEX3-OPER-03", also=("DEX3-PATH-01",))
+@wrong_hand("DEX3-OPER-03")
 class Springs(_OpenEnd, FingerService):
     """Moves 25 % too far for 0.5 s when it leaves the open end of a joint."""
 
@@ -243,22 +223,22 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-@wrong_hand("DEX3-OPER-05", also=("DEX3-CMD-01", "DEX3-GAIN-04", "DEX3-MODE-02", "DEX3-TRACK-02"))
-@wrong_hand("BRAINCO-OPER-05", also=("BRAINCO-OPER-02",), where=has_speeds)
+@wrong_hand("DEX3-OPER-05")
+@wrong_hand("BRAINCO-OPER-05", where=has_speeds)
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
 
 
-@wrong_hand("DFX-OPER-02", also=("DFX-MOVE-08", "DFX-OPER-05", "DFX-WDOG-03"))
-@wrong_hand("FTP-OPER-02", also=("FTP-OPER-05",))
+@wrong_hand("DFX-OPER-02")
+@wrong_hand("FTP-OPER-02")
 class LaggingFingers(Delayed, FingerService):
     """Obeys each command 0.38 s late, and shows it later still."""
 
     delay = 0.38
 
 
-@wrong_hand("DFX-OPER-05", also=("DFX-MOVE-08", "DFX-OPER-02", "DFX-WDOG-03"))
-@wrong_hand("FTP-OPER-05", also=("FTP-OPER-02",))
+@wrong_hand("DFX-OPER-05")
+@wrong_hand("FTP-OPER-05")
 class LaterFingers(Delayed, FingerService):
     """Obeys each command 0.39 s late."""
 

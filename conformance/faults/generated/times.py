@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from dexkit.conformance.mutants.generated.rig import Faulty, Track, When
+from dexkit.conformance.faults.generated.rig import Faulty, Track, When
 from dexkit.hand import Side
 
 __all__ = ["WHENS"]

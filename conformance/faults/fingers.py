@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.faults.registry import BOTH, obeys_gains, wrong_hand
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.registry import BOTH, obeys_gains, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import (
     Dex3Service,
@@ -144,7 +144,7 @@ class Unmirrored(FingerService):
         return tuple((self.signs(side) * super().positions(side)).tolist())
 
 
-@wrong_hand("DEX3-FIELD-04", also=("DEX3-FIELD-16",))
+@wrong_hand("DEX3-FIELD-04")
 class TurnedVelocity(FingerService):
     """Publishes dq with the wrong sign."""
 
@@ -162,7 +162,7 @@ class _Timed(FingerService):
             hand.changed()
 
 
-@wrong_hand("DEX3-FIELD-15", also=("DEX3-PATH-01", "DEX3-STILL-01"))
+@wrong_hand("DEX3-FIELD-15")
 class JumpsOnce(_Timed):
     """Has no dq, and publishes one pose that is half of each joint's range off."""
 
@@ -175,7 +175,7 @@ class JumpsOnce(_Timed):
             motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
 
 
-@wrong_hand("DEX3-FIELD-16", also=("DEX3-FIELD-19",))
+@wrong_hand("DEX3-FIELD-16")
 class ShakenVelocity(_Timed):
     """For some seconds has an oscillation on dq that q does not make."""
 
@@ -220,9 +220,7 @@ class VelocityOfTheLastDrive(_Timed):
         motors["dq"] = np.where(hand.driven, motors["dq"], last)
 
 
-@wrong_hand(
-    "DEX3-FIELD-17", also=("DEX3-FIELD-21", "DEX3-FRESH-02", "DEX3-PATH-01", "DEX3-STILL-01")
-)
+@wrong_hand("DEX3-FIELD-17")
 class ShiftsForAWhile(_Timed):
     """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
 
@@ -264,17 +262,7 @@ class _Filled(FingerService):
         return message
 
 
-@wrong_hand(
-    "DEX3-FIELD-20",
-    also=(
-        "DEX3-FIELD-05",
-        "DEX3-FIELD-19",
-        "DEX3-GAIN-03",
-        "DEX3-GAIN-04",
-        "DEX3-GAIN-05",
-    ),
-    whole=True,
-)
+@wrong_hand("DEX3-FIELD-20", whole=True)
 class ShowsTheGoalNearIt(FingerService):
     """Publishes the commanded q of one joint within 8 % of its range from it."""
 
@@ -407,7 +395,7 @@ class SevenPackets(FingerService):
     sensors = 7
 
 
-@wrong_hand("DEX3-SENS-04", also=("DEX3-SENS-10",), sides=BOTH)
+@wrong_hand("DEX3-SENS-04", sides=BOTH)
 class Numb(FingerService):
     """Publishes the pressure of an untouched hand at every contact."""
 
@@ -415,7 +403,7 @@ class Numb(FingerService):
         return hand.untouched()
 
 
-@wrong_hand("DEX3-SENS-04", also=("DEX3-SENS-10",), sides=BOTH)
+@wrong_hand("DEX3-SENS-04", sides=BOTH)
 class CrossedCables(Dex3Service):
     """Publishes the index finger's pressures as the middle finger's, and the other way round."""
 
@@ -423,7 +411,7 @@ class CrossedCables(Dex3Service):
         return super().pressures(hand)[[0, 1, 4, 5, 2, 3, 6, 7, 8]]
 
 
-@wrong_hand("DEX3-SENS-07", also=("DEX3-SENS-03", "DEX3-SENS-10"), sides=BOTH)
+@wrong_hand("DEX3-SENS-07", sides=BOTH)
 class SaturatesToNothing(FingerService):
     """Publishes a pressure at the end of the converter's range as a slot without a sensor."""
 
@@ -493,7 +481,7 @@ class OneSensorBuffer(FingerService):
         return super().pressures(right)
 
 
-@wrong_hand("DEX3-SENS-09", also=("FTP-TOUCH-05",), sides=BOTH)
+@wrong_hand("DEX3-SENS-09", sides=BOTH)
 class TaresInAGrip(FingerService):
     """Treats a pressure that is constant for a second as drift, and takes it as the new zero."""
 
@@ -571,7 +559,7 @@ class OneJointBackwards(FingerService):
     hand_fault = _Backwards
 
 
-@wrong_hand("DEX3-MOVE-02", also=("DEX3-FORCE-09",))
+@wrong_hand("DEX3-MOVE-02")
 class OtherScale(FingerService):
     """Moves only 75 % of the way from its rest pose."""
 
@@ -592,7 +580,7 @@ class _Hunts(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", also=("DEX3-FORCE-09",), whole=True, where=obeys_gains)
+@wrong_hand("DEX3-MOVE-03", whole=True, where=obeys_gains)
 class Hunts(FingerService):
     """One joint oscillates about its goal."""
 
@@ -623,15 +611,15 @@ class _Springy(FingerHand):
         super().take(undamped, mode)
 
 
-@wrong_hand("DEX3-MOVE-05", also=("DEX3-PATH-01",), where=obeys_gains)
+@wrong_hand("DEX3-MOVE-05", where=obeys_gains)
 class Undamped(FingerService):
     """Applies 15 % of kd where kp is not 0."""
 
     hand_fault = _Springy
 
 
-@wrong_hand("DEX3-SIDE-01", also=("DEX3-MOVE-07",), sides=BOTH)
-@wrong_hand("BRAINCO-SIDE-01", also=("BRAINCO-MOVE-02",), sides=BOTH)
+@wrong_hand("DEX3-SIDE-01", sides=BOTH)
+@wrong_hand("BRAINCO-SIDE-01", sides=BOTH)
 class Coupled(FingerService):
     """The goal of the left hand's first finger leaks into the right one's."""
 
@@ -685,7 +673,7 @@ class _Creeps(FingerHand):
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-07", also=("DEX3-MOVE-04",))
+@wrong_hand("DEX3-MOVE-07")
 class Creeps(FingerService):
     """One joint moves the last part of the way to its goal slowly."""
 
@@ -730,7 +718,7 @@ class _GainsOfFirst(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-SAFE-06",))
+@wrong_hand("DEX3-GAIN-02")
 class GainsOfFirstMotor(FingerService):
     """Uses the gains of its first motor for all."""
 
@@ -744,7 +732,7 @@ class _GainsOfNeighbour(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-02", also=("DEX3-SAFE-06",))
+@wrong_hand("DEX3-GAIN-02")
 class GainsOfTheMotorBefore(FingerService):
     """Uses the gains of the motor before in each."""
 
@@ -800,7 +788,7 @@ class _TurnedTorque(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04",))
+@wrong_hand("DEX3-GAIN-07")
 class TurnedTorque(FingerService):
     """Obeys the torque of a command with the wrong sign."""
 
@@ -814,7 +802,7 @@ class _TorqueOfNeighbour(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04", "DEX3-HOLD-01"))
+@wrong_hand("DEX3-GAIN-07")
 class TorqueOfTheMotorBefore(FingerService):
     """Adds the torque that is commanded to the motor before, in each."""
 
@@ -828,7 +816,7 @@ class _SwappedTorque(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-07", also=("DEX3-GAIN-04",))
+@wrong_hand("DEX3-GAIN-07")
 class SwappedTorque(Dex3Service):
     """Adds the torques of index and middle finger to each other's."""
 
@@ -856,7 +844,7 @@ class _TurnedVelocityCommand(FingerHand):
         super().take(own, mode)
 
 
-@wrong_hand("DEX3-GAIN-06", also=("DEX3-GAIN-03",))
+@wrong_hand("DEX3-GAIN-06")
 class TurnedVelocityCommand(FingerService):
     """Obeys the velocity of a command with the wrong sign."""
 
@@ -910,7 +898,7 @@ class _IgnoresStatus(FingerHand):
         return np.ones_like(status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-06", "DEX3-MODE-07"))
+@wrong_hand("DEX3-MODE-03")
 class IgnoresStatus(FingerService):
     """Drives its motors whatever the mode byte of the command is."""
 
@@ -929,7 +917,7 @@ class _ZeroIsNoChange(FingerHand):
         return np.where(status == 0, self.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-06"))
+@wrong_hand("DEX3-MODE-03")
 class ZeroIsNoChange(FingerService):
     """Keeps a joint driven that is switched off: takes 0 for "as before"."""
 
@@ -943,14 +931,14 @@ class _OneStaysOn(FingerHand):
         return np.where(last & (status == 0), self.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02", "DEX3-MODE-06"))
+@wrong_hand("DEX3-MODE-03")
 class LastJointStaysOn(FingerService):
     """Keeps its last joint driven when it is switched off."""
 
     hand_fault = _OneStaysOn
 
 
-@wrong_hand("DEX3-MODE-03", also=("DEX3-MODE-02",), whole=True)
+@wrong_hand("DEX3-MODE-03", whole=True)
 class StaysOnForALaterClient(FingerService):
     """Switches its motors off for its first client only."""
 
@@ -1021,7 +1009,7 @@ class GoesById(FingerService):
 # ------------------------------------------------------------------------------------- force
 
 
-@wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-07",), sides=BOTH)
+@wrong_hand("DEX3-FORCE-01", sides=BOTH)
 class TurnedForce(FingerService):
     """Publishes tau_est with the wrong sign."""
 
@@ -1030,7 +1018,7 @@ class TurnedForce(FingerService):
         motors["tau_est"] = -motors["tau_est"]
 
 
-@wrong_hand("DEX3-FORCE-04", also=("DEX3-FORCE-07",))
+@wrong_hand("DEX3-FORCE-04")
 class UnsignedForce(Dex3Service):
     """Has unsigned sensors of the current: each torque is that of closing."""
 
@@ -1067,14 +1055,14 @@ class _GearSquared(FingerHand):
         self.law_kd = [k / 1.75**2 if i else k for i, k in enumerate(self.law_kd)]
 
 
-@wrong_hand("DEX3-FORCE-10", also=("DEX3-FORCE-05", "DEX3-GAIN-04"), sides=BOTH, whole=True)
+@wrong_hand("DEX3-FORCE-10", sides=BOTH, whole=True)
 class GearOfTheThumb(Dex3Service):
     """Divides the gains of all joints by the square of the thumb's gear but for the thumb's own."""
 
     hand_fault = _GearSquared
 
 
-@wrong_hand("DEX3-FIELD-21", also=("DEX3-FIELD-17", "DEX3-FORCE-09"))
+@wrong_hand("DEX3-FIELD-21")
 class ThumbWithoutVelocity(Dex3Service):
     """Publishes no dq of the thumb."""
 
@@ -1156,7 +1144,7 @@ class _BoostsIndex(Boosts):
     joints = (5, 6)
 
 
-@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-02", "DEX3-FORCE-05"), sides=BOTH, whole=True)
+@wrong_hand("DEX3-FORCE-08", sides=BOTH, whole=True)
 class OneFingerBoosts(Dex3Service):
     """Its index finger presses with two and a half times the torque where it is blocked."""
 
@@ -1168,21 +1156,14 @@ class _WeakThumb(OtherInContact):
     factor = 0.35
 
 
-@wrong_hand("DEX3-FORCE-08", also=("DEX3-FORCE-05",), sides=BOTH)
+@wrong_hand("DEX3-FORCE-08", sides=BOTH)
 class ThumbGivesIn(Dex3Service):
     """Its thumb presses with a third of the torque where it is blocked."""
 
     hand_fault = _WeakThumb
 
 
-@wrong_hand(
-    ("DEX3-FORCE-11", "BRAINCO-FORCE-11"),
-    also=(
-        *("BRAINCO-FIELD-04", "DEX3-FIELD-04", "DEX3-FIELD-05", "DEX3-FIELD-17"),
-        "DEX3-FIELD-21",
-    ),
-    sides=BOTH,
-)
+@wrong_hand(("DEX3-FORCE-11", "BRAINCO-FORCE-11"), sides=BOTH)
 class ReportsGoalsWhenStalled(FingerService):
     """Reports that a stalled joint moves on to its goal: q is predicted, and not measured."""
 
@@ -1205,7 +1186,7 @@ class ReportsGoalsWhenStalled(FingerService):
             hand.version += 1
 
 
-@wrong_hand("DEX3-FORCE-01", also=("DEX3-FORCE-05", "DEX3-FORCE-10", "DEX3-MOVE-09"), sides=BOTH)
+@wrong_hand("DEX3-FORCE-01", sides=BOTH)
 class TorqueInMillis(Dex3Service):
     """Publishes a thousandth of the torque: a conversion from mN m is made twice."""
 
@@ -1244,7 +1225,7 @@ class _NegativeGains(FingerHand):
         self.kd = np.abs(rows[4])
 
 
-@wrong_hand("DEX3-SAFE-06", also=("DEX3-SAFE-11",))
+@wrong_hand("DEX3-SAFE-06")
 class NegativeGains(FingerService):
     """Applies a negative kp."""
 
@@ -1258,7 +1239,7 @@ class _ChecksTheFirst(FingerHand):
             self.kp = np.where(rows[3] < 0.0, 0.3 * rows[3], rows[3])
 
 
-@wrong_hand("DEX3-SAFE-11", also=("DEX3-SAFE-06",))
+@wrong_hand("DEX3-SAFE-11")
 class ChecksTheGainsOfTheFirst(FingerService):
     """Rejects negative gains in its first joint, and applies them in the others."""
 
@@ -1294,7 +1275,7 @@ class _NanPerJoint(FingerHand):
         )
 
 
-@wrong_hand("DEX3-SAFE-01", also=("DEX3-SAFE-03",))
+@wrong_hand("DEX3-SAFE-01")
 @wrong_hand("BRAINCO-SAFE-01", brief=True)
 class RejectsOnlyTheBadJoint(FingerService):
     """Ignores only the joint whose command is NaN, and moves the others."""
@@ -1325,7 +1306,7 @@ class _NoLimits(FingerHand):
 
 @wrong_hand("DEX3-SAFE-02", whole=True)
 # its goal is so far that it presses through the object
-@wrong_hand("DFX-SAFE-02", also=("DFX-FORCE-11",), whole=True)
+@wrong_hand("DFX-SAFE-02", whole=True)
 @wrong_hand("FTP-SAFE-02", whole=True)
 class NoLimits(FingerService):
     """Follows goals up to 0.5 rad beyond its limits."""
@@ -1398,7 +1379,7 @@ class GoesHome(FingerHand):
             self.law_on[0], self.law_q[0], self.law_kp[0] = True, self.floor[0], 1.5
 
 
-@wrong_hand("DEX3-WDOG-01", also=("DEX3-GUARD-01", "DEX3-LIFE-06"))
+@wrong_hand("DEX3-WDOG-01")
 class FirstJointGoesHome(Dex3Service):
     """Sends its first joint to one end after the time-out, whatever was commanded."""
 
@@ -1470,7 +1451,7 @@ class _LatchesWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
-@wrong_hand("DEX3-WDOG-03", also=("DEX3-MODE-02", "DEX3-MOVE-08"))
+@wrong_hand("DEX3-WDOG-03")
 @wrong_hand(("BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"), brief=True)
 class StuckAfterSilence(FingerService):
     """Obeys no command after a silence without protection."""
@@ -1499,7 +1480,7 @@ class _BeginsAtZero(FingerHand):
             self.goal = np.minimum(np.maximum(0.0, self.low), self.high)
 
 
-@wrong_hand("DEX3-PATH-01", also=("DEX3-MODE-05", "DEX3-WDOG-03"))
+@wrong_hand("DEX3-PATH-01")
 class BeginsAtZero(FingerService):
     """Goes towards 0 for 0.15 s when the commands come again after a silence."""
 
@@ -1571,7 +1552,7 @@ class _OneGuard(FingerHand):
         return status, np.full_like(guarded, guarded[-1])
 
 
-@wrong_hand("DEX3-GUARD-01", also=("DEX3-HOLD-01", "DEX3-MODE-05"))
+@wrong_hand("DEX3-GUARD-01")
 class GuardOfTheLast(Dex3Service):
     """Applies the last motor's time-out bit to all."""
 
@@ -1620,14 +1601,7 @@ class _FedByNews(FingerHand):
             super().command(motors)
 
 
-@wrong_hand(
-    "DEX3-GUARD-02",
-    also=(
-        *("DEX3-SENS-09", "DEX3-FORCE-05", "DEX3-FORCE-06", "DEX3-FORCE-08", "DEX3-FORCE-10"),
-        "DEX3-SIDE-03",
-    ),
-    sides=BOTH,
-)
+@wrong_hand("DEX3-GUARD-02", sides=BOTH)
 class DropsEqualCommands(Dex3Service):
     """Drops commands that equal the last, before they feed the time-out."""
 
@@ -1653,7 +1627,7 @@ class _NotDriven(FingerHand):
         self.status = np.where(self.guarded, 0, self.status)
 
 
-@wrong_hand("DEX3-MODE-05", also=("DEX3-GAIN-03",))
+@wrong_hand("DEX3-MODE-05")
 class ProtectedIsNotDriven(Dex3Service):
     """Locks a motor whose time-out bit is set: its status is looked up by the whole byte."""
 
@@ -1687,11 +1661,7 @@ class _Dead(FingerHand):
         self.dead = tripped if self.dead is None else self.dead | tripped
 
 
-@wrong_hand(
-    "DEX3-GUARD-04",
-    also=("DEX3-GUARD-02", "DEX3-MODE-02", "DEX3-WDOG-03"),
-    whole=True,
-)
+@wrong_hand("DEX3-GUARD-04", whole=True)
 class NeverClears(FingerService):
     """A motor whose protection has tripped never reacts again."""
 
@@ -1718,7 +1688,7 @@ class _ForEver(FingerHand):
 
 
 # what it ignores in that time is not driven in the silence that follows
-@wrong_hand("DEX3-GUARD-04", also=("DEX3-GUARD-02", "DEX3-WDOG-03"), whole=True)
+@wrong_hand("DEX3-GUARD-04", whole=True)
 class SlowToClear(FingerService):
     """Stays tripped for 2 s after it was cleared."""
 

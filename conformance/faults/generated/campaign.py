@@ -20,11 +20,11 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from dexkit.conformance.mutants.generated import Generated, parse
-from dexkit.conformance.mutants.generated.oracle import Opinion, Severity, examine, shortest
-from dexkit.conformance.mutants.generated.rig import Faulty
-from dexkit.conformance.mutants.outsiders import blame
-from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.conformance.faults.generated import Generated, parse
+from dexkit.conformance.faults.generated.oracle import Opinion, Severity, examine, shortest
+from dexkit.conformance.faults.generated.rig import Faulty
+from dexkit.conformance.faults.outsiders import blame
+from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.scores import wilson
 from dexkit.conformance.selection import RunKind

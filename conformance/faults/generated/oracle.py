@@ -17,11 +17,9 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.hands import under_test
-from dexkit.conformance.layers import recording_of
-from dexkit.conformance.mutants.generated import Generated
-from dexkit.conformance.mutants.generated.rig import Faulty, compose
-from dexkit.conformance.mutants.generated.stimulus import (
+from dexkit.conformance.faults.generated import Generated
+from dexkit.conformance.faults.generated.rig import Faulty, compose
+from dexkit.conformance.faults.generated.stimulus import (
     Event,
     Segment,
     Stretch,
@@ -29,7 +27,9 @@ from dexkit.conformance.mutants.generated.stimulus import (
     play_order,
     random_segments,
 )
-from dexkit.conformance.mutants.trials import plan_for
+from dexkit.conformance.faults.trials import plan_for
+from dexkit.conformance.hands import under_test
+from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import States
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.virtual import MemoryTrace

@@ -2,17 +2,18 @@
 must find exactly that.
 
 A wrong hand is a small change of a reference that meets every requirement, declared by the
-decorator :func:`~dexkit.conformance.mutants.registry.wrong_hand`.
+decorator :func:`~dexkit.conformance.faults.registry.wrong_hand`. They are for the work on the
+checks: the wheel does not hold them.
 """
 
 from __future__ import annotations
 
 from functools import cache
 
-from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants import (
+from dexkit.conformance.faults import (
     any_model,
     clients,
+    dex5,
     fingers,
     gripper,
     operator,
@@ -21,14 +22,15 @@ from dexkit.conformance.mutants import (
     touch,
     usb,
 )
-from dexkit.conformance.mutants.registry import Mutant, expand, wrong_hand
-from dexkit.conformance.mutants.trials import plan_for, run_mutant
+from dexkit.conformance.faults.registry import Mutant, expand, wrong_hand
+from dexkit.conformance.faults.trials import plan_for, run_mutant
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.requirements import models
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 
-MODULES = (any_model, gripper, fingers, servos, touch, operator, clients, robot, usb)
-"""Modules that declare wrong hands of more than one model, or of one with its own mechanics."""
+MODULES = (any_model, gripper, fingers, servos, touch, operator, clients, robot, usb, dex5)
+"""The modules that declare wrong hands."""
 
 
 @cache

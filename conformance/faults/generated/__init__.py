@@ -17,11 +17,11 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
+from dexkit.conformance.faults.generated.good import DEVIATIONS, GROUPS
+from dexkit.conformance.faults.generated.rig import Faulty, Part, What, When, compose
+from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants.generated.faults import FAULTS, KINDS
-from dexkit.conformance.mutants.generated.good import DEVIATIONS, GROUPS
-from dexkit.conformance.mutants.generated.rig import Faulty, Part, What, When, compose
-from dexkit.conformance.mutants.generated.times import WHENS
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import MODELS, Dialect, HandModel, dialect, model
@@ -143,7 +143,7 @@ def parse(name: str) -> Generated:
     if not match:
         raise UsageError(
             f"{name!r} names no generated hand",
-            hint="MODEL/DIALECT:WHAT@SIDE,JOINT,WHEN, as dexkit mutants prints it",
+            hint="MODEL/DIALECT:WHAT@SIDE,JOINT,WHEN, as --list prints it",
         )
     of = model(match[1])
     spoken = dialect(match[2])

@@ -9,8 +9,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
+from dexkit.conformance.faults.registry import takes_floats, wrong_hand
 from dexkit.conformance.motor_messages import LIMP, Motor
-from dexkit.conformance.mutants.registry import takes_floats, wrong_hand
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual.client import ReferenceClient
 from dexkit.hand import Side
@@ -153,7 +153,7 @@ class HalfRateClient(ReferenceClient):
         return self.turn % 2 == 0
 
 
-@wrong_hand("DEX1-CLIENT-07", also=("DEX1-CLIENT-06",))
+@wrong_hand("DEX1-CLIENT-07")
 class Stutters(ReferenceClient):
     """Sends nothing for 0.25 s, twice."""
 

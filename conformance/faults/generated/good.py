@@ -16,8 +16,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from dexkit.conformance.faults.generated.rig import Faulty, Motors, Report, What
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants.generated.rig import Faulty, Motors, Report, What
 from dexkit.conformance.virtual import Sample
 from dexkit.hand import Side
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.faults import any_model, fingers, operator
+from dexkit.conformance.faults.registry import BOTH, wrong_hand
 from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.mutants import any_model, fingers, operator
-from dexkit.conformance.mutants.registry import BOTH, wrong_hand
 from dexkit.conformance.virtual.dex5 import Dex5Service
 from dexkit.conformance.virtual.fingers import FingerHand, FingerService, Flags, Ints
 from dexkit.hand import Floats, Side
@@ -39,7 +39,7 @@ class DecodesRis(FingerService):
     hand_fault = _Ris
 
 
-@wrong_hand("DEX5-WDOG-01", also=("DEX5-LIFE-06",))
+@wrong_hand("DEX5-WDOG-01")
 class IndexGoesHome(FingerService):
     """Sends its first joint to one end after the time-out, whatever was commanded."""
 
@@ -59,7 +59,7 @@ class AnyModeDrives(FingerService):
     hand_fault = _AnyModeDrives
 
 
-@wrong_hand("DEX5-FORCE-02", also=("DEX5-FORCE-03",), sides=BOTH)
+@wrong_hand("DEX5-FORCE-02", sides=BOTH)
 class ThumbInTheFingersUnit(FingerService):
     """Publishes the torques of the thumb in mN m, as those of the fingers."""
 
@@ -94,12 +94,7 @@ class _FadingGrip(FingerHand):
         super().move(dt, [0.3 * p for p in pull] if self.pressed > 0.9 else pull)
 
 
-@wrong_hand(
-    "DEX5-FORCE-06",
-    also=("DEX5-FORCE-03", "DEX5-FORCE-05", "DEX5-FORCE-08", "DEX5-FORCE-10"),
-    sides=BOTH,
-    whole=True,
-)
+@wrong_hand("DEX5-FORCE-06", sides=BOTH, whole=True)
 class GripFades(Dex5Service):
     """Presses with a third of the torque after 0.9 s of contact: a limit of the mean current."""
 
@@ -124,7 +119,7 @@ class SoftThumb(Dex5Service):
     hand_fault = _SoftThumb
 
 
-@wrong_hand("DEX5-FORCE-10", also=("DEX5-FORCE-03", "DEX5-FORCE-05"), sides=BOTH)
+@wrong_hand("DEX5-FORCE-10", sides=BOTH)
 class WeakThumb(Dex5Service):
     """Moves and presses with three tenths of the torque in all joints of the thumb."""
 
@@ -135,7 +130,7 @@ class _BoostsLittle(fingers.Boosts):
     joints = (13, 14, 15)
 
 
-@wrong_hand("DEX5-FORCE-08", also=("DEX5-FORCE-05",), sides=BOTH)
+@wrong_hand("DEX5-FORCE-08", sides=BOTH)
 class LittleFingerBoosts(Dex5Service):
     """Its little finger presses with two and a half times the torque where it is blocked."""
 
@@ -147,7 +142,7 @@ class _WeakRing(fingers.OtherInContact):
     factor = 0.35
 
 
-@wrong_hand("DEX5-FORCE-08", also=("DEX5-FORCE-05",), sides=BOTH)
+@wrong_hand("DEX5-FORCE-08", sides=BOTH)
 class RingFingerGivesIn(Dex5Service):
     """Its ring finger presses with a third of the torque where it is blocked."""
 
@@ -188,110 +183,41 @@ class OneJointGoesOn(Dex5Service):
 
 # Faults that other hands have as well
 
-wrong_hand(
-    "DEX5-FRESH-01",
-    also=(
-        *("DEX5-GAIN-03", "DEX5-GAIN-04"),
-        *(f"DEX5-SAFE-0{i}" for i in range(1, 7)),
-    ),
-    whole=True,
-)(any_model.StaleState)
-wrong_hand("DEX5-FRESH-01", also=("DEX5-GAIN-04",), whole=True)(any_model.StaleLater)
-wrong_hand("DEX5-FRESH-02", also=("DEX5-FIELD-19",), whole=True)(any_model.FreezesOnce)
-wrong_hand(
-    "DEX5-FRESH-03",
-    also=("DEX5-FIELD-04", "DEX5-FIELD-05", "DEX5-FIELD-16", "DEX5-MOVE-06"),
-    whole=True,
-)(any_model.SwapsBuffers)
+wrong_hand("DEX5-FRESH-01", whole=True)(any_model.StaleState)
+wrong_hand("DEX5-FRESH-01", whole=True)(any_model.StaleLater)
+wrong_hand("DEX5-FRESH-02", whole=True)(any_model.FreezesOnce)
+wrong_hand("DEX5-FRESH-03", whole=True)(any_model.SwapsBuffers)
 # the first requirement that finds that nothing moves is about the mode byte
 wrong_hand("DEX5-MODE-01", brief=True)(any_model.Frozen)
-wrong_hand("DEX5-MOVE-06", also=("DEX5-MODE-07", "DEX5-PATH-01", "DEX5-WDOG-03"))(
-    any_model.KicksBack
-)
-wrong_hand(
-    "DEX5-STILL-01",
-    also=("DEX5-PATH-01", "DEX5-SAFE-06", "DEX5-SAFE-11"),
-    sides=BOTH,
-    whole=True,
-)(any_model.KicksTheOtherSide)
-wrong_hand("DEX5-FIELD-16", also=("DEX5-FIELD-19", "DEX5-FORCE-09"))(fingers.ShakenVelocity)
-wrong_hand(
-    "DEX5-FIELD-20",
-    also=("DEX5-FIELD-05", "DEX5-FRESH-03", "DEX5-GAIN-04", "DEX5-GAIN-05"),
-    whole=True,
-)(fingers.ShowsTheGoalNearIt)
-wrong_hand("DEX5-PATH-01", also=("DEX5-WDOG-03",))(fingers.BeginsAtZero)
+wrong_hand("DEX5-MOVE-06")(any_model.KicksBack)
+wrong_hand("DEX5-STILL-01", sides=BOTH, whole=True)(any_model.KicksTheOtherSide)
+wrong_hand("DEX5-FIELD-16")(fingers.ShakenVelocity)
+wrong_hand("DEX5-FIELD-20", whole=True)(fingers.ShowsTheGoalNearIt)
+wrong_hand("DEX5-PATH-01")(fingers.BeginsAtZero)
 wrong_hand("DEX5-MOVE-02")(fingers.OtherScale)
 wrong_hand("DEX5-MOVE-03", whole=True)(fingers.Hunts)
-wrong_hand("DEX5-MOVE-04", also=("DEX5-TRACK-01", "DEX5-GAIN-02"))(fingers.Slow)
-wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-05",))(fingers.OwnStiffness)
-wrong_hand("DEX5-MOVE-05", also=("DEX5-GAIN-02", "DEX5-GAIN-05", "DEX5-SAFE-02", "DEX5-PATH-01"))(
-    fingers.Undamped
-)
-wrong_hand("DEX5-SIDE-01", also=("DEX5-MOVE-02",), sides=BOTH)(fingers.Coupled)
-wrong_hand("DEX5-SIDE-03", also=("DEX5-GAIN-03",), sides=BOTH, whole=True)(
-    any_model.WaitsForTheOtherGrip
-)
-wrong_hand("DEX5-MOVE-07", also=("DEX5-FORCE-09",))(fingers.Creeps)
-wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-SAFE-06"))(
-    fingers.GainsOfFirstMotor
-)
-wrong_hand("DEX5-GAIN-02", also=("DEX5-GAIN-03", "DEX5-FIELD-18", "DEX5-FORCE-09", "DEX5-SAFE-06"))(
-    fingers.GainsOfTheMotorBefore
-)
-wrong_hand("DEX5-GAIN-07", also=("DEX5-GAIN-04", "DEX5-FIELD-18"))(fingers.TorqueOfTheMotorBefore)
-wrong_hand("DEX5-MODE-03", also=("DEX5-MODE-02", "DEX5-MODE-07"))(fingers.ZeroIsNoChange)
-wrong_hand("DEX5-MODE-03", also=("DEX5-MODE-02", "DEX5-MODE-07"))(fingers.LastJointStaysOn)
-wrong_hand("DEX5-FORCE-01", also=("DEX5-FORCE-03", "DEX5-FORCE-07"), sides=BOTH)(
-    fingers.TurnedForce
-)
+wrong_hand("DEX5-MOVE-04")(fingers.Slow)
+wrong_hand("DEX5-GAIN-02")(fingers.OwnStiffness)
+wrong_hand("DEX5-MOVE-05")(fingers.Undamped)
+wrong_hand("DEX5-SIDE-01", sides=BOTH)(fingers.Coupled)
+wrong_hand("DEX5-SIDE-03", sides=BOTH, whole=True)(any_model.WaitsForTheOtherGrip)
+wrong_hand("DEX5-MOVE-07")(fingers.Creeps)
+wrong_hand("DEX5-GAIN-02")(fingers.GainsOfFirstMotor)
+wrong_hand("DEX5-GAIN-02")(fingers.GainsOfTheMotorBefore)
+wrong_hand("DEX5-GAIN-07")(fingers.TorqueOfTheMotorBefore)
+wrong_hand("DEX5-MODE-03")(fingers.ZeroIsNoChange)
+wrong_hand("DEX5-MODE-03")(fingers.LastJointStaysOn)
+wrong_hand("DEX5-FORCE-01", sides=BOTH)(fingers.TurnedForce)
 wrong_hand("DEX5-SAFE-01")(fingers.RejectsOnlyTheBadJoint)
-wrong_hand("DEX5-WDOG-03", also=("DEX5-MODE-02",))(fingers.StuckAfterSilence)
+wrong_hand("DEX5-WDOG-03")(fingers.StuckAfterSilence)
 wrong_hand("DEX5-WDOG-03")(fingers.SleepsWithoutGuard)
-wrong_hand(
-    "DEX5-OPER-02",
-    also=(
-        "DEX5-CMD-01",
-        "DEX5-FORCE-09",
-        "DEX5-LOAD-02",
-        "DEX5-MODE-07",
-        "DEX5-SAFE-06",
-        "DEX5-SAFE-11",
-    ),
-)(operator.FingerDeadBand)
+wrong_hand("DEX5-OPER-02")(operator.FingerDeadBand)
 wrong_hand("DEX5-OPER-04")(operator.CoarseFingers)
 # its session begins at the open end
-wrong_hand("DEX5-OPER-01", also=("DEX5-OPER-05", "DEX5-TRACK-01", "DEX5-MOVE-08", "DEX5-MODE-05"))(
-    operator.SlowToLeave
-)
+wrong_hand("DEX5-OPER-01")(operator.SlowToLeave)
 # its delay is long compared with the steps of the light joints
-wrong_hand(
-    "DEX5-OPER-05",
-    also=(
-        "DEX5-CMD-01",
-        "DEX5-GAIN-04",
-        "DEX5-GAIN-05",
-        "DEX5-MODE-02",
-        "DEX5-OPER-02",
-        "DEX5-TRACK-02",
-    ),
-)(operator.LateFingers)
+wrong_hand("DEX5-OPER-05")(operator.LateFingers)
 # the hands are not mirrored
-wrong_hand(
-    "DEX5-SAFE-01",
-    also=(
-        *("DEX5-MOVE-08", "DEX5-PATH-01"),
-        *("DEX5-WDOG-01", "DEX5-WDOG-03"),
-    ),
-    sides=BOTH,
-    whole=True,
-)(any_model.CrossesSidesAfterBadCommands)
-wrong_hand(
-    "DEX5-SIDE-01",
-    also=("DEX5-FORCE-08", "DEX5-LIFE-03", "DEX5-PATH-01", "DEX5-STILL-01"),
-    sides=BOTH,
-    whole=True,
-)(any_model.SwappedWhenRestarted)
-wrong_hand("DEX5-FORCE-11", also=("DEX5-FIELD-04", "DEX5-FIELD-05", "DEX5-FIELD-17"), sides=BOTH)(
-    fingers.ReportsGoalsWhenStalled
-)
+wrong_hand("DEX5-SAFE-01", sides=BOTH, whole=True)(any_model.CrossesSidesAfterBadCommands)
+wrong_hand("DEX5-SIDE-01", sides=BOTH, whole=True)(any_model.SwappedWhenRestarted)
+wrong_hand("DEX5-FORCE-11", sides=BOTH)(fingers.ReportsGoalsWhenStalled)

@@ -1,4 +1,4 @@
-"""``dexkit mutants``: test the conformance checks on deliberately wrong hands."""
+"""Command line: ``python -m dexkit.conformance.faults``, of a checkout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dexkit.cli.options import (
 )
 from dexkit.console import Console
 from dexkit.documents import check_output_paths
-from dexkit.errors import UsageError
+from dexkit.errors import DexkitError, UsageError
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import StopRequest, stop_on_signals
@@ -32,9 +32,9 @@ from dexkit.stop_signals import StopRequest, stop_on_signals
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from dexkit.conformance.mutants.generated.campaign import Campaign, Trial
-    from dexkit.conformance.mutants.matrix import Score, WrongHandResult
-    from dexkit.conformance.mutants.outsiders import Verdicts
+    from dexkit.conformance.faults.generated.campaign import Campaign, Trial
+    from dexkit.conformance.faults.matrix import Score, WrongHandResult
+    from dexkit.conformance.faults.outsiders import Verdicts
 
 
 def _follow(
@@ -63,7 +63,7 @@ def _end_with(
 
 def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: int | None) -> None:
     """Try the hands of a file or module, and end with the exit code."""
-    from dexkit.conformance.mutants import outsiders
+    from dexkit.conformance.faults import outsiders
 
     hands = outsiders.load(source)
     by_index: dict[int, Verdicts] = {}
@@ -85,7 +85,6 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
 
 
 @click.command(
-    "mutants",
     cls=Command,
     exit_codes={
         0: "every requirement detects its wrong hand; with --generated and --from, every wrong "
@@ -188,8 +187,8 @@ def command(
     # Python's worker processes begin with the working folder in front of their import path
     os.chdir("/")
     if generated is not None or names:
-        from dexkit.conformance.mutants.generated import dialects, parse, sample, sample_good
-        from dexkit.conformance.mutants.generated.campaign import Campaign
+        from dexkit.conformance.faults.generated import dialects, parse, sample, sample_good
+        from dexkit.conformance.faults.generated.campaign import Campaign
         from dexkit.conformance.selection import RunKind
 
         if model in ROBOTS:
@@ -208,7 +207,7 @@ def command(
         with stop_on_signals() as stop:
             _follow(len(hands), campaign.run(hands, stop, jobs), stop)
         _end_with(campaign, console, json_path, verbose=verbose)
-    from dexkit.conformance.mutants.matrix import Score, chosen, print_list
+    from dexkit.conformance.faults.matrix import Score, chosen, print_list
 
     requirements, trials = chosen(model, require)
     if list_only:
@@ -218,3 +217,16 @@ def command(
     with stop_on_signals() as stop:
         _follow(len(trials), score.run(trials, stop, jobs), stop)
     _end_with(score, console, json_path, verbose=verbose)
+
+
+def main() -> None:
+    """Run the command; an error is a line with a hint."""
+    try:
+        command.main(prog_name="python -m dexkit.conformance.faults")
+    except DexkitError as error:
+        click.echo(f"error: {error.message}\n  {error.hint}", err=True)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":  # the worker processes import this module, too
+    main()

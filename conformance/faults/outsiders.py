@@ -23,10 +23,10 @@ from typing import Any, NamedTuple, TypeVar
 
 from rich.markup import escape
 
+from dexkit.conformance.faults.matrix import ignore_interrupts
+from dexkit.conformance.faults.registry import mix
+from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.mutants.matrix import ignore_interrupts
-from dexkit.conformance.mutants.registry import mix
-from dexkit.conformance.mutants.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import Level, catalogue
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.virtual import Service

@@ -9,9 +9,12 @@ them.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from dexkit.conformance.layers import layer
@@ -45,8 +48,6 @@ class Mutant:
     :param layer: of its requirement, one of :data:`~dexkit.conformance.layers.LAYERS`.
     :param made: the reference of the model with the fault in it.
     :param kills: the requirement that must fail or warn.
-    :param also: requirements that cannot but fail or warn with it. No other may: that would be
-        for the wrong reason.
     :param sides: the hands that are needed to see the fault.
     :param dialect: where the fault is in one dialect only; empty for the model's first.
     :param brief: apply only the phases that its requirements need.
@@ -57,7 +58,6 @@ class Mutant:
     model: str
     made: type[Any]
     kills: str
-    also: tuple[str, ...] = ()
     sides: tuple[Subject, ...] = BOTH
     dialect: str = ""
     brief: bool = False
@@ -74,9 +74,29 @@ class Mutant:
         return self.layer, self.model, self.name
 
     @property
+    def pin(self) -> str:
+        """The name under which ``make pins`` keeps what it fails."""
+        return f"{self.layer} {self.model} {self.name} ({self.kills})"
+
+    @property
+    def pinned(self) -> frozenset[str] | None:
+        """Ids of the requirements that fail or warn, and no others; None of other packages' hands:
+        of them, only that ``kills`` must is known.
+        """
+        found = _pins().get(self.pin)
+        return None if found is None else frozenset(found)
+
+    @property
     def summary(self) -> str:
         """Its fault: the first line of its class's docstring."""
         return (self.made.__doc__ or "").strip().splitlines()[0]
+
+
+@cache
+def _pins() -> Mapping[str, Sequence[str]]:
+    file = Path(__file__).resolve().parents[2] / "tests" / "pinned" / "blamed.json"
+    found: dict[str, list[str]] = json.loads(file.read_text(encoding="utf-8"))
+    return found
 
 
 @dataclass(frozen=True)
@@ -85,7 +105,6 @@ class _Declaration:
 
     made: type[Any]
     kills: tuple[str, ...]
-    also: tuple[str, ...]
     sides: tuple[Side, ...] | None
     dialect: str
     brief: bool
@@ -101,7 +120,6 @@ _declared: list[_Declaration] = []
 def wrong_hand(
     kills: str | tuple[str, ...],
     *,
-    also: tuple[str, ...] = (),
     sides: tuple[Side, ...] | None = None,
     dialect: str = "",
     brief: bool = False,
@@ -115,7 +133,6 @@ def wrong_hand(
 
     :param kills: the id of the requirement that must find the fault; where catalogues number it
         differently, one id for each. Requirements that are ``like`` it are meant as well.
-    :param also: ids of requirements that cannot but fail with it, for the same models.
     :param sides: the hands that are needed to see the fault; by default those that the
         reference's ``fault_sides`` names.
     :param dialect: see :class:`Mutant`; ``brief`` and ``whole`` likewise. With several ids, all
@@ -125,7 +142,7 @@ def wrong_hand(
     ids = (kills,) if isinstance(kills, str) else kills
 
     def declare(made: C) -> C:
-        _declared.append(_Declaration(made, ids, also, sides, dialect, brief, whole, where))
+        _declared.append(_Declaration(made, ids, sides, dialect, brief, whole, where))
         return made
 
     return declare
@@ -184,7 +201,6 @@ def _mutants(declared: _Declaration, index: _Index, references: _References) -> 
                 *place,
                 mix(declared.made, reference),
                 requirement.id,
-                tuple(r.id for other in declared.also for r, _ in index.like(other, place)),
                 declared.sides or reference.fault_sides,
                 declared.dialect,
                 not declared.whole and (declared.brief or i > 0),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.mutants.registry import wrong_hand
+from dexkit.conformance.faults.registry import wrong_hand
 from dexkit.conformance.virtual import MemoryTrace, Sample
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.hand import Floats, RobotSubject, Subject
@@ -47,7 +47,7 @@ class OtherState(_OtherFamily):
         return kind.encode(kind.cls())
 
 
-@wrong_hand("H1-TOPIC-02", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
+@wrong_hand("H1-TOPIC-02")
 class OtherCommands(_OtherFamily):
     """Subscribes to the other family's LowCmd_."""
 
@@ -67,7 +67,7 @@ class TwoStatePublishers(ReferenceRobot):
         return every + [e for e in every if e.kind == "writer"]
 
 
-@wrong_hand("H1-QOS-01", also=("H1-MOVE-01", "H1-MODE-01", "H1-WDOG-03"))
+@wrong_hand("H1-QOS-01")
 class AsksForMore(ReferenceRobot):
     """Requests TRANSIENT_LOCAL commands, which no official client offers."""
 
@@ -322,7 +322,7 @@ class NoMode(ReferenceRobot):
 # --------------------------------------------------------------------------------------- motion
 
 
-@wrong_hand("H1-MOVE-01", also=("H1-WDOG-03",))
+@wrong_hand("H1-MOVE-01")
 class Halfway(ReferenceRobot):
     """Moves only half of the way to its goals."""
 
@@ -364,7 +364,7 @@ class NoVelocity(ReferenceRobot):
         super().obey(orders)
 
 
-@wrong_hand("H1-GAIN-03", also=("H1-GAIN-01",))
+@wrong_hand("H1-GAIN-03")
 class NoTorque(ReferenceRobot):
     """Ignores tau."""
 
@@ -396,7 +396,7 @@ class NoForce(ReferenceRobot):
 # --------------------------------------------------------------------------------------- safety
 
 
-@wrong_hand("H1-MODE-02", also=("H1-MODE-01",))
+@wrong_hand("H1-MODE-02")
 class NoModes(ReferenceRobot):
     """Ignores the mode byte of commands."""
 
@@ -489,7 +489,7 @@ class AnswersOnly(ReferenceRobot):
         return [] if 0.5 < waited < math.inf else super().publish()
 
 
-@wrong_hand("H1-WDOG-03", also=("H1-LIFE-02",))
+@wrong_hand("H1-WDOG-03")
 class Latches(ReferenceRobot):
     """Obeys no command after a time-out."""
 

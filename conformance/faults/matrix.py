@@ -1,7 +1,7 @@
 """The matrix of all wrong hands and all requirements: which fault each requirement finds, and which
 requirement no wrong hand proves.
 
-``dexkit mutants`` prints it; the tests require that it is complete.
+``python -m dexkit.conformance.faults`` prints it; the tests require that it is complete.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import TypeVar
 from rich.markup import escape
 from rich.table import Table
 
-from dexkit.conformance.mutants import Mutant, mutants
-from dexkit.conformance.mutants.trials import blamed, trial_of
+from dexkit.conformance.faults import Mutant, mutants
+from dexkit.conformance.faults.trials import blamed, cost
 from dexkit.conformance.requirements import Level, Requirement, catalogue, select
 from dexkit.console import Console
 from dexkit.documents import write_file
@@ -28,7 +28,6 @@ __all__ = [
     "Score",
     "WrongHandResult",
     "chosen",
-    "cost",
     "essential",
     "in_processes",
     "print_list",
@@ -54,9 +53,9 @@ class WrongHandResult:
 
     @classmethod
     def from_blame(cls, mutant: Mutant, blamed: set[str]) -> WrongHandResult:
-        """Compare the requirements that failed or warned with those that were declared."""
-        due = {mutant.kills, *mutant.also}
-        return cls(mutant, tuple(sorted(due - blamed)), tuple(sorted(blamed - due)))
+        """Compare the requirements that failed or warned with the pinned ones."""
+        due, may = {mutant.kills, *(mutant.pinned or ())}, mutant.pinned or blamed
+        return cls(mutant, tuple(sorted(due - blamed)), tuple(sorted(blamed - may)))
 
     @property
     def name(self) -> str:
@@ -65,7 +64,7 @@ class WrongHandResult:
 
     @property
     def good(self) -> bool:
-        """Whether exactly the declared requirements found the fault."""
+        """Whether exactly the pinned requirements found the fault."""
         return not self.missed and not self.wrongly
 
 
@@ -92,11 +91,6 @@ def print_list(console: Console, given: Sequence[Mutant]) -> None:
         table.add_row(m.name, m.model + spoken, m.kills, sides, escape(m.summary))
     console.print(table)
     console.print(f"{len(given)} wrong hands", highlight=False)
-
-
-def cost(mutant: Mutant) -> float:
-    """Roughly how long a trial takes, in units of the shortest on DDS."""
-    return trial_of(mutant).cost(mutant)
 
 
 def essential(given: Sequence[Mutant]) -> tuple[Mutant, ...]:
@@ -204,7 +198,7 @@ class Score:
                     "layer": o.mutant.layer,
                     "model": o.mutant.model,
                     "kills": o.mutant.kills,
-                    "also": list(o.mutant.also),
+                    "also": sorted((o.mutant.pinned or frozenset()) - {o.mutant.kills}),
                     "summary": o.mutant.summary,
                     "missed": list(o.missed),
                     "wrongly": list(o.wrongly),
