@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from dexkit.models import MODELS
+from dexkit.backends import Backend, Emulator, backend, simulators
 from dexkit.robots import ROBOTS
-
-if TYPE_CHECKING:  # reports import this module, and need no backend
-    from dexkit.backends import Backend, Emulator
 
 __all__ = ["EXTERNAL", "ROBOT_EMULATORS", "SIMULATED", "emulator_of", "has_usb_requirements"]
 
 EXTERNAL = "external"
 """The backend's name for a service that the kit does not start."""
 
-SIMULATED = tuple(m.simulator for m in MODELS.values() if m.simulator)
+SIMULATED = tuple(simulators().values())
 """Backends without a device, which have a setting ``object``."""
 ROBOT_EMULATORS = {f"sim-{name}": name for name in ROBOTS}
 """Backends that are emulated robots: the names of their emulators."""
@@ -43,6 +38,4 @@ def _hand(name: str) -> Backend | None:
     """The backend of that name; None where the kit starts none, or it is a robot."""
     if name == EXTERNAL or name in ROBOT_EMULATORS:
         return None
-    from dexkit.backends import backend
-
     return backend(name)

@@ -1,5 +1,5 @@
-"""Backends by name: the entry-point group ``dexkit.backends``, the simulated hands of the profiles
-in dexkit, and ``package.module:Object``.
+"""Backends by name: the entry-point group ``dexkit.backends``, the simulated hands of dexkit, and
+``package.module:Object``.
 
 A backend is a :class:`Backend`: a description and a factory that makes a
 :class:`~dexkit.hand.Hand` from :class:`BackendOptions`. A plug-in package registers one under
@@ -7,6 +7,9 @@ its name::
 
     [project.entry-points."dexkit.backends"]
     my-gripper = "my_package.hand:backend"
+
+A backend called ``sim-`` and the name of a model simulates that model, without a device and with a
+setting ``object``: the conformance kit and ``dexkit emulate all`` start it (:func:`simulators`).
 
 ``package.module:Class`` also takes a plain callable ``(options) -> Hand`` or a Hand class whose
 constructor takes the side. The module is installed, or lies in the working directory.
@@ -27,7 +30,7 @@ from dexkit import __version__
 from dexkit.errors import BackendBroken, BackendConflict, DexkitError, UnknownBackend, UsageError
 from dexkit.hand import Hand, HandSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models import BUILT_IN
+from dexkit.models import short_names
 from dexkit.plugins import entry_points, import_object, is_own, origin, where
 
 if TYPE_CHECKING:
@@ -42,9 +45,19 @@ __all__ = [
     "Emulator",
     "backend",
     "list_backends",
+    "simulators",
 ]
 
 GROUP = "dexkit.backends"
+_SIMULATED = {
+    "sim-dex1": "dexkit.emulators.sim_dex1:sim_dex1",
+    "sim-dex3": "dexkit.emulators.sim_dex3:sim_dex3",
+    "sim-dex5": "dexkit.emulators.sim_dex5:sim_dex5",
+    "sim-brainco": "dexkit.emulators.sim_brainco:sim_brainco",
+    "sim-inspire-dfx": "dexkit.emulators.sim_inspire:sim_inspire_dfx",
+    "sim-inspire-ftp": "dexkit.emulators.sim_inspire:sim_inspire_ftp",
+}
+"""The simulated hands of dexkit itself."""
 
 
 @dataclass(frozen=True)
@@ -197,11 +210,22 @@ class _Registered:
 def _registered() -> list[_Registered]:
     """Every backend that has a name, once."""
     found = {_Registered(not is_own(e), e.name, e.value, origin(e)) for e in entry_points(GROUP)}
-    for model in BUILT_IN:
-        if model.simulated_by:
-            target = model.simulated_by.target
-            found.add(_Registered(False, model.simulator, target, f"dexkit {__version__}"))
+    own = f"dexkit {__version__}"
+    found |= {_Registered(False, name, target, own) for name, target in _SIMULATED.items()}
     return sorted(found)
+
+
+def simulators() -> dict[str, str]:
+    """The backend that simulates each model, by the model's name: ``sim-`` and that name, whole or
+    short. Nothing is loaded.
+    """
+    names = {entry.name for entry in _registered()}
+    return {
+        hand.name: name
+        for short, hand in short_names().items()
+        for name in (f"sim-{short}", f"sim-{hand.name}")
+        if name in names
+    }
 
 
 def _select(name: str, registered: Iterable[_Registered]) -> _Registered | None:

@@ -8,18 +8,12 @@ whose ``mode_machine`` is 5.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec
-from dexkit.lazy import Lazy
-
-if TYPE_CHECKING:
-    from dexkit.kinematics import Skeleton
-    from dexkit.robot_layout import RobotLayout
 
 __all__ = ["DQ_STOP", "G1", "H1", "Q_STOP", "ROBOTS", "RobotModel", "robot"]
 
@@ -40,8 +34,6 @@ class RobotModel:
     :param battery_cells: of the battery, in series.
     :param teleop_name: its name in xr_teleoperate (``--arm``).
     :param lerobot_name: its name in LeRobot (``--robot.type``), or empty.
-    :param layout: how it is drawn in the docs.
-    :param skeleton: makes the joint axes and origins, for the viewer.
     :param joints: by motor slot; None where the slot is not used.
     :param enable: mode byte that lets the motor of a slot follow commands; 0 turns it off.
     :param client_gains: by slot, kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends.
@@ -65,8 +57,6 @@ class RobotModel:
     has_battery: bool
     battery_cells: int
     teleop_name: str
-    layout: Lazy[RobotLayout]
-    skeleton: Lazy[Callable[[], Skeleton]]
     joints: tuple[JointSpec | None, ...]
     enable: tuple[int, ...]
     client_gains: tuple[tuple[float, float], ...]
@@ -207,8 +197,6 @@ H1 = RobotModel(
     has_battery=True,
     battery_cells=15,  # as many as its state has fields for (docs/sources/unitree-dex.md#a2)
     teleop_name="H1",
-    layout=Lazy("dexkit.robot_layout:H1"),
-    skeleton=Lazy("dexkit.models.skeletons:h1"),
     joints=_h1_joints,
     # docs/sources/unitree-dex.md#a8: 0x01 for weak motors (ankles, arms), 0x0A for the others
     enable=tuple(0x01 if i in _H1_WEAK else 0x0A for i in range(len(_H1_ORDER))),
@@ -276,8 +264,6 @@ G1 = RobotModel(
     battery_cells=13,  # the G1's datasheet
     teleop_name="G1_29",
     lerobot_name="unitree_g1",
-    layout=Lazy("dexkit.robot_layout:G1"),
-    skeleton=Lazy("dexkit.models.skeletons:g1"),
     joints=_g1_joints,
     enable=(1,) * len(_G1_ORDER),  # docs/sources/unitree-dex.md#a8: 1 enable, 0 disable
     client_gains=tuple(_g1_gains(name) for name in _G1_ORDER),

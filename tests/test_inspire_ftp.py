@@ -28,7 +28,7 @@ from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.messages import message_type
 from dexkit.messages.inspire import inspire_hand_ctrl, inspire_hand_state
 from dexkit.messages.layout import IdlError, parse
-from dexkit.models import INSPIRE_DFX, INSPIRE_FTP, MODELS, dialect
+from dexkit.models import INSPIRE_DFX, INSPIRE_FTP, dialect
 from dexkit.service.dialects import DialectMap, StateView, dialect_map
 from dexkit.service.ftp_map import FtpMap
 from dexkit.teleop import client_for
@@ -123,7 +123,6 @@ def test_topics_have_the_side_as_a_letter() -> None:
     assert (state.kind, state.dialect.name, state.sides) == ("state", "inspire_ftp", (RIGHT,))
     assert not FTP.shared
     assert INSPIRE_FTP.joints == INSPIRE_DFX.joints
-    assert len({m.short_name for m in MODELS.values()}) == len(MODELS)
 
 
 def test_messages_do_not_mention_radians() -> None:

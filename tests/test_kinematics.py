@@ -14,9 +14,9 @@ from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.kinematics import BASE, Box, Segment, Skeleton, quaternions, rotation, turned_to
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, MODELS
-from dexkit.models.skeletons import schematic, skeleton_of
 from dexkit.robots import ROBOTS
 from dexkit.urdf import read_urdf
+from dexkit.view.skeletons import schematic, skeleton_of
 
 FEW = settings(max_examples=25, deadline=None)
 angles = st.floats(-3.1, 3.1)

@@ -22,6 +22,7 @@ import dexkit.models
 from dexkit.cli import cli
 from dexkit.conformance.faults import mutants, plan_for, run_mutant
 from dexkit.conformance.faults.matrix import chosen, cost, try_one
+from dexkit.conformance.hands import BUILT_IN as UNDER_TEST
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Overall
@@ -29,7 +30,7 @@ from dexkit.dds import DdsNode
 from dexkit.errors import ModelBroken, UsageError
 from dexkit.hand import Side
 from dexkit.lazy import Lazy
-from dexkit.models import BUILT_IN, DIALECTS, MODELS, model, model_plugins
+from dexkit.models import BUILT_IN, DIALECTS, MODELS, model, model_plugins, short_names
 from dexkit.robots import ROBOTS
 from tests.dds_helpers import free_domain, take_until
 from tests.optional import UV
@@ -51,7 +52,7 @@ sim-twofinger = twofinger_hand.simulated:sim_twofinger
 
 # ------------------------------------------------------------------------ no tables elsewhere
 
-NAMES = {m.name for m in BUILT_IN} | {m.short_name for m in BUILT_IN} | set(ROBOTS)
+NAMES = {m.name for m in BUILT_IN} | set(short_names()) | set(ROBOTS)
 NAMES |= {d.name for m in BUILT_IN for d in m.dialects} | {"unitree_go", "unitree_hg"}
 CONSTANTS = {
     "DEX1_1",
@@ -131,7 +132,7 @@ def test_nothing_outside_the_profiles_depends_on_the_name_of_a_model_or_dialect(
 
 
 def test_every_reference_of_a_profile_can_be_loaded() -> None:
-    owners = [*BUILT_IN, *ROBOTS.values(), *(d for m in BUILT_IN for d in m.dialects)]
+    owners = [*UNDER_TEST, *(d for m in BUILT_IN for d in m.dialects)]
     references = [
         value
         for owner in owners
@@ -278,9 +279,6 @@ WRONG_TYPES = """
         replace(DEX5_1.dialects[0], name="bad", model="bad-1", state_type="a::B_"),
     ),
 """
-OWN_DIALECT = """
-    dialects=(replace(DEX5_1.dialects[0], name="bad", model="bad-1"),),
-"""
 BAD_PROFILE = """
 from dataclasses import replace
 from dexkit.models import DEX5_1, DEX3_1
@@ -307,11 +305,6 @@ def test_profiles_of_dexkit_meet_what_is_asked_of_others() -> None:
         ("bad-1", BAD_PROFILE.format(change="joints={}"), "it has no joints"),
         ("bad-1", BAD_PROFILE.format(change="rest_q=DEX3_1.rest_q"), "rest_q of the left hand"),
         ("bad-1", BAD_PROFILE.format(change=WRONG_TYPES), "has to use the types unitree_hg"),
-        (
-            "bad-1",
-            BAD_PROFILE.format(change=OWN_DIALECT),
-            "simulated_by is for the models of dexkit",
-        ),
     ],
 )
 def test_a_broken_model_says_why_and_affects_no_other(

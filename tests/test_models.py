@@ -22,6 +22,7 @@ from dexkit.models import BUILT_IN, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
 from tests.each import each
 from tools.generate import DOCS
+from tools.generate.hand_layouts import LAYOUTS
 from tools.generate.model_drawing import draw_hand, draw_robot
 from tools.generate.models_page import drawing
 from tools.generate.svg_sheet import Box, Sheet
@@ -182,12 +183,11 @@ def test_sensors_are_drawn_where_the_model_has_them() -> None:
 
 
 def test_finger_joints_have_their_finger_in_the_name() -> None:
-    assert DEX3_1.layout is not None
-    for finger in DEX3_1.layout.fingers:
+    for finger in LAYOUTS[DEX3_1.name].fingers:
         for i in finger.joints:
             assert DEX3_1.joints[Side.LEFT][i].name.startswith(f"{finger.name}_")
     for hand in BUILT_IN:
-        fingers = hand.layout.fingers if hand.layout else ()
+        fingers = LAYOUTS[hand.name].fingers if hand.name in LAYOUTS else ()
         covered = sorted(i for finger in fingers for i in finger.joints)
         assert covered == (list(range(len(hand.joints[Side.LEFT]))) if fingers else [])
 

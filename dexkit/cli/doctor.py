@@ -26,7 +26,7 @@ from dexkit.cli.options import (
     peer_addresses,
 )
 from dexkit.errors import UsageError
-from dexkit.models import DIALECTS, MODELS, Dialect
+from dexkit.models import DIALECTS, MODELS, Dialect, short_names
 from dexkit.open_file_limit import require_open_files
 from dexkit.stop_signals import StopRequest, stop_on_signals
 
@@ -38,7 +38,7 @@ __all__ = ["command"]
 
 _REFRESH = 1.0  # seconds between looks
 _FILES = 16  # descriptors beside one a domain and interface
-_MODEL_NAMES = {hand.short_name: name for name, hand in MODELS.items()}
+_MODEL_NAMES = {short: hand.name for short, hand in short_names().items()}
 
 
 def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int]:

@@ -257,9 +257,9 @@ def _skeletons(urdfs: Sequence[str]) -> dict[tuple[str, str], Skeleton]:
     :raises UsageError: a file is no URDF, or none of a hand or robot that is known.
     """
     from dexkit.models import MODELS
-    from dexkit.models.skeletons import skeleton_of
     from dexkit.robots import ROBOTS
     from dexkit.urdf import read_urdf
+    from dexkit.view.skeletons import skeleton_of
 
     known: dict[tuple[str, str], Sequence[JointSpec]] = {
         (m.name, str(side)): m.joints[side] for m in MODELS.values() for side in Side

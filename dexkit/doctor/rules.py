@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
+from dexkit.backends import simulators
 from dexkit.doctor.awaited_topics import AWAITED, Awaited, awaited
 from dexkit.doctor.catalogue import DIAGNOSES, Finding, Severity
 from dexkit.doctor.motion_direction import Course, moves_against, swapped
@@ -27,8 +28,9 @@ from dexkit.doctor.topic_spelling import closest_topic, short
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.hand import Side
 from dexkit.messages.earlier import EARLIER, earlier_by_hash
-from dexkit.models import DIALECTS, MODELS, Dialect, ModeByte
+from dexkit.models import DIALECTS, MODELS, Dialect, HandModel, ModeByte, short_names
 from dexkit.other_interfaces import TWO_FINGERS, other_interface
+from dexkit.teleop.hands import teleop_hand
 from dexkit.topics import Role, roles, split_prefix, under_prefix
 from dexkit.wire import dex3_usb, mx64
 
@@ -561,7 +563,7 @@ def _listeners(view: DomainView, scope: Scope) -> Iterator[Finding]:
                 domain=view.number,
                 topic=topic,
             )
-        elif MODELS[part.role.dialect.model].client_forks and not (stream and stream.samples):
+        elif teleop_hand(part.role.dialect.model).forks and not (stream and stream.samples):
             late = _late(view, part.endpoint, readers)
             if late:
                 yield _finding(
@@ -1061,7 +1063,7 @@ def _absent(
                 (there,) = sides
                 other_side = Side.RIGHT if there is Side.LEFT else Side.LEFT
                 is_read = other_side in _read_sides(view, dialect)
-                backend = MODELS[dialect.model].simulator or "BACKEND"
+                backend = simulators().get(dialect.model, "BACKEND")
                 replacement = (
                     f"'dexkit serve {backend} --side {other_side} --domain {view.number}' replaces "
                     "a missing one"
@@ -1105,6 +1107,12 @@ def _instead(view: DomainView, dialect: Dialect) -> _Part | None:
     return next((p for p in served if p.role.dialect.model not in asked), None)
 
 
+def _client_option(hand: HandModel) -> str:
+    """A hand's name in xr_teleoperate's ``--ee``."""
+    short = next(name for name, each in short_names().items() if each is hand)
+    return teleop_hand(hand.name).option or short
+
+
 def _other_hand(view: DomainView, dialect: Dialect, instead: _Part) -> Finding:
     wanted, there = MODELS[dialect.model], MODELS[instead.role.dialect.model]
     readers = _parts(view, "reader", "state", Scope(dialects=(dialect,)))
@@ -1114,7 +1122,7 @@ def _other_hand(view: DomainView, dialect: Dialect, instead: _Part) -> Finding:
         f"{view.number}; {readers[0].who if readers else 'the client'} waits for "
         f"{dialect.topics(Side.LEFT)[1]} ({wanted.title})",
         fix="select the hand that is there in the client (xr_teleoperate: "
-        f"--ee={there.client_option or there.short_name}), or serve the other one",
+        f"--ee={_client_option(there)}), or serve the other one",
         domain=view.number,
         topic=instead.endpoint.topic,
     )

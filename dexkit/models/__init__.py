@@ -27,8 +27,6 @@ from dexkit.models.dex5 import DEX5_1
 from dexkit.models.inspire import INSPIRE_DFX, INSPIRE_FTP
 from dexkit.models.profile import (
     Dialect,
-    Finger,
-    HandLayout,
     HandModel,
     ModeByte,
     PressureSensor,
@@ -48,8 +46,6 @@ __all__ = [
     "INSPIRE_FTP",
     "MODELS",
     "Dialect",
-    "Finger",
-    "HandLayout",
     "HandModel",
     "ModeByte",
     "ModelPlugin",
@@ -59,6 +55,7 @@ __all__ = [
     "model",
     "model_plugins",
     "registered_record",
+    "short_names",
 ]
 
 GROUP = "dexkit.models"
@@ -119,11 +116,6 @@ def _load_plugins() -> tuple[ModelPlugin, ...]:
                     f"{owner} registers {', '.join(sorted(taken))}, which is there already",
                     hint="give the model and each of its dialects a name of its own",
                 )
-            if loaded.simulated_by is not None:
-                raise ModelBroken(
-                    f"{owner}: simulated_by is for the models of dexkit itself",
-                    hint="register the simulated backend under the entry points dexkit.backends",
-                )
             known.add(name)
             dialects |= {d.name for d in loaded.dialects}
         except ModelBroken as broken:
@@ -174,7 +166,11 @@ def _checked(value: object, name: str) -> HandModel:
             f"{', or '.join(' and '.join(pair) for pair in pairs)}",
         )
     if not value.dialects[0].is_gripper:
-        require(len(value.fingers) == count, "fingers has to name a finger for each joint")
+        for side in Side:
+            require(
+                all(j.finger for j in value.joints[side]),
+                f"a joint of the {side} hand has no finger",
+            )
     return value
 
 
@@ -233,6 +229,17 @@ def model(name: str) -> HandModel:
             if plugin.name == name and plugin.error is not None:
                 raise plugin.error from None
         raise UsageError(f"no hand model {name!r}", hint=f"known: {', '.join(MODELS)}") from None
+
+
+def short_names() -> dict[str, HandModel]:
+    """Every usable model by its name without the vendor's revision: ``dex3`` of ``dex3-1``; by its
+    whole name where one before it has that.
+    """
+    found: dict[str, HandModel] = {}
+    for hand in MODELS.values():
+        short = hand.name.partition("-")[0]
+        found[hand.name if short in found else short] = hand
+    return found
 
 
 @cache

@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel
+from dexkit.models.profile import Dialect, HandModel
 
 __all__ = ["BRAINCO_REVO2"]
 
@@ -27,7 +27,13 @@ def _joint(name: str, travel: float, degrees_s: float) -> JointSpec:
     much torque that is.
     """
     return JointSpec(
-        name, q_min=0.0, q_max=1.0, dq_max=math.radians(degrees_s) / travel, tau_max=1.0, closing=1
+        name,
+        q_min=0.0,
+        q_max=1.0,
+        dq_max=math.radians(degrees_s) / travel,
+        tau_max=1.0,
+        closing=1,
+        finger=name.partition("_")[0],
     )
 
 
@@ -65,22 +71,4 @@ BRAINCO_REVO2 = HandModel(
     client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j1, as client_dq
     client_dq=1.0,
     rest_q=dict.fromkeys(Side, (0.1, 0.1, 0.15, 0.15, 0.15, 0.15)),
-    simulator="sim-brainco",
-    simulated_by=Lazy("dexkit.emulators.sim_brainco:sim_brainco"),
-    # ring and little finger move as the middle one does
-    fingers=("thumb", "thumb", "index", "middle", "middle", "middle"),
-    client_forks=True,
-    layout=HandLayout(
-        centres=(240.0, 640.0),
-        top=466.0,
-        palm=(280.0, 130.0),
-        width=62.0,
-        fingers=(
-            Finger("Index", range(2, 3), (-108.0, -90.0), (0.0, -150.0), tip=1.0),
-            Finger("Middle", range(3, 4), (-36.0, -106.0), (0.0, -150.0), tip=1.0),
-            Finger("Ring", range(4, 5), (36.0, -90.0), (0.0, -150.0), tip=1.0),
-            Finger("Pinky", range(5, 6), (108.0, -66.0), (0.0, -120.0), tip=1.0),
-            Finger("Thumb", range(0, 2), (-167.0, 26.0), (-9.0, -66.0), tip=1.0, root=0.1),
-        ),
-    ),
 )

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 from dexkit.hand import JointSpec, Side
-from dexkit.kinematics import BASE, Box, Segment, Skeleton, Vector
 from dexkit.lazy import Lazy
 from dexkit.models.profile import Dialect, HandModel
 
-__all__ = ["DEX1_1", "skeleton"]
+__all__ = ["DEX1_1"]
 
 # docs/sources/unitree-dex.md#b3: 0 closed, rising q opens, 5.4 rad = 9 cm of jaw travel; closing is
 # toward smaller q.
@@ -81,52 +79,4 @@ DEX1_1 = HandModel(
     client_gains=(5.0, 0.05),  # docs/sources/unitree-dex.md#b1
     rest_q=dict.fromkeys(Side, (0.2 * _JOINT.stroke,)),
     vendor_ids={Side.LEFT: 1, Side.RIGHT: 0},  # docs/sources/unitree-dex.md#b2
-    simulator="sim-dex1",
-    simulated_by=Lazy("dexkit.emulators.sim_dex1:sim_dex1"),
-    client=Lazy("dexkit.teleop.client:Dex1Client"),
-    operator_profiles=Lazy("dexkit.teleop.profiles:gripper_profiles"),
-    skeleton=Lazy("dexkit.models.dex1:skeleton"),
 )
-
-_RIGHT = math.pi / 2
-
-
-@cache
-def skeleton(side: Side) -> Skeleton:
-    """The joint axes, origins and drawn boxes (docs/sources/unitree-dex.md#i1,
-    docs/sources/unitree-dex.md#i2): two jaws that slide; both sides are alike.
-
-    In the URDF a jaw slides from 0.0245 m, where the jaws touch, to -0.02 m. That q is in
-    proportion is derived: 5.4 rad are 9 cm (docs/sources/unitree-dex.md#b3).
-    """
-    touching, stroke = 0.0245, 0.0445 / 5.4
-    segments, boxes = [], [Box.between(BASE, (-0.035, 0.0, -0.035), (0.035, 0.074, 0.035))]
-    for sign, name in ((1, "jaw_1"), (-1, "jaw_2")):
-        segments.append(
-            Segment(
-                name,
-                BASE,
-                (sign * 0.04055, 0.0593, sign * 0.0152),
-                axis=(-float(sign), 0.0, 0.0),
-                joint=0,
-                prismatic=True,
-                factor=-stroke,
-                offset=touching,
-            )
-        )
-        here = len(segments) - 1
-        for low, high in (
-            ((-0.08, -0.005, -0.008), (0.0, 0.009, 0.0065)),  # the rack
-            ((-0.019, 0.006, -0.03), (0.0, 0.088, 0.0)),  # the finger
-            ((-0.0155, 0.036, -0.029), (-0.0115, 0.085, -0.001)),  # its pad
-        ):
-            # the second jaw is the first one turned by half a turn about y
-            boxes.append(Box.between(here, *_turned(low, high, sign)))
-    return Skeleton(tuple(segments), tuple(boxes), mount=(_RIGHT, 0.0, 0.0))
-
-
-def _turned(low: Vector, high: Vector, sign: int) -> tuple[Vector, Vector]:
-    """Extents turned by half a turn about y, if the sign is -1."""
-    if sign > 0:
-        return low, high
-    return (-high[0], low[1], -high[2]), (-low[0], high[1], -low[2])

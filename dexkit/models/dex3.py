@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 from dexkit.hand import JointSpec, Side
-from dexkit.kinematics import BASE, Box, Element, Segment, Skeleton, Vector
 from dexkit.lazy import Lazy
 from dexkit.models.profile import (
     Dialect,
-    Finger,
-    HandLayout,
     HandModel,
     ModeByte,
     PressureSensor,
 )
 
-__all__ = ["DEX3_1", "skeleton"]
+__all__ = ["DEX3_1"]
 
 
 def _joints(side: Side) -> tuple[JointSpec, ...]:
@@ -49,6 +45,7 @@ def _joints(side: Side) -> tuple[JointSpec, ...]:
             closing=mirror * flexing,
             urdf=f"{side}_hand_{name}_joint",
             gear_ratio=ratio,
+            finger=name.partition("_")[0],
         )
 
     finger = [("0", -1.5708), ("1", -1.7453)]
@@ -116,94 +113,4 @@ DEX3_1 = HandModel(
     },
     sensors=_SENSORS,
     low_rate=9.1,  # as a real robot's copy comes (docs/sources/real-hands.md#dex3-low-rate)
-    simulator="sim-dex3",
-    simulated_by=Lazy("dexkit.emulators.sim_dex3:sim_dex3"),
-    fingers=3 * ("thumb",) + 2 * ("middle",) + 2 * ("index",),
-    client_forks=True,
-    layout=HandLayout(
-        centres=(256.0, 624.0),
-        top=432.0,
-        palm=(206.0, 150.0),
-        width=76.0,
-        fingers=(
-            Finger("thumb", range(0, 3), (-122.0, 28.0), (-12.0, -72.0), tip=1.35, root=0.1),
-            Finger("middle", range(3, 5), (52.0, -108.0), (0.0, -72.0), tip=1.35),
-            Finger("index", range(5, 7), (-38.0, -108.0), (0.0, -72.0), tip=1.35),
-        ),
-        palm_sensors=((10.0, -40.0), (-24.0, 34.0), (44.0, 34.0)),
-    ),
-    skeleton=Lazy("dexkit.models.dex3:skeleton"),
 )
-
-_RIGHT = math.pi / 2
-
-
-@cache
-def skeleton(side: Side) -> Skeleton:
-    """The joint axes, origins and drawn boxes (docs/sources/unitree-dex.md#i1,
-    docs/sources/unitree-dex.md#i2); places of the pressure sensors are schematic.
-    """
-    # the right hand is the left one mirrored in y; its joints turn about the same axes
-    m = 1.0 if side is Side.LEFT else -1.0
-
-    def finger(name: str, joint: int, z: float) -> tuple[Segment, Segment]:
-        return (
-            Segment(f"{name}_0", BASE, (0.0777, m * 0.0016, z), joint=joint),
-            Segment(f"{name}_1", joint, (0.0458, 0.0, 0.0), joint=joint + 1),
-        )
-
-    segments = (
-        Segment("thumb_0", BASE, (0.0255, 0.0, 0.0), axis=(0.0, 1.0, 0.0), joint=0),
-        Segment("thumb_1", 0, (-0.0025, -m * 0.0193, 0.0), joint=1),
-        Segment("thumb_2", 1, (0.0, -m * 0.0458, 0.0), joint=2),
-        *finger("middle", 3, -0.0285),
-        *finger("index", 5, 0.0285),
-    )
-
-    def box(segment: int, low: Vector, high: Vector) -> Box:
-        return Box.between(segment, *_mirrored(low, high, m))
-
-    lower = ((-0.007, -0.0147, -0.0128), (0.0548, 0.0126, 0.0129))
-    upper = ((-0.007, -0.0088, -0.0129), (0.052, 0.0089, 0.0131))
-    # of the thumb, the same bodies turned: they point to -y, and bend toward x
-    boxes = (
-        box(BASE, (0.0, -0.0203, -0.0439), (0.0867, 0.0214, 0.0439)),
-        box(0, (-0.0115, -0.0283, -0.0095), (0.0101, 0.0, 0.0095)),
-        box(1, (-0.0126, -0.0548, -0.0129), (0.0147, 0.007, 0.0128)),
-        box(2, (-0.0089, -0.052, -0.0131), (0.0088, 0.007, 0.0129)),
-        *(box(i, *(lower if i in (3, 5) else upper)) for i in (3, 4, 5, 6)),
-    )
-    elements: list[Element] = []
-    for tip in (2, 4, 6):
-        # the pad's 2 x 2, then the tip's 3, on the side toward which the finger bends
-        for along, across in (
-            *_square(0.022, 0.007),
-            (0.048, -0.007),
-            (0.048, 0.0),
-            (0.048, 0.007),
-        ):
-            if tip == 2:
-                elements.append(Element(tip, (0.0095, -m * along, across)))
-            else:
-                elements.append(Element(tip, (along, -m * 0.0095, across)))
-    for x, z in ((0.066, 0.0), (0.02, 0.028), (0.02, -0.028)):
-        elements += [Element(BASE, (x + u, -m * 0.021, z + v)) for u, v in _square(0.0, 0.007)]
-    mount = (0.0, -_RIGHT, 0.0) if side is Side.LEFT else (math.pi, -_RIGHT, 0.0)
-    return Skeleton(
-        segments,
-        boxes,
-        tuple(elements),
-        mount=mount,
-        note="places of the pressure sensors are schematic",
-    )
-
-
-def _mirrored(low: Vector, high: Vector, m: float) -> tuple[Vector, Vector]:
-    """Extents mirrored in y, if m is -1."""
-    if m > 0:
-        return low, high
-    return (low[0], -high[1], low[2]), (high[0], -low[1], high[2])
-
-
-def _square(along: float, half: float) -> tuple[tuple[float, float], ...]:
-    return tuple((along + u, v) for u in (-half, half) for v in (-half, half))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 from dexkit.hand import JointSpec, Side
-from dexkit.kinematics import BASE, Box, Segment, Skeleton
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, ModeByte
+from dexkit.models.profile import Dialect, HandModel, ModeByte
 
-__all__ = ["DEX5_1", "skeleton"]
+__all__ = ["DEX5_1"]
+
+
+_FINGERS = ("thumb", "index", "middle", "ring", "little")
+"""As the names of the joints count them, from 1."""
 
 
 def _joints(side: Side) -> tuple[JointSpec, ...]:
@@ -36,6 +38,7 @@ def _joints(side: Side) -> tuple[JointSpec, ...]:
             tau_max=0.93,
             closing=flexing,
             urdf=f"{urdf or name}{letter}",
+            finger=_FINGERS[int(name[-2]) - 1],
         )
 
     fingers = [
@@ -112,75 +115,4 @@ DEX5_1 = HandModel(
     # and fingers less one in each finger, and what a finger of four joints shares is its two outer
     # ones. Uncertain.
     shared_motors=((2, 3), (6, 7), (10, 11), (14, 15)),
-    simulator="sim-dex5",
-    simulated_by=Lazy("dexkit.emulators.sim_dex5:sim_dex5"),
-    # ring and little finger move as the middle one does
-    fingers=4 * ("index",) + 12 * ("middle",) + 4 * ("thumb",),
-    client_forks=True,
-    client_note="--ee=dex5 is not in a release: pull request 321",
-    layout=HandLayout(
-        centres=(240.0, 640.0),
-        top=466.0,
-        palm=(280.0, 130.0),
-        width=62.0,
-        fingers=(
-            Finger("index", range(0, 4), (-108.0, -90.0), (0.0, -66.0), tip=0.15),
-            Finger("middle", range(4, 8), (-36.0, -106.0), (0.0, -66.0), tip=0.15, root=0.7),
-            Finger("ring", range(8, 12), (36.0, -90.0), (0.0, -66.0), tip=0.15),
-            Finger("little", range(12, 16), (108.0, -66.0), (0.0, -66.0), tip=0.15),
-            Finger("thumb", range(16, 20), (-167.0, 26.0), (-9.0, -66.0), tip=0.15, root=0.1),
-        ),
-    ),
-    skeleton=Lazy("dexkit.models.dex5:skeleton"),
 )
-
-_RIGHT = math.pi / 2
-
-
-@cache
-def skeleton(side: Side) -> Skeleton:
-    """The joint axes, origins and drawn boxes (docs/sources/unitree-dex.md#i1,
-    docs/sources/unitree-dex.md#i2): four fingers of four joints, then the thumb.
-    """
-    left = side is Side.LEFT
-    m = 1.0 if left else -1.0
-    segments: list[Segment] = []
-    boxes = [
-        # narrower than the mesh, which has the thumb's mount as well
-        Box.between(BASE, (-0.07, -0.0398, -0.012 if left else -0.028),
-                 (0.024, 0.072, 0.028 if left else 0.012)),
-    ]  # fmt: skip
-    for x, y in ((0.01, 0.0731), (-0.012, 0.0771), (-0.034, 0.0731), (-0.056, 0.0691)):
-        turn = (-math.pi, 0.0, _RIGHT) if left else (0.0, 0.0, _RIGHT)
-        n = len(segments)
-        finger = f"{2 + n // 4}"
-        segments += [
-            Segment(f"Roll_{finger}1", BASE, (x, y, m * 0.0034702), turn, joint=n),
-            Segment(f"Pitch_{finger}2", n, (0.0042, 0.0, 0.0), (_RIGHT, 0.0, 0.0), joint=n + 1),
-            Segment(f"Pitch_{finger}3", n + 1, (0.04, 0.0, 0.0), joint=n + 2),
-            Segment(f"Pitch_{finger}4", n + 2, (0.020985, 0.000804, 0.0), joint=n + 3),
-        ]
-        boxes += [
-            Box.between(n + 1, (-0.0044, -0.0145, -0.0082), (0.0471, 0.0058, 0.0082)),
-            Box.between(n + 2, (-0.0025, -0.0125, -0.008), (0.0242, 0.005, 0.0082)),
-            Box.between(n + 3, (-0.0029, -0.0125, -0.0082), (0.029, 0.0051, 0.0082)),
-        ]
-    n = len(segments)
-    segments += [
-        Segment("Yaw_11", BASE, (0.0, 0.0, -m * 0.01435), joint=n),
-        Segment("Roll_12", n, (-0.0000106, 0.0, 0.0), (_RIGHT, 0.0, 0.0), joint=n + 1),
-        Segment("Pitch_13", n + 1, (0.0335, 0.0, -0.006), (-_RIGHT, 0.0, 0.0), joint=n + 2),
-        Segment("Pitch_14", n + 2, (0.036609, -0.0053654, 0.0), joint=n + 3),
-    ]
-    boxes += [
-        Box.between(n + 1, (-0.0085, -0.0165, -0.0165), (0.0415, 0.0165, 0.0165)),
-        Box.between(n + 2, (-0.0132, -0.0245, -0.0145), (0.0476, 0.0097, 0.0145)),
-        Box.between(n + 3, (-0.008, -0.0088, -0.0133), (0.0589, 0.015, 0.0135)),
-    ]
-    mount = (_RIGHT, 0.0, math.pi) if left else (_RIGHT, 0.0, 0.0)
-    return Skeleton(
-        tuple(segments),
-        tuple(boxes),
-        mount=mount,
-        note="the palm's and the fingers' backs are simplified",
-    )

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, Finger, HandLayout, HandModel, TouchArea
+from dexkit.models.profile import Dialect, HandModel, TouchArea
 
 __all__ = ["INSPIRE_DFX", "INSPIRE_FTP"]
 
@@ -16,7 +16,16 @@ _NAMES = ("pinky", "ring", "middle", "index", "thumb_bend", "thumb_rotation")
 
 _JOINTS = tuple(
     # 1 is open; the limit of force is 1000 of its register, and sources differ on how much that is
-    JointSpec(name, 0.0, 1.0, dq_max=1.0 / _FULL_TRAVEL_S, tau_max=1.0, closing=-1, straight=1.0)
+    JointSpec(
+        name,
+        q_min=0.0,
+        q_max=1.0,
+        dq_max=1.0 / _FULL_TRAVEL_S,
+        tau_max=1.0,
+        closing=-1,
+        straight=1.0,
+        finger=name.partition("_")[0],
+    )
     for name in _NAMES
 )
 
@@ -51,27 +60,7 @@ INSPIRE_DFX = HandModel(
     command_rate=100.0,  # docs/sources/unitree-dex.md#j2
     command_timeout=1.0,  # docs/sources/unitree-dex.md#j2
     client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j2
-    client=Lazy("dexkit.teleop.client:RightHandClient"),
     rest_q=dict.fromkeys(Side, (0.85, 0.85, 0.85, 0.85, 0.9, 0.9)),
-    simulator="sim-inspire-dfx",
-    simulated_by=Lazy("dexkit.emulators.sim_inspire:sim_inspire_dfx"),
-    # ring and little finger move as the middle one does
-    fingers=("middle", "middle", "middle", "index", "thumb", "thumb"),
-    client_forks=True,
-    client_option="inspire_dfx",
-    layout=HandLayout(
-        centres=(240.0, 640.0),
-        top=466.0,
-        palm=(280.0, 130.0),
-        width=62.0,
-        fingers=(
-            Finger("Index", range(3, 4), (-108.0, -90.0), (0.0, -150.0), tip=1.0),
-            Finger("Middle", range(2, 3), (-36.0, -106.0), (0.0, -150.0), tip=1.0),
-            Finger("Ring", range(1, 2), (36.0, -90.0), (0.0, -150.0), tip=1.0),
-            Finger("Pinky", range(0, 1), (108.0, -66.0), (0.0, -120.0), tip=1.0),
-            Finger("Thumb", range(4, 6), (-167.0, 26.0), (-9.0, -66.0), tip=1.0, root=0.1),
-        ),
-    ),
 )
 
 # docs/sources/unitree-dex.md#j3: the vendor counts the fingers from the pinky
@@ -91,7 +80,6 @@ INSPIRE_FTP = replace(
     INSPIRE_DFX,
     name="inspire-ftp",
     title="Inspire FTP hand",
-    other_short_name="inspire-ftp",
     dialects=(
         Dialect(
             name="inspire_ftp",
@@ -113,8 +101,4 @@ INSPIRE_FTP = replace(
     ),
     areas=_AREAS,
     touch_rate=50.0,  # more than the 30 Hz that clients record
-    client=Lazy("dexkit.teleop.client:EitherHandClient"),
-    simulator="sim-inspire-ftp",
-    simulated_by=Lazy("dexkit.emulators.sim_inspire:sim_inspire_ftp"),
-    client_option="inspire_ftp",
 )

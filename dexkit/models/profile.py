@@ -1,13 +1,14 @@
-"""The profile of a hand model: joints, dialects, rates, and references to its other data.
+"""The facts of a hand model: joints, dialects, rates, units, touch.
 
-Facts are values: joints, topics, types, rates, poses. Code that works for one model only (codec,
-client) is named by a :class:`~dexkit.lazy.Lazy` reference, so that a profile loads none of it.
+What else is needed of it refers to these: how it is judged (:mod:`dexkit.conformance.hands`),
+teleoperated (:mod:`dexkit.teleop.hands`), drawn (:mod:`dexkit.view.skeletons`) and simulated
+(``dexkit.emulators``).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -17,16 +18,10 @@ from dexkit.hand import HandSpec, JointMode, JointSpec, Side, Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
-    from dexkit.backends import Backend
-    from dexkit.kinematics import Skeleton
     from dexkit.service.dialects import DialectMap
-    from dexkit.teleop.client import TeleopClient
-    from dexkit.teleop.profiles import Profile
 
 __all__ = [
     "Dialect",
-    "Finger",
-    "HandLayout",
     "HandModel",
     "ModeByte",
     "PressureSensor",
@@ -209,67 +204,9 @@ class TouchArea:
 
 
 @dataclass(frozen=True)
-class Finger:
-    """Joints of a drawn finger, one behind the other; lengths in px, y downward.
-
-    :param name: of the finger; sensor packets are found by it (``"thumb pad"``).
-    :param joints: their indices, from the palm outward.
-    :param start: place of the first joint, relative to the palm's centre.
-    :param step: from one joint to the next.
-    :param tip: from the last joint to the end, in steps.
-    :param root: from its beginning, which the palm may hide, to the first joint, in steps.
-    """
-
-    name: str
-    joints: range
-    start: tuple[float, float]
-    step: tuple[float, float]
-    tip: float
-    root: float = 0.4
-
-    def along(self, steps: float) -> tuple[float, float]:
-        """The place so many steps behind the first joint."""
-        (x, y), (dx, dy) = self.start, self.step
-        return x + steps * dx, y + steps * dy
-
-    @property
-    def end(self) -> tuple[float, float]:
-        """Position of its tip."""
-        return self.along(len(self.joints) - 1 + self.tip)
-
-
-@dataclass(frozen=True)
-class HandLayout:
-    """Layout of the drawing of a hand with several joints; schematic, not to scale, lengths in px.
-
-    :param centres: x of the left and of the right hand.
-    :param top: y of the palm's centre on the sheet.
-    :param palm: its size.
-    :param width: of a finger.
-    :param fingers: of a left hand, the palm toward the reader.
-    :param palm_sensors: where the palm's sensor packets are.
-    """
-
-    centres: tuple[float, float]
-    top: float
-    palm: tuple[float, float]
-    width: float
-    fingers: tuple[Finger, ...]
-    palm_sensors: tuple[tuple[float, float], ...] = ()
-
-
-_FINGER_CLIENT: Lazy[type[TeleopClient]] = Lazy("dexkit.teleop.client:FingerClient")
-_FINGER_PROFILES: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = Lazy(
-    "dexkit.teleop.profiles:finger_profiles"
-)
-
-
-@dataclass(frozen=True)
 class HandModel:
     """One hand model.
 
-    :param other_short_name: what it is called in ``--hands``, if another model has the same name
-        without its revision.
     :param unit: of q, of its limits and of all that is derived from them.
     :param torque_unit: of tau_est and tau_max: A, where a hand reports currents.
     :param limit_margin: how far beyond its joint's limits q of a genuine hand, or of its client,
@@ -294,26 +231,6 @@ class HandModel:
     :param touch_rate: Hz of the touch message that dexkit publishes, where the dialect has one.
     :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
     :param shared_motors: joints that one motor moves, by index; the others have one each.
-    :param simulator: name of the backend that simulates it, with the setting ``object``; or empty.
-    :param simulated_by: that backend, of a model of dexkit itself; another package registers its
-        by an entry point of ``dexkit.backends``.
-
-    **Teleoperation.**
-
-    :param client: model of the client that drives it.
-    :param operator_profiles: makes its operator profiles.
-    :param fingers: per joint, the finger whose motion it follows in an operator profile:
-        ``thumb``, ``middle`` or ``index``. Empty for a gripper.
-    :param client_forks: its client sends from a forked process, which a reader that starts later
-        does not receive.
-    :param client_note: what a user of its client has to know, or empty.
-    :param client_option: its name in the client's ``--ee``; empty if that is the short name.
-
-    **Drawing.**
-
-    :param layout: how it is drawn; None for a gripper, and where no drawing is needed.
-    :param skeleton: makes the joint axes and origins of a side; None where they are not known, and
-        ``dexkit view`` draws fingers side by side.
     """
 
     name: str
@@ -331,28 +248,12 @@ class HandModel:
     areas: tuple[TouchArea, ...] = ()
     touch_rate: float = 0.0
     low_rate: float = 0.0
-    other_short_name: str = ""
     unit: str = "rad"
     torque_unit: str = "N m"
     limit_margin: float = 0.15
     client_dq: float = 0.0
     joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
     shared_motors: tuple[tuple[int, ...], ...] = ()
-    simulator: str = ""
-    simulated_by: Lazy[Backend] | None = None
-    client: Lazy[type[TeleopClient]] = _FINGER_CLIENT
-    operator_profiles: Lazy[Callable[[HandModel], tuple[Profile, ...]]] = _FINGER_PROFILES
-    fingers: tuple[str, ...] = ()
-    client_forks: bool = False
-    client_note: str = ""
-    client_option: str = ""
-    layout: HandLayout | None = None
-    skeleton: Lazy[Callable[[Side], Skeleton]] | None = None
-
-    @property
-    def short_name(self) -> str:
-        """The name without the vendor's revision, unless it has another: ``dex3`` of ``dex3-1``."""
-        return self.other_short_name or self.name.partition("-")[0]
 
     @property
     def gains(self) -> tuple[tuple[float, float], ...]:

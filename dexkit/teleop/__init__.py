@@ -18,9 +18,9 @@ from dexkit.teleop.client import (
     StateReceiver,
     StickyFilter,
     TeleopClient,
-    client_for,
 )
-from dexkit.teleop.profiles import Operator, Profile, profile, profiles_for, recorded
+from dexkit.teleop.hands import client_for, profile, profiles_for
+from dexkit.teleop.profiles import Operator, Profile, recorded
 from dexkit.teleop.tracking import TrackingFigures, tracking_figures
 
 __all__ = [

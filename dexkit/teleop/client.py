@@ -29,7 +29,7 @@ from typing import NamedTuple, TypeAlias
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointMode, Side
-from dexkit.models import DEX1_1, Dialect, dialect, model
+from dexkit.models import DEX1_1, Dialect, model
 
 __all__ = [
     "LEAD",
@@ -47,7 +47,6 @@ __all__ = [
     "StateReceiver",
     "StickyFilter",
     "TeleopClient",
-    "client_for",
 ]
 
 POLL_PAUSE = 0.002
@@ -442,24 +441,3 @@ class EitherHandClient(FingerClient):
     def _awaited(self) -> Sequence[Side]:
         latest = self.receiver.seen
         return () if any(any(q) for q in latest.values()) else self.sides
-
-
-def client_for(
-    spoken: Dialect | str,
-    sides: Sequence[Side] = tuple(Side),
-    *,
-    release: Release | None = None,
-    simulated: bool = False,
-) -> TeleopClient:
-    """The client that drives hands of this dialect.
-
-    :raises UsageError: no such dialect, or a release or simulation of a client that has none.
-    """
-    chosen = dialect(spoken) if isinstance(spoken, str) else spoken
-    profile = model(chosen.model)
-    client = profile.client.load()
-    if issubclass(client, Dex1Client):
-        return client(chosen, sides, release=release, simulated=simulated)
-    if release is not None or simulated:
-        raise UsageError(f"the client of a {profile.title} is the same in all releases")
-    return client(chosen, sides)

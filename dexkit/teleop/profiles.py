@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.models import MODELS, Dialect, HandModel, model
+from dexkit.models import Dialect, HandModel, model
 from dexkit.teleop.client import PINCH_MAX, PINCH_MIN, Pose
 
 __all__ = [
@@ -24,8 +24,6 @@ __all__ = [
     "Profile",
     "finger_profiles",
     "gripper_profiles",
-    "profile",
-    "profiles_for",
     "recorded",
 ]
 
@@ -79,10 +77,7 @@ class Operator:
         rate: float = INPUT_RATE,
     ) -> None:
         if chosen.model != spoken.model:
-            raise UsageError(
-                f"the profile {chosen.name} is for a {model(chosen.model).title}",
-                hint=f"there are: {', '.join(p.name for p in profiles_for(spoken.model))}",
-            )
+            raise UsageError(f"the profile {chosen.name} is for a {model(chosen.model).title}")
         self.profile = chosen
         self.dialect = spoken
         self.rate = rate
@@ -166,9 +161,10 @@ def _sine(low: float, high: float, period: float, begin: float = 0.0) -> Closing
 def _fingers(hand: HandModel, closing: Closing, **parts: float) -> Closing:
     """The same motion to different depths for the fingers of a hand.
 
-    :param parts: of ``thumb``, ``middle`` and ``index``.
+    :param parts: of ``thumb``, ``middle`` and ``index``; other fingers move as the middle one does.
     """
-    each = tuple(parts[finger] for finger in hand.fingers)
+    joints = hand.joints[Side.LEFT]
+    each = tuple(parts.get(joint.finger, parts["middle"]) for joint in joints)
 
     def all_joints(t: float) -> Pose | None:
         found = closing(t)
@@ -332,31 +328,6 @@ def gripper_profiles(hand: HandModel) -> tuple[Profile, ...]:
             _OPEN_AND_CHECK,
         ),
     )
-
-
-def profiles_for(hand_model: str) -> tuple[Profile, ...]:
-    """The profiles of a model."""
-    hand = model(hand_model)
-    return hand.operator_profiles.load()(hand)
-
-
-def profile(name: str, hand_model: str) -> Profile:
-    """The profile of that name.
-
-    :raises UsageError: that model has none.
-    """
-    found = [p for p in profiles_for(hand_model) if p.name == name]
-    if not found:
-        owner = next(
-            (m for m in MODELS.values() if name in {p.name for p in profiles_for(m.name)}), None
-        )
-        its = f"--dialect {owner.dialects[0].name} has it; " if owner else ""
-        raise UsageError(
-            f"a {model(hand_model).title} has no profile {name!r}",
-            hint=f"{its}there are: {', '.join(p.name for p in profiles_for(hand_model))}, or give "
-            "a recording: FILE.mcap",
-        )
-    return found[0]
 
 
 def recorded(

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from dexkit.hand import Floats, Side
 from dexkit.kinematics import Skeleton, rotation
-from dexkit.models.skeletons import skeleton_of
 from dexkit.pressure import STILL
 from dexkit.robots import RobotModel
+from dexkit.view.skeletons import skeleton_of
 from dexkit.watch import SubjectView
 
 __all__ = ["BODY", "CALM", "GHOST", "Colors", "Drawing", "Drawn", "places"]

@@ -19,10 +19,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dexkit.backends import simulators
 from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.messages import encode, unitree_go
-from dexkit.models import BUILT_IN, DEX1_1, Dialect
+from dexkit.models import DEX1_1, MODELS, Dialect
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import sweep
 from tools.campaign.case import Batch, Case
@@ -321,9 +322,9 @@ def _served() -> dict[str, Callable[[Path], Bench]]:
     devices.
     """
     found: dict[str, Callable[[Path], Bench]] = {
-        m.simulator: partial(Bench, backend=m.simulator)
-        for m in BUILT_IN
-        if m.simulator and not m.dialects[0].position_servo
+        backend: partial(Bench, backend=backend)
+        for name, backend in simulators().items()
+        if not MODELS[name].dialects[0].position_servo
     }
     return found | {bench.backend: bench for bench in DEVICES}
 

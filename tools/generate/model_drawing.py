@@ -1,6 +1,6 @@
 """The drawings: joints by index and name, how they close, and the tactile elements.
 
-Places come from the layout of a profile, everything else from the models.
+Places come from the layouts beside this module, everything else from the models.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ from collections.abc import Sequence
 
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, Side
-from dexkit.models import Dialect, Finger, HandLayout, HandModel
-from dexkit.robot_layout import RobotLayout
+from dexkit.models import Dialect, HandModel
 from dexkit.robots import RobotModel
+from tools.generate import hand_layouts, robot_layouts
+from tools.generate.hand_layouts import Finger, HandLayout
+from tools.generate.robot_layouts import RobotLayout
 from tools.generate.svg_sheet import Point, Sheet
 
 __all__ = ["WIDTH", "draw_hand", "draw_robot"]
@@ -32,9 +34,10 @@ def draw_hand(model: HandModel) -> Sheet:
     """
     if len(model.joints[Side.LEFT]) == 1:
         return _draw_gripper(model)
-    if model.layout is None:
-        raise UsageError(f"the profile of the {model.title} has no layout, so it cannot be drawn")
-    return _draw_fingers(model, model.layout)
+    layout = hand_layouts.LAYOUTS.get(model.name)
+    if layout is None:
+        raise UsageError(f"the {model.title} has no layout, so it cannot be drawn")
+    return _draw_fingers(model, layout)
 
 
 def _sheet(height: float, title: str, what: str, view: str) -> Sheet:
@@ -240,7 +243,7 @@ def draw_robot(model: RobotModel) -> Sheet:
 
     :raises KeyError: a robot that has no layout.
     """
-    layout = model.layout.load()
+    layout = robot_layouts.LAYOUTS[model.name]
     top = 138.0
     height = top + layout.bottom + 74
     sheet = _sheet(height, model.title, "joints by motor slot", "from behind: its left is left")

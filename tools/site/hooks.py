@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from dexkit.models import BUILT_IN
+from dexkit.models import short_names
 from tools.generate import built_pages
 from tools.generate.requirement_pages import REQUIREMENT
 
@@ -48,7 +48,7 @@ def on_config(config: Any) -> Any:
 
 def hand_pages() -> list[str]:
     """The page of each model that has one by its short name: ``dex3.md``."""
-    names = (f"{hand.short_name}.md" for hand in BUILT_IN)
+    names = (f"{short}.md" for short in short_names())
     return [name for name in names if (ROOT / "docs" / name).exists()]
 
 

@@ -34,7 +34,7 @@ import numpy as np
 from dexkit.command_age import PAUSE, SETTLE
 from dexkit.hand import JointMode, Side
 from dexkit.models import ModeByte, model
-from dexkit.teleop.client import JointCommand, client_for
+from dexkit.teleop import JointCommand, client_for
 from dexkit.traces.replay.prepare import Plan, Track, joint_limits
 from dexkit.traces.replay.states import DecodedHand
 

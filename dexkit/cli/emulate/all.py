@@ -14,6 +14,7 @@ from contextlib import nullcontext
 
 import click
 
+from dexkit.backends import simulators
 from dexkit.child_processes import READY_TIMEOUT, Tool
 from dexkit.cli.emulate.lerobot import LOOPBACK, parse_ports, ports_option
 from dexkit.cli.exit_codes import Command
@@ -28,17 +29,19 @@ from dexkit.cli.options import (
 )
 from dexkit.cli.status_line import STATUS_LINES, StatusLine
 from dexkit.errors import DexkitError, EmulatorError
-from dexkit.models import DEX1_1, DEX3_1, MODELS
+from dexkit.models import short_names
 from dexkit.robots import ROBOTS
 from dexkit.stop_signals import StopRequest, stop_on_signals
+from dexkit.teleop.hands import teleop_hand
 from dexkit.view.viewer_process import viewer
 
 __all__ = ["emulate_all"]
 
-_HANDS = {hand.short_name: hand for hand in MODELS.values() if hand.simulator}
+_SIMULATORS = simulators()
+_HANDS = {short: hand for short, hand in short_names().items() if hand.name in _SIMULATORS}
 _POLL = 0.05  # seconds between looks whether all parts live
 _XR, _LEROBOT = "xr_teleoperate", "lerobot"
-_XR_HANDS, _LEROBOT_HANDS = DEX3_1.short_name, DEX1_1.short_name  # each client's own default
+_XR_HANDS, _LEROBOT_HANDS = "dex3", "dex1"  # each client's own default
 
 
 @click.command(
@@ -121,7 +124,7 @@ def emulate_all(
     if hands != "none":
         own = [option for text in settings for option in ("--set", text)]
         own += ["--dialect", dialect] if dialect else []
-        parts["hands"] = ("serve", _HANDS[hands].simulator, "--side", "both", *own, *common)
+        parts["hands"] = ("serve", _SIMULATORS[_HANDS[hands].name], "--side", "both", *own, *common)
     if for_lerobot:
         places = [] if ports is None else ["--ports", ",".join(map(str, parse_ports(ports)))]
         more = ["--domain", str(domain), *places, *["--quiet"] * quiet]
@@ -147,14 +150,15 @@ def _for_xr(robot: str, hands: str, domain: int) -> list[str]:
     """The command that starts xr_teleoperate."""
     if domain not in (0, 1):
         return ["xr_teleoperate joins domain 1 with --sim, else 0: docs/whole-robot.md"]
-    end = "" if hands == "none" else f" --ee={_HANDS[hands].client_option or hands}"
+    driven = teleop_hand(_HANDS[hands].name) if hands in _HANDS else None
+    end = f" --ee={driven.option or hands}" if driven else ""
     sim = " --sim" if domain == 1 else ""
     lines = [
         "next, in xr_teleoperate/teleop (docs/whole-robot.md):",
         f"  python teleop_hand_and_arm.py --arm={ROBOTS[robot].teleop_name}{end}{sim}",
     ]
-    if hands in _HANDS and _HANDS[hands].client_note:
-        lines.append(f"  ({_HANDS[hands].client_note})")
+    if driven and driven.note:
+        lines.append(f"  ({driven.note})")
     return lines
 
 

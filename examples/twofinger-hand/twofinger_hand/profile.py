@@ -22,6 +22,7 @@ def _joints(side: Side) -> tuple[JointSpec, ...]:
             dq_max=12.0,  # rad/s
             tau_max=1.4,  # N m
             closing=closing,
+            finger=finger,
         )
         for finger in ("thumb", "index")
         for part in ("base", "middle", "tip")
@@ -55,6 +56,4 @@ TWOFINGER_1 = HandModel(
     command_timeout=1.0,
     client_gains=(1.5, 0.2),
     rest_q={Side.LEFT: 2 * (0.3, 0.4, 0.4), Side.RIGHT: 2 * (-0.3, -0.4, -0.4)},
-    simulator="sim-twofinger",
-    fingers=3 * ("thumb",) + 3 * ("index",),
 )

@@ -1,10 +1,5 @@
-"""Skeletons of robots, and of hands whose profile has none: joint axes and origins, and the boxes
-that are drawn.
-
-Those of hands are in their profiles. Origins and axes are those of Unitree's URDFs
-(docs/sources/unitree-dex.md#i1). The boxes have the extents of the meshes that the URDFs name,
-rounded (docs/sources/unitree-dex.md#i2); the meshes themselves are not used. Places of pressure
-sensor elements are schematic (docs/sources/unitree-dex.md#i3).
+"""Skeletons of the robots: joint axes and origins of Unitree's URDFs
+(docs/sources/unitree-dex.md#i1). Bodies are schematic.
 """
 
 from __future__ import annotations
@@ -13,28 +8,12 @@ import math
 from collections.abc import Sequence
 from functools import cache
 
-from dexkit.hand import JointSpec, Side
 from dexkit.kinematics import BASE, Box, Segment, Skeleton, Vector
-from dexkit.models.profile import HandModel
 from dexkit.robots import G1, H1, RobotModel
 
-__all__ = ["g1", "h1", "schematic", "skeleton_of"]
+__all__ = ["g1", "h1"]
 
 _RIGHT = math.pi / 2
-
-
-def skeleton_of(model: HandModel | RobotModel, side: Side | None = None) -> Skeleton:
-    """The skeleton of a hand or a robot: its profile's, or a schematic one of a hand.
-
-    :param side: of a hand; None for a robot.
-    """
-    if isinstance(model, RobotModel):
-        return model.skeleton.load()()
-    assert side is not None
-    if model.skeleton is not None:
-        return model.skeleton.load()(side)
-    return schematic(model, side)
-
 
 # (joint, its parent or "" for the pelvis, axis, origin in m, rpy in rad)
 _Row = tuple[str, str, str, Vector, Vector]
@@ -169,48 +148,3 @@ def _limbs(segments: Sequence[Segment], skip: set[int], width: float) -> list[Bo
                 along=segment.origin)
         )  # fmt: skip
     return out
-
-
-def schematic(model: HandModel, side: Side) -> Skeleton:
-    """A drawing of a hand whose axes and lengths are not known: fingers side by side.
-
-    Joints that close the hand bend, the others swing sideways.
-    """
-    groups = _groups(model)
-    joints = model.joints[side]
-    width = 0.03
-    height = max(0.06, width * len(groups))
-    segments: list[Segment] = []
-    boxes = [Box(BASE, (0.0, 0.0, -0.045), (height, 0.03, 0.09))]
-    for column, group in enumerate(groups):
-        x = (column - (len(groups) - 1) / 2) * width
-        parent, place = BASE, (x, 0.0, 0.0)
-        for joint in group:
-            here = len(segments)
-            segments.append(
-                Segment(joints[joint].name, parent, place, axis=_swing(joints[joint]), joint=joint)
-            )
-            boxes.append(Box(here, (0.0, 0.0, 0.02), (0.022, 0.022, 0.044)))
-            parent, place = here, (0.0, 0.0, 0.04)
-    return Skeleton(
-        tuple(segments), tuple(boxes), schematic=True, note="axes and lengths are not known"
-    )
-
-
-def _groups(model: HandModel) -> list[list[int]]:
-    """Joints by finger, one behind the other."""
-    if model.layout is not None:
-        return [list(finger.joints) for finger in model.layout.fingers]
-    found: list[list[int]] = []
-    before = None
-    for i in range(len(model.joints[Side.LEFT])):
-        finger = model.fingers[i] if i < len(model.fingers) else str(i)
-        if finger != before or len(found[-1]) >= 4:
-            found.append([])
-        found[-1].append(i)
-        before = finger
-    return found
-
-
-def _swing(joint: JointSpec) -> Vector:
-    return (float(joint.closing), 0.0, 0.0) if joint.closing else (0.0, 1.0, 0.0)

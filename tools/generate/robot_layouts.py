@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["G1", "H1", "Limb", "RobotLayout"]
+from dexkit.robots import G1, H1
+
+__all__ = ["LAYOUTS", "Limb", "RobotLayout"]
 
 Point = tuple[float, float]
 
@@ -47,7 +49,7 @@ def _row(joints: tuple[str, ...], start: Point, step: Point, tip: float) -> Limb
     return Limb(joints, tuple((x + k * dx, y + k * dy) for k in steps))
 
 
-H1 = RobotLayout(
+_H1 = RobotLayout(
     limbs=(
         _row(
             ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"),
@@ -63,7 +65,7 @@ H1 = RobotLayout(
     bottom=510.0,
 )
 
-G1 = RobotLayout(
+_G1 = RobotLayout(
     limbs=(
         _row(
             (
@@ -85,3 +87,6 @@ G1 = RobotLayout(
     torso=(4.0, 286.0, 66.0),
     bottom=530.0,
 )
+
+LAYOUTS = {model.name: layout for model, layout in ((H1, _H1), (G1, _G1))}
+"""By the robot's name."""
