@@ -118,14 +118,6 @@ def test_anchors_are_unique() -> None:
         assert len(ids) == len(set(ids)), path.name
 
 
-def test_the_list_of_sections_is_complete() -> None:
-    listed = (SOURCES / "README.md").read_text(encoding="utf-8")
-    for path in SOURCES.glob("*-*.md"):
-        text = path.read_text(encoding="utf-8")
-        for anchor in re.findall(r'(?m)^<a id="([^"]+)"></a>$', text):
-            assert f"]({path.name}#{anchor})" in listed
-
-
 def test_every_source_of_the_catalogue_has_text() -> None:
     """A citation alone means nothing to a vendor: who says so stands beside it."""
     for requirement in catalogue(None, None):
