@@ -6,7 +6,6 @@ layer to layer is data, in :mod:`dexkit.conformance.layers`.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from datetime import datetime, timezone
 from functools import cache
@@ -22,7 +21,6 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.results import Result, RunResult, Stage
 from dexkit.conformance.run_record import recorded_subject
-from dexkit.conformance.scores import Score, score_of
 from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
 from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
@@ -76,7 +74,6 @@ def judge(
         catalogue=len({r.requirement.id for r in results}),
         recorded_at=when.isoformat(timespec="seconds"),
         run=dict(recording.run),
-        score=_score(recording, chosen),
     )
 
 
@@ -188,17 +185,6 @@ def _harness(recording: Recording) -> dict[str, float]:
         figures["waited"] = max(w.worst.part for w in known)
         figures["longest_wait_ms"] = max(w.longest for w in known) * 1e3
     return figures
-
-
-def _score(recording: Recording, results: Sequence[Result]) -> Score:
-    """Number of wrong hands that a run with these results catches."""
-    return score_of(
-        recording.model.name,
-        recording.dialect.name,
-        [str(side) for side in recording.judged],
-        recording.stimulus,
-        Counter(r.requirement.id for r in results if r.verdict.judged),
-    )
 
 
 def _stage(recording: Recording, side: Subject) -> Stage:

@@ -12,7 +12,7 @@ from typing import Any
 from dexkit import documents
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
-from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue
+from dexkit.conformance.requirements import Kind, Level, Requirement
 from dexkit.conformance.results import (
     FORMAT,
     VERSION,
@@ -24,7 +24,6 @@ from dexkit.conformance.results import (
     Stage,
     Verdict,
 )
-from dexkit.conformance.scores import Score
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 
@@ -61,22 +60,19 @@ def parse_result(data: Any, path: object) -> RunResult:
             hint="judge the recording again: dexkit check RECORDING.mcap --json RESULT.json",
         )
     validate(data, path)
-    # files of the first programs that wrote version 3 have no score, and none of a client
-    score = {"score": Score.from_dict(data["score"])} if "score" in data else {}
     return RunResult(
         subject=data["subject"],
         stage={side: Stage(stage) for side, stage in data["stage"].items()},
         duration_s=data["duration_s"],
         notes=data["notes"],
         environment=data["environment"],
-        run=data.get("run", {}),  # files of the first programs that wrote version 3 have none
+        run=data["run"],
         harness=data["harness"],
         claims=data["claims"],
         catalogue=data["catalogue"],
         recorded_at=data["recorded_at"],
         results=[_result_of(entry) for entry in data["results"]],
-        client=[_result_of(entry) for entry in (data.get("client") or {"results": []})["results"]],
-        **score,
+        client=[_result_of(entry) for entry in (data["client"] or {"results": []})["results"]],
     )
 
 
@@ -166,24 +162,13 @@ def _expected(rule: str, value: Any, found: Any) -> str:
     return f"is not as it should be ({rule})"
 
 
-def _kind_of(name: str, data: dict[str, Any]) -> dict[str, Any]:
-    """Kind of a requirement, and what the original does.
-
-    A file that was written before there were kinds has none: then those of today's catalogue.
-    """
-    if "kind" in data:
-        return {"kind": Kind(data["kind"]), "original": data.get("original", "")}
-    known = next((r for r in catalogue(None, None) if r.id == name), None)
-    return {"kind": known.kind, "original": known.original} if known else {}
-
-
 def _result_of(entry: dict[str, Any]) -> Result:
     data = dict(entry["requirement"])
     data["level"] = Level(data["level"])
     data["after"] = tuple(data["after"])
     data["dialects"] = tuple(data["dialects"])
     data["plots"] = _plots(data["plots"])
-    data |= _kind_of(entry["id"], data)
+    data["kind"] = Kind(data["kind"])
     return Result(
         requirement=Requirement(**data),
         side=entry["side"],
@@ -201,8 +186,7 @@ def _result_of(entry: dict[str, Any]) -> Result:
         ),
         plots=_plots(entry["plots"]),
         retry=entry["retry"],
-        # files of the first programs that wrote version 3 have none
-        measure=Measure.of_dict(entry["measure"]) if entry.get("measure") else None,
+        measure=Measure.of_dict(entry["measure"]) if entry["measure"] else None,
     )
 
 

@@ -31,7 +31,6 @@ from dexkit import __version__, documents
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
-from dexkit.conformance.scores import NO_SCORE, Score
 from dexkit.hand import Side
 
 __all__ = [
@@ -352,7 +351,6 @@ class RunResult:
         the hand of that side. They do not count in the verdict on the hands. Empty in a run of
         the kit, which is its own client.
     :param run: the run record (:mod:`~.run_record`); empty where no live run was made.
-    :param score: how many wrong hands a run like this catches.
     """
 
     subject: dict[str, str]
@@ -367,7 +365,6 @@ class RunResult:
     catalogue: int = 0
     client: list[Result] = field(default_factory=list)
     run: dict[str, str] = field(default_factory=dict)
-    score: Score = NO_SCORE
 
     @property
     def hands(self) -> tuple[Side, ...]:
@@ -506,7 +503,6 @@ class RunResult:
             }
             if self.client
             else None,
-            "score": self.score.as_dict(),
         }
 
     def write_json(self, path: Path) -> None:

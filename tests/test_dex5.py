@@ -37,7 +37,6 @@ from dexkit.traces import Recorder, open_trace, sample_path, samples
 
 ROOT = Path(__file__).parent.parent
 GENERATED = (
-    "conformance/scores.json",
     *("docs/images/*", "docs/layouts/*", "traces/samples/*", "tests/pinned/*.json"),
     "dexkit/messages/idl/*",
 )

@@ -205,7 +205,7 @@ def test_every_condition_is_true_and_false_at_some_time() -> None:
 @pytest.mark.parametrize(
     ("name", "severity", "caught"),
     [
-        # one that breaks a MUST is in tests/test_scores.py, a good one below
+        # a good one is below
         pytest.param(
             *("dex1-1/unitree_go:q-mirror@left,joint0,always", "must-breaking", True),
             marks=pytest.mark.soak,
@@ -301,7 +301,6 @@ def test_command_tries_a_generated_hand(tmp_path: Path) -> None:
     assert found["caught"] is True
 
 
-@pytest.mark.soak  # the test of the tool that makes the scores tries one in each quick run
 def test_a_quick_run_judges_only_its_requirements() -> None:
     found = try_generated(parse("dex1-1/unitree_go:q-offset@left,joint0,always"), 1, RunKind.QUICK)
     quick = {r.id for r in RunKind.QUICK.requirements(catalogue("dex1-1"))}

@@ -240,7 +240,7 @@ def swap(document: Document) -> None:
 
 
 FORGED: dict[str, tuple[Callable[[Document], object], str]] = {
-    "score": (lambda d: d["score"].update(sentence="It caught all of them."), "score.sentence"),
+    "sentence": (add("sentence", "PASS: every MUST is met"), "sentence"),
     "note": (lambda d: d["notes"].append("a perfect hand"), "notes[0]"),
     "new member": (add("certified_by", "Unitree"), "certified_by"),
     "subject": (lambda d: d["subject"].update(certified="yes"), "subject.certified"),
@@ -354,7 +354,7 @@ def test_command_finds_an_unchanged_result_the_same(result: Path, session: Path)
     assert "as stated, not compared: subject.recording " in out
 
 
-@each("name", ("score", "note"))
+@each("name", ("sentence", "note"))
 def test_command_names_a_forged_member(
     name: str, tmp_path: Path, of_session: Document, session: Path
 ) -> None:

@@ -11,7 +11,7 @@ it, under the model's name::
 from __future__ import annotations
 
 from dexkit.conformance.hands import brainco, dex1, dex3, dex5, inspire, robots
-from dexkit.conformance.hands.record import JointRoles, ModelUnderTest, ScoredHands
+from dexkit.conformance.hands.record import JointRoles, ModelUnderTest
 from dexkit.errors import UsageError
 from dexkit.models import registered_record
 
@@ -20,7 +20,6 @@ __all__ = [
     "GROUP",
     "JointRoles",
     "ModelUnderTest",
-    "ScoredHands",
     "under_test",
 ]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dexkit import models
-from dexkit.conformance.hands.record import ModelUnderTest, ScoredHands
+from dexkit.conformance.hands.record import ModelUnderTest
 from dexkit.hand import Side
 from dexkit.lazy import Lazy
 
@@ -18,5 +18,4 @@ DEX1_1 = ModelUnderTest(
     # 2.0 rad of opening, where the session closes on an object
     objects={Side.RIGHT: 37.0},
     session="dex1_pick_place",
-    scored_hands=ScoredHands(quick=100, default=100, thorough=20, external=60),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dexkit import models
-from dexkit.conformance.hands.record import JointRoles, ModelUnderTest, ScoredHands
+from dexkit.conformance.hands.record import JointRoles, ModelUnderTest
 from dexkit.hand import Side
 from dexkit.lazy import Lazy
 
@@ -19,5 +19,4 @@ DEX3_1 = ModelUnderTest(
     # nearly as far as the session closes
     objects={Side.RIGHT: 60.0},
     session="dex3_pinch",
-    scored_hands=ScoredHands(quick=40, default=40, thorough=10, external=20),
 )

@@ -14,7 +14,7 @@ from dexkit.lazy import Lazy
 from dexkit.models import HandModel
 from dexkit.robots import RobotModel
 
-__all__ = ["JointRoles", "ModelUnderTest", "ScoredHands"]
+__all__ = ["JointRoles", "ModelUnderTest"]
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,6 @@ class JointRoles:
     driven: tuple[int, ...]
     slow: tuple[int, ...]
     crossed: tuple[int, int] = (0, 0)
-
-
-@dataclass(frozen=True)
-class ScoredHands:
-    """Number of generated wrong hands that ``python -m tools.scores`` tries in runs of each kind.
-    A run for which it is 0 has no score.
-
-    :param external: in quick and in default runs of a service that the kit does not start.
-    """
-
-    quick: int
-    default: int
-    thorough: int = 0
-    external: int = 0
 
 
 @dataclass(frozen=True)
@@ -63,8 +49,6 @@ class ModelUnderTest:
     :param wrong_hands: the module with the wrong hands of another package's model, which have the
         decorator ``dexkit.conformance.faults.wrong_hand``; None where the shared ones prove its
         requirements.
-    :param scored_hands: how many generated wrong hands its runs are scored by; only the hands of
-        dexkit itself are scored.
     :raises UsageError: a file has no name, or a hand of several joints has no roles.
     """
 
@@ -77,7 +61,6 @@ class ModelUnderTest:
     objects: Mapping[Side, float] = field(default_factory=dict)
     session: str | Path = ""
     wrong_hands: Lazy[ModuleType] | None = None
-    scored_hands: ScoredHands = ScoredHands(quick=40, default=40, external=30)
 
     def __post_init__(self) -> None:
         if not all(self.requirements):

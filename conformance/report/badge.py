@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from dexkit.conformance.report.labels import count_verdicts, device_kind, model_title
+from dexkit.conformance.report.labels import (
+    catch_sentence,
+    count_verdicts,
+    device_kind,
+    model_title,
+)
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Overall, RunResult
 from dexkit.escaping import html as escape
@@ -65,7 +70,7 @@ def _width(text: str) -> int:
 
 
 def render_badge(result: RunResult, kind: Kind | None = None) -> str:
-    """Return the badges as one SVG, side by side; its title also has the score of the run.
+    """Return the badges as one SVG, side by side; its title also says what a run catches.
 
     :param kind: as for :func:`badges`.
     """
@@ -76,7 +81,7 @@ def render_badge(result: RunResult, kind: Kind | None = None) -> str:
         width, content = _badge(left, right, _colour(result, grade), x, number)
         drawn.append(content)
         x += width + _GAP
-    title = escape("; ".join([*titles, result.score.sentence()]))
+    title = escape("; ".join([*titles, catch_sentence(result)]))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{x - _GAP}" height="20" role="img" '
         f'aria-label="{title}"><title>{title}</title>{"".join(drawn)}</svg>\n'

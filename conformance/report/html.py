@@ -26,6 +26,7 @@ from dexkit.conformance.report.labels import (
     VERDICTS,
     about_harness,
     answer_of,
+    catch_sentence,
     device_kind,
     hand_name,
     model_title,
@@ -178,7 +179,7 @@ def _verdict(result: RunResult) -> str:
         f"<p>{escape(sentence)}</p>{caution}</header>"
         f"{'' if result.client_only else _safety(result)}"
         f'<div class="chips">{chips}</div><div class="stages">{stages}</div>'
-        f'<p class="dim score">{escape(result.score.sentence())}</p>'
+        f'<p class="dim">{escape(catch_sentence(result))}</p>'
     )
 
 

@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from xml.etree import ElementTree
 
-from dexkit.conformance.report.labels import hand_name
+from dexkit.conformance.report.labels import catch_sentence, hand_name
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.documents import write_file
@@ -50,7 +50,7 @@ def write_junit(result: RunResult, path: Path) -> None:
         **{f"harness.{name}": f"{value:g}" for name, value in result.harness.items()},
         "overall": str(result.overall),
         **{f"grade.{kind}": result.grade(kind).sentence() for kind in Kind},
-        "score": result.score.sentence(),
+        "catch-rate": catch_sentence(result),
     }.items():
         ElementTree.SubElement(properties, "property", name=name, value=value)
     for entry, verdict in zip(entries, verdicts, strict=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
+from dexkit.conformance.catch_rates import CATCH_RATES, wilson
 from dexkit.conformance.known_backends import ROBOT_EMULATORS, SIMULATED
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Grade, Overall, RunResult, Verdict, worst
@@ -19,6 +20,7 @@ __all__ = [
     "Word",
     "about_harness",
     "answer_of",
+    "catch_sentence",
     "count_verdicts",
     "device_kind",
     "hand_name",
@@ -123,6 +125,20 @@ def model_title(result: RunResult) -> str:
     name = result.subject.get("model", "")
     known = MODELS.get(name) or ROBOTS.get(name)
     return known.title if known else "hand"
+
+
+def catch_sentence(result: RunResult) -> str:
+    """How many wrong hands of that model runs of the kit catch, whatever this run has found."""
+    parts = []
+    for kind, (caught, tried) in CATCH_RATES.get(result.subject.get("model", ""), {}).items():
+        low, high = (f"{100 * bound:.0f}" for bound in wilson(caught, tried))
+        parts.append(f"a {kind} run {caught} of {tried} (95 % interval {low} to {high} %)")
+    if not parts:
+        return "A run does not find every fault; how many has not been measured for this model."
+    return (
+        "A run does not find every fault: of generated wrong hands that break a MUST of a "
+        f"{model_title(result)}, caught {' and '.join(parts)}."
+    )
 
 
 def subject(result: RunResult, *, many: bool = False) -> str:

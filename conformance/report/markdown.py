@@ -14,6 +14,7 @@ from dexkit.conformance.report.labels import (
     VERDICTS,
     about_harness,
     answer_of,
+    catch_sentence,
     device_kind,
     hand_name,
     model_title,
@@ -79,7 +80,7 @@ def render_markdown(result: RunResult) -> str:
     ]
     if harness := about_harness(result):
         lines.append(f"- test machine: {harness}")
-    lines += ["", plain(result.score.sentence())]
+    lines += ["", plain(catch_sentence(result))]
     lines += ["", *_areas(result), ""]
     lines += _troubles(result)
     lines += _folded("Every requirement", _every(result.results)) if result.results else []

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits
-from dexkit.conformance.report.labels import about_harness
+from dexkit.conformance.report.labels import about_harness, catch_sentence
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict, grouped, worst
 from dexkit.console import Console
@@ -79,7 +79,7 @@ def print_result(
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
     console.print()
     # one line each at any width, so that logs can be searched for them
-    console.print(f"[dim]{escape(result.score.sentence())}[/dim]", highlight=False, soft_wrap=True)
+    console.print(f"[dim]{escape(catch_sentence(result))}[/dim]", highlight=False, soft_wrap=True)
     if result.client and not result.client_only:
         console.print(escape(result.client_sentence()), highlight=False, soft_wrap=True)
     for grade in () if result.client_only else map(result.grade, Kind):

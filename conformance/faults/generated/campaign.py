@@ -20,13 +20,13 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from dexkit.conformance.catch_rates import wilson
 from dexkit.conformance.faults.generated import Generated, parse
 from dexkit.conformance.faults.generated.oracle import Opinion, Severity, examine, shortest
 from dexkit.conformance.faults.generated.rig import Faulty
 from dexkit.conformance.faults.outsiders import blame
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.scores import wilson
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.console import Console

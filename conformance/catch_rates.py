@@ -1,0 +1,39 @@
+"""How many wrong hands a run catches: one measured number for each model and kind of run.
+
+``python -m dexkit.conformance.faults --model MODEL --generated 12``, with ``--quick`` for quick
+runs, measures it again on the virtual clock (docs/mutants.md). These are of the levels of
+2026-11-29; thorough runs were not measured with them. The numbers are about the kit, and not about
+the hand that a report is about.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dexkit.conformance.selection import RunKind
+
+__all__ = ["CATCH_RATES", "wilson"]
+
+CATCH_RATES: dict[str, dict[RunKind, tuple[int, int]]] = {
+    "dex1-1": {RunKind.QUICK: (2, 8), RunKind.DEFAULT: (7, 8)},
+    "dex3-1": {RunKind.QUICK: (2, 4), RunKind.DEFAULT: (4, 4)},
+    "dex5-1": {RunKind.QUICK: (3, 3), RunKind.DEFAULT: (3, 3)},
+    "brainco-revo2": {RunKind.QUICK: (1, 2), RunKind.DEFAULT: (2, 2)},
+    "inspire-dfx": {RunKind.QUICK: (2, 3), RunKind.DEFAULT: (3, 3)},
+    "inspire-ftp": {RunKind.QUICK: (2, 3), RunKind.DEFAULT: (3, 3)},
+}
+"""Of generated wrong hands that break a MUST: how many were caught, and how many were tried."""
+
+
+def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """The confidence interval of a proportion by Wilson's score, 95 % by default.
+
+    :returns: lower and upper bound, 0 to 1; the whole range where there is nothing to count.
+    """
+    if not count:
+        return 0.0, 1.0
+    p = hits / count
+    scale = 1.0 + z * z / count
+    middle = (p + z * z / (2 * count)) / scale
+    half = z * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count)) / scale
+    return max(0.0, middle - half), min(1.0, middle + half)

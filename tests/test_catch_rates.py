@@ -1,0 +1,76 @@
+"""Test how many wrong hands a run is said to catch, in every report."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from rich.console import Console
+
+from dexkit.conformance import hands
+from dexkit.conformance.catch_rates import CATCH_RATES, wilson
+from dexkit.conformance.report.badge import render_badge
+from dexkit.conformance.report.html import render
+from dexkit.conformance.report.junit import write_junit
+from dexkit.conformance.report.labels import catch_sentence
+from dexkit.conformance.report.markdown import plain, render_markdown
+from dexkit.conformance.report.terminal import print_result
+from dexkit.conformance.results import RunResult
+from dexkit.conformance.selection import RunKind
+from dexkit.escaping import html
+from dexkit.models import HandModel
+from tests.report_helpers import result_of_every_kind
+
+
+def test_every_hand_of_dexkit_is_measured_in_quick_and_default_runs() -> None:
+    assert set(CATCH_RATES) == {
+        h.model.name for h in hands.BUILT_IN if isinstance(h.model, HandModel)
+    }
+    for rates in CATCH_RATES.values():
+        assert set(rates) >= {RunKind.QUICK, RunKind.DEFAULT}
+
+
+def test_sentence_has_the_number_of_each_kind_of_run_with_its_interval() -> None:
+    caught, tried = CATCH_RATES["dex1-1"][RunKind.DEFAULT]
+    low, high = wilson(caught, tried)
+    sentence = catch_sentence(result_of_every_kind())
+    assert (
+        f"default run {caught} of {tried} (95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
+        in (sentence)
+    )
+
+
+def renderings(result: RunResult, folder: Path) -> Iterator[tuple[str, str]]:
+    """Each report's name, and its text without its own escapes."""
+    sentence = catch_sentence(result)
+    out = io.StringIO()
+    print_result(result, Console(file=out, width=60))
+    yield "terminal", out.getvalue()
+    yield "page", render(result).replace(html(sentence), sentence)
+    yield "Markdown", render_markdown(result).replace(plain(sentence), sentence)
+    image = ElementTree.fromstring(render_badge(result))
+    title = image.find("{http://www.w3.org/2000/svg}title")
+    assert title is not None
+    yield "title of the badge", title.text or ""
+    write_junit(result, folder / "junit.xml")
+    yield "JUnit", (folder / "junit.xml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("model", ["dex1-1", "g1", "of another package"])
+def test_every_report_has_the_sentence(model: str, tmp_path: Path) -> None:
+    result = result_of_every_kind()
+    result = replace(result, subject={**result.subject, "model": model})
+    assert ("not been measured" in catch_sentence(result)) is (model != "dex1-1")
+    for name, text in renderings(result, tmp_path):
+        assert catch_sentence(result) in text, name
+
+
+def test_wilson_interval() -> None:
+    assert wilson(0, 0) == (0.0, 1.0)
+    low, high = wilson(8, 10)
+    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
+    assert wilson(10, 10)[1] == pytest.approx(1.0)
