@@ -272,4 +272,4 @@ class Rig:
 
 def _object(options: RigOptions, side: Side) -> tuple[str, ...]:
     touch = options.objects.get(side)
-    return () if touch is None else ("--object", f"{touch:g}")
+    return () if touch is None else ("--set", f"object={touch:g}")

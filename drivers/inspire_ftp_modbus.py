@@ -165,6 +165,8 @@ backend = Backend(
     needs="--device left=HOST --device right=HOST",
     settings=SETTINGS,
     emulator=Emulator(
-        ("rh56", "--modbus-tcp", "0", "--tactile"), linked=False, settings=SHARED_MACHINE
+        ("rh56", "--link", "tcp://127.0.0.1:0", "--set", "tactile=yes"),
+        linked=False,
+        settings=SHARED_MACHINE,
     ),
 )

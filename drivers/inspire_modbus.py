@@ -129,5 +129,7 @@ backend = Backend(
     make=_make,
     needs="--device left=HOST --device right=HOST",
     settings=SETTINGS,
-    emulator=Emulator(("rh56", "--modbus-tcp", "0"), linked=False, settings=SHARED_MACHINE),
+    emulator=Emulator(
+        ("rh56", "--link", "tcp://127.0.0.1:0"), linked=False, settings=SHARED_MACHINE
+    ),
 )

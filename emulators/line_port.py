@@ -14,7 +14,7 @@ from dexkit.escaping import one_line
 if TYPE_CHECKING:
     from dexkit.emulators.ftdi import FtdiPort
 
-__all__ = ["SCHEME", "line_port"]
+__all__ = ["SCHEME", "line_port", "server_address"]
 
 SCHEME = "usbip://"
 _PORT = 3240
@@ -39,18 +39,27 @@ def line_port(
     """
     if not isinstance(link, str) or not link.startswith(SCHEME):
         return Port(line, link, check_baudrate=check_baudrate)
-    try:
-        parts = urlsplit(link)
-        host, port = parts.hostname, _PORT if parts.port is None else parts.port
-        if not host or parts.path or parts.query or parts.username is not None:
-            raise ValueError
-    except ValueError as error:
-        raise UsageError(
-            f"{one_line(link, 80)} is no address of a server", hint=f"{SCHEME}127.0.0.1:{_PORT}"
-        ) from error
+    host, port = server_address(link)
     # imported here, because a pseudo-terminal needs none of the USB packages
     from dexkit.emulators.ftdi import FT232H, FT232R, FtdiPort, FtdiUsb
 
     model = FT232H if fast else FT232R
     adapter = FtdiUsb(line, serial, model=model, check_baudrate=check_baudrate)
     return FtdiPort([adapter], host=host, port=port)
+
+
+def server_address(link: str) -> tuple[str, int]:
+    """Host and port of ``usbip://HOST[:PORT]``; 3240 if none is named.
+
+    :raises UsageError: it is none.
+    """
+    try:
+        parts = urlsplit(link)
+        host, port = parts.hostname, _PORT if parts.port is None else parts.port
+        if parts.scheme != "usbip" or not host or parts.path or parts.query or parts.username:
+            raise ValueError
+    except ValueError as error:
+        raise UsageError(
+            f"{one_line(link, 80)} is no address of a server", hint=f"{SCHEME}127.0.0.1:{_PORT}"
+        ) from error
+    return host, port

@@ -17,7 +17,7 @@ __all__ = ["EmulatorProcess"]
 
 
 class EmulatorProcess:
-    """``dexkit emulate DEVICE --faults-from-stdin ...``, ready.
+    """``dexkit emulate DEVICE --fault - ...``, ready.
 
     :param arguments: of that command.
     :param faults: the faults that the device can have.
@@ -40,7 +40,7 @@ class EmulatorProcess:
         self._faults = faults
         self.output = self.errors = ""
         self.process = subprocess.Popen(
-            command_line("emulate", device, "--faults-from-stdin", *arguments),
+            command_line("emulate", device, "--fault=-", *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

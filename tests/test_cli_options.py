@@ -16,27 +16,19 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import Number
 
 COMMANDS = Path(__file__).parent.parent / "dexkit" / "cli"
 SHARED = "options"
 
 DIFFERENT = {
-    "--baudrate": (
-        {"calibrate", "emulate/mx64", "emulate/serving"},
-        "the values differ: any or auto, those of the servo's table, any up to the line's most",
-    ),
     "--force": ({SHARED, "calibrate"}, "calibrate measures a force"),
     "--from": (
         {SHARED, "bridge", "cut"},
         "a format, a dialect, a time",
     ),
-    "--id": (
-        {SHARED, "calibrate", "emulate/mx64"},
-        "the id of one device, one or auto, and several on one line",
-    ),
-    "--link": ({SHARED, "doctor"}, "a path, and the host at the other end of a network"),
+    "--link": ({"emulate/serving", "doctor"}, "a path, and the host at the other end of a network"),
     "--log": ({"monitor", "setup_dds"}, "a recording, and the output of programs"),
     "--out": (
         {SHARED, "export", "view"},

@@ -244,7 +244,7 @@ def test_speed_is_not_judged_with_few_samples() -> None:
 
 @pytest.fixture(scope="module")
 def emulator() -> Iterator[Tool]:
-    with Tool("emulate", "dex3-usb", "--side", "both", "--port", "0") as tool:
+    with Tool("emulate", "dex3-usb", "--side", "both", "--link", "usbip://127.0.0.1:0") as tool:
         tool.wait_ready(threading.Event())
         yield tool
 
@@ -256,9 +256,9 @@ def hands(emulator: Tool) -> str:
 
 def test_emulated_hand_passes_and_faulty_hand_fails(emulator: Tool, tmp_path: Path) -> None:
     messages: list[str] = []
-    fault = ("--fault", "silent:id=3")
+    words = ("--side", "right", "--link", "usbip://127.0.0.1:0", "--fault", "silent:id=3")
     with (
-        Tool("emulate", "dex3-usb", "--side", "right", "--port", "0", *fault) as faulty,
+        Tool("emulate", "dex3-usb", *words) as faulty,
         Recorder(tmp_path / "run.mcap") as recorder,
     ):
         faulty.wait_ready(threading.Event())

@@ -147,7 +147,7 @@ def test_served_hand_unplugged_in_motion_comes_back_without_motion(
 def test_emulator_accepts_realtime_priority() -> None:
     with real_time() as permitted:
         pass
-    arguments = ["emulate", "dex3-usb", "--port", "0", "--real-time"]
+    arguments = ["emulate", "dex3-usb", "--link", "usbip://127.0.0.1:0", "--set", "real-time=yes"]
     with started(command_line(*arguments), stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready: usbip://127.0.0.1:")

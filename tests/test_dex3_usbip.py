@@ -696,10 +696,10 @@ def test_the_port_is_in_use() -> None:
         with pytest.raises(EmulatorError) as caught, emulated_dex3(port=port):
             pass
         assert str(port) in caught.value.message
-        assert "--port" in caught.value.hint
+        assert "another port" in caught.value.hint
         with pytest.raises(EmulatorError) as caught, emulated_dex3(port=port, process=True):
             pass
-        assert "--port" in caught.value.hint
+        assert "another port" in caught.value.hint
 
 
 def test_an_address_that_is_not_this_machines() -> None:

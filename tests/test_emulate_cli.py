@@ -15,6 +15,7 @@ import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import usbip
@@ -115,7 +116,7 @@ def emulate(*arguments: str) -> subprocess.Popen[bytes]:
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_emulator_answers_stops_and_leaves_no_files(tmp_path: Path, signum: signal.Signals) -> None:
     link = tmp_path / "gripper"
-    process = emulate("--link", str(link), "--id", "7", "--baudrate", "57600")
+    process = emulate("--link", str(link), "--set", "id=7", "--set", "baudrate=57600")
     assert process.stdout is not None
     line = process.stdout.readline().decode()
     assert line.startswith(f"ready: {link} id=7 baudrate=57600 pty=/dev/pts/")
@@ -143,7 +144,7 @@ def test_port_thread_takes_part_in_shutdown_while_a_client_is_connected(tmp_path
 
 
 def test_two_grippers_on_one_line(tmp_path: Path) -> None:
-    with emulated_ezgripper(process=True, extra=["--id=2"]) as gripper:
+    with emulated_ezgripper(process=True, servo_ids=(1, 2)) as gripper:
         assert ping(gripper.path, 1)
         assert ping(gripper.path, 2)
         assert not ping(gripper.path, 3, 0.2)
@@ -199,12 +200,12 @@ def test_link_of_another_program_is_not_removed(tmp_path: Path) -> None:
     ("arguments", "code", "expected"),
     [
         ([], 2, "--link"),
-        (["--id", "253"], 2, "253"),
-        (["--id", "1", "--id", "1"], 2, "different ids"),
-        (["--baudrate", "1234"], 2, "1234"),
-        (["--object", "100"], 2, "100"),
+        (["--set", "id=253"], 2, "253"),
+        (["--set", "id=1,1"], 2, "different ids"),
+        (["--set", "baudrate=1234"], 2, "1234"),
+        (["--set", "object=100"], 2, "100"),
         (["--fault", "fire"], 2, "overload"),
-        (["--latency-timer", "-1"], 2, "-1"),
+        (["--set", "latency-timer=-1"], 2, "-1"),
     ],
 )
 def test_wrong_options_of_mx64_are_refused(
@@ -221,7 +222,7 @@ def test_wrong_options_of_mx64_are_refused(
 def test_help_names_every_option() -> None:
     result = CliRunner().invoke(command, ["mx64", "--help"])
     assert result.exit_code == 0
-    for option in ("--link", "--id", "--object", "--no-line-time", "--fault", "--eeprom"):
+    for option in ("--link", "--fault", "id=N", "object=PCT", "line-time=yes|no", "eeprom=FILE"):
         assert option in result.output
 
 
@@ -236,13 +237,13 @@ def test_helper_gives_up_waiting_for_a_silent_emulator() -> None:
     with pytest.raises(EmulatorError, match="did not start"):
         EmulatedProcess([], timeout=0.01)
     with pytest.raises(EmulatorError, match="did not start"):
-        Dex3Process(["--port=0"], timeout=0.01)
+        Dex3Process(["--link=usbip://127.0.0.1:0"], timeout=0.01)
 
 
 def test_helper_refuses_unsupported_options() -> None:
     with pytest.raises(UsageError), emulated_ezgripper(process=True, firmware=Firmware()):
         pass
-    with pytest.raises(UsageError), emulated_ezgripper(extra=["--id=2"]):
+    with pytest.raises(UsageError), emulated_ezgripper(extra=["--set=backup=yes"]):
         pass
 
 
@@ -252,7 +253,7 @@ def test_helper_refuses_unsupported_options() -> None:
 def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
     file = tmp_path / "eeprom.json"
     with (
-        emulated_ezgripper(process=True, extra=[f"--eeprom={file}"]) as gripper,
+        emulated_ezgripper(process=True, extra=[f"--set=eeprom={file}"]) as gripper,
         client(gripper.path) as opened,
     ):
         assert not file.exists()
@@ -260,7 +261,7 @@ def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
         assert opened.ask(dxl.encode(1, Instruction.WRITE, b"\x07\0\x09")) is not None
     assert json.loads(file.read_text())["device"] == "mx64"
     with (
-        emulated_ezgripper(process=True, extra=[f"--eeprom={file}"]) as gripper,
+        emulated_ezgripper(process=True, extra=[f"--set=eeprom={file}"]) as gripper,
         client(gripper.path) as opened,
     ):
         assert "id=9" in gripper.ready_line
@@ -271,7 +272,7 @@ def test_eeprom_file_keeps_id_and_settings(tmp_path: Path) -> None:
 
 
 def test_eeprom_file_without_a_directory_is_an_error_at_once(tmp_path: Path) -> None:
-    process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(tmp_path / "no" / "e.json"))
+    process = emulate("--link", str(tmp_path / "g"), f"--set=eeprom={tmp_path / 'no' / 'e.json'}")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
     assert b"directory" in errors
@@ -282,7 +283,7 @@ def test_eeprom_file_without_a_directory_is_an_error_at_once(tmp_path: Path) -> 
 def test_broken_eeprom_file_is_an_error(tmp_path: Path, text: str) -> None:
     file = tmp_path / "eeprom.json"
     file.write_text(text)
-    process = emulate("--link", str(tmp_path / "g"), "--eeprom", str(file))
+    process = emulate("--link", str(tmp_path / "g"), f"--set=eeprom={file}")
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "EEPROM" in err.decode()
@@ -381,7 +382,7 @@ def test_faults_can_be_injected(process: bool) -> None:
 
 def test_protocol_1_firmware(tmp_path: Path) -> None:
     with (
-        emulated_ezgripper(process=True, extra=["--protocol-1"]) as gripper,
+        emulated_ezgripper(process=True, extra=["--set=protocol-1=yes"]) as gripper,
         client(gripper.path) as opened,
     ):
         assert opened.ask(PING, 0.2) is None
@@ -420,7 +421,7 @@ def test_port_in_the_callers_thread_can_be_stopped() -> None:
 
 def emulate_dex3(*arguments: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        command_line("emulate", "dex3-usb", "--port", "0", *arguments),
+        command_line("emulate", "dex3-usb", "--link", "usbip://127.0.0.1:0", *arguments),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -429,7 +430,7 @@ def emulate_dex3(*arguments: str) -> subprocess.Popen[bytes]:
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_hand_prints_its_address_commands_and_counters(signum: signal.Signals) -> None:
-    process = emulate_dex3("--side", "both", "--serial", "A1", "--serial", "B2")
+    process = emulate_dex3("--side", "both", "--set", "serial=A1,B2")
     assert process.stdout is not None
     lines = [process.stdout.readline().decode().rstrip() for _ in range(7)]
     port = lines[0].split()[1].rsplit(":", 1)[1]
@@ -456,13 +457,13 @@ def test_hand_prints_its_address_commands_and_counters(signum: signal.Signals) -
 
 
 def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
-    process = emulate_dex3("--faults-from-stdin", "--fault", "drop@1h:for=1s")
+    process = emulate_dex3("--fault=-", "--fault", "drop@1h:for=1s")
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert b"'1h' is not a time" in err
     assert b"silent" in err  # the hint names what a hand can have
 
-    process = emulate_dex3("--faults-from-stdin")
+    process = emulate_dex3("--fault=-")
     assert process.stdin is not None
     assert process.stdout is not None
     port = int(process.stdout.readline().decode().split()[1].rsplit(":", 1)[1])
@@ -480,16 +481,16 @@ def test_hand_takes_faults_from_its_input_and_stops_at_its_end() -> None:
 @each(
     ("arguments", "expected"),
     [
-        (["--serial", "a", "--serial", "b"], "2 serial numbers for 1 hand"),
-        (["--out-endpoint", "0x81"], "an OUT endpoint is 0x01 to 0x0f, not 0x81"),
-        (["--in-endpoint", "one"], "'one' is not an endpoint address such as 0x81"),
-        (["--host", "203.0.113.1"], "cannot serve USB/IP on 203.0.113.1"),
-        (["--start", "80", "--object", "40"], "inside the object"),
+        (["--set", "serial=a,b"], "2 serial numbers for 1 hand"),
+        (["--set", "out-endpoint=0x81"], "an OUT endpoint is 0x01 to 0x0f, not 0x81"),
+        (["--set", "in-endpoint=one"], "'one' is not an endpoint address such as 0x81"),
+        (["--link", "usbip://203.0.113.1:0"], "cannot serve USB/IP on 203.0.113.1"),
+        (["--set", "start=80", "--set", "object=40"], "inside the object"),
         (["--side", "middle"], "middle"),
     ],
 )
 def test_invalid_hand_options_are_refused(arguments: list[str], expected: str) -> None:
-    code, _, err = run_command(["emulate", "dex3-usb", "--port", "0", *arguments])
+    code, _, err = run_command(["emulate", "dex3-usb", *arguments])
     assert code == 2
     assert expected in err
 
@@ -499,7 +500,7 @@ def test_help_lists_the_devices_and_their_options() -> None:
     assert "dex3-usb" in result.output
     assert "mx64" in result.output
     result = CliRunner().invoke(command, ["dex3-usb", "--help"])
-    for option in ("--side", "--serial", "--port", "--host", "--object", "--fault", "--seed"):
+    for option in ("--side", "--link", "--fault", "serial=S", "object=PCT", "seed=N"):
         assert option in result.output
     assert CliRunner().invoke(command, ["dex9"]).exit_code == 2
 
@@ -508,17 +509,15 @@ def test_hand_on_every_address_prints_the_host_name() -> None:
     from dexkit.cli.emulate.dex3_usb import _how_to
 
     name = socket.gethostname()
-    text = "\n".join(_how_to("usbip://0.0.0.0:3240", "0.0.0.0", ["1-1"]))
+    text = "\n".join(_how_to(SimpleNamespace(url="usbip://0.0.0.0:3240", busids=["1-1"])))
     assert "0.0.0.0" not in text
     assert f"usbip attach -r {name} -b 1-1" in text
     assert f"usbip://{name}:3240" in text
 
 
-@each("option", ["--object=40", "--start=10", "--closed-at=100"])
+@each("option", ["object=40", "start=10", "closed-at=100"])
 def test_a_bare_servo_has_no_gripper_to_set(option: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(
-        command, ["mx64", "--bare", option, "--link", str(tmp_path / "servo")]
-    )
-    assert result.exit_code == 2
-    assert option.partition("=")[0] in result.output
-    assert "describes a gripper" in result.output
+    words = ["mx64", "--set=bare=yes", f"--set={option}", "--link", str(tmp_path / "servo")]
+    code, _, err = run_command(["emulate", *words])
+    assert code == 2
+    assert f"{option.partition('=')[0]} describes a gripper" in err

@@ -93,7 +93,7 @@ def test_exception_in_one_device_is_logged_and_the_line_continues(
 
 def test_emulator_process_survives_an_oversized_fast_read(tmp_path: Path) -> None:
     link = tmp_path / "tty"
-    with running("emulate", "mx64", "--link", link, "--fast-reads") as emulator:
+    with running("emulate", "mx64", "--link", link, "--set", "fast-reads=yes") as emulator:
         emulator.ready()
         fd = os.open(link, os.O_RDWR | os.O_NOCTTY)
         try:
@@ -162,7 +162,7 @@ def test_invalid_standard_input_is_reported(tmp_path: Path) -> None:
             "mx64",
             "--link",
             str(tmp_path / "tty"),
-            "--faults-from-stdin",
+            "--fault=-",
         ],
         input=lines,
         capture_output=True,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 from dexkit import stop_signals
 from dexkit.cli.options import Number
+from dexkit.cli.settings import SettingsOption
 from dexkit.emulators.faults import (
     DEX3_FAULTS,
     M4010_FAULTS,
@@ -34,7 +36,7 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("compare",): ["<result>", "<result>"],
     ("doctor",): ["--scan", "none", "--domain", "1", "--seconds", "0.2"],
     ("emulate", "dex1-motor"): ["--link", "<link>"],
-    ("emulate", "dex3-usb"): ["--port", "0"],
+    ("emulate", "dex3-usb"): ["--link", "usbip://127.0.0.1:0"],
     ("emulate", "mx64"): ["--link", "<link>"],
     ("emulate", "revo2"): ["--link", "<link>"],
     ("emulate", "rh56"): ["--link", "<link>"],
@@ -53,24 +55,38 @@ _SLOW = {("demo",), ("emulate", "all")}
 _CODES = {0, 1, 2, 130}
 
 
-def _options() -> Iterator[tuple[tuple[str, ...], click.Option]]:
+@dataclass(frozen=True)
+class _Value:
+    """A value of the command line.
+
+    :param begin: what stands before it: ``--fault=``, or ``--set=object=``.
+    """
+
+    begin: str
+    type: click.ParamType[Any]
+
+
+def _options() -> Iterator[tuple[tuple[str, ...], _Value]]:
     for name, command in hostile.commands():
         for parameter in command.params:
             if isinstance(parameter, click.Option) and not parameter.is_flag:
-                yield name, parameter
+                yield name, _Value(f"{parameter.opts[0]}=", parameter.type)
+            if isinstance(parameter, SettingsOption):
+                for setting in parameter.known:
+                    yield name, _Value(f"--set={setting.key}=", setting.type)
 
 
 def test_every_number_on_the_command_line_is_finite_and_bounded() -> None:
     seen = 0
     for name, option in _options():
         kind = option.type
-        where = f"dexkit {' '.join(name)} {option.opts[0]}"
+        where = f"dexkit {' '.join(name)} {option.begin}"
         if isinstance(kind, click.types.FloatParamType):
             assert isinstance(kind, Number), f"{where}: take dexkit.cli.options.Number"
             seen += 1
             for text in ("nan", "-nan", "inf", "-inf", "1e400", "1e300", "", "²", "1e"):
                 with pytest.raises(click.BadParameter):
-                    kind.convert(text, option, None)
+                    kind.convert(text, None, None)
         elif isinstance(kind, click.types.IntParamType):
             assert isinstance(kind, click.IntRange), f"{where}: a range, please"
             assert kind.min is not None, where
@@ -79,7 +95,7 @@ def test_every_number_on_the_command_line_is_finite_and_bounded() -> None:
                 if kind.max is None and text.isdigit():
                     continue
                 with pytest.raises(click.BadParameter):
-                    kind.convert(text, option, None)
+                    kind.convert(text, None, None)
     assert seen > 30
 
 
@@ -103,7 +119,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _run_all(
-    folder: Path, wanted: Callable[[click.Option], bool], values: tuple[str, ...]
+    folder: Path, wanted: Callable[[_Value], bool], values: tuple[str, ...]
 ) -> tuple[int, list[str]]:
     _, recording = hostile.judged_result(folder)
     given = {
@@ -121,7 +137,7 @@ def _run_all(
             if name in _SLOW and isinstance(option.type, click.Path | click.types.StringParamType):
                 continue
             tried += 1
-            arguments = [*name, *fixed, f"{option.opts[0]}={value}"]
+            arguments = [*name, *fixed, f"{option.begin}{value}"]
             try:
                 code, out, err = hostile.run_command(arguments)
             except hostile.Crash as crash:
@@ -142,7 +158,7 @@ def test_no_value_of_an_option_ends_in_a_traceback(
     monkeypatch.chdir(tmp_path)  # where a name without a folder leads to
     (tmp_path / "here").mkdir()
 
-    def wanted(option: click.Option) -> bool:
+    def wanted(option: _Value) -> bool:
         return not isinstance(option.type, click.Choice)
 
     tried, wrong = _run_all(tmp_path / "here", wanted, ("nan", "\x1b[31m\udc80"))
@@ -226,7 +242,7 @@ def test_backend_settings_are_parsed_or_refused() -> None:
 
 
 def _feed(lines: list[Any], inject: Callable[[str], None], monkeypatch: Any) -> None:
-    """What ``--faults-from-stdin`` and ``--remote-from-stdin`` do with lines."""
+    """What ``--fault -`` and ``--remote -`` do with lines."""
     from dexkit.cli.emulate import stdin
 
     pieces = iter([*lines, b""])

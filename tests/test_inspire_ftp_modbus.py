@@ -169,7 +169,7 @@ def test_hand_without_tactile_areas_reports_no_pressure() -> None:
 def test_backend_inspire_ftp_modbus_reads_its_settings() -> None:
     assert backend("inspire-ftp-modbus") is inspire_ftp_modbus.backend
     assert inspire_ftp_modbus.backend.emulator is not None
-    assert "--tactile" in inspire_ftp_modbus.backend.emulator.arguments
+    assert "tactile=yes" in inspire_ftp_modbus.backend.emulator.arguments
     options = BackendOptions(Side.LEFT, "10.0.0.2:7000", {"id": "255", "areas": "5"})
     made = inspire_ftp_modbus.backend.make(options)
     assert isinstance(made, InspireFtpModbus)

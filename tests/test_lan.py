@@ -394,7 +394,7 @@ def test_every_program_on_loopback_filters_its_sockets(
         "bridge": ("bridge", *ends, "--domain", 111, "--to-domain", 112),
         "robot": ("emulate", "h1", "--domain", 113),
         "recorder": ("record", recording, "--domain", 114),
-        "USB device": ("emulate", "dex3-usb", "--port", 0),
+        "USB device": ("emulate", "dex3-usb", "--link", "usbip://127.0.0.1:0"),
         "doctor": ("doctor", "--watch", "--domain", 115),
     }
     with ExitStack() as stack:
@@ -444,7 +444,7 @@ _LISTENING: dict[str, tuple[object, ...]] = {
     "doctor": ("doctor", "--watch", "--domain", 121),
     "emulate dex3-usb": ("emulate", "dex3-usb"),
     "emulate lerobot-g1": ("emulate", "lerobot-g1", "--domain", 122),
-    "emulate rh56 --modbus-tcp": ("emulate", "rh56", "--modbus-tcp", 1502),
+    "emulate rh56 --link tcp://...": ("emulate", "rh56", "--link", "tcp://127.0.0.1:1502"),
     "view": ("view", "--no-open", "--domain", 123),
     "view --to foxglove": ("view", "--to", "foxglove", "--domain", 124),
     "view --to rerun": (

@@ -226,7 +226,10 @@ def test_pymodbus_drives_the_emulated_revo2() -> None:
 
 def test_commands_serve_until_they_are_stopped(tmp_path: Path) -> None:
     link = tmp_path / "hand"
-    arguments = (("rh56", "--modbus-tcp", "0"), ("revo2", "--side", "left", "--link", str(link)))
+    arguments = (
+        ("rh56", "--link", "tcp://127.0.0.1:0"),
+        ("revo2", "--side", "left", "--link", str(link)),
+    )
     started = [
         subprocess.Popen(
             command_line("emulate", *each_), stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -256,12 +259,12 @@ def test_commands_serve_until_they_are_stopped(tmp_path: Path) -> None:
 @each(
     "arguments",
     [
-        (),
-        ("--link", "x", "--modbus-tcp", "0"),
-        ("--modbus-tcp", "0", "--baudrate", "9600"),
-        ("--modbus-tcp", "0", "--id", "2"),
-        ("--modbus-tcp", "0", "--fault", "corrupt"),
-        ("--modbus-tcp", "0", "--side", "both"),
+        ("--link", "x", "--link", "tcp://127.0.0.1:0"),
+        ("--link", "tcp://127.0.0.1:0", "--set", "baudrate=9600"),
+        ("--link", "tcp://127.0.0.1:0", "--set", "id=2"),
+        ("--link", "tcp://127.0.0.1:0", "--fault", "corrupt"),
+        ("--link", "tcp://127.0.0.1:0", "--side", "both"),
+        ("--link", "tcp://0.0.0.0:0"),
     ],
 )
 def test_options_that_do_not_go_together(arguments: tuple[str, ...]) -> None:

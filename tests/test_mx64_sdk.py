@@ -41,7 +41,9 @@ def silence(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def pair() -> Iterator[EmulatedProcess]:
     """Two grippers on one line, in another process."""
-    with emulated_ezgripper(process=True, extra=["--id=2", "--fast-reads"]) as gripper:
+    with emulated_ezgripper(
+        process=True, servo_ids=(1, 2), extra=["--set=fast-reads=yes"]
+    ) as gripper:
         assert isinstance(gripper, EmulatedProcess)
         yield gripper
 
@@ -291,7 +293,7 @@ def test_robotis_read_write_example_finishes_with_a_bare_servo() -> None:
     It polls until the position is within 20 ticks of the goal, for ever if need be. With a gripper
     on the shaft it never gets there.
     """
-    with closing(EmulatedProcess(["--bare", "--baudrate=57600"])) as servo:
+    with closing(EmulatedProcess(["--set=bare=yes", "--set=baudrate=57600"])) as servo:
         handler = sdk.PortHandler(servo.path)
         assert handler.openPort()
         assert handler.setBaudRate(57_600)

@@ -35,7 +35,6 @@ _INPUTS = {
     "--against",
     "--capabilities",
     "--recording",
-    "--eeprom",
     "--config",
     "--answers",
     "--baseline",
@@ -47,7 +46,6 @@ _ELSEWHERE = {
     ("audit", "--out"),  # a folder: tests/test_audit.py
     ("export", "--out"),  # one, too: tests/test_sessions_export.py
     ("bringup", "--save-answers"),  # at the end of a session: tests/test_bringup_cli.py
-    ("emulate", "--log-commands"),  # lines are added while it runs
     ("selftest", "--json"),  # after the test of a hand, as others write
     ("selftest", "--report"),
     ("demo", "--out"),  # a folder, made before anything starts

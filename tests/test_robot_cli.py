@@ -35,8 +35,8 @@ def test_emulated_robot_serves_until_it_is_stopped(node: DdsNode) -> None:
     """Ready, state, commands good and bad, the remote, JSON, a clean end."""
     process = subprocess.Popen(
         [
-            *command_line("emulate", "g1", "--no-real-time"),
-            *("--domain", str(node.domain), "--remote-from-stdin", "--json"),
+            *command_line("emulate", "g1", "--set", "real-time=no"),
+            *("--domain", str(node.domain), "--remote", "-", "--json"),
         ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -91,7 +91,7 @@ def test_emulated_robot_serves_until_it_is_stopped(node: DdsNode) -> None:
 
 
 def test_two_robots_on_one_domain(node: DdsNode) -> None:
-    arguments = ["h1", "--domain", str(node.domain), "--duration", "0.2", "--no-real-time"]
+    arguments = ["h1", "--domain", str(node.domain), "--duration", "0.2", "--set", "real-time=no"]
     stop, ready = threading.Event(), threading.Event()
     thread = threading.Thread(
         target=run_robot, args=(H1,), kwargs={"domain": node.domain, "stop": stop, "ready": ready}
@@ -142,7 +142,7 @@ def test_help_of_robots_shows_their_options(name: str) -> None:
     result = CliRunner().invoke(command, [name, "--help"])
     assert result.exit_code == 0
     assert f"dexkit emulate {name} --remote A,R1,lx=0.5" in result.output
-    assert ("--mode-machine" in result.output) == (name == "g1")
+    assert ("mode-machine=N" in result.output) == (name == "g1")
 
 
 def test_unknown_key_of_the_remote_is_refused() -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import Number, jobs_option, out_option, quiet_option
 from dexkit.cli.status_line import StatusLine
 from dexkit.console import Console

@@ -8,7 +8,7 @@ import click
 from rich.text import Text
 
 from dexkit.backends import BackendInfo, list_backends
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.console import Console
 from dexkit.escaping import one_line
 

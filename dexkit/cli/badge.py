@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
     grade_option,

@@ -14,19 +14,18 @@ from dexkit import documents
 from dexkit.backends import BackendOptions, backend, list_backends
 from dexkit.bringup import Bench, BringupSession, Drive, Effort, Findings, Question, Snapshot
 from dexkit.bringup.script import describe
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.held_key import Terminal
 from dexkit.cli.options import (
     FILE,
     Number,
     device_option,
     dry_run_option,
-    set_option,
-    setting,
     side_option,
     usb_option,
 )
 from dexkit.cli.remarks import remark
+from dexkit.cli.settings import key_and_value, set_option
 from dexkit.clock import Rate, RealClock
 from dexkit.errors import HandTimeout, UsageError
 from dexkit.escaping import one_line
@@ -149,7 +148,7 @@ def command(
 def _settings(texts: tuple[str, ...], usb: str | None) -> dict[str, str]:
     values = {}
     for text in (*texts, *([] if usb is None else [f"usb={usb}"])):
-        key, value = setting(text)
+        key, value = key_and_value(text)
         if key in values:
             raise UsageError(f"{key} is given twice")
         values[key] = value

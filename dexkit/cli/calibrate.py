@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
     Number,

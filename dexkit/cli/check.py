@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from dexkit import option_texts
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     FILE,
     LocalPath,

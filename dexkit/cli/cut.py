@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import FILE, OUTPUT_FILE, Number, overwrite_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import domain_option, out_option, view_option
 from dexkit.console import Console
 from dexkit.errors import ConformanceError

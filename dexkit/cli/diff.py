@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import FILE, Number, html_option, json_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.cli.report import write_text

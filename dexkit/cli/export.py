@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import FILE
 from dexkit.cli.remarks import remark, remarks
 from dexkit.errors import DexkitError, SessionError, UsageError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import FILE, html_option, json_option
 from dexkit.cli.report import write_text
 from dexkit.documents import check_output_paths

@@ -19,7 +19,7 @@ import platformdirs
 
 from dexkit.backends import Backend, backend
 from dexkit.child_processes import code_line, command_line
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
     devices_by_side,
@@ -28,10 +28,10 @@ from dexkit.cli.options import (
     domain_option,
     dry_run_option,
     interface_option,
-    set_option,
     side_option,
     wait_for_interface_option,
 )
+from dexkit.cli.settings import set_option
 from dexkit.documents import write_file
 from dexkit.errors import OutputError, UsageError
 from dexkit.hand import Side

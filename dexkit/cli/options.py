@@ -25,7 +25,6 @@ __all__ = [
     "OUTPUT_FILE",
     "LocalPath",
     "Number",
-    "any_baudrate_option",
     "dds_options",
     "device_option",
     "devices_by_side",
@@ -34,29 +33,22 @@ __all__ = [
     "domain_option",
     "dry_run_option",
     "duration_option",
-    "fault_options",
     "force_option",
     "found_interface",
     "grade_option",
     "guesses_option",
     "host_option",
     "html_option",
-    "id_option",
     "interface_option",
     "interfaces_option",
     "jobs_option",
     "json_file_option",
     "json_option",
     "junit_option",
-    "latency_timer_option",
     "level_option",
-    "line_time_option",
-    "link_option",
-    "links_option",
     "list_option",
     "markdown_option",
     "network_options",
-    "object_option",
     "one_side_option",
     "out_option",
     "output_option",
@@ -71,17 +63,13 @@ __all__ = [
     "require_option",
     "seed_option",
     "session_options",
-    "set_option",
-    "setting",
     "side_option",
-    "start_option",
     "topic_option",
     "usb_option",
     "verbose_option",
     "view_option",
     "wait_for_interface_option",
     "wait_option",
-    "wiring_option",
     "with_guesses",
     "yes_option",
 ]
@@ -566,28 +554,6 @@ def wait_option(help: str, *, default: float | None = 10.0) -> Callable[[F], F]:
     )
 
 
-def set_option(help: str) -> Callable[[F], F]:
-    """``--set KEY=VALUE``, repeated, as ``settings``."""
-    return click.option(
-        "--set",
-        "settings",
-        multiple=True,
-        metavar="KEY=VALUE",
-        help=help,
-    )
-
-
-def setting(text: str) -> tuple[str, str]:
-    """Key and value of a ``--set KEY=VALUE``.
-
-    :raises UsageError: it is none.
-    """
-    key, equals, value = text.partition("=")
-    if not equals or not key:
-        raise UsageError(f"--set {text} is not KEY=VALUE")
-    return key, value
-
-
 # ------------------------------------------------------------------------------ running
 
 
@@ -763,31 +729,6 @@ def require_option(example: str) -> Callable[[F], F]:
 # ------------------------------------------------------------------------------ emulated devices
 
 
-def link_option(help: str, *, required: bool = True) -> Callable[[F], F]:
-    """``--link PATH``: the name that clients of an emulated serial device open."""
-    return click.option("--link", required=required, metavar="PATH", help=help)
-
-
-def links_option(help: str) -> Callable[[F], F]:
-    """``--link PATH``, repeated, as ``links``: of several serial lines."""
-    return click.option("--link", "links", required=True, multiple=True, metavar="PATH", help=help)
-
-
-def id_option(ids: range, help: str, default: int | None = None) -> Callable[[F], F]:
-    """``--id N`` of an emulated serial device, as ``number``.
-
-    :param ids: those that there are.
-    """
-    return click.option(
-        "--id",
-        "number",
-        type=click.IntRange(ids[0], ids[-1]),
-        default=default,
-        metavar="N",
-        help=help,
-    )
-
-
 def seed_option(what: str, default: int = 0) -> Callable[[F], F]:
     """``--seed N``.
 
@@ -800,66 +741,3 @@ def seed_option(what: str, default: int = 0) -> Callable[[F], F]:
         show_default=True,
         help=f"Seed of the random numbers of {what}.",
     )
-
-
-def fault_options(example: str) -> Callable[[F], F]:
-    """``--fault SPEC``, repeated, as ``faults``; and ``--faults-from-stdin``."""
-    fault = click.option(
-        "--fault",
-        "faults",
-        multiple=True,
-        metavar="SPEC",
-        help=f"Inject a fault, e.g. {example}; may be repeated.",
-    )
-    from_stdin = click.option(
-        "--faults-from-stdin",
-        is_flag=True,
-        help="Also read faults as lines of standard input, and stop at its end.",
-    )
-    return lambda function: fault(from_stdin(function))
-
-
-def object_option(when: str) -> Callable[[F], F]:
-    """``--object PCT``, as ``object_pct``."""
-    return click.option(
-        "--object",
-        "object_pct",
-        type=Number(0, 100, min_open=True, max_open=True),
-        metavar="PCT",
-        help=f"{when}.  [default: no object]",
-    )
-
-
-def start_option(help: str, default: float | None = None) -> Callable[[F], F]:
-    """``--start PCT``."""
-    return click.option("--start", type=Number(0, 100), default=default, metavar="PCT", help=help)
-
-
-def wiring_option(help: str) -> Callable[[F], F]:
-    """``--wiring SEED``: an emulated device whose wiring is random."""
-    return click.option("--wiring", type=click.IntRange(0, 2**32 - 1), metavar="SEED", help=help)
-
-
-def line_time_option() -> Callable[[F], F]:
-    """``--line-time/--no-line-time``."""
-    return click.option(
-        "--line-time/--no-line-time",
-        default=True,
-        help="Simulate the transmission time of each byte.",
-    )
-
-
-def latency_timer_option(default: float) -> Callable[[F], F]:
-    """``--latency-timer MS``."""
-    return click.option(
-        "--latency-timer",
-        type=Number(0, 255),
-        default=default,
-        metavar="MS",
-        help="Latency timer of the USB-serial adapter: an untuned FTDI has 16, a ttyACM device 0.",
-    )
-
-
-def any_baudrate_option() -> Callable[[F], F]:
-    """``--any-baudrate``."""
-    return click.option("--any-baudrate", is_flag=True, help="Accept clients at any baud rate.")

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.command_help import Command
 from dexkit.cli.consent import Consent
-from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     FILE,
     Number,
@@ -25,12 +25,11 @@ from dexkit.cli.options import (
     json_file_option,
     one_side_option,
     quiet_option,
-    set_option,
-    setting,
     wait_option,
     with_guesses,
     yes_option,
 )
+from dexkit.cli.settings import key_and_value, set_option
 from dexkit.cli.status_line import StatusLine
 from dexkit.cli.stop_keys import Keys, is_enter, is_stop, keys
 from dexkit.errors import DdsError, UsageError
@@ -199,7 +198,7 @@ def _hand(
 
         kind = backend(name)
         texts = with_guesses(given["settings"], kind.settings, given["accept_guesses"])
-        settings = dict(map(setting, texts))
+        settings = dict(map(key_and_value, texts))
         return kind.create(BackendOptions(side, given["device"], settings)), None
     from dexkit.conformance.selftest.external import ExternalHand
     from dexkit.dds import DdsNode

@@ -13,7 +13,7 @@ from types import FrameType
 import click
 
 from dexkit.backends import BackendOptions, backend
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     Number,
     dds_options,
@@ -25,13 +25,12 @@ from dexkit.cli.options import (
     prefix_option,
     quiet_option,
     real_time_option,
-    set_option,
-    setting,
     side_option,
     usb_option,
     view_option,
     with_guesses,
 )
+from dexkit.cli.settings import key_and_value, set_option
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
 from dexkit.errors import DexkitError, TopicConflict, UsageError
 from dexkit.hand import Hand, Side
@@ -229,7 +228,7 @@ def _settings(texts: Sequence[str], sides: Sequence[Side]) -> dict[Side, dict[st
     """The settings of each hand."""
     values: dict[Side, dict[str, str]] = {side: {} for side in sides}
     for text in texts:
-        key, value = setting(text)
+        key, value = key_and_value(text)
         prefix, dot, rest = key.partition(".")
         if dot and prefix in [str(s) for s in Side]:
             if Side(prefix) not in values:

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
     dry_run_option,

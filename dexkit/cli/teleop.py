@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dexkit.cli.command_help import Command
 from dexkit.cli.consent import Consent
-from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     LocalPath,
     dds_options,

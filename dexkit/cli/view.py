@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     FILE,
     dds_options,

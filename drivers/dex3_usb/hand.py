@@ -428,7 +428,9 @@ backend = Backend(
     bringup=Lazy("dexkit.drivers.dex3_usb.bringup:bench"),
     udev_rules=Lazy("dexkit.systemd_units:usb_rules"),
     # the emulated hand is wired as the guesses say
-    emulator=Emulator(("dex3-usb", "--port", "0"), linked=False, settings={"guesses": "accept"}),
+    emulator=Emulator(
+        ("dex3-usb", "--link", "usbip://127.0.0.1:0"), linked=False, settings={"guesses": "accept"}
+    ),
     usb_requirements=True,
     settings_file=Lazy("dexkit.drivers.dex3_usb.settings:default_path"),
 )

@@ -537,7 +537,7 @@ backend = Backend(
     bringup=Lazy("dexkit.drivers.ezgripper.bringup:bench"),
     settings_file=Lazy("dexkit.drivers.ezgripper.calibration_file:default_path"),
     emulator=Emulator(
-        ("mx64", "--closed-at", _EMULATED_ZERO),
+        ("mx64", "--set", f"closed-at={_EMULATED_ZERO}"),
         linked=True,
         settings={**SHARED_MACHINE, "zero": _EMULATED_ZERO},
     ),

@@ -141,8 +141,15 @@ class Dex3Hands:
         for usb in self._usb.values():
             self._server.call(partial(usb.mcu.inject, fault))
 
+    def summaries(self) -> list[str]:
+        """The counters of each hand."""
+        return [
+            f"{side}: {usb.mcu.counters.summary() or 'nothing was sent'}"
+            for side, usb in self._usb.items()
+        ]
+
     def close(self) -> None:
-        """Disconnect clients and free the port."""
+        """Disconnect clients and free the port. May be called twice."""
         self._server.close()
         if self._log is not None:
             self._log.close()
@@ -232,14 +239,14 @@ def emulated_dex3(
         hands = Dex3Process(
             [
                 f"--side={sides[0] if len(sides) == 1 else 'both'}",
-                f"--port={port}",
-                f"--out-endpoint={out_endpoint}",
-                f"--in-endpoint={in_endpoint}",
-                f"--seed={seed}",
-                *(f"--serial={serial}" for serial in serials),
+                f"--link=usbip://127.0.0.1:{port}",
+                f"--set=out-endpoint={out_endpoint}",
+                f"--set=in-endpoint={in_endpoint}",
+                f"--set=seed={seed}",
+                *([f"--set=serial={','.join(serials)}"] if serials else []),
                 *(f"--fault={spec}" for spec in faults),
-                *([] if object_pct is None else [f"--object={object_pct:g}"]),
-                *([] if start is None else [f"--start={start:g}"]),
+                *([] if object_pct is None else [f"--set=object={object_pct:g}"]),
+                *([] if start is None else [f"--set=start={start:g}"]),
             ]
         )
     else:

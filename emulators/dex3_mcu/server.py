@@ -523,12 +523,12 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         listener = listen(host, port, MAX_CONNECTIONS)
     except (OSError, TypeError, ValueError) as error:  # the latter two: no host has such a name
-        hint = "--host takes an address of this machine"
+        hint = "serve it on an address of this machine"
         if not isinstance(error, OSError):
             what = f"cannot serve USB/IP on {one_line(host, 80)!r}: no such host"
             raise EmulatorError(what, hint=hint) from error
         if error.errno == errno.EADDRINUSE:
-            hint = "another USB/IP server has it; choose another with --port, or --port 0"
+            hint = "another USB/IP server has it; choose another port, or 0 for a free one"
         elif error.errno == errno.EACCES:
             hint = "ports below 1024 belong to root"
         why = error.strerror or str(error)

@@ -250,9 +250,9 @@ def emulated_dex1(
         found = Dex1Process(
             [
                 f"--side={side}",
-                f"--start={start_pct:g}",
+                f"--set=start={start_pct:g}",
                 *(f"--fault={spec}" for spec in faults),
-                *([] if object_pct is None else [f"--object={object_pct:g}"]),
+                *([] if object_pct is None else [f"--set=object={object_pct:g}"]),
             ]
         )
     else:

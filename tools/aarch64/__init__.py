@@ -199,7 +199,7 @@ class Emulated(Trial):
         link.unlink(missing_ok=True)
         # neither the line's time nor the driver's 30 ms for an answer is for a slow processor
         servo = subprocess.Popen(
-            [*map(str, dexkit), "emulate", "mx64", "--link", str(link), "--no-line-time"],
+            [*map(str, dexkit), "emulate", "mx64", "--link", str(link), "--set", "line-time=no"],
             cwd=ROOT, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:

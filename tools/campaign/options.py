@@ -10,9 +10,11 @@ import logging
 import resource
 import shutil
 import signal
+from typing import Any
 
 import click
 
+from dexkit.cli.settings import SettingsOption
 from tools.campaign.case import Batch, Case
 from tools.campaign.process import Program, traceback_in
 from tools.campaign.rig import until
@@ -54,7 +56,7 @@ _BASE: dict[tuple[str, ...], tuple[str, ...]] = {
     ("doctor",): ("--scan", "none", "--domain", "{domain}", "--seconds", "0.2"),
     ("emulate", "all"): ("--duration", "0.3", "--domain", "{domain}"),
     ("emulate", "dex1-motor"): ("--link", "{scratch}/link"),
-    ("emulate", "dex3-usb"): ("--port", "0"),
+    ("emulate", "dex3-usb"): ("--link", "usbip://127.0.0.1:0"),
     ("emulate", "g1"): ("--duration", "0.3", "--domain", "{domain}"),
     ("emulate", "h1"): ("--duration", "0.3", "--domain", "{domain}"),
     ("emulate", "mx64"): ("--link", "{scratch}/link"),
@@ -129,8 +131,12 @@ class OptionsCase(Case):
     ) -> None:
         rng = batch.random
         odd: list[str] = []
+        kind: click.ParamType[Any] = option.type
+        begin = ""
+        if isinstance(option, SettingsOption):
+            setting = rng.choice(option.known)
+            kind, begin = setting.type, f"{setting.key}="
         if not option.is_flag:
-            kind = option.type
             pool: tuple[str, ...]
             if isinstance(kind, click.types.IntParamType | click.types.FloatParamType):
                 pool = _NUMBERS
@@ -141,7 +147,7 @@ class OptionsCase(Case):
             value = rng.choice(pool)
             if value.startswith("{"):
                 value = value.format(**places)
-            odd = [value]
+            odd = [begin + value]
         words = [w.format(**places) for w in _BASE[path]]
         limits = []
         if path == ("doctor",) and rng.random() < 0.5:

@@ -383,13 +383,16 @@ def specs() -> list[Spec]:
             codes=(0, 1, 130),
             works=_topic_flows(lambda: (source.topics(SIDE)[0], source.cmd_type)),
         ),
-        Spec("emulate-mx64", emulate("mx64", "--link", "SCRATCH/mx64", "--any-baudrate"),
+        Spec("emulate-mx64", emulate("mx64", "--link", "SCRATCH/mx64", "--set", "any-baudrate=yes"),
              _emulated(Mx64), works=_answers),
         Spec("emulate-dex1-motor", emulate("dex1-motor", "--link", "SCRATCH/m4010"),
              _emulated(M4010), works=_answers),
         Spec(
             "emulate-dex3-usb",
-            lambda s: ["dexkit", "emulate", "dex3-usb", "--port", str(4000 + s.batch.domain)],
+            lambda s: [
+                "dexkit", "emulate", "dex3-usb",
+                "--link", f"usbip://127.0.0.1:{4000 + s.batch.domain}",
+            ],
             _emulated(Dex3),
             works=_usb_answers,
         ),

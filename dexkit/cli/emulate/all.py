@@ -16,17 +16,17 @@ import click
 
 from dexkit.backends import simulators
 from dexkit.child_processes import READY_TIMEOUT, Tool
+from dexkit.cli.command_help import Command
 from dexkit.cli.emulate.lerobot import LOOPBACK, parse_ports, ports_option
-from dexkit.cli.exit_codes import Command
 from dexkit.cli.options import (
     dds_options,
     dialect_option,
     duration_option,
     force_option,
     quiet_option,
-    set_option,
     view_option,
 )
+from dexkit.cli.settings import set_option
 from dexkit.cli.status_line import STATUS_LINES, StatusLine
 from dexkit.errors import DexkitError, EmulatorError
 from dexkit.models import short_names

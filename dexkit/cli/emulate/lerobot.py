@@ -8,7 +8,7 @@ import time
 
 import click
 
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
 from dexkit.cli.options import domain_option, duration_option, quiet_option
 from dexkit.cli.status_line import StatusLine, log_to_stderr
 from dexkit.errors import EmulatorError, UsageError

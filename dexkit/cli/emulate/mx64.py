@@ -5,219 +5,228 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import sys
-from contextlib import nullcontext
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from dexkit import documents
-from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
-from dexkit.cli.exit_codes import Command
-from dexkit.cli.options import (
-    LocalPath,
-    any_baudrate_option,
-    fault_options,
-    latency_timer_option,
-    line_time_option,
-    link_option,
-    object_option,
-    real_time_option,
-    seed_option,
-    start_option,
-    wiring_option,
+from dexkit.cli.emulate.serving import (
+    ANY_BAUDRATE,
+    LINE_TIME,
+    device_command,
+    latency_timer,
+    object_setting,
+    one_link,
+    seed_setting,
+    start_setting,
+    wiring_setting,
 )
+from dexkit.cli.options import LocalPath
+from dexkit.cli.settings import YES_OR_NO, Setting, Settings
 from dexkit.clock import RealClock
 from dexkit.errors import EmulatorError, UsageError
-from dexkit.stop_signals import stop_on_signals
+from dexkit.escaping import one_line
 from dexkit.wire import mx64
+
+if TYPE_CHECKING:
+    from dexkit.emulators.ftdi import FtdiPort
+    from dexkit.emulators.mx64 import Bus
+    from dexkit.emulators.serial_port import Port
 
 __all__ = ["emulate_mx64"]
 
+_HIGHEST_ID = 252
 
-@click.command(
+
+class _Ids(click.ParamType):  # type: ignore[type-arg]
+    name = "ids"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        words = str(value).split(",")
+        if not all(re.fullmatch("[0-9]{1,3}", w) and int(w) <= _HIGHEST_ID for w in words):
+            self.fail(f"{one_line(value, 40)!r} is not ids of servos, each 0 to {_HIGHEST_ID}")
+        return tuple(map(int, words))
+
+
+@device_command(
     "mx64",
-    context_settings={"show_default": True},
-    cls=Command,
-    exit_codes={
-        0: "stopped by Ctrl-C or SIGTERM",
-        1: "the emulator failed",
-    },
+    side=None,
+    link="Link that clients open; usbip://HOST:PORT for an FTDI adapter (FT232R) on USB/IP, which "
+    "has a latency timer of its own.",
+    settings=(
+        Setting("id", "N[,N...]", _Ids(), "Id of the servo, or of several on one line.", (1,)),
+        Setting(
+            "baudrate",
+            "B",
+            click.Choice([str(rate) for rate in mx64.BAUD_RATES.values()]),
+            "Baud rate of the servo, bit/s.",
+            "1000000",
+        ),
+        Setting(
+            "bare",
+            "yes|no",
+            YES_OR_NO,
+            "Emulate the servo without a gripper: its shaft turns freely.",
+            False,
+        ),
+        object_setting("Percent of opening at which the fingers touch an object"),
+        start_setting("Percent of opening at first.", 50.0),
+        Setting(
+            "closed-at",
+            "TICK",
+            click.IntRange(0, mx64.TICKS_PER_TURN - 1),
+            "Encoder tick at which the fingers are closed.",
+            1510,
+        ),
+        wiring_setting(
+            "One or two grippers, dual or quad, with random ids, directions, closed positions and "
+            "strokes, to test a bring-up; replaces id and the settings of a gripper."
+        ),
+        LINE_TIME,
+        latency_timer(1.0),
+        seed_setting("the faults and of measurement noise"),
+        Setting(
+            "eeprom",
+            "FILE",
+            LocalPath(dir_okay=False),
+            "Keep the servos' EEPROM in this file between runs; it overrides id and baudrate.",
+        ),
+        ANY_BAUDRATE,
+        Setting(
+            "fast-reads", "yes|no", YES_OR_NO, "Firmware with Fast Sync and Fast Bulk Read.", False
+        ),
+        Setting("backup", "yes|no", YES_OR_NO, "Firmware with Control Table Backup.", False),
+        Setting("protocol-1", "yes|no", YES_OR_NO, "Old firmware with Protocol 1.0 only.", False),
+    ),
+    faults="overload@3s, drop:p=0.05, unplug@5s:for=2s",
 )
-@link_option(
-    "Link that clients open; usbip://HOST:PORT for an FTDI adapter (FT232R) on USB/IP, which "
-    "has a latency timer of its own."
-)
-@click.option(
-    "--id",
-    "ids",
-    type=click.IntRange(0, 252),
-    multiple=True,
-    default=(1,),
-    help="Id of the servo; repeat it for several grippers on one line.",
-)
-@click.option(
-    "--baudrate",
-    type=click.Choice([str(rate) for rate in mx64.BAUD_RATES.values()]),
-    default="1000000",
-    metavar="B",
-    help="Baud rate of the servo, bit/s.",
-)
-@click.option(
-    "--bare", is_flag=True, help="Emulate the servo without a gripper: its shaft turns freely."
-)
-@object_option("Percent of opening at which the fingers touch an object")
-@start_option("Opening at first.", 50.0)
-@click.option(
-    "--closed-at",
-    type=click.IntRange(0, mx64.TICKS_PER_TURN - 1),
-    default=1510,
-    metavar="TICK",
-    help="Encoder tick at which the fingers are closed.",
-)
-@wiring_option(
-    "One or two grippers, dual or quad, with random ids, directions, closed positions and "
-    "strokes, to test a bring-up; replaces --id and the options of a gripper."
-)
-@line_time_option()
-@latency_timer_option(1.0)
-@fault_options("overload@3s, drop:p=0.05, unplug@5s:for=2s")
-@seed_option("the faults and of measurement noise")
-@click.option(
-    "--eeprom",
-    type=LocalPath(dir_okay=False),
-    metavar="FILE",
-    help="Keep the servos' EEPROM in this file between runs; it overrides --id and --baudrate.",
-)
-@any_baudrate_option()
-@click.option("--fast-reads", is_flag=True, help="Firmware with Fast Sync and Fast Bulk Read.")
-@click.option("--backup", is_flag=True, help="Firmware with Control Table Backup.")
-@click.option("--protocol-1", is_flag=True, help="Old firmware with Protocol 1.0 only.")
-@real_time_option(default=False)
-def emulate_mx64(
-    link: str,
-    ids: tuple[int, ...],
-    baudrate: str,
-    bare: bool,
-    object_pct: float | None,
-    start: float,
-    closed_at: int,
-    wiring: int | None,
-    line_time: bool,
-    latency_timer: float,
-    faults: tuple[str, ...],
-    faults_from_stdin: bool,
-    seed: int,
-    eeprom: Path | None,
-    any_baudrate: bool,
-    fast_reads: bool,
-    backup: bool,
-    protocol_1: bool,
-    real_time: bool,
-) -> None:
+def emulate_mx64(links: Sequence[str], settings: Settings, faults: Sequence[str]) -> _Grippers:
     """Emulate a DYNAMIXEL MX-64 (Protocol 2.0) with an EZGripper on its shaft.
 
-    Use --bare for ROBOTIS' own examples: they move between ends of the range that no gripper
-    reaches.
+    Use --set bare=yes for ROBOTIS' own examples: they move between ends of the range that no
+    gripper reaches.
 
     Prints "ready: PATH ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
     link.
     """
     from dexkit.emulators.faults import parse_fault
-    from dexkit.emulators.line_port import SCHEME, line_port
-    from dexkit.emulators.mx64 import (
-        Bus,
-        Firmware,
-        GripperMechanics,
-        Physics,
-        Servo,
-        Wiring,
-    )
+    from dexkit.emulators.line_port import line_port
+    from dexkit.emulators.mx64 import Bus, Firmware, GripperMechanics, Physics, Servo, Wiring
     from dexkit.emulators.mx64.protocol1 import Protocol1Servo
-    from dexkit.service.realtime import real_time as real_time_priority
 
+    link = one_link(links)
     plan = [parse_fault(spec) for spec in faults]
-    if bare:
-        _refuse_gripper_options("--bare has none", "object_pct", "start", "closed_at")
+    baudrate, seed = int(settings["baudrate"]), settings["seed"]
+    if settings["bare"]:
+        _refuse_gripper(settings, "a bare servo has none", "object", "start", "closed-at")
         mechanics = GripperMechanics.none()
     else:
-        mechanics = GripperMechanics(closed_at=closed_at, start=start, object_pct=object_pct)
-    grippers = [(number, mechanics) for number in ids]
-    if wiring is not None:
-        _refuse_gripper_options(
-            "--wiring sets it", "bare", "ids", "object_pct", "start", "closed_at"
+        mechanics = GripperMechanics(
+            closed_at=settings["closed-at"],
+            start=settings["start"],
+            object_pct=settings["object"],
         )
-        sides = Wiring.random(wiring).servos.values()
+    grippers = [(number, mechanics) for number in settings["id"]]
+    if settings["wiring"] is not None:
+        _refuse_gripper(settings, "wiring sets it", "bare", "id", "object", "start", "closed-at")
+        sides = Wiring.random(settings["wiring"]).servos.values()
         grippers = [pair for servos_of in sides for pair in servos_of.items()]
-    firmware = Firmware(fast_reads=fast_reads, backup=backup)
-    store = _EepromFile(eeprom) if eeprom is not None else None
-    with (
-        # before the line's thread is started, which inherits it
-        real_time_priority() if real_time else nullcontext(True) as granted,
-        stop_on_signals() as request,
-    ):
-        if not granted:
-            click.echo("no real-time priority: this user has no rtprio limit", err=True)
-        now = RealClock().now()
-        servos = []
-        if not protocol_1:
-            for index, (servo_id, each) in enumerate(grippers):
-                servo = Servo(
-                    servo_id,
-                    baudrate=int(baudrate),
-                    physics=dataclasses.replace(Physics(), gripper=each),
-                    firmware=firmware,
-                    now=now,
-                    eeprom=store.load(index) if store else None,
-                    seed=seed + index,
-                )
-                servos.append(servo)
-        bus = Bus(
-            servos,
-            line_time=line_time,
-            latency_timer=latency_timer * 1e-3,
-            faults=plan,
-            start=now,
-            seed=seed,
-            protocol_1=[Protocol1Servo(i, baudrate=int(baudrate)) for i in ids]
-            if protocol_1
-            else (),
+    firmware = Firmware(fast_reads=settings["fast-reads"], backup=settings["backup"])
+    store = None if settings["eeprom"] is None else _EepromFile(settings["eeprom"])
+    old = settings["protocol-1"]
+    now = RealClock().now()
+    servos = [
+        Servo(
+            servo_id,
+            baudrate=baudrate,
+            physics=dataclasses.replace(Physics(), gripper=each),
+            firmware=firmware,
+            now=now,
+            eeprom=store.load(index) if store else None,
+            seed=seed + index,
         )
-        if store is not None:
-            for servo in servos:
-                servo.on_eeprom = lambda: store.save([s.eeprom for s in servos])
-        with line_port(bus, link, serial="DKMX64", check_baudrate=not any_baudrate) as port:
-            if faults_from_stdin:
-                read_faults(lambda spec: port.inject(parse_fault(spec)), request)
-            port.start()
-            answering = ",".join(
-                [str(s.id) for s in bus.servos] + [str(s.id) for s in bus.protocol_1]
-            )
-            rate = servos[0].baudrate if servos else int(baudrate)
-            shown = port.path if link.startswith(SCHEME) else link
-            click.echo(f"ready: {shown} id={answering} baudrate={rate} {port.place}")
-            sys.stdout.flush()
-            while not request.wait(0.2):
-                if port.error is not None:
-                    raise EmulatorError(f"the emulator stopped: {port.error}") from port.error
-        summary = bus.counters.summary() or "nothing was sent"
-        if port.overruns:
-            summary += f", {port.overruns} bytes not read by the client"
-        click.echo(f"stopped: {summary}")
-        if bus.failure is not None:
-            raise EmulatorError(f"the emulator failed inside: {bus.failure!r}", hint=A_MISTAKE)
+        for index, (servo_id, each) in enumerate([] if old else grippers)
+    ]
+    bus = Bus(
+        servos,
+        line_time=settings["line-time"],
+        latency_timer=settings["latency-timer"] * 1e-3,
+        faults=plan,
+        start=now,
+        seed=seed,
+        protocol_1=[Protocol1Servo(i, baudrate=baudrate) for i in settings["id"]] if old else (),
+    )
+    if store is not None:
+        for servo in servos:
+            servo.on_eeprom = lambda: store.save([s.eeprom for s in servos])
+    port = line_port(bus, link, serial="DKMX64", check_baudrate=not settings["any-baudrate"])
+    return _Grippers(port, bus, link, servos[0].baudrate if servos else baudrate)
 
 
-def _refuse_gripper_options(why: str, *names: str) -> None:
-    """Refuse options of a gripper that another option leaves without meaning.
+class _Grippers:
+    """The servos on their line; a context manager."""
+
+    def __init__(self, port: Port | FtdiPort, bus: Bus, link: str, baudrate: int) -> None:
+        self._port, self._bus, self._link, self._baudrate = port, bus, link, baudrate
+
+    @property
+    def ready_lines(self) -> list[str]:
+        """Where it answers, and its ids."""
+        from dexkit.emulators.line_port import SCHEME
+
+        numbers = [s.id for s in self._bus.servos] + [s.id for s in self._bus.protocol_1]
+        ids = ",".join(map(str, numbers))
+        shown = self._port.path if self._link.startswith(SCHEME) else self._link
+        return [f"ready: {shown} id={ids} baudrate={self._baudrate} {self._port.place}"]
+
+    @property
+    def error(self) -> BaseException | None:
+        """The error that ended its service, or None."""
+        return self._port.error
+
+    @property
+    def failure(self) -> Exception | None:
+        """The first exception that its service has survived, or None."""
+        return self._bus.failure
+
+    def inject(self, spec: str) -> None:
+        """Inject a fault."""
+        from dexkit.emulators.faults import parse_fault
+
+        self._port.inject(parse_fault(spec))
+
+    def summaries(self) -> list[str]:
+        """Its counters."""
+        text = self._bus.counters.summary() or "nothing was sent"
+        if self._port.overruns:
+            text += f", {self._port.overruns} bytes not read by the client"
+        return [text]
+
+    def close(self) -> None:
+        """Stop, and remove the path."""
+        self._port.close()
+
+    def __enter__(self) -> _Grippers:
+        self._port.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _refuse_gripper(settings: Settings, why: str, *keys: str) -> None:
+    """Refuse settings of a gripper that another one leaves without meaning.
 
     :raises UsageError: one was given.
     """
-    context = click.get_current_context()
-    for name in names:
-        if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
-            option = next(p.opts[0] for p in context.command.params if p.name == name)
-            raise click.UsageError(f"{option} describes a gripper, and {why}")
+    for key in keys:
+        if key in settings.given:
+            raise UsageError(f"{key} describes a gripper, and {why}")
 
 
 class _EepromFile:

@@ -2,46 +2,48 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 import click
 
-from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
-from dexkit.cli.exit_codes import Command
-from dexkit.cli.options import id_option, link_option, object_option, side_option, start_option
+from dexkit.cli.emulate.serving import (
+    Served,
+    device_command,
+    line_arguments,
+    line_settings,
+    object_setting,
+    one_link,
+    one_side,
+    start_setting,
+)
+from dexkit.cli.settings import Setting, Settings
 from dexkit.hand import Side
-from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import revo2
 
 __all__ = ["emulate_revo2"]
 
 
-@click.command(
+@device_command(
     "revo2",
-    context_settings={"show_default": True},
-    cls=Command,
-    exit_codes={
-        0: "stopped by Ctrl-C or SIGTERM",
-        1: "the emulator failed",
-    },
-)
-@side_option("Hand to emulate.", default="right")
-@link_option("Link that clients open.")
-@object_option("Percent of closing at which the joints touch an object")
-@start_option("Percent of closing at first; by default a relaxed pose.")
-@id_option(revo2.IDS, "Its Modbus unit; by default 126 of a left hand and 127 of a right one.")
-@line_options(
-    "hand", baudrate=revo2.BAUD_RATE, most=5_000_000, faults="unplug@5s:for=2s, drop:p=0.1"
+    side="right",
+    link="Link that clients open.",
+    settings=(
+        object_setting("Percent of closing at which the joints touch an object"),
+        start_setting("Percent of closing at first.  [default: a relaxed pose]"),
+        Setting(
+            "id",
+            "N",
+            click.IntRange(revo2.IDS[0], revo2.IDS[-1]),
+            "Its Modbus unit.  [default: 126 of a left hand, 127 of a right one]",
+        ),
+        *line_settings("hand", baudrate=revo2.BAUD_RATE, most=5_000_000),
+    ),
+    faults="unplug@5s:for=2s, drop:p=0.1",
 )
 def emulate_revo2(
-    sides: tuple[Side, ...],
-    link: str,
-    object_pct: float | None,
-    start: float | None,
-    number: int | None,
-    faults_from_stdin: bool,
-    **line: Any,
-) -> None:
+    sides: Sequence[Side], links: Sequence[str], settings: Settings, faults: Sequence[str]
+) -> AbstractContextManager[Served]:
     """Emulate a BrainCo Revo2 hand on its serial line (Modbus RTU).
 
     Prints "ready: PATH SIDE ..." when it answers there. Ctrl-C or SIGTERM ends it and removes the
@@ -49,15 +51,11 @@ def emulate_revo2(
     """
     from dexkit.emulators.revo2 import Revo2Hand
 
-    with (
-        stop_on_signals() as request,
-        Revo2Hand(
-            one_side(sides),
-            link=link,
-            number=number,
-            object_pct=object_pct,
-            start_pct=start,
-            **line_settings(line),
-        ) as hand,
-    ):
-        serve(hand, request, faults_from_stdin=faults_from_stdin)
+    return Revo2Hand(
+        one_side(sides),
+        link=one_link(links),
+        number=settings["id"],
+        object_pct=settings["object"],
+        start_pct=settings["start"],
+        **line_arguments(settings, faults),
+    )

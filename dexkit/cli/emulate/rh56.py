@@ -2,111 +2,87 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 import click
 
-from dexkit.cli.emulate.serving import line_options, line_settings, one_side, serve
-from dexkit.cli.exit_codes import Command
-from dexkit.cli.options import id_option, link_option, object_option, side_option, start_option
+from dexkit.cli.emulate.serving import (
+    Served,
+    device_command,
+    line_arguments,
+    line_settings,
+    object_setting,
+    one_link,
+    one_side,
+    start_setting,
+)
+from dexkit.cli.settings import YES_OR_NO, Setting, Settings
 from dexkit.errors import UsageError
+from dexkit.escaping import one_line
 from dexkit.hand import Side
-from dexkit.stop_signals import stop_on_signals
 from dexkit.wire import rh56
 
 __all__ = ["emulate_rh56"]
 
-_SERIAL_ONLY = ("number", "baudrate", "line_time", "latency_timer", "any_baudrate")
+_TCP = "tcp://127.0.0.1:"
+_SERIAL_ONLY = {"id", "baudrate", "line-time", "latency-timer", "any-baudrate"}
 
 
-@click.command(
+@device_command(
     "rh56",
-    context_settings={"show_default": True},
-    cls=Command,
-    exit_codes={
-        0: "stopped by Ctrl-C or SIGTERM",
-        1: "the emulator failed",
-    },
-)
-@side_option("Hand to emulate.", default="right")
-@link_option("Link that clients open: the hand's serial line.", required=False)
-@click.option(
-    "--modbus-tcp",
-    "tcp",
-    type=click.IntRange(0, 65535),
-    metavar="PORT",
-    help="Instead of --link: Modbus on this TCP port of 127.0.0.1; 0 takes a free one.",
-)
-@click.option("--tactile", is_flag=True, help="With --modbus-tcp: an RH56DFTP, with its areas.")
-@object_option("Percent of closing at which the joints touch an object")
-@start_option("Percent of closing at first; by default a relaxed pose.")
-@id_option(rh56.IDS, "Its id on the line.", 1)
-@line_options(
-    "hand",
-    baudrate=rh56.BAUD_RATE,
-    most=1_000_000,
+    side="right",
+    link=f"Link that clients open: the hand's serial line. {_TCP}PORT serves Modbus on that port "
+    "of this machine instead; 0 takes a free one.",
+    settings=(
+        Setting("tactile", "yes|no", YES_OR_NO, "With tcp://: an RH56DFTP, with its areas.", False),
+        object_setting("Percent of closing at which the joints touch an object"),
+        start_setting("Percent of closing at first.  [default: a relaxed pose]"),
+        Setting(
+            "id", "N", click.IntRange(rh56.IDS[0], rh56.IDS[-1]), "Its id on the serial line.", 1
+        ),
+        *line_settings("hand", baudrate=rh56.BAUD_RATE, most=1_000_000),
+    ),
     faults="unplug@5s:for=2s, drop:p=0.1, locked@3s",
 )
 def emulate_rh56(
-    sides: tuple[Side, ...],
-    link: str | None,
-    tcp: int | None,
-    tactile: bool,
-    object_pct: float | None,
-    start: float | None,
-    number: int,
-    faults_from_stdin: bool,
-    **line: Any,
-) -> None:
-    """Emulate an Inspire RH56 hand on its serial line, or with --modbus-tcp on the network.
+    sides: Sequence[Side], links: Sequence[str], settings: Settings, faults: Sequence[str]
+) -> AbstractContextManager[Served]:
+    """Emulate an Inspire RH56 hand on its serial line, or on the network.
 
     Prints "ready: PATH SIDE ..." (or HOST:PORT) when it answers there. Ctrl-C or SIGTERM ends it
     and removes the link.
     """
     from dexkit.emulators.rh56 import Rh56Hand, Rh56TcpHand
 
-    side, on_line = one_side(sides), line_settings(line)
-    if (link is None) == (tcp is None):
-        raise UsageError(
-            "no place for the hand is given",
-            hint="--link PATH for a serial line, or --modbus-tcp PORT",
-        )
-    with stop_on_signals() as request:
-        hand: Rh56Hand | Rh56TcpHand
-        if tcp is not None:
-            _refuse_serial_options()
-            hand = Rh56TcpHand(
-                side,
-                port=tcp,
-                object_pct=object_pct,
-                start_pct=start,
-                tactile=tactile,
-                **{name: on_line[name] for name in ("answer_time", "faults", "seed")},
-            )
-        else:
-            if tactile:
-                raise UsageError("--tactile needs --modbus-tcp", hint="--modbus-tcp PORT")
-            hand = Rh56Hand(
-                side,
-                link=link,
-                number=number,
-                object_pct=object_pct,
-                start_pct=start,
-                **on_line,
-            )
-        with hand:
-            serve(hand, request, faults_from_stdin=faults_from_stdin)
+    side, link = one_side(sides), one_link(links)
+    on_line = line_arguments(settings, faults)
+    pose = {"object_pct": settings["object"], "start_pct": settings["start"]}
+    if "://" not in link:
+        if settings["tactile"]:
+            raise UsageError("a tactile hand is on the network", hint=f"--link {_TCP}PORT")
+        return Rh56Hand(side, link=link, number=settings["id"], **pose, **on_line)
+    if wrong := sorted(_SERIAL_ONLY & settings.given):
+        raise UsageError(f"{wrong[0]} is of a serial line, not of {link}", hint="leave it out")
+    return Rh56TcpHand(
+        side,
+        port=_port(link),
+        tactile=settings["tactile"],
+        **pose,
+        **{name: on_line[name] for name in ("answer_time", "faults", "seed")},
+    )
 
 
-def _refuse_serial_options() -> None:
-    """Refuse the options of a serial line beside ``--modbus-tcp``.
+def _port(link: str) -> int:
+    """The port of ``tcp://127.0.0.1:PORT``.
 
-    :raises UsageError: one was given.
+    :raises UsageError: it is another address, or no port.
     """
-    context = click.get_current_context()
-    for name in _SERIAL_ONLY:
-        if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
-            option = next(p.opts[0] for p in context.command.params if p.name == name)
-            raise UsageError(
-                f"{option} applies to a serial line, not to --modbus-tcp", hint="leave it out"
-            )
+    port = link.removeprefix(_TCP)
+    if not (link.startswith(_TCP) and port.isascii() and port.isdecimal() and len(port) <= 5):
+        raise UsageError(
+            f"{one_line(link, 80)} is no port of this machine", hint=f"--link {_TCP}6000"
+        )
+    if int(port) > 65535:
+        raise UsageError(f"{port} is no TCP port", hint="1 to 65535, or 0 for a free one")
+    return int(port)

@@ -7,13 +7,15 @@ import json
 import logging
 import sys
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from dexkit.cli.emulate.stdin import read_faults
-from dexkit.cli.exit_codes import Command
+from dexkit.cli.command_help import Command
+from dexkit.cli.emulate.serving import real_time_setting, seed_setting
+from dexkit.cli.emulate.stdin import STDIN, read_faults
 from dexkit.cli.options import (
     Number,
     dds_options,
@@ -21,9 +23,8 @@ from dexkit.cli.options import (
     force_option,
     json_option,
     quiet_option,
-    real_time_option,
-    seed_option,
 )
+from dexkit.cli.settings import YES_OR_NO, Setting, Settings, settings_option
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
 from dexkit.errors import DdsError, TopicConflict
 from dexkit.robots import G1, H1, RobotModel
@@ -47,41 +48,40 @@ def _command(model: RobotModel) -> click.Command:
         domain: int,
         interface: str,
         duration: float | None,
-        remote: str,
-        remote_from_stdin: bool,
-        lenient: bool,
-        noise: float,
-        seed: int,
+        remote: tuple[str, ...],
+        settings: Settings,
         force: bool,
-        real_time: bool,
         as_json: bool,
         quiet: bool,
-        mode_machine: int | None = None,
     ) -> None:
-        from dexkit.emulators.robot import EmulatedRobot, Remote, Settings
+        from dexkit.emulators import robot as emulated
         from dexkit.service.realtime import prepare_process
         from dexkit.service.realtime import real_time as real_time_priority
 
-        held = Remote.parse(remote)
-        chosen = dataclasses.replace(model, mode_machine=mode_machine or model.mode_machine)
-        settings = Settings(lenient=lenient, noise=noise, seed=seed)
+        held = emulated.Remote.parse(",".join(keys for keys in remote if keys != STDIN))
+        chosen = dataclasses.replace(
+            model, mode_machine=settings.get("mode-machine", model.mode_machine)
+        )
+        peculiar = emulated.Settings(
+            lenient=settings["lenient"], noise=settings["noise"], seed=settings["seed"]
+        )
         status = StatusLine(quiet)
         log_to_stderr(quiet=True, status=status.on_terminal, always=log.name)
-        robot = EmulatedRobot(
-            chosen, domain=domain, interface=interface, settings=settings, force=force
+        robot = emulated.EmulatedRobot(
+            chosen, domain=domain, interface=interface, settings=peculiar, force=force
         )
         robot.robot.remote = held
         with (
             # before its thread is started, which inherits it
-            real_time_priority() if real_time else nullcontext(True),
+            real_time_priority() if settings["real-time"] else nullcontext(True),
             stop_on_signals() as stop,
             robot,
         ):
             prepare_process()
-            if remote_from_stdin:
+            if STDIN in remote:
 
                 def press(text: str) -> None:
-                    robot.robot.remote = Remote.parse("" if text == "release" else text)
+                    robot.robot.remote = emulated.Remote.parse("" if text == "release" else text)
 
                 read_faults(press, stop)
             click.echo(
@@ -114,16 +114,8 @@ def _command(model: RobotModel) -> click.Command:
     Prints "ready: ..." when the topics are up. Ctrl-C or SIGTERM ends it.
     """
     decorated = emulate
-    for option in reversed(_OPTIONS):
+    for option in reversed(_options(model)):
         decorated = option(decorated)
-    if model.mode_machine is not None:
-        decorated = click.option(
-            "--mode-machine",
-            type=click.IntRange(1, 255),
-            default=model.mode_machine,
-            show_default=True,
-            help="mode_machine of the state, the kind of robot (the table is in unitree_ros).",
-        )(decorated)
     return click.command(
         model.name,
         cls=Command,
@@ -131,41 +123,50 @@ def _command(model: RobotModel) -> click.Command:
             0: "stopped by Ctrl-C, SIGTERM or --duration",
             1: "it failed while it ran, or another program publishes the same topics",
         },
-    )(dds_options()(decorated))
+    )(decorated)
 
 
-_OPTIONS = [
-    duration_option(),
-    click.option(
-        "--remote",
-        default="",
-        metavar="KEYS",
-        help="Keys held on the wireless remote, and positions of its sticks, e.g. A,R1,lx=0.5.",
+def _options(model: RobotModel) -> list[Callable[[Any], Any]]:
+    machine = () if model.mode_machine is None else (_mode_machine(model.mode_machine),)
+    return [
+        dds_options(),
+        duration_option(),
+        click.option(
+            "--remote",
+            multiple=True,
+            metavar="KEYS",
+            help="Keys held on the wireless remote, and positions of its sticks, e.g. A,R1,lx=0.5. "
+            "- reads KEYS (or 'release') as lines of standard input, and stops at its end.",
+        ),
+        settings_option((*machine, *_SETTINGS)),
+        force_option(),
+        json_option("Print a line of JSON each second."),
+        quiet_option(),
+    ]
+
+
+def _mode_machine(default: int) -> Setting:
+    return Setting(
+        "mode-machine",
+        "N",
+        click.IntRange(1, 255),
+        "mode_machine of the state, the kind of robot (the table is in unitree_ros).",
+        default,
+    )
+
+
+_SETTINGS = (
+    Setting(
+        "lenient",
+        "yes|no",
+        YES_OR_NO,
+        "Obey any mode byte but 0, and commands with another mode_machine.",
+        False,
     ),
-    click.option(
-        "--remote-from-stdin",
-        is_flag=True,
-        help="Also read KEYS (or 'release') as lines of standard input, and stop at its end.",
-    ),
-    click.option(
-        "--lenient",
-        is_flag=True,
-        help="Obey any mode byte but 0, and commands with another mode_machine.",
-    ),
-    click.option(
-        "--noise",
-        type=Number(0, 1000),
-        default=0.0,
-        show_default=True,
-        metavar="X",
-        help="Noise of the IMU; 1 is that of a plain one.",
-    ),
-    seed_option("the noise"),
-    force_option(),
-    real_time_option(),
-    json_option("Print a line of JSON each second."),
-    quiet_option(),
-]
+    Setting("noise", "X", Number(0, 1000), "Noise of the IMU; 1 is that of a plain one.", 0.0),
+    seed_setting("the noise"),
+    real_time_setting(True),
+)
 
 
 def _watch(

@@ -1,29 +1,40 @@
-"""Options and run loop shared by the emulators of devices on a line."""
+"""What the commands of emulated devices have in common: options, settings and run loop."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Protocol
 
 import click
 
-from dexkit.cli.emulate.stdin import A_MISTAKE, read_faults
-from dexkit.cli.options import (
-    Number,
-    any_baudrate_option,
-    fault_options,
-    latency_timer_option,
-    line_time_option,
-    seed_option,
-)
+from dexkit.cli.command_help import Command
+from dexkit.cli.emulate.stdin import A_MISTAKE, STDIN, read_faults
+from dexkit.cli.options import Number, side_option
+from dexkit.cli.settings import YES_OR_NO, Setting, Settings, settings_option
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.hand import Side
-from dexkit.stop_signals import StopRequest
+from dexkit.stop_signals import StopRequest, stop_on_signals
 
-__all__ = ["Served", "line_options", "line_settings", "one_side", "serve"]
+__all__ = [
+    "ANY_BAUDRATE",
+    "LINE_TIME",
+    "Served",
+    "device_command",
+    "latency_timer",
+    "line_arguments",
+    "line_settings",
+    "object_setting",
+    "one_link",
+    "one_side",
+    "real_time_setting",
+    "seed_setting",
+    "start_setting",
+    "wiring_setting",
+]
 
-F = TypeVar("F", bound=Callable[..., Any])
+_SEED = click.IntRange(0, 2**32 - 1)
 
 
 class Served(Protocol):
@@ -51,59 +62,174 @@ class Served(Protocol):
         """Stop. May be called twice."""
 
 
-def line_options(
-    device: str, *, baudrate: int, most: int, faults: str, latency_timer: float = 0.0
-) -> Callable[[F], F]:
-    """The options of a device on a serial line, from ``--baudrate`` to ``--any-baudrate``.
-    :func:`line_settings` makes the device's arguments of them.
+# ------------------------------------------------------------------------------ settings
+
+LINE_TIME = Setting(
+    "line-time", "yes|no", YES_OR_NO, "Simulate the transmission time of each byte.", True
+)
+ANY_BAUDRATE = Setting(
+    "any-baudrate", "yes|no", YES_OR_NO, "Accept clients at any baud rate.", False
+)
+
+
+def real_time_setting(default: bool) -> Setting:
+    """``real-time``: whether it has priority."""
+    return Setting(
+        "real-time",
+        "yes|no",
+        YES_OR_NO,
+        "Run before ordinary processes where the system permits it (docs/service.md).",
+        default,
+    )
+
+
+def object_setting(when: str) -> Setting:
+    """``object``: where there is one."""
+    percent = Number(0, 100, min_open=True, max_open=True)
+    return Setting("object", "PCT", percent, f"{when}.  [default: no object]")
+
+
+def start_setting(help: str, default: float | None = None) -> Setting:
+    """``start``: the pose at power-on."""
+    return Setting("start", "PCT", Number(0, 100), help, default)
+
+
+def wiring_setting(help: str) -> Setting:
+    """``wiring``: the seed of a random wiring."""
+    return Setting("wiring", "SEED", _SEED, help)
+
+
+def seed_setting(what: str = "the faults") -> Setting:
+    """``seed`` of the random numbers of ``what``."""
+    return Setting("seed", "N", _SEED, f"Seed of the random numbers of {what}.", 0)
+
+
+def latency_timer(default: float) -> Setting:
+    """``latency-timer`` of the adapter."""
+    return Setting(
+        "latency-timer",
+        "MS",
+        Number(0, 255),
+        "Latency timer of the USB-serial adapter: an untuned FTDI has 16, a ttyACM device 0.",
+        default,
+    )
+
+
+def line_settings(device: str, *, baudrate: int, most: int) -> tuple[Setting, ...]:
+    """The settings of a device on a serial line; :func:`line_arguments` reads them.
 
     :param device: what the help calls it.
     :param baudrate: its own; ``most`` that can be given.
-    :param faults: examples.
     """
-    options = (
-        click.option(
-            "--baudrate",
-            type=click.IntRange(9600, most),
-            default=baudrate,
-            metavar="B",
-            help=f"Baud rate of the {device}.",
+    return (
+        Setting(
+            "baudrate", "B", click.IntRange(9600, most), f"Baud rate of the {device}.", baudrate
         ),
-        line_time_option(),
-        click.option(
-            "--answer-time",
-            type=Number(0, 1000),
-            default=0.0,
-            metavar="MS",
-            help=f"Time from a request to its answer; that of the real {device} is not known.",
+        LINE_TIME,
+        Setting(
+            "answer-time",
+            "MS",
+            Number(0, 1000),
+            f"Time from a request to its answer; that of the real {device} is not known.",
+            0.0,
         ),
-        latency_timer_option(latency_timer),
-        fault_options(faults),
-        seed_option("the faults"),
-        any_baudrate_option(),
+        latency_timer(0.0),
+        seed_setting(),
+        ANY_BAUDRATE,
     )
 
-    def add(function: F) -> F:
-        for option in reversed(options):
-            function = option(function)
-        return function
 
-    return add
-
-
-def line_settings(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of :func:`line_options` as arguments of an emulated device: milliseconds become
-    seconds; without those that :func:`serve` uses.
-    """
+def line_arguments(settings: Settings, faults: Sequence[str]) -> dict[str, Any]:
+    """Arguments of an emulated device of its :func:`line_settings`, in seconds."""
     return {
-        "baudrate": given["baudrate"],
-        "answer_time": given["answer_time"] * 1e-3,
-        "line_time": given["line_time"],
-        "latency_timer": given["latency_timer"] * 1e-3,
-        "faults": given["faults"],
-        "seed": given["seed"],
-        "check_baudrate": not given["any_baudrate"],
+        "baudrate": settings["baudrate"],
+        "answer_time": settings["answer-time"] * 1e-3,
+        "line_time": settings["line-time"],
+        "latency_timer": settings["latency-timer"] * 1e-3,
+        "faults": faults,
+        "seed": settings["seed"],
+        "check_baudrate": not settings["any-baudrate"],
     }
+
+
+# ------------------------------------------------------------------------------ commands
+
+Maker = Callable[..., AbstractContextManager[Served]]
+
+
+def device_command(
+    name: str,
+    *,
+    side: str | None,
+    link: str,
+    default_link: str | None = None,
+    settings: Sequence[Setting],
+    faults: str,
+    then: Callable[[Any], Sequence[str]] = lambda device: (),
+) -> Callable[[Maker], click.Command]:
+    """Make the command ``dexkit emulate NAME`` of a function that makes the device.
+
+    The function gets ``link`` (a list), ``settings``, ``faults``, and ``sides`` where there are
+    some; its docstring is the command's help.
+
+    :param side: the default of ``--side``; None for a device that has none.
+    :param link: the help of ``--link``.
+    :param faults: examples.
+    :param then: lines to print below those that say that it is ready.
+    """
+
+    def decorate(make: Maker) -> click.Command:
+        def run(settings: Settings, faults: tuple[str, ...], **given: Any) -> None:
+            from dexkit.service.realtime import real_time
+
+            specs = [spec for spec in faults if spec != STDIN]
+            with (
+                # before any thread of the device is started, which inherits it
+                real_time() if settings["real-time"] else nullcontext(True) as granted,
+                stop_on_signals() as request,
+                make(settings=settings, faults=specs, **given) as device,
+            ):
+                if not granted:
+                    click.echo("no real-time priority: this user has no rtprio limit", err=True)
+                if STDIN in faults:
+                    read_faults(device.inject, request)
+                click.echo("\n".join([*device.ready_lines, *then(device)]))
+                sys.stdout.flush()
+                _serve(device, request)
+
+        run.__doc__ = make.__doc__
+        options: list[Callable[[Any], Any]] = [
+            click.option(
+                "--link",
+                "links",
+                required=default_link is None,
+                default=() if default_link is None else (default_link,),
+                multiple=True,
+                metavar="PATH",
+                help=link if default_link is None else f"{link}  [default: {default_link}]",
+            ),
+            settings_option((*settings, real_time_setting(False))),
+            click.option(
+                "--fault",
+                "faults",
+                multiple=True,
+                metavar="SPEC",
+                help=f"Inject a fault, e.g. {faults}; may be repeated. - reads faults as lines of "
+                "standard input, and stops at its end.",
+            ),
+        ]
+        if side is not None:
+            options.insert(0, side_option("Hand to emulate.", default=side))
+        decorated: Callable[..., Any] = run
+        for option in reversed(options):
+            decorated = option(decorated)
+        return click.command(
+            name,
+            cls=Command,
+            exit_codes={0: "stopped by Ctrl-C or SIGTERM", 1: "the emulator failed"},
+        )(decorated)
+
+    return decorate
 
 
 def one_side(sides: Sequence[Side]) -> Side:
@@ -119,15 +245,21 @@ def one_side(sides: Sequence[Side]) -> Side:
     return sides[0]
 
 
-def serve(device: Served, request: StopRequest, *, faults_from_stdin: bool) -> None:
+def one_link(links: Sequence[str]) -> str:
+    """The place of a device that has one.
+
+    :raises UsageError: several are given.
+    """
+    if len(links) != 1:
+        raise UsageError("this emulator is at one place", hint="give --link once")
+    return links[0]
+
+
+def _serve(device: Served, request: StopRequest) -> None:
     """Serve until a stop is requested; then close the device and print its counters.
 
     :raises EmulatorError: its service ended, or it failed inside.
     """
-    if faults_from_stdin:
-        read_faults(device.inject, request)
-    click.echo("\n".join(device.ready_lines))
-    sys.stdout.flush()
     while not request.wait(0.2):
         if device.error is not None:
             raise EmulatorError(f"the emulator stopped: {device.error}") from device.error

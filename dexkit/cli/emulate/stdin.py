@@ -11,7 +11,10 @@ from dexkit.errors import DexkitError
 from dexkit.stop_signals import StopRequest
 from dexkit.threads import Worker
 
-__all__ = ["A_MISTAKE", "read_faults"]
+__all__ = ["A_MISTAKE", "STDIN", "read_faults"]
+
+STDIN = "-"
+"""The value of an option whose values are lines of standard input."""
 
 A_MISTAKE = "this is a mistake in dexkit; what was sent is in the log above: please report it"
 

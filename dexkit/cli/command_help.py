@@ -1,10 +1,12 @@
-"""Commands whose help ends with their exit codes."""
+"""Commands whose help lists their settings and ends with their exit codes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import click
+
+from dexkit.cli.settings import SettingsOption
 
 __all__ = ["Command"]
 
@@ -27,6 +29,16 @@ class Command(click.Command):
     ) -> None:
         super().__init__(*args, **attributes)  # type: ignore[arg-type]
         self.exit_codes = {**_USUAL, **(exit_codes or {})}
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, and the settings of ``--set``."""
+        super().format_options(ctx, formatter)
+        for option in self.params:
+            if isinstance(option, SettingsOption):
+                with formatter.section("Settings (--set)"):
+                    formatter.write_dl(
+                        [(f"{s.key}={s.value}", s.description) for s in option.known]
+                    )
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the exit codes."""
