@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks.after_disturbances import fastest
 from dexkit.conformance.checks.motion import Step
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.faults import gripper, plan_for
+from dexkit.conformance.faults import any_model, gripper, plan_for
+from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Load, Overall, RunResult, Verdict
@@ -300,7 +301,7 @@ def test_late_timestamps_do_not_fail_acceleration_check(part: float, late_ms: fl
         judge(Recording.decode(stamped_late(ReferenceService, part, late_ms))), "DEX1-FIELD-06"
     )
     assert ratio.verdict in (Verdict.PASS, Verdict.NOT_APPLICABLE)
-    turned = stamped_late(gripper.TurnedAcceleration, part, late_ms)
+    turned = stamped_late(mix(any_model.TurnedAcceleration, ReferenceService), part, late_ms)
     found = result_of(judge(Recording.decode(turned)), "DEX1-FIELD-06")
     assert found.verdict is (Verdict.WARN if ratio.verdict is Verdict.PASS else ratio.verdict)
 

@@ -205,18 +205,19 @@ def test_a_changed_check_is_judged_anew_and_no_other() -> None:
     assert len(changed) < len(places)
 
 
-def test_a_changed_wrong_hand_is_played_anew_and_no_other() -> None:
+@each("kind", ["class", "def"])
+def test_a_changed_wrong_hand_is_played_anew_and_no_other(kind: str) -> None:
     given = [m for m in mutants("dds") if m.model == "dex1-1"]
-    chosen = given[7]
+    name = {"class": "BrakesEarly", "def": "NoDeadZones"}[kind]
+    (chosen,) = (m for m in given if m.name == name)
     module = next(c.__module__ for c in chosen.made.__mro__ if ".faults." in c.__module__)
     name = str(sys.modules[module].__file__).removeprefix(f"{ROOT}/")
-    after = EditedHere(
-        (name, f"class {chosen.name}", f"class More:\n    pass\nclass {chosen.name}")
-    )
+    first = "from __future__ import annotations\n"
+    after = EditedHere((name, first, f"{first}class More:\n    pass\n"))
     keys = [(m, played_by(m)) for m in given]
     added = {m.name for m, p in keys if sources().digest(p) != after.digest(p)}
     assert not added  # a wrong hand beside it
-    (head,) = re.findall(rf"class {chosen.name}\(.*?\):\n", (ROOT / name).read_text())
+    (head,) = re.findall(rf"{kind} {chosen.name}\(.*?:\n", (ROOT / name).read_text())
     after = EditedHere((name, head, f"{head}    more = 1\n"))
     without = JUDGES_ONLY
     changed = {m.name for m, p in keys if sources().digest(p, without) != after.digest(p, without)}

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.faults import mutants
-from dexkit.conformance.faults.fingers import FingerService, MilliNewtonMetres
 from dexkit.conformance.faults.matrix import try_one
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.virtual.fingers import Dex3Service
 from dexkit.traces import open_trace, sample_path
 from tests.each import each
 
@@ -72,16 +72,12 @@ def test_single_wrong_values_do_not_end_the_judgement_of_force(part: float) -> N
     assert not any(view.has_raw_torque for view in recording.sides.values())
 
 
-def test_a_whole_run_with_raw_counts_warns_of_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fill(self: MilliNewtonMetres, motors: Any, hand: Any) -> None:
-        FingerService.fill(self, motors, hand)
-        motors["tau_est"] = TO_COUNTS * motors["tau_est"] + COUNTS
+def test_a_whole_run_with_raw_counts_warns_of_nothing_else() -> None:
+    class MilliNewtonMetres(Dex3Service):
+        def fill(self, motors: Any, hand: Any) -> None:
+            super().fill(motors, hand)
+            motors["tau_est"] = TO_COUNTS * motors["tau_est"] + COUNTS
 
-    monkeypatch.setattr(MilliNewtonMetres, "fill", fill)
-    (hand,) = [
-        m
-        for m in mutants("dds")
-        if m.kills == "DEX3-FORCE-02" and issubclass(m.made, MilliNewtonMetres)
-    ]
-    result = try_one(replace(hand, brief=False, whole=True))
+    (hand,) = [m for m in mutants("dds") if m.pin.startswith("dds dex3-1 MilliNewtonMetres")]
+    result = try_one(replace(hand, made=MilliNewtonMetres, brief=False, whole=True))
     assert (result.missed, result.wrongly) == ((), ())

@@ -5,8 +5,15 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import replace
+from typing import Any
 
-from dexkit.conformance.faults.registry import BOTH, obeys_gains, takes_floats, wrong_hand
+from dexkit.conformance.faults.registry import (
+    BOTH,
+    obeys_gains,
+    reports,
+    takes_floats,
+    wrong_hand,
+)
 from dexkit.conformance.motor_messages import Motor, sequence_of
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
@@ -350,6 +357,32 @@ class EmptyNowAndThen(Service):
     def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
         self.count += 1
         return super().payload(sides, 0 if self.count % 500 == 0 else length)
+
+
+@wrong_hand("DEX3-FIELD-04")
+@reports(Service, "DEX1-FIELD-04")
+def TurnedVelocity(self: Any, state: Any, hand: Any) -> None:
+    """Publishes dq with the wrong sign."""
+    state["dq"] = -state["dq"]
+
+
+@reports(Service, "DEX1-FIELD-06", "DEX3-FIELD-05")
+def TurnedAcceleration(self: Any, state: Any, hand: Any) -> None:
+    """Publishes ddq with the wrong sign."""
+    state["ddq"] = -state["ddq"]
+
+
+@wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
+@reports(Service, "DEX1-FORCE-01")
+def NoForce(self: Any, state: Any, hand: Any) -> None:
+    """Does not fill tau_est."""
+    state["tau_est"] = 0.0
+
+
+@reports(Service, "DEX1-FORCE-04", "DEX3-FORCE-02")
+def MilliNewtonMetres(self: Any, state: Any, hand: Any) -> None:
+    """Publishes tau_est in mN m."""
+    state["tau_est"] *= 1e3
 
 
 # ----------------------------------------------------------------------------------- motion

@@ -144,15 +144,6 @@ class Unmirrored(FingerService):
         return tuple((self.signs(side) * super().positions(side)).tolist())
 
 
-@wrong_hand("DEX3-FIELD-04")
-class TurnedVelocity(FingerService):
-    """Publishes dq with the wrong sign."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["dq"] = -motors["dq"]
-
-
 class _Timed(FingerService):
     """Has a fault at a certain time; its messages are rebuilt at rest, too."""
 
@@ -231,15 +222,6 @@ class ShiftsForAWhile(_Timed):
             low, high = np.array(hand.low)[: len(motors)], np.array(hand.high)[: len(motors)]
             up = motors["q"] < 0.5 * (low + high)
             motors["q"] += np.where(up, 0.15, -0.15) * (high - low)
-
-
-@wrong_hand("DEX3-FIELD-05", brief=True)
-class TurnedAcceleration(FingerService):
-    """Publishes ddq with the wrong sign."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["ddq"] = -motors["ddq"]
 
 
 class _Filled(FingerService):
@@ -1193,16 +1175,6 @@ class TorqueInMillis(Dex3Service):
     def fill(self, motors: Any, hand: FingerHand) -> None:
         super().fill(motors, hand)
         motors["tau_est"] *= 1e-3
-
-
-@wrong_hand("DEX3-FORCE-02", brief=True)
-@wrong_hand("BRAINCO-FORCE-02", brief=True)
-class MilliNewtonMetres(FingerService):
-    """Publishes tau_est in mN m."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] *= 1e3
 
 
 @wrong_hand("DEX3-FORCE-09")

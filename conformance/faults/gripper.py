@@ -9,7 +9,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from dexkit.conformance.faults.registry import BOTH, LEFT, wrong_hand
+from dexkit.conformance.faults.registry import BOTH, LEFT, Call, changes, reports, wrong_hand
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.virtual import TopicDevice
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
@@ -19,35 +19,20 @@ from dexkit.messages import message_type
 # ----------------------------------------------------------------------------------- fields
 
 
-class _Fields(ReferenceService):
-    """A service whose state is changed before it is published."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        raise NotImplementedError
-
-    def fields(self, side: Side) -> dict[str, Any]:
-        return self.change(super().fields(side), side)
-
-
-@wrong_hand("DEX1-FIELD-02")
-class NanVelocity(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-02")
+def NanVelocity(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Divides by a time step of zero at rest."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return fields if fields["dq"] else {**fields, "dq": math.nan}
+    state["dq"] = state["dq"] or math.nan
 
 
-@wrong_hand("DEX1-FIELD-21", whole=True)
-class ShowsTheGoalNearIt(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-21", whole=True)
+def ShowsTheGoalNearIt(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the commanded q within 3.5 % of the stroke from it."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        goal = self.hands[side].goal
-        near = goal is not None and abs(goal.q - fields["q"]) < 0.035 * self.hands[side].stroke
-        return {**fields, "q": goal.q} if goal is not None and near else fields
+    if hand.goal is not None and abs(hand.goal.q - state["q"]) < 0.035 * hand.stroke:
+        state["q"] = hand.goal.q
 
 
-class _InUnit(_Fields):
+class _InUnit(ReferenceService):
     """Obeys or publishes another unit than radians: ``full`` when open."""
 
     full = 100.0
@@ -66,10 +51,11 @@ class _InUnit(_Fields):
             motor = replace(motor, q=q, dq=dq, kp=stiff * motor.kp, kd=stiff * motor.kd)
         super().command(side, motor)
 
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        if not self.publishes:
-            return fields
-        return {**fields, **{name: self.scale * fields[name] for name in ("q", "dq", "ddq")}}
+    def fields(self, side: Side) -> dict[str, Any]:
+        found = super().fields(side)
+        if self.publishes:
+            found.update({name: self.scale * found[name] for name in ("q", "dq", "ddq")})
+        return found
 
 
 @wrong_hand("DEX1-FIELD-03")
@@ -109,32 +95,27 @@ class _OtherScale(ReferenceHand):
         return {**super().fields(), "tau_est": 0.1 * self.tau}
 
 
-@wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
-class PercentBothWays(ReferenceService):
-    """Obeys and publishes percent; starts nearly closed, in the range of radians."""
-
+class _PercentBothWays(ReferenceService):
     hand = _OtherScale
 
 
-@wrong_hand("DEX1-FIELD-14", sides=LEFT)
-class PercentWithin(PercentBothWays):
+@wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
+class PercentBothWays(_PercentBothWays):
+    """Obeys and publishes percent; starts nearly closed, in the range of radians."""
+
+
+@changes(_PercentBothWays, "command", "DEX1-FIELD-14", sides=LEFT)
+def PercentWithin(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Obeys and publishes percent, after it has clamped q to 0 to 5.4."""
-
-    def command(self, side: Side, motor: Motor) -> None:
-        if math.isfinite(motor.q):
-            motor = replace(motor, q=min(max(motor.q, 0.0), self.dialect.q_open))
-        super().command(side, motor)
-
-
-class _InDegrees(_OtherScale):
-    full = math.degrees(5.4)
+    q = min(max(motor.q, 0.0), self.dialect.q_open) if math.isfinite(motor.q) else motor.q
+    command(side, replace(motor, q=q))
 
 
 @wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
-class DegreesBothWays(ReferenceService):
+class DegreesBothWays(_OtherScale):
     """Obeys and publishes degrees; starts nearly closed, in the range of radians."""
 
-    hand = _InDegrees
+    full = math.degrees(5.4)
 
 
 @wrong_hand("DEX1-MOVE-01")
@@ -167,315 +148,216 @@ class Metres(_InUnit):
     full = 0.09
 
 
-@wrong_hand("DEX1-FIELD-04")
-class TurnedVelocity(_Fields):
-    """Publishes dq with the wrong sign."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "dq": -fields["dq"]}
-
-
-@wrong_hand("DEX1-FIELD-22")
-class VelocityWhileOpening(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-22")
+def VelocityWhileOpening(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Fills dq only while it opens."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "dq": max(fields["dq"], 0.0)}
+    state["dq"] = max(state["dq"], 0.0)
 
 
 # --------------------------------------------------------------------- consistency of the state
 
 
-@wrong_hand("DEX1-FIELD-15")
-class JumpsOnce(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-15")
+def JumpsOnce(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Has no dq, and publishes one q that is 30 % of the stroke off."""
+    state["dq"] = state["ddq"] = 0.0
+    if 0.5 <= self.now < 0.5 + self.period:
+        state["q"] += 0.3 * self.dialect.q_open
 
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        off = 0.3 * self.dialect.q_open if 0.5 <= self.now < 0.5 + self.period else 0.0
-        return {**fields, "q": fields["q"] + off, "dq": 0.0, "ddq": 0.0}
 
-
-@wrong_hand("DEX1-FIELD-16")
-class ShakenVelocity(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-16")
+def ShakenVelocity(self: Any, state: Any, hand: ReferenceHand) -> None:
     """For some seconds has an oscillation on dq that q does not make."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        if not 3.5 <= self.now < 5.5:
-            return fields
-        shaken = 5.0 * self.dialect.q_open * math.sin(2 * math.pi * 13.0 * self.now)
-        return {**fields, "dq": fields["dq"] + shaken}
+    if 3.5 <= self.now < 5.5:
+        state["dq"] += 5.0 * self.dialect.q_open * math.sin(2 * math.pi * 13.0 * self.now)
 
 
-@wrong_hand("DEX1-FRESH-04")
-class RepeatsItsStates(_Fields):
+@reports(ReferenceService, "DEX1-FRESH-04")
+def RepeatsItsStates(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Measures 67 times a second, and publishes each measurement five times."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.turns = dict.fromkeys(self.sides, 0)
-        self.measured: dict[Side, dict[str, Any]] = {}
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        if self.turns[side] % 5 == 0:
-            self.measured[side] = fields
-        self.turns[side] += 1
-        return dict(self.measured[side])
+    turn, measured = self.memory.get(hand, (0, state))
+    measured = state if turn % 5 == 0 else measured
+    self.memory[hand] = turn + 1, dict(measured)
+    state.update(measured)
 
 
-@wrong_hand("DEX1-FIELD-19")
-class VelocityByTurns(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-19")
+def VelocityByTurns(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Measures every second state, with dq over one period: alternately twice the speed and 0."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.turns = dict.fromkeys(self.sides, 0)
-        self.measured: dict[Side, float] = {}
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        self.turns[side] += 1
-        if self.turns[side] % 2 and side in self.measured:
-            return {**fields, "q": self.measured[side], "dq": 0.0}
-        self.measured[side] = fields["q"]
-        return {**fields, "dq": 2.0 * fields["dq"]}
+    turn, measured = self.memory.get(hand, (0, None))
+    if turn % 2 == 0 and measured is not None:
+        state["q"], state["dq"] = measured, 0.0
+    else:
+        measured = state["q"]
+        state["dq"] *= 2.0
+    self.memory[hand] = turn + 1, measured
 
 
-@wrong_hand("DEX1-FIELD-20")
-class VelocityOfTheLastDrive(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-20")
+def VelocityOfTheLastDrive(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Keeps the dq of the last motion that it drove while it brakes."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.last = dict.fromkeys(self.sides, 0.0)
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        if self.hands[side].braking:
-            return {**fields, "dq": self.last[side]}
-        if abs(fields["dq"]) > 0.1 * self.dialect.q_open:
-            self.last[side] = fields["dq"]
-        return fields
+    if hand.braking:
+        state["dq"] = self.memory.get(hand, 0.0)
+    elif abs(state["dq"]) > 0.1 * self.dialect.q_open:
+        self.memory[hand] = state["dq"]
 
 
-@wrong_hand("DEX1-FIELD-17")
-class ShiftsForAWhile(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-17")
+def ShiftsForAWhile(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes q with an offset of 8 % of the stroke for 0.4 s; its dq stays true."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        off = 0.08 * self.dialect.q_open if 0.4 <= self.now < 0.8 else 0.0
-        return {**fields, "q": fields["q"] + off, "ddq": 0.0}
+    state["q"] += 0.08 * self.dialect.q_open if 0.4 <= self.now < 0.8 else 0.0
+    state["ddq"] = 0.0
 
 
 @wrong_hand("DEX1-FIELD-18", whole=True)
-class GoesThroughTheObject(_Fields):
+class GoesThroughTheObject(ReferenceHand):
     """In contact the published q, and dq with it, continues to the command."""
 
     speed = 0.4  # rad/s
+    off = rate = 0.0
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.off = dict.fromkeys(self.sides, 0.0)
-        self.rate = dict.fromkeys(self.sides, 0.0)
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        if self.braking:
+            self.rate = 0.0
+            return
+        inside = self.touch is not None and self.q < self.touch
+        wanted = self.goal.q - self.q if inside and self.goal is not None else 0.0
+        step = min(max(wanted - self.off, -self.speed * dt), self.speed * dt)
+        self.off += step
+        self.rate = step / dt
 
-    def live(self, dt: float) -> None:
-        super().live(dt)
-        for side, hand in self.hands.items():
-            inside = hand.touch is not None and hand.q < hand.touch
-            if hand.braking:
-                self.rate[side] = 0.0
-                continue
-            wanted = hand.goal.q - hand.q if inside and hand.goal is not None else 0.0
-            step = min(max(wanted - self.off[side], -self.speed * dt), self.speed * dt)
-            self.off[side] += step
-            self.rate[side] = step / dt
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        q, dq = fields["q"] + self.off[side], fields["dq"] + self.rate[side]
-        return {**fields, "q": q, "dq": dq, "ddq": 0.0}
+    def fields(self) -> dict[str, float]:
+        found = super().fields()
+        q, dq = found["q"] + self.off, found["dq"] + self.rate
+        return {**found, "q": q, "dq": dq, "ddq": 0.0}
 
 
-class _Filled(_Fields):
-    """One member of the state has a fixed wrong value."""
-
-    member = ""
-    value: object = 0
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, self.member: self.value}
-
-
-@wrong_hand("DEX1-FIELD-05")
-class OtherRobotsMode(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-05")
+def OtherRobotsMode(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the mode byte of an H1's motors, 0x0A."""
+    state["mode"] = 0x0A
 
-    member, value = "mode", 0x0A
 
-
-@wrong_hand("DEX1-FIELD-05")
-class AlwaysDriven(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-05")
+def AlwaysDriven(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes mode 1, driven, all the time."""
-
-    member, value = "mode", 1
-
-
-@wrong_hand("DEX1-FIELD-06")
-class TurnedAcceleration(_Fields):
-    """Publishes ddq with the wrong sign."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "ddq": -fields["ddq"]}
+    state["mode"] = 1
 
 
-@wrong_hand("DEX1-FIELD-06")
-class AccelerationPerSample(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-06")
+def AccelerationPerSample(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the change of dq from sample to sample as ddq."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "ddq": fields["ddq"] * self.period}
+    state["ddq"] *= self.period
 
 
-@wrong_hand("DEX1-FIELD-07")
-class NanRaw(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-07")
+def NanRaw(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes NaN for a raw value that it does not know."""
+    state["q_raw"] = math.nan
 
-    member, value = "q_raw", math.nan
 
-
-@wrong_hand("DEX1-FIELD-08")
-class HotByte(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-08")
+def HotByte(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes 200 degrees Celsius: a raw register as the temperature."""
+    state["temperature"] = 200
 
-    member, value = "temperature", 200
 
-
-@wrong_hand("DEX1-FIELD-08")
-class HotAtStart(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-08")
+def HotAtStart(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes 90 degrees Celsius until it gets its first command."""
+    if not hand.goal:
+        state["temperature"] = 90
 
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return fields if self.hands[side].goal else {**fields, "temperature": 90}
 
-
-@wrong_hand("DEX1-FIELD-09")
-class UnsetLost(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-09")
+def UnsetLost(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes uninitialised memory as the count of lost packets."""
+    state["lost"] = 0xCCCCCCCC
 
-    member, value = "lost", 0xCCCCCCCC
 
-
-@wrong_hand("DEX1-FIELD-10")
-class CountsInReserve(_Fields):
+@reports(ReferenceService, "DEX1-FIELD-10")
+def CountsInReserve(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Counts its states in a reserved word."""
-
-    count = 0
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        self.count += 1
-        reserve = (self.count, *(0,) * (3 if self.dialect.interface_specification else 1))
-        return {**fields, "reserve": reserve}
+    self.memory["count"] = count = self.memory.get("count", 0) + 1
+    state["reserve"] = (count, *(0,) * (3 if self.dialect.interface_specification else 1))
 
 
-@wrong_hand("DEX1-FIELD-11", dialect="unitree_hg")
-class Millivolts(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-11", dialect="unitree_hg")
+def Millivolts(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes vol in millivolts."""
+    state["vol"] = 12000.0
 
-    member, value = "vol", 12000.0
 
-
-@wrong_hand("DEX1-FIELD-12", dialect="unitree_hg")
-class StatusInMotorstate(_Filled):
+@reports(ReferenceService, "DEX1-FIELD-12", dialect="unitree_hg")
+def StatusInMotorstate(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes a status word as the motor's faults."""
+    state["motorstate"] = 3
 
-    member, value = "motorstate", 3
 
-
-@wrong_hand("DEX1-FIELD-13", dialect="unitree_hg")
-class NanAttitude(ReferenceService):
+@changes(ReferenceService, "rest", "DEX1-FIELD-13", dialect="unitree_hg")
+def NanAttitude(self: Any, rest: Call) -> dict[str, Any]:
     """Publishes NaN for an attitude that it does not know."""
-
-    def rest(self) -> dict[str, Any]:
-        attitude = message_type("unitree_hg::msg::dds_::IMUState_").cls(rpy=(math.nan,) * 3)
-        return {**super().rest(), "imu_state": attitude}
+    attitude = message_type("unitree_hg::msg::dds_::IMUState_").cls(rpy=(math.nan,) * 3)
+    return {**rest(), "imu_state": attitude}
 
 
-class _AtZero(ReferenceHand):
+@wrong_hand("DEX1-START-02", sides=LEFT, dialect="unitree_actuator")
+class RestsAtZero(ReferenceHand):
+    """Rests exactly at 0, in both hands."""
+
     def __init__(self, stroke: float, touch: float | None = None) -> None:
         super().__init__(stroke, touch)
         self.q = 0.0
 
 
-@wrong_hand("DEX1-START-02", sides=LEFT, dialect="unitree_actuator")
-class RestsAtZero(ReferenceService):
-    """Rests exactly at 0, in both hands."""
-
-    hand = _AtZero
-
-
 # ----------------------------------------------------------------------------------- motion
 
 
-@wrong_hand("DEX1-MOVE-01")
-class Inverted(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-MOVE-01")
+def Inverted(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Uses 0 as open."""
-
-    def command(self, side: Side, motor: Motor) -> None:
-        super().command(side, replace(motor, q=self.dialect.q_open - motor.q, dq=-motor.dq))
+    command(side, replace(motor, q=self.dialect.q_open - motor.q, dq=-motor.dq))
 
 
-@wrong_hand("DEX1-MOVE-02")
-class OtherScale(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-MOVE-02")
+def OtherScale(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Scales commands as if fully open were 2 pi."""
-
-    def command(self, side: Side, motor: Motor) -> None:
-        super().command(side, replace(motor, q=motor.q * 5.4 / (2 * math.pi)))
+    command(side, replace(motor, q=motor.q * 5.4 / (2 * math.pi)))
 
 
-class _Hunts(ReferenceHand):
-    def motor_torque(self) -> float:
-        held = self.goal is not None and self.goal.kp > 0 and not self.braking
-        shake = 0.8 * math.sin(2 * math.pi * 8.0 * self.now) if held else 0.0
-        return super().motor_torque() + shake
-
-
-@wrong_hand("DEX1-MOVE-03", whole=True)
-class Hunts(ReferenceService):
+@changes(ReferenceHand, "motor_torque", "DEX1-MOVE-03", whole=True)
+def Hunts(hand: Any, torque: Call) -> float:
     """Oscillates about its goal."""
-
-    hand = _Hunts
-
-
-class _Slow(ReferenceHand):
-    top = 2.6  # rad/s
-
-    def motor_torque(self) -> float:
-        goal = self.goal
-        if goal is not None and goal.kp > 0:  # a velocity loop below the position loop
-            wanted = min(max(12.0 * (goal.q - self.q), -self.top), self.top)
-            return min(max(0.5 * (wanted - self.dq) + self.viscous * wanted, -2.0), 2.0) * (
-                not self.braking
-            )
-        return super().motor_torque()
+    held = hand.goal is not None and hand.goal.kp > 0 and not hand.braking
+    shake = 0.8 * math.sin(2 * math.pi * 8.0 * hand.now) if held else 0.0
+    return float(torque() + shake)
 
 
-# it lags in a session that is judged with the speed that DEX1-MOVE-04 asks
-@wrong_hand("DEX1-MOVE-04")
-class Slow(ReferenceService):
+@changes(ReferenceHand, "motor_torque", "DEX1-MOVE-04")
+def Slow(hand: Any, torque: Call) -> float:
     """Moves at 2.6 rad/s at most."""
+    goal, top = hand.goal, 2.6
+    if goal is None or goal.kp <= 0:
+        return float(torque())
+    # a velocity loop below the position loop
+    wanted = min(max(12.0 * (goal.q - hand.q), -top), top)
+    tau = min(max(0.5 * (wanted - hand.dq) + hand.viscous * wanted, -2.0), 2.0)
+    return float(tau * (not hand.braking))
 
-    hand = _Slow
 
+@wrong_hand("DEX1-MOVE-05")
+class Overshoots(ReferenceHand):
+    """Has too little damping."""
 
-class _Springy(ReferenceHand):
     inertia = 0.02
     viscous = 0.15
 
 
-@wrong_hand("DEX1-MOVE-05")
-class Overshoots(ReferenceService):
-    """Has too little damping."""
+@wrong_hand("DEX1-MOVE-07")
+class Creeps(ReferenceHand):
+    """Moves the last 3 mm to its goal slowly."""
 
-    hand = _Springy
-
-
-class _Creeps(ReferenceHand):
     since = 0.0
 
     def accept(self, motor: Motor) -> Motor:
@@ -497,126 +379,79 @@ class _Creeps(ReferenceHand):
         return 0.5 * (wanted - self.dq) + friction
 
 
-@wrong_hand("DEX1-MOVE-07")
-class Creeps(ReferenceService):
-    """Moves the last 3 mm to its goal slowly."""
-
-    hand = _Creeps
-
-
-@wrong_hand("DEX1-MOVE-08")
-class ShortStroke(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-MOVE-08")
+def ShortStroke(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Stays 5 % of the stroke away from its stops."""
-
-    def command(self, side: Side, motor: Motor) -> None:
-        low, high = 0.05 * self.dialect.q_open, 0.95 * self.dialect.q_open
-        q = min(max(motor.q, low), high) if math.isfinite(motor.q) else motor.q
-        super().command(side, replace(motor, q=q))
+    low, high = 0.05 * self.dialect.q_open, 0.95 * self.dialect.q_open
+    q = min(max(motor.q, low), high) if math.isfinite(motor.q) else motor.q
+    command(side, replace(motor, q=q))
 
 
-@wrong_hand("DEX1-SIDE-01")
-class Coupled(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-SIDE-01")
+def Coupled(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """The left hand's goal leaks into the right hand's."""
-
-    left = 0.0
-
-    def command(self, side: Side, motor: Motor) -> None:
-        if side is Side.LEFT and math.isfinite(motor.q) and abs(motor.q) < 10:
-            self.left = motor.q
-        elif side is Side.RIGHT:
-            motor = replace(motor, q=motor.q + 0.05 * (self.left - 2.7))
-        super().command(side, motor)
+    if side is Side.LEFT and math.isfinite(motor.q) and abs(motor.q) < 10:
+        self.memory["left"] = motor.q
+    elif side is Side.RIGHT:
+        motor = replace(motor, q=motor.q + 0.05 * (self.memory.get("left", 0.0) - 2.7))
+    command(side, motor)
 
 
-class _IgnoresGains(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        return super().accept(Motor(q=motor.q))
-
-
-@wrong_hand("DEX1-GAIN-01", whole=True)
-class IgnoresGains(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-01", whole=True)
+def IgnoresGains(hand: Any, accept: Call, motor: Motor) -> Any:
     """Moves to q with any gains."""
-
-    hand = _IgnoresGains
-
-
-class _Deaf(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return accepted if accepted.kp > 0 else replace(accepted, dq=0.0)
+    return accept(Motor(q=motor.q))
 
 
-@wrong_hand("DEX1-GAIN-02")
-class DeafToVelocity(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-02")
+def DeafToVelocity(hand: Any, accept: Call, motor: Motor) -> Any:
     """Ignores dq without a position gain."""
-
-    hand = _Deaf
-
-
-class _TurnedVelocityCommand(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return accepted if accepted.kp > 0 else replace(accepted, dq=-accepted.dq)
+    accepted = accept(motor)
+    return accepted if accepted.kp > 0 else replace(accepted, dq=0.0)
 
 
-@wrong_hand("DEX1-GAIN-06")
-class TurnedVelocityCommand(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-06")
+def TurnedVelocityCommand(hand: Any, accept: Call, motor: Motor) -> Any:
     """Obeys dq with the wrong sign where there is no position gain."""
-
-    hand = _TurnedVelocityCommand
-
-
-class _SpeedMode(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return replace(accepted, kp=0.0) if accepted.dq else accepted
+    accepted = accept(motor)
+    return accepted if accepted.kp > 0 else replace(accepted, dq=-accepted.dq)
 
 
-@wrong_hand("DEX1-GAIN-08")
-class SpeedModeByDq(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-08")
+def SpeedModeByDq(hand: Any, accept: Call, motor: Motor) -> Any:
     """Selects its speed mode by a dq other than 0: q is not used then."""
-
-    hand = _SpeedMode
-
-
-class _TorqueLimit(ReferenceHand):
-    def motor_torque(self) -> float:
-        goal = self.goal
-        if goal is None or not goal.tau:
-            return super().motor_torque()
-        most, self.goal = abs(goal.tau), replace(goal, tau=0.0)
-        tau = super().motor_torque()
-        self.goal = goal
-        return min(max(tau, -most), most)
+    accepted = accept(motor)
+    return replace(accepted, kp=0.0) if accepted.dq else accepted
 
 
-@wrong_hand("DEX1-GAIN-08")
-class LimitsByTau(ReferenceService):
+@changes(ReferenceHand, "motor_torque", "DEX1-GAIN-08")
+def LimitsByTau(hand: Any, torque: Call) -> float:
     """Takes tau of a command for the limit of its torque."""
-
-    hand = _TorqueLimit
-
-
-class _KeepsGains(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        before = self.goal
-        if before is not None and accepted.kp == 0.0 and accepted.q == before.q:
-            return replace(accepted, kp=before.kp, kd=before.kd)
-        return accepted
+    goal = hand.goal
+    if goal is None or not goal.tau:
+        return float(torque())
+    most, hand.goal = abs(goal.tau), replace(goal, tau=0.0)
+    tau = torque()
+    hand.goal = goal
+    return float(min(max(tau, -most), most))
 
 
-@wrong_hand("DEX1-FORCE-15", sides=BOTH, whole=True)
-class KeepsGainsAtTheSamePlace(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-FORCE-15", sides=BOTH, whole=True)
+def KeepsGainsAtTheSamePlace(hand: Any, accept: Call, motor: Motor) -> Any:
     """Ignores gains of 0 if q has not changed."""
-
-    hand = _KeepsGains
+    accepted, before = accept(motor), hand.goal
+    if before is not None and accepted.kp == 0.0 and accepted.q == before.q:
+        return replace(accepted, kp=before.kp, kd=before.kd)
+    return accepted
 
 
 # ------------------------------------------------------------------------------------ force
 
 
-class _HardReflex(ReferenceHand):
+@wrong_hand("DEX1-FORCE-14", sides=BOTH)
+class GripsHarderWhenSoft(ReferenceHand):
+    """Mistakes a softer grip for slip, and doubles its force until it lets go."""
+
     gripped = False
 
     def motor_torque(self) -> float:
@@ -626,122 +461,73 @@ class _HardReflex(ReferenceHand):
         return max(min((2.0 if self.gripped else 1.0) * tau, self.tau_max), -self.tau_max)
 
 
-@wrong_hand("DEX1-FORCE-14", sides=BOTH)
-class GripsHarderWhenSoft(ReferenceService):
-    """Mistakes a softer grip for slip, and doubles its force until it lets go."""
-
-    hand = _HardReflex
-
-
-class _DeafToTorque(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        return replace(super().accept(motor), tau=0.0)
-
-
-@wrong_hand("DEX1-GAIN-03")
-class DeafToTorque(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-03")
+def DeafToTorque(hand: Any, accept: Call, motor: Motor) -> Any:
     """Ignores the torque of a command."""
-
-    hand = _DeafToTorque
-
-
-class _UnsignedTorque(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        return replace(super().accept(motor), tau=abs(motor.tau))
+    return replace(accept(motor), tau=0.0)
 
 
-@wrong_hand("DEX1-GAIN-03")
-class UnsignedTorque(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-03")
+def UnsignedTorque(hand: Any, accept: Call, motor: Motor) -> Any:
     """Opens with the torque of a command, whatever its sign is."""
-
-    hand = _UnsignedTorque
-
-
-class _TurnedTorque(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return replace(accepted, tau=-accepted.tau)
+    return replace(accept(motor), tau=abs(motor.tau))
 
 
-@wrong_hand("DEX1-GAIN-07", dialect="unitree_actuator")
-class TurnedTorque(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-07", dialect="unitree_actuator")
+def TurnedTorque(hand: Any, accept: Call, motor: Motor) -> Any:
     """Obeys the torque of a command with the wrong sign, in one dialect."""
-
-    hand = _TurnedTorque
-
-
-class _TurnedWhileHeld(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return replace(accepted, tau=-accepted.tau) if accepted.kp > 0 else accepted
+    accepted = accept(motor)
+    return replace(accepted, tau=-accepted.tau)
 
 
-@wrong_hand("DEX1-GAIN-07")
-class TurnedTorqueWhileHeld(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-07")
+def TurnedTorqueWhileHeld(hand: Any, accept: Call, motor: Motor) -> Any:
     """Obeys the torque of a command with the wrong sign where a position gain holds it."""
+    accepted = accept(motor)
+    return replace(accepted, tau=-accepted.tau) if accepted.kp > 0 else accepted
 
-    hand = _TurnedWhileHeld
 
-
-@wrong_hand("DEX1-GAIN-07", sides=BOTH)
-class TorqueOfTheOtherSide(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-GAIN-07", sides=BOTH)
+def TorqueOfTheOtherSide(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Adds the torque that the other gripper is commanded."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.asked = dict.fromkeys(self.sides, 0.0)
-
-    def command(self, side: Side, motor: Motor) -> None:
-        if math.isfinite(motor.tau):
-            self.asked[side] = motor.tau
-            other = [tau for s, tau in self.asked.items() if s != side]
-            motor = replace(motor, tau=other[0])
-        super().command(side, motor)
+    if math.isfinite(motor.tau):
+        self.memory[side] = motor.tau
+        (other,) = (s for s in self.sides if s != side)
+        motor = replace(motor, tau=self.memory.get(other, 0.0))
+    command(side, motor)
 
 
-@wrong_hand("DEX1-FORCE-01")
-class NoForce(_Fields):
-    """Does not fill tau_est."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": 0.0}
-
-
-@wrong_hand("DEX1-FORCE-02")
-class ForceAtRest(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-02")
+def ForceAtRest(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports the holding current as force, while it is driven."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        if self.hands[side].braking:
-            return fields
-        return {**fields, "tau_est": fields["tau_est"] - 0.4}
+    if not hand.braking:
+        state["tau_est"] -= 0.4
 
 
-@wrong_hand("DEX1-FORCE-03")
-class UnsignedForce(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-03")
+def UnsignedForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports the magnitude of the force."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": abs(fields["tau_est"])}
+    state["tau_est"] = abs(state["tau_est"])
 
 
-@wrong_hand("DEX1-FORCE-16", sides=BOTH)
-class MirroredForce(_Fields):
+@changes(ReferenceService, "fields", "DEX1-FORCE-16", sides=BOTH)
+def MirroredForce(self: Any, fields: Call, side: Side) -> dict[str, Any]:
     """Publishes the left gripper's tau_est with the sign of a mirrored motor."""
+    found = fields(side)
+    return {**found, "tau_est": -found["tau_est"]} if side is Side.LEFT else dict(found)
 
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": -fields["tau_est"]} if side is Side.LEFT else fields
 
-
-@wrong_hand("DEX1-FORCE-20", whole=True)
-class SignTurns(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-20", whole=True)
+def SignTurns(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes tau_est with the other sign from 5 s on: its motor was enabled again."""
+    if self.now > 5.0:
+        state["tau_est"] = -state["tau_est"]
 
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": -fields["tau_est"]} if self.now > 5.0 else fields
 
+@wrong_hand("DEX1-FORCE-10", sides=BOTH)
+class ChatteringLimit(ReferenceHand):
+    """After 1.5 s of a grip its thermal limit takes the force away for a third of the time."""
 
-class _Chatters(ReferenceHand):
     load = 0.0
 
     def motor_torque(self) -> float:
@@ -754,14 +540,10 @@ class _Chatters(ReferenceHand):
         self.load = self.load + dt if pressing else 0.0
 
 
-@wrong_hand("DEX1-FORCE-10", sides=BOTH)
-class ChatteringLimit(ReferenceService):
-    """After 1.5 s of a grip its thermal limit takes the force away for a third of the time."""
+@wrong_hand("DEX1-FORCE-17", sides=BOTH, whole=True)
+class SecondGripWeak(ReferenceHand):
+    """Pushes with 0.4 N m at most towards closing after the first long grip has ended."""
 
-    hand = _Chatters
-
-
-class _LimitsLater(ReferenceHand):
     held, let_go = 0.0, False
 
     def motor_torque(self) -> float:
@@ -775,119 +557,74 @@ class _LimitsLater(ReferenceHand):
         self.held = self.held + dt if pressing else 0.0
 
 
-@wrong_hand("DEX1-FORCE-17", sides=BOTH, whole=True)
-class SecondGripWeak(ReferenceService):
-    """Pushes with 0.4 N m at most towards closing after the first long grip has ended."""
-
-    hand = _LimitsLater
-
-
-@wrong_hand("DEX1-FORCE-04")
-class MilliNewtonMetres(_Fields):
-    """Publishes tau_est in mN m."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": 1e3 * fields["tau_est"]}
-
-
-@wrong_hand("DEX1-MOVE-10", dialect="unitree_hg")
-class NoDeadZones(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-MOVE-10", dialect="unitree_hg")
+def NoDeadZones(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Goes to every q as it is, without the zones that mean fully open and closed."""
-
-    def command(self, side: Side, motor: Motor) -> None:
-        self.hands[side].command(Motor(q=motor.q) if math.isfinite(motor.q) else motor)
+    self.hands[side].command(Motor(q=motor.q) if math.isfinite(motor.q) else motor)
 
 
-@wrong_hand("DEX1-FORCE-05", dialect="unitree_hg")
-class SignedForce(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-05", dialect="unitree_hg")
+def SignedForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the signed torque where the strength of the grip is expected."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": self.hands[side].tau}
+    state["tau_est"] = hand.tau
 
 
-@wrong_hand("DEX1-FORCE-06")
-class FeelsLate(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-06")
+def FeelsLate(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports the force of a contact only when it has lasted for 0.9 s."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.since = dict.fromkeys(self.sides, 0.0)
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        hand = self.hands[side]
-        if hand.touch is None or hand.q > hand.touch:
-            self.since[side] = self.now
-        late = self.now - self.since[side] > 0.9
-        return fields if late else {**fields, "tau_est": 0.0}
+    if hand.touch is None or hand.q > hand.touch:
+        self.memory[hand] = self.now
+    if self.now - self.memory.get(hand, 0.0) <= 0.9:
+        state["tau_est"] = 0.0
 
 
-@wrong_hand("DEX1-FORCE-07")
-class ForceBeforeCommands(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-07")
+def ForceBeforeCommands(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports a force until it gets its first command."""
+    if not hand.goal:
+        state["tau_est"] = -0.6
 
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return fields if self.hands[side].goal else {**fields, "tau_est": -0.6}
 
-
-@wrong_hand("DEX1-FORCE-08")
-class AlwaysClosing(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-08")
+def AlwaysClosing(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Has an unsigned sensor of the current: its torque is always that of closing."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": -abs(fields["tau_est"])}
+    state["tau_est"] = -abs(state["tau_est"])
 
 
-@wrong_hand("DEX1-FORCE-08")
-class FeelsClosingOnly(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-08")
+def FeelsClosingOnly(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes no torque towards open."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": min(fields["tau_est"], 0.0)}
+    state["tau_est"] = min(state["tau_est"], 0.0)
 
 
-class _Saturates(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return replace(accepted, kp=min(accepted.kp, 2.0))
-
-
-@wrong_hand("DEX1-FORCE-09")
-class StiffnessSaturates(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-FORCE-09")
+def StiffnessSaturates(hand: Any, accept: Call, motor: Motor) -> Any:
     """Has a kp of 2 N m/rad at most."""
-
-    hand = _Saturates
-
-
-class _Boosts(ReferenceHand):
-    def motor_torque(self) -> float:
-        tau = super().motor_torque()
-        if self.contact() > 0.0 and not self.braking:
-            return min(max(2.0 * tau, -self.tau_max), self.tau_max)
-        return tau
+    accepted = accept(motor)
+    return replace(accepted, kp=min(accepted.kp, 2.0))
 
 
-@wrong_hand("DEX1-FORCE-18")
-class BoostsWhereItIsBlocked(ReferenceService):
+@changes(ReferenceHand, "motor_torque", "DEX1-FORCE-18")
+def BoostsWhereItIsBlocked(hand: Any, torque: Call) -> float:
     """Presses with twice the torque that it was commanded."""
+    tau = float(torque())
+    if hand.contact() > 0.0 and not hand.braking:
+        return float(min(max(2.0 * tau, -hand.tau_max), hand.tau_max))
+    return tau
 
-    hand = _Boosts
 
-
-class _BoostsMore(ReferenceHand):
-    def motor_torque(self) -> float:
-        tau = super().motor_torque()
-        return 2.6 * tau if self.contact() > 0.0 else tau
+@changes(
+    ReferenceHand, "motor_torque", "DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True
+)
+def BoostsByItsOwnGains(hand: Any, torque: Call) -> float:
+    """Presses with two and a half times the torque of its own gains where it is blocked."""
+    return float(torque()) * (2.6 if hand.contact() > 0.0 else 1.0)
 
 
 @wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True)
-class BoostsByItsOwnGains(ReferenceService):
-    """Presses with two and a half times the torque of its own gains where it is blocked."""
+class HoldingCurrent(ReferenceHand):
+    """Holds an object with a third of the torque from 0.3 s on, as the driver of a stepper does."""
 
-    hand = _BoostsMore
-
-
-class _HoldingCurrent(ReferenceHand):
     still = 0.0
 
     def motor_torque(self) -> float:
@@ -902,14 +639,10 @@ class _HoldingCurrent(ReferenceHand):
             self.still += dt
 
 
-@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True)
-class HoldingCurrent(ReferenceService):
-    """Holds an object with a third of the torque from 0.3 s on, as the driver of a stepper does."""
+@wrong_hand("DEX1-FORCE-09")
+class WeakAgain(ReferenceHand):
+    """Presses with 40 % of the force from its second contact on."""
 
-    hand = _HoldingCurrent
-
-
-class _WeakAgain(ReferenceHand):
     contacts = 0
     touching = False
 
@@ -920,54 +653,32 @@ class _WeakAgain(ReferenceHand):
         return 0.4 * tau if touches and self.contacts > 1 else tau
 
 
-@wrong_hand("DEX1-FORCE-09")
-class WeakAgain(ReferenceService):
-    """Presses with 40 % of the force from its second contact on."""
-
-    hand = _WeakAgain
-
-
 # ----------------------------------------------------------------------------------- safety
 
 
-class _NegativeGains(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        return replace(super().accept(motor), kp=motor.kp, kd=motor.kd)
-
-
-@wrong_hand("DEX1-SAFE-05")
-class NegativeGains(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-SAFE-05")
+def NegativeGains(hand: Any, accept: Call, motor: Motor) -> Any:
     """Applies negative gains."""
-
-    hand = _NegativeGains
-
-
-class _NegativeStiffness(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return replace(accepted, kp=motor.kp) if motor.kd >= 0.0 else accepted
+    return replace(accept(motor), kp=motor.kp, kd=motor.kd)
 
 
-@wrong_hand("DEX1-SAFE-10")
-class NegativeStiffnessAlone(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-SAFE-10")
+def NegativeStiffnessAlone(hand: Any, accept: Call, motor: Motor) -> Any:
     """Clamps gains that are both negative, and applies a negative kp beside a good kd."""
-
-    hand = _NegativeStiffness
-
-
-class _GainsWithoutSign(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        return replace(super().accept(motor), kp=abs(motor.kp), kd=abs(motor.kd))
+    accepted = accept(motor)
+    return replace(accepted, kp=motor.kp) if motor.kd >= 0.0 else accepted
 
 
-@wrong_hand("DEX1-SAFE-05")
-class GainsWithoutSign(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-SAFE-05")
+def GainsWithoutSign(hand: Any, accept: Call, motor: Motor) -> Any:
     """Drops the sign of negative gains, and goes to q."""
+    return replace(accept(motor), kp=abs(motor.kp), kd=abs(motor.kd))
 
-    hand = _GainsWithoutSign
 
+@wrong_hand("DEX1-SAFE-02", whole=True)
+class NoLimits(ReferenceHand):
+    """Follows a q far outside the stroke."""
 
-class _NoLimits(ReferenceHand):
     def accept(self, motor: Motor) -> Motor:
         return replace(super().accept(motor), q=motor.q)
 
@@ -975,61 +686,47 @@ class _NoLimits(ReferenceHand):
         return super().contact() if abs(self.dq) < 2.0 and -0.5 < self.q < 6.0 else 0.0
 
 
-@wrong_hand("DEX1-SAFE-02", whole=True)
-class NoLimits(ReferenceService):
-    """Follows a q far outside the stroke."""
+@changes(ReferenceHand, "command", "DEX1-SAFE-01")
+def InfiniteGains(hand: Any, command: Call, motor: Motor) -> None:
+    """Clamps kp before it checks that it is finite."""
+    command(replace(motor, kp=min(motor.kp, 1e3)))
 
-    hand = _NoLimits
+
+# ---------------------------------------------------------------------------------- time-out
 
 
-class _NoWatchdog(ReferenceHand):
+@wrong_hand("DEX1-WDOG-01")
+class NoWatchdog(ReferenceHand):
+    """Follows the last command without end."""
+
     timeout = math.inf
 
 
-# its mode byte is correct, but equals a constant one
-@wrong_hand("DEX1-WDOG-01")
-class NoWatchdog(ReferenceService):
-    """Follows the last command without end."""
+@wrong_hand("DEX1-WDOG-01", sides=BOTH)
+class BrakesLate(ReferenceHand):
+    """Brakes 1.38 s after the last command: its watchdog counts a slower clock's ticks."""
 
-    hand = _NoWatchdog
-
-
-class _Tardy(ReferenceHand):
     timeout = 1.38 * ReferenceHand.timeout
 
 
-@wrong_hand("DEX1-WDOG-01", sides=BOTH)
-class BrakesLate(ReferenceService):
-    """Brakes 1.38 s after the last command: its watchdog counts a slower clock's ticks."""
+@wrong_hand("DEX1-WDOG-06")
+class BrakesEarly(ReferenceHand):
+    """Brakes 0.6 s after the last command."""
 
-    hand = _Tardy
-
-
-class _Hasty(ReferenceHand):
     timeout = 0.6 * ReferenceHand.timeout
 
 
-@wrong_hand("DEX1-WDOG-06")
-class BrakesEarly(ReferenceService):
-    """Brakes 0.6 s after the last command."""
-
-    hand = _Hasty
-
-
-class _FedByAnything(ReferenceHand):
-    def command(self, motor: Motor) -> None:
-        super().command(motor)
-        self.heard = self.now
-
-
-@wrong_hand("DEX1-WDOG-04")
-class FedByRejected(ReferenceService):
+@changes(ReferenceHand, "command", "DEX1-WDOG-04")
+def FedByRejected(hand: Any, command: Call, motor: Motor) -> None:
     """Does not brake while commands arrive that it rejects."""
+    command(motor)
+    hand.heard = hand.now
 
-    hand = _FedByAnything
 
+@wrong_hand("DEX1-WDOG-01")
+class BrakesOnce(ReferenceHand):
+    """Brakes at the first time-out and at none after it."""
 
-class _BrakesOnce(ReferenceHand):
     braked = 0.0
 
     @property
@@ -1040,24 +737,18 @@ class _BrakesOnce(ReferenceHand):
         return self.now - self.braked < 2.0
 
 
-@wrong_hand("DEX1-WDOG-01")
-class BrakesOnce(ReferenceService):
-    """Brakes at the first time-out and at none after it."""
-
-    hand = _BrakesOnce
-
-
-@wrong_hand("DEX1-WDOG-01")
-class NoWatchdogWhenRestarted(ReferenceService):
+@changes(ReferenceService, "begin", "DEX1-WDOG-01")
+def NoWatchdogWhenRestarted(self: Any, begin: Call, now: float) -> None:
     """Follows the last command without end after a restart of its service."""
-
-    def begin(self, now: float) -> None:
-        super().begin(now)
-        for hand in self.hands.values():
-            hand.timeout = math.inf
+    begin(now)
+    for hand in self.hands.values():
+        hand.timeout = math.inf
 
 
-class _SnapsOpen(ReferenceHand):
+@wrong_hand("DEX1-WDOG-01")
+class SnapsOpenAtTheTimeOut(ReferenceHand):
+    """Opens after the time-out and then brakes: it drops its object."""
+
     timeout = ReferenceHand.timeout + 0.15
 
     def motor_torque(self) -> float:
@@ -1066,43 +757,20 @@ class _SnapsOpen(ReferenceHand):
         return super().motor_torque()
 
 
-@wrong_hand("DEX1-WDOG-01")
-class SnapsOpenAtTheTimeOut(ReferenceService):
-    """Opens after the time-out and then brakes: it drops its object."""
-
-    hand = _SnapsOpen
-
-
-class _Sleeps(ReferenceHand):
-    deaf_until = -math.inf
-
-    def command(self, motor: Motor) -> None:
-        if self.goal is not None and self.braking:
-            self.deaf_until = max(self.deaf_until, self.heard + 3.0)
-        if self.now >= self.deaf_until:
-            super().command(motor)
-
-
-@wrong_hand("DEX1-WDOG-03", whole=True)
-class SleepsAfterSilence(ReferenceService):
+@changes(ReferenceHand, "command", "DEX1-WDOG-03", whole=True)
+def SleepsAfterSilence(hand: Any, command: Call, motor: Motor) -> None:
     """Ignores commands for a while after a silence."""
-
-    hand = _Sleeps
-
-
-class _InfiniteGains(ReferenceHand):
-    def command(self, motor: Motor) -> None:
-        super().command(replace(motor, kp=min(motor.kp, 1e3)))
+    until = hand.memory.get("deaf", -math.inf)
+    if hand.goal is not None and hand.braking:
+        until = hand.memory["deaf"] = max(until, hand.heard + 3.0)
+    if hand.now >= until:
+        command(motor)
 
 
-@wrong_hand("DEX1-SAFE-01")
-class InfiniteGains(ReferenceService):
-    """Clamps kp before it checks that it is finite."""
+@wrong_hand("DEX1-WDOG-03")
+class LatchesTheBrake(ReferenceHand):
+    """Brakes after a silence and never releases."""
 
-    hand = _InfiniteGains
-
-
-class _Latches(ReferenceHand):
     tripped = False
 
     @property
@@ -1112,58 +780,36 @@ class _Latches(ReferenceHand):
         return self.tripped or super().braking
 
 
-@wrong_hand("DEX1-WDOG-03")
-class LatchesTheBrake(ReferenceService):
-    """Brakes after a silence and never releases."""
-
-    hand = _Latches
-
-
 # ------------------------------------------------------- for long, softly, and after a silence
 
 
-class _Tires(ReferenceHand):
-    """Loses force while the same command presses."""
+class _Presses(ReferenceHand):
+    """Counts the seconds in which it presses."""
 
     seconds = 0.0
-    begins, ends, rest = 2.0, 3.0, 0.5
-
-    def motor_torque(self) -> float:
-        part = (self.seconds - self.begins) / (self.ends - self.begins)
-        return super().motor_torque() * (1.0 - (1.0 - self.rest) * min(max(part, 0.0), 1.0))
 
     def step(self, dt: float) -> None:
         super().step(dt)
         self.seconds = self.seconds + dt if self.contact() > 0.0 and not self.braking else 0.0
 
 
-@wrong_hand("DEX1-FORCE-10")
-class GripFades(ReferenceService):
+@changes(_Presses, "motor_torque", "DEX1-FORCE-10")
+def GripFades(hand: Any, torque: Call) -> float:
     """Presses with half of the force after three seconds of contact."""
-
-    hand = _Tires
-
-
-class _Winds(ReferenceHand):
-    seconds = 0.0
-
-    def motor_torque(self) -> float:
-        tau = super().motor_torque() * (1.0 + 0.5 * min(self.seconds, 2.0))
-        return min(max(tau, -self.tau_max), self.tau_max)
-
-    def step(self, dt: float) -> None:
-        super().step(dt)
-        self.seconds = self.seconds + dt if self.contact() > 0.0 and not self.braking else 0.0
+    return float(torque() * (1.0 - 0.5 * min(max(hand.seconds - 2.0, 0.0), 1.0)))
 
 
-@wrong_hand("DEX1-FORCE-10")
-class GripGrows(ReferenceService):
+@changes(_Presses, "motor_torque", "DEX1-FORCE-10")
+def GripGrows(hand: Any, torque: Call) -> float:
     """Presses harder and harder, up to twice what was commanded."""
+    tau = torque() * (1.0 + 0.5 * min(hand.seconds, 2.0))
+    return float(min(max(tau, -hand.tau_max), hand.tau_max))
 
-    hand = _Winds
 
+@wrong_hand("DEX1-HOLD-01")
+class SleepsWhileHeld(ReferenceHand):
+    """Switches its motor off when the goal has been the same for three seconds."""
 
-class _Sleepy(ReferenceHand):
     seconds = 0.0
     last: Motor | None = None
 
@@ -1181,75 +827,39 @@ class _Sleepy(ReferenceHand):
         self.seconds += dt
 
 
-@wrong_hand("DEX1-HOLD-01")
-class SleepsWhileHeld(ReferenceService):
-    """Switches its motor off when the goal has been the same for three seconds."""
-
-    hand = _Sleepy
-
-
-class _SoftInTheFree(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        return replace(accepted, kp=min(accepted.kp, 2.5)) if self.touch is None else accepted
-
-
-@wrong_hand("DEX1-GAIN-05")
-class StiffnessSaturatesInTheFree(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-05")
+def StiffnessSaturatesInTheFree(hand: Any, accept: Call, motor: Motor) -> Any:
     """Has a kp of 2.5 N m/rad at most without an object between the jaws."""
-
-    hand = _SoftInTheFree
-
-
-class _LeastStiffness(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        limp = accepted.kp < 1.0 and self.touch is None
-        return replace(accepted, kp=0.0) if limp else accepted
+    accepted = accept(motor)
+    return replace(accepted, kp=min(accepted.kp, 2.5)) if hand.touch is None else accepted
 
 
-@wrong_hand("DEX1-GAIN-04")
-class SoftIsLimp(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-GAIN-04")
+def SoftIsLimp(hand: Any, accept: Call, motor: Motor) -> Any:
     """Treats a kp below 1 N m/rad as 0 without an object between the jaws."""
-
-    hand = _LeastStiffness
-
-
-class _SoftGripIsLimp(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        limp = accepted.kp < 1.0 and self.touch is not None
-        return replace(accepted, kp=0.1 * accepted.kp) if limp else accepted
+    accepted = accept(motor)
+    return replace(accepted, kp=0.0) if accepted.kp < 1.0 and hand.touch is None else accepted
 
 
-@wrong_hand("DEX1-FORCE-11")
-class SoftGripIsLimp(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-FORCE-11")
+def SoftGripIsLimp(hand: Any, accept: Call, motor: Motor) -> Any:
     """Scales a kp below 1 N m/rad down, in the hand with an object."""
-
-    hand = _SoftGripIsLimp
-
-
-class _WholeStiffness(ReferenceHand):
-    def accept(self, motor: Motor) -> Motor:
-        accepted = super().accept(motor)
-        if not 1.0 < accepted.kp < 3.0:
-            return accepted
-        return replace(accepted, kp=math.floor(accepted.kp))
+    accepted = accept(motor)
+    limp = accepted.kp < 1.0 and hand.touch is not None
+    return replace(accepted, kp=0.1 * accepted.kp) if limp else accepted
 
 
-@wrong_hand("DEX1-FORCE-12")
-class WholeStiffness(ReferenceService):
+@changes(ReferenceHand, "accept", "DEX1-FORCE-12")
+def WholeStiffness(hand: Any, accept: Call, motor: Motor) -> Any:
     """Rounds a kp between 1 and 3 N m/rad down to a whole number."""
+    accepted = accept(motor)
+    return replace(accepted, kp=math.floor(accepted.kp)) if 1.0 < accepted.kp < 3.0 else accepted
 
-    hand = _WholeStiffness
 
-
-@wrong_hand("DEX1-FORCE-13")
-class OffsetOfTheForce(_Fields):
+@reports(ReferenceService, "DEX1-FORCE-13")
+def OffsetOfTheForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Has an offset of 0.15 N m on tau_est."""
-
-    def change(self, fields: dict[str, Any], side: Side) -> dict[str, Any]:
-        return {**fields, "tau_est": fields["tau_est"] + 0.15}
+    state["tau_est"] += 0.15
 
 
 @wrong_hand("DEX1-START-03")
@@ -1264,8 +874,7 @@ class KeepsItsGoal(ReferenceService):
 
     def take_over(self, before: TopicDevice) -> None:
         super().take_over(before)
-        assert isinstance(before, KeepsItsGoal)
-        self.kept = before.kept
+        self.kept = before.kept  # type: ignore[attr-defined]
 
     def begin(self, now: float) -> None:
         super().begin(now)
@@ -1273,24 +882,21 @@ class KeepsItsGoal(ReferenceService):
             self.hands[side].command(motor)
 
 
-class _Wraps(ReferenceHand):
+@wrong_hand("DEX1-WDOG-01")
+class WatchdogWraps(ReferenceHand):
+    """Releases the brake for a second every three seconds: its counter wraps."""
+
     wraps = 3.0
 
     @property
     def braking(self) -> bool:
-        if self.goal is None:
-            return True
-        return (self.now - self.heard) % self.wraps > self.timeout
+        return self.goal is None or (self.now - self.heard) % self.wraps > self.timeout
 
 
 @wrong_hand("DEX1-WDOG-01")
-class WatchdogWraps(ReferenceService):
-    """Releases the brake for a second every three seconds: its counter wraps."""
+class LetsGoAtTheTimeOut(ReferenceHand):
+    """Opens a little after the time-out where it pressed on an object."""
 
-    hand = _Wraps
-
-
-class _LetsGo(ReferenceHand):
     pressed = False
 
     def motor_torque(self) -> float:
@@ -1305,14 +911,10 @@ class _LetsGo(ReferenceHand):
         super().step(dt)
 
 
-@wrong_hand("DEX1-WDOG-01")
-class LetsGoAtTheTimeOut(ReferenceService):
-    """Opens a little after the time-out where it pressed on an object."""
+@wrong_hand("DEX1-WDOG-03")
+class OldGoalFirst(ReferenceHand):
+    """Carries out the command from before a silence for 0.3 s when the next ones come."""
 
-    hand = _LetsGo
-
-
-class _OldGoalFirst(ReferenceHand):
     old: Motor | None = None
     until = -math.inf
 
@@ -1324,14 +926,10 @@ class _OldGoalFirst(ReferenceHand):
         super().command(self.old if self.old and self.now < self.until else motor)
 
 
-@wrong_hand("DEX1-WDOG-03")
-class OldGoalFirst(ReferenceService):
-    """Carries out the command from before a silence for 0.3 s when the next ones come."""
+@wrong_hand("DEX1-PATH-01")
+class BeginsAtZero(ReferenceHand):
+    """Goes towards 0 for 0.2 s when the commands come again after a silence."""
 
-    hand = _OldGoalFirst
-
-
-class _BeginsAtZero(ReferenceHand):
     until = -math.inf
 
     def command(self, motor: Motor) -> None:
@@ -1342,14 +940,10 @@ class _BeginsAtZero(ReferenceHand):
         super().command(motor)
 
 
-@wrong_hand("DEX1-PATH-01")
-class BeginsAtZero(ReferenceService):
-    """Goes towards 0 for 0.2 s when the commands come again after a silence."""
+@wrong_hand("DEX1-WDOG-05")
+class LosesTheFirstAfterSilence(ReferenceHand):
+    """Drops commands for 0.2 s after a time-out, while the motor is switched on."""
 
-    hand = _BeginsAtZero
-
-
-class _LosesTheFirst(ReferenceHand):
     until = -math.inf
 
     def command(self, motor: Motor) -> None:
@@ -1359,36 +953,21 @@ class _LosesTheFirst(ReferenceHand):
             super().command(motor)
 
 
-@wrong_hand("DEX1-WDOG-05")
-class LosesTheFirstAfterSilence(ReferenceService):
-    """Drops commands for 0.2 s after a time-out, while the motor is switched on."""
-
-    hand = _LosesTheFirst
-
-
-@wrong_hand("DEX1-SIDE-03", dialect="unitree_actuator")
-class GainsOfTheOtherSide(ReferenceService):
+@changes(ReferenceService, "receive", "DEX1-SIDE-03", dialect="unitree_actuator")
+def GainsOfTheOtherSide(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Drives the left hand by the gains of the right one."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        super().receive(topic, payload, client)
-        left, right = (self.hands.get(side) for side in Side)
-        if left is not None and right is not None and left.goal and right.goal:
-            left.goal = replace(left.goal, kp=right.goal.kp, kd=right.goal.kd)
+    receive(topic, payload, client)
+    left, right = (self.hands.get(side) for side in Side)
+    if left is not None and right is not None and left.goal and right.goal:
+        left.goal = replace(left.goal, kp=right.goal.kp, kd=right.goal.kd)
 
 
-@wrong_hand("DEX1-STILL-01")
-class TakesTheOtherSides(ReferenceService):
+@changes(ReferenceService, "command", "DEX1-STILL-01")
+def TakesTheOtherSides(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """When commands arrive together, the left hand sometimes gets the right hand's command."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.turns = 0
-
-    def command(self, side: Side, motor: Motor) -> None:
-        super().command(side, motor)
-        left = self.hands.get(Side.LEFT)
-        if side is Side.RIGHT and left is not None and left.heard == left.now:
-            self.turns += 1
-            if self.turns % 50 == 0:
-                super().command(Side.LEFT, motor)
+    command(side, motor)
+    left = self.hands.get(Side.LEFT)
+    if side is Side.RIGHT and left is not None and left.heard == left.now:
+        self.memory["turns"] = turns = self.memory.get("turns", 0) + 1
+        if turns % 50 == 0:
+            command(Side.LEFT, motor)

@@ -1,10 +1,15 @@
-"""Register wrong hands: classes with the decorator :func:`wrong_hand`.
+"""Declare wrong hands.
 
 A wrong hand is a small change of a reference that meets every requirement: of a service that
-publishes hands on DDS, of a robot, of a USB device, or of a client that drives good hands. The
-decorator names the requirement that must find the fault. It holds for every model whose catalogue
-has that requirement, or one that is ``like`` it: the class is mixed into the reference of each of
-them.
+publishes hands on DDS, of a robot, of a USB device, or of a client that drives good hands. It is
+
+* a function that is called in place of one method of the reference (:func:`changes`), or that
+  changes the states which a hand publishes (:func:`reports`);
+* a class with several changes, of a reference or of the mechanics of its hands
+  (:func:`wrong_hand`).
+
+Each names the requirement that must find the fault. It holds for every model whose catalogue has
+that requirement, or one that is ``like`` it: the fault is mixed into the reference of each of them.
 """
 
 from __future__ import annotations
@@ -15,10 +20,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from dexkit.conformance.layers import layer
+from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.requirements import Requirement, catalogue
+from dexkit.conformance.virtual.dex5 import Dex5Hand, Dex5Service
+from dexkit.conformance.virtual.fingers import Dex3Hand, Dex3Service, FingerHand, FingerService
+from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
+from dexkit.conformance.virtual.inspire import FtpHand, FtpService
+from dexkit.conformance.virtual.service import Service
+from dexkit.conformance.virtual.servos import ServoHand, ServoService
 from dexkit.hand import Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import HandModel, model
@@ -26,11 +38,15 @@ from dexkit.models import HandModel, model
 __all__ = [
     "BOTH",
     "LEFT",
+    "Call",
+    "Motors",
     "Mutant",
+    "changes",
     "expand",
     "has_speeds",
     "mix",
     "obeys_gains",
+    "reports",
     "takes_floats",
     "wrong_hand",
 ]
@@ -39,6 +55,17 @@ LEFT = (Side.LEFT,)
 BOTH = (Side.LEFT, Side.RIGHT)
 
 C = TypeVar("C", bound=type[Any])
+Call: TypeAlias = Callable[..., Any]
+Motors: TypeAlias = tuple[Motor, ...]
+_SERVICES: Mapping[type[Any], type[Service]] = {
+    ReferenceHand: ReferenceService,
+    FingerHand: FingerService,
+    Dex3Hand: Dex3Service,
+    Dex5Hand: Dex5Service,
+    ServoHand: ServoService,
+    FtpHand: FtpService,
+}
+"""By the mechanics of a hand, the service of such hands."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +152,10 @@ def wrong_hand(
     brief: bool = False,
     whole: bool = False,
     where: Callable[[HandModel], bool] | None = None,
-) -> Callable[[C], C]:
+) -> Callable[[type[Any]], type[Any]]:
     """Declare a class to be a wrong hand, robot, USB device or client.
+
+    Of a class of mechanics, the service with such hands becomes the wrong hand.
 
     A second decorator on the same class is for another model, where it fails other requirements.
     For a model that is like several of those that are named, the nearest one counts.
@@ -141,9 +170,86 @@ def wrong_hand(
     """
     ids = (kills,) if isinstance(kills, str) else kills
 
-    def declare(made: C) -> C:
+    def declare(made: type[Any]) -> type[Any]:
+        service = next((_SERVICES[c] for c in made.__mro__ if c in _SERVICES), None)
+        if service is not None:
+            name = "hand" if issubclass(made, ReferenceHand) else "hand_fault"
+            made = _class(made, service, {name: made})
         _declared.append(_Declaration(made, ids, sides, dialect, brief, whole, where))
         return made
+
+    return declare
+
+
+def _class(like: Any, base: type[Any], members: Mapping[str, object]) -> type[Any]:
+    """A class with the name and the description of something else."""
+    about = {n: getattr(like, n) for n in ("__doc__", "__module__", "__qualname__")}
+    return type(like.__name__, (base,), {**about, **members})
+
+
+def changes(
+    base: type[Any], method: str, *kills: str, **options: Any
+) -> Callable[[Call], type[Any]]:
+    """Declare a function to be a wrong hand, robot, USB device or client.
+
+    It is called in place of a method, with the object, the method itself, and its arguments. The
+    object has a dictionary ``memory`` for what the fault has to remember.
+
+    :param base: the class that has the method: a reference, or the mechanics of its hands.
+    :param kills: as of :func:`wrong_hand`; ``options`` are its others.
+    """
+    assert hasattr(base, method), f"{base.__name__} has no {method}"
+
+    def declare(function: Call) -> type[Any]:
+        def begin(self: Any, *args: Any) -> None:
+            self.memory = {}
+            super(made, self).__init__(*args)
+
+        def changed(self: Any, *args: Any) -> Any:
+            return function(self, getattr(super(made, self), method), *args)
+
+        made = _class(function, base, {"__init__": begin, method: changed})
+        return wrong_hand(kills, **options)(made)
+
+    return declare
+
+
+def reports(
+    base: type[Service], *kills: str, at_rest: bool = False, **options: Any
+) -> Callable[[Call], type[Any]]:
+    """Declare a function that changes the states of a hand to be a wrong hand.
+
+    It is called with the service, the members of the state by name, and the mechanics. Each member
+    is a number of a gripper, and an array with a number for each joint of others; the function
+    writes in place. For ``memory`` see :func:`changes`.
+
+    :param base: a reference, or ``Service`` for all.
+    :param kills: as of :func:`wrong_hand`; ``options`` are its others.
+    :param at_rest: the state of a hand of several joints can change while it rests.
+    """
+
+    def declare(function: Call) -> type[Any]:
+        def begin(self: Any, *args: Any) -> None:
+            self.memory = {}
+            super(made, self).__init__(*args)
+
+        def fields(self: Any, side: Side) -> Any:
+            found = super(made, self).fields(side)
+            function(self, found, self.hands[side])
+            return found
+
+        def fill(self: Any, motors: Any, hand: Any) -> None:
+            super(made, self).fill(motors, hand)
+            function(self, motors, hand)
+
+        def live(self: Any, dt: float) -> None:
+            super(made, self).live(dt)
+            for hand in self.hands.values():
+                hand.changed()
+
+        members = {"__init__": begin, "fields": fields, "fill": fill}
+        made = _class(function, base, {**members, **({"live": live} if at_rest else {})})
+        return wrong_hand(kills, **options)(made)
 
     return declare
 

@@ -456,15 +456,6 @@ class ForceOfNextJoint(ServoService):
         motors["tau_est"] = np.roll(motors["tau_est"], 1)
 
 
-@wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
-class NoForce(ServoService):
-    """Reports no force."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] = 0.0
-
-
 @wrong_hand("BRAINCO-FORCE-04", sides=BOTH, whole=True)
 class ForceKept(ServoService):
     """Keeps the largest force of each joint for ever."""

@@ -8,7 +8,7 @@ from dexkit.conformance.virtual.fingers import FingerHand, FingerService, Flags,
 from dexkit.hand import JointMode
 from dexkit.models import DEX5_1
 
-__all__ = ["Dex5Service"]
+__all__ = ["Dex5Hand", "Dex5Service"]
 
 
 class Dex5Hand(FingerHand):

@@ -17,7 +17,7 @@ from dexkit.messages import message_type
 from dexkit.models import DEX3_1, Dialect, HandModel
 from dexkit.pressure import NO_VALUE
 
-__all__ = ["GO_MOTOR", "Dex3Service", "FingerHand", "FingerService", "Flags", "Ints"]
+__all__ = ["GO_MOTOR", "Dex3Hand", "Dex3Service", "FingerHand", "FingerService", "Flags", "Ints"]
 
 Flags: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]

@@ -16,7 +16,7 @@ from dexkit.messages.integer_lists import IntegerLists
 from dexkit.models import INSPIRE_DFX, INSPIRE_FTP
 from dexkit.traces import TraceEndpoint
 
-__all__ = ["FtpService", "InspireService"]
+__all__ = ["FtpHand", "FtpService", "InspireService"]
 
 
 class InspireHand(ServoHand):
