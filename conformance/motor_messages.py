@@ -62,8 +62,8 @@ class Motor:
     q: float = 0.0
     dq: float = 0.0
     tau: float = 0.0
-    kp: float = DEX1_1.client_gains[0]
-    kd: float = DEX1_1.client_gains[1]
+    kp: float = DEX1_1.gains[0][0]
+    kd: float = DEX1_1.gains[0][1]
     mode: int = 0
 
 

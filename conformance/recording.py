@@ -559,10 +559,8 @@ def _seconds(times: NDArray[np.int64], origin: int) -> Floats:
 
 
 def _touch(dialect: Dialect, samples: SampleArray, origin: int) -> Touch:
-    hand = model(dialect.model)
-    assert isinstance(hand, HandModel)  # a robot has no dialect with a touch topic
     columns = samples.decoded if samples.decoded is not None else samples.columns()
-    return Touch(samples.topic, _seconds(samples.log_time_ns, origin), columns, hand.areas)
+    return Touch(samples.topic, _seconds(samples.log_time_ns, origin), columns, dialect.areas)
 
 
 def _publisher_times(t: Floats, sent: Floats) -> Floats:

@@ -138,6 +138,7 @@ class JointSpec:
     :param straight: q of an open hand; of a joint that closes.
     :param urdf: name of the joint in Unitree's URDF, or empty.
     :param gear_ratio: turns of the rotor for one of the joint.
+    :param coupled: moved by the motor of the joint before it, not by one of its own.
     :param finger: to which it belongs: ``thumb``, ``index``, ``middle`` or another; empty for a
         gripper's and a robot's joints.
     """
@@ -151,6 +152,7 @@ class JointSpec:
     urdf: str = ""
     gear_ratio: float = 1.0
     straight: float = 0.0
+    coupled: bool = False
     finger: str = ""
 
     def __post_init__(self) -> None:

@@ -105,20 +105,20 @@ def _hand(model: HandModel, plugins: bool) -> dict[str, Any]:
         "rates_hz": {
             "state": model.state_rate,
             "state_at_least": model.min_state_rate,
-            "low_rate_state": model.low_rate or None,
-            "touch": model.touch_rate or None,
+            "low_rate_state": model.dialects[0].low_rate or None,
+            "touch": model.dialects[0].touch_rate or None,
             "command": model.command_rate,
         },
         "command_timeout_s": model.command_timeout,
         **_client(model),
-        "shared_motors": [list(group) for group in model.shared_motors],
+        "shared_motors": [list(group) for group in model.motors if len(group) > 1],
         "pressure_sensors": [
             {"packet": i, "place": sensor.place, "slots": list(sensor.slots)}
             for i, sensor in enumerate(model.sensors)
         ],
         "tactile_areas": [
             {"place": a.place, "member": a.member, "rows": a.rows, "columns": a.columns}
-            for a in model.areas
+            for a in model.dialects[0].areas
         ],
         "backends": _backends(model.name, plugins),
     }
@@ -159,7 +159,7 @@ def _robot(model: RobotModel) -> dict[str, Any]:
 
 def _client(model: HandModel) -> dict[str, Any]:
     if model.dialects[0].position_servo:
-        return {"client_dq": model.client_dq}
+        return {"client_dq": model.client_command.dq}
     return {"client_gains": [_gains(*pair) for pair in model.gains]}
 
 

@@ -31,7 +31,7 @@ from dexkit.wire.rh56 import FULL, JOINTS, Register, Status
 
 __all__ = ["SETTINGS", "InspireFtpModbus", "InspireFtpModbusSettings", "backend"]
 
-_AREAS = INSPIRE_FTP.areas
+_AREAS = INSPIRE_FTP.dialects[0].areas
 _PLACES = tuple(
     Register.TOUCH + 2 * before
     for before in accumulate((area.elements for area in _AREAS), initial=0)

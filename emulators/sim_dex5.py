@@ -51,9 +51,9 @@ class Dex5Mechanics(FingerMechanics):
         motors = [
             # the thumb has ten times the fingers' gains, and so its motors' size
             _motor(joint, inertia=5e-5, brake=0.2, coulomb=0.005)
-            if i in DEX5_1.joint_gains
+            if joint.finger == "thumb"
             else _motor(joint, inertia=1e-5, brake=0.04, coulomb=0.0005)
-            for i, joint in enumerate(DEX5_1.joints[side])
+            for joint in DEX5_1.joints[side]
         ]
         super().__init__(DEX5_1, side, motors, object_at=object_at, start=start)
 

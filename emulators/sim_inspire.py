@@ -67,7 +67,7 @@ def _bump(elements: int) -> Floats:
 
 def _touch_shares() -> Floats:
     """Shape (n_areas, elements of the largest): counts at the full force; NaN for no element."""
-    areas = INSPIRE_FTP.areas
+    areas = INSPIRE_FTP.dialects[0].areas
     shares = np.full((len(areas), max(area.elements for area in areas)), np.nan)
     for row, area in zip(shares, areas, strict=True):
         pressed = area.place.partition(" ")[2] in ("top", "palm")
@@ -87,7 +87,7 @@ class FtpMechanics(ServoMechanics):
             for i, joint in enumerate(INSPIRE_FTP.joints[Side.LEFT])
             if joint.name.partition("_")[0] == area.place.partition(" ")[0]
         ]
-        for area in INSPIRE_FTP.areas
+        for area in INSPIRE_FTP.dialects[0].areas
     )
     _felt: tuple[list[float], Floats] | None = None
 

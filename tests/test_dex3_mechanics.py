@@ -16,7 +16,7 @@ from dexkit.hand import Floats, HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
 from tests.each import each
 
-KP, KD = DEX3_1.client_gains
+KP, KD = DEX3_1.gains[0]
 THUMB_0, THUMB_1, THUMB_2, MIDDLE_0, MIDDLE_1, INDEX_0, INDEX_1 = range(7)
 FLEXING = (THUMB_1, THUMB_2, MIDDLE_0, MIDDLE_1, INDEX_0, INDEX_1)
 

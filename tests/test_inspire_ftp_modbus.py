@@ -24,7 +24,7 @@ from tests.patience import PATIENCE
 N = 6
 PATIENT = 1.0  # s; a busy machine answers late
 FULL_SPEED = INSPIRE_FTP.joints[Side.RIGHT][0].dq_max
-PLACES = [area.place for area in INSPIRE_FTP.areas]
+PLACES = [area.place for area in INSPIRE_FTP.dialects[0].areas]
 
 # docs/sources/unitree-dex.md#j3: the manual's table of tactile registers, in bytes
 TABLE = {

@@ -47,7 +47,7 @@ from tests.service_helpers import FakeNode, wait_until
 
 FTP = dialect("inspire_ftp")
 TOUCH, STATE = message_type(FTP.touch_type), message_type(FTP.state_type)
-LENGTHS = {area.member: area.elements for area in INSPIRE_FTP.areas}
+LENGTHS = {area.member: area.elements for area in FTP.areas}
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 N = 6
 FULL_SPEED = INSPIRE_FTP.joints[LEFT][0].dq_max
@@ -58,7 +58,7 @@ FULL_SPEED = INSPIRE_FTP.joints[LEFT][0].dq_max
 def test_areas_are_those_of_the_message() -> None:
     assert {f.name: f.most for f in TOUCH.layout.fields} == LENGTHS
     assert sum(LENGTHS.values()) == 1062
-    assert INSPIRE_FTP.areas[-2].place == "thumb palm"
+    assert FTP.areas[-2].place == "thumb palm"
     (role,) = roles("rt/inspire_hand/touch/r")
     assert (role.kind, role.sides, role.type_name) == ("touch", (RIGHT,), TOUCH.name)
 
@@ -93,7 +93,7 @@ def felt(hand: SimInspireFtp, state: HandState) -> dict[str, int]:
     data = mapping.encode_touch({hand.spec.side: StateView(state, (0,) * N)})
     assert data is not None
     message = TOUCH.decode(data)
-    most = {area.place: max(getattr(message, area.member)) for area in INSPIRE_FTP.areas}
+    most = {area.place: max(getattr(message, area.member)) for area in FTP.areas}
     return {place: count for place, count in most.items() if count}
 
 
@@ -206,7 +206,7 @@ def test_touch_in_a_recording_is_no_stream_of_joints() -> None:
     recording = Recording.decode(trace)
     assert recording.touch[RIGHT].values.shape[1:] == (17, 112)
     assert np.isnan(recording.touch[RIGHT].values[0, 0, 9:]).all()
-    assert len(parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields) == len(INSPIRE_FTP.areas)
+    assert len(parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields) == len(FTP.areas)
     for topic, count in ((FTP.touch_topic_of(RIGHT), 0), (FTP.topics(RIGHT)[1], 1)):
         assert len(list(_streams(topic, trace.load([topic])[topic]))) == count
 
@@ -259,7 +259,7 @@ def test_viewers_show_the_most_that_each_finger_counts() -> None:
     ]
     assert "index 812 · thumb 0" in hand_table(view, "right")
     shown = json.loads(json_line(Picture(0.1, (), (view,)), (), 0))["subjects"][0]["touch"]
-    assert dict(zip([a.place for a in INSPIRE_FTP.areas], shown, strict=True))["index top"] == 812
+    assert dict(zip([a.place for a in FTP.areas], shown, strict=True))["index top"] == 812
 
 
 # ----------------------------------------------------------------------------------------- doctor

@@ -14,7 +14,7 @@ from dexkit.models import DEX3_1
 from dexkit.traces import open_trace, sample_path
 from tests.each import each
 
-KP, KD = DEX3_1.client_gains
+KP, KD = DEX3_1.gains[0]
 
 
 def opened(side: Side = Side.LEFT, **options: float) -> tuple[SimDex3, ManualClock]:

@@ -26,7 +26,7 @@ from dexkit.conformance.median import medians
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
-from dexkit.models import ModeByte, model
+from dexkit.models import ModeByte
 
 _SLOTS = 12  # of a PressSensorState_
 
@@ -452,13 +452,12 @@ def units(ctx: Context) -> Outcome:
         return ctx.skipped("no command while it squeezed")
     here, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
     due = np.median(given.kp[commanded], axis=0) * (np.median(given.q[commanded], axis=0) - here)
-    joints = model(ctx.recording.dialect.model).joint_gains
     ratios = {}
     for name, mine in (("thumb", True), ("fingers", False)):
         pressing = [
             float(tau[i] / due[i])
             for i, j in enumerate(ctx.joints)
-            if j.closing and (i in joints) is mine and abs(due[i]) > 1e-3
+            if j.closing and (j.finger == "thumb") is mine and abs(due[i]) > 1e-3
         ]
         if not pressing:
             return ctx.skipped(f"no joint of the {name} pressed on the object")

@@ -216,7 +216,7 @@ def _softer(ctx: Context) -> list[tuple[float, float, float, float, float, float
     """
     hand = ctx.recording.model
     assert isinstance(hand, HandModel)  # a robot grips nothing
-    return [grip for grip in _soft(ctx) if grip[3] < hand.client_gains[0]]
+    return [grip for grip in _soft(ctx) if grip[3] < hand.gains[0][0]]
 
 
 _OWN = "this gripper has a force of its own"

@@ -84,7 +84,7 @@ def _places(ctx: Context) -> list[str]:
     """Where the packets or areas are."""
     hand = ctx.recording.model
     assert isinstance(hand, HandModel)  # a robot has no fingers
-    return [one.place for one in hand.sensors or hand.areas]
+    return [one.place for one in hand.sensors or ctx.recording.dialect.areas]
 
 
 def _fingers(ctx: Context) -> tuple[str, ...]:

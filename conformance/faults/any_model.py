@@ -459,7 +459,7 @@ class _Moves(Service):
             tuple(
                 Motor(
                     q + math.copysign(part * j.stroke, 0.5 * (j.q_min + j.q_max) - q),
-                    dq=hand.client_dq,
+                    dq=hand.client_command.dq,
                     kp=kp,
                     kd=kd,
                     mode=self.codec.mode(i),
@@ -764,7 +764,7 @@ class EmptyIsZero(Service):
             return
         for side in self.sides:
             if self.codec.command_topics[side] == topic:
-                dq = model(self.dialect.model).client_dq
+                dq = model(self.dialect.model).client_command.dq
                 motors = (Motor(dq=dq, mode=self.codec.mode(i)) for i in range(self.codec.joints))
                 self.motors(side, tuple(motors))
 
@@ -1200,14 +1200,14 @@ class ParksWhenItEnds(Service):
 
     def brake(self) -> None:
         profile = model(self.dialect.model)
-        kp, kd = profile.client_gains
+        kp, kd = profile.gains[0]
         for side, hand in self.hands.items():  # type: ignore[attr-defined]
             hand.timeout = math.inf
             here = [hand.q] if self.codec.joints == 1 else hand.q
             joints = joints_of(self.dialect, side)
             places = [self.place(q, j) for q, j in zip(here, joints, strict=True)]
             goals = [
-                Motor(q=q, dq=profile.client_dq, kp=kp, kd=kd, mode=self.codec.mode(i))
+                Motor(q=q, dq=profile.client_command.dq, kp=kp, kd=kd, mode=self.codec.mode(i))
                 for i, q in enumerate(places)
             ]
             self.motors(side, tuple(goals))

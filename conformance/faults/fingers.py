@@ -1293,7 +1293,7 @@ class FillsUpWithZeros(FingerService):
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         super().receive(topic, payload, client)
         sequence = self.codec.commanded(payload)
-        dq = self.hand.model.client_dq
+        dq = self.hand.model.client_command.dq
         for side in self.sides:
             mine = self.codec.command_topics[side] == topic
             first = self.dialect.index[side]

@@ -12,7 +12,7 @@ from dexkit.hand import Floats, Side
 from dexkit.models import INSPIRE_FTP
 from dexkit.traces import TraceEndpoint
 
-_TOPS = [i for i, area in enumerate(INSPIRE_FTP.areas) if area.place.endswith(" top")]
+_TOPS = [i for i, area in enumerate(INSPIRE_FTP.dialects[0].areas) if area.place.endswith(" top")]
 
 
 @wrong_hand("FTP-TOUCH-01", brief=True)

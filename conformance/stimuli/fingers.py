@@ -311,7 +311,7 @@ class FingerScript(HandScript):
 
     def _motors(self, side: Side, pose: Pose) -> Motors:
         return [
-            Motor(q=q, dq=self._model.client_dq, kp=kp, kd=kd, mode=self._codec.mode(i))
+            Motor(q=q, dq=self._model.client_command.dq, kp=kp, kd=kd, mode=self._codec.mode(i))
             for i, (q, (kp, kd)) in enumerate(zip(pose, self._model.gains, strict=True))
         ]
 

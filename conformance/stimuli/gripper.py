@@ -349,7 +349,7 @@ class GripperScript(HandScript):
                 ]
                 yield from self._bad_commands(name, alone, longer, 0.15)
         elif name == "negative":
-            kp, kd = self._model.client_gains
+            kp, kd = self._model.gains[0]
             for alone in self._each_alone():
                 near = {s: self._aside(s, 0.1)[0] for s in alone}
                 for damping in (-kd, kd):
@@ -396,7 +396,7 @@ class GripperScript(HandScript):
             yield from self._bad_commands("long", sides, [longer], 0.15)
         if "negative" in phases and self._gains_used:
             yield from self._hold(BETWEEN)
-            kp, kd = self._model.client_gains
+            kp, kd = self._model.gains[0]
             wrong = {s: (Motor(q=self._aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
             yield from self._bad_commands("negative", sides, [wrong], 0.15)
         yield from self._far_away((1e6, -1e6), 0.2)
@@ -643,7 +643,7 @@ class GripperScript(HandScript):
                 low = {s: (self._low(s),) for s in (first,) if s in pressing}
                 if low:
                     yield from self._turn("center", low, least=0.5)
-                gain = self._model.client_gains[1]
+                gain = self._model.gains[0][1]
                 yield from self._drive([s for s in sides if s not in self._grip], 0.07, kd=gain)
             self._report("... silence on both sides, and broken commands to one: both must brake")
             yield from self._silent_and_rejected(first, rest, timeout)

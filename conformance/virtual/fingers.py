@@ -438,7 +438,7 @@ class Dex3Service(FingerService):
     hand = Dex3Hand
     sensors = len(DEX3_1.sensors)
     attitude = (1.0, 0.0, 0.0, 0.0)
-    low_period = 1.0 / DEX3_1.low_rate
+    low_period = 1.0 / DEX3_1.dialects[0].low_rate
     low_due = 0.0
 
     def publish(self) -> list[Sample]:

@@ -42,7 +42,7 @@ class InspireService(ServoService):
         motors["q"] = hand.q[: len(motors)]
 
 
-_AREAS = INSPIRE_FTP.areas
+_AREAS = INSPIRE_FTP.dialects[0].areas
 _MOST = max(area.elements for area in _AREAS)
 _JOINTS = tuple(joint.name.partition("_")[0] for joint in INSPIRE_FTP.joints[Side.LEFT])
 _COUNTS = 800.0  # at the full force, in each element of a finger's top area

@@ -328,7 +328,7 @@ class Commands(Direction):
         self._states = states
         hand = model(target.model)
         self._timeout = hand.command_timeout
-        self._damping = hand.client_gains[1]
+        self._damping = hand.gains[0][1]
         self._resting: dict[Side, unitree_go.MotorCmd_] = {}
         # what a position of the grippers is multiplied by to be one of the client's
         self._scale = source.q_open / target.q_open

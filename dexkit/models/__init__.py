@@ -26,6 +26,7 @@ from dexkit.models.dex3 import DEX3_1
 from dexkit.models.dex5 import DEX5_1
 from dexkit.models.inspire import INSPIRE_DFX, INSPIRE_FTP
 from dexkit.models.profile import (
+    ClientCommand,
     Dialect,
     HandModel,
     ModeByte,
@@ -45,6 +46,7 @@ __all__ = [
     "INSPIRE_DFX",
     "INSPIRE_FTP",
     "MODELS",
+    "ClientCommand",
     "Dialect",
     "HandModel",
     "ModeByte",
@@ -155,7 +157,9 @@ def _checked(value: object, name: str) -> HandModel:
     for side in Side:
         require(len(value.joints.get(side, ())) == count, f"its {side} hand lacks joints")
         require(len(value.rest_q.get(side, ())) == count, f"rest_q of the {side} hand lacks joints")
+        require(not value.joints[side][0].coupled, f"the first joint of the {side} hand is coupled")
         require(any(value.rest_q[side]), "rest_q is all 0, which clients take for no state")
+    require(len(value.gains) == count, "client_command lacks joints")
     require(bool(value.dialects), "it has no dialect")
     for each in value.dialects:
         require(each.model == name, f"its dialect {each.name} is of {each.model!r}")

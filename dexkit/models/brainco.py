@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel
+from dexkit.models.profile import ClientCommand, Dialect, HandModel
 
 __all__ = ["BRAINCO_REVO2"]
 
@@ -68,7 +68,6 @@ BRAINCO_REVO2 = HandModel(
     command_rate=100.0,  # docs/sources/unitree-dex.md#j1
     # dexkit's own: the vendor's service has none (docs/decisions.md)
     command_timeout=1.0,
-    client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j1, as client_dq
-    client_dq=1.0,
+    client_command=ClientCommand(gains=6 * ((0.0, 0.0),), dq=1.0),  # docs/sources/unitree-dex.md#j1
     rest_q=dict.fromkeys(Side, (0.1, 0.1, 0.15, 0.15, 0.15, 0.15)),
 )

@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel
+from dexkit.models.profile import ClientCommand, Dialect, HandModel
 
 __all__ = ["DEX1_1"]
 
@@ -76,7 +76,7 @@ DEX1_1 = HandModel(
     min_state_rate=200.0,  # docs/sources/unitree-dex.md#d7; the interface specification "200+ Hz"
     command_rate=200.0,  # docs/sources/unitree-dex.md#b1
     command_timeout=1.0,  # docs/sources/unitree-dex.md#b2: timeout_ms_ = 1000
-    client_gains=(5.0, 0.05),  # docs/sources/unitree-dex.md#b1
+    client_command=ClientCommand(gains=((5.0, 0.05),)),  # docs/sources/unitree-dex.md#b1
     rest_q=dict.fromkeys(Side, (0.2 * _JOINT.stroke,)),
     vendor_ids={Side.LEFT: 1, Side.RIGHT: 0},  # docs/sources/unitree-dex.md#b2
 )

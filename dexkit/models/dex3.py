@@ -7,6 +7,7 @@ import math
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
 from dexkit.models.profile import (
+    ClientCommand,
     Dialect,
     HandModel,
     ModeByte,
@@ -97,6 +98,7 @@ DEX3_1 = HandModel(
             # docs/sources/unitree-dex.md#a1: the only state topic to which the vendor's C++ example
             # subscribes
             low_rate_topic="rt/lf/dex3/{side}/state",
+            low_rate=9.1,  # as a real robot's copy comes (docs/sources/real-hands.md#dex3-low-rate)
             codec=Lazy("dexkit.service.dialects:RisModeMap"),
             mode_byte=ModeByte.RIS,
             zero_is_no_state=True,
@@ -106,11 +108,10 @@ DEX3_1 = HandModel(
     min_state_rate=200.0,  # inferred: twice the client's command rate, as for the Dex1-1
     command_rate=100.0,  # docs/sources/unitree-dex.md#b1
     command_timeout=1.0,  # the Dex3-1 manual RIS_Mode_t: "default 1s timeout"
-    client_gains=(1.5, 0.2),  # docs/sources/unitree-dex.md#b1
+    client_command=ClientCommand(gains=7 * ((1.5, 0.2),)),  # docs/sources/unitree-dex.md#b1
     rest_q={
         Side.LEFT: _REST,
         Side.RIGHT: tuple(q if i == 0 else -q for i, q in enumerate(_REST)),
     },
     sensors=_SENSORS,
-    low_rate=9.1,  # as a real robot's copy comes (docs/sources/real-hands.md#dex3-low-rate)
 )

@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel, ModeByte
+from dexkit.models.profile import ClientCommand, Dialect, HandModel, ModeByte
 
 __all__ = ["DEX5_1"]
 
@@ -22,13 +22,21 @@ def _joints(side: Side) -> tuple[JointSpec, ...]:
     read, and from Unitree's URDF (docs/sources/unitree-dex.md#b5). Names are the URDF's without the
     side's letter; the left URDF calls joint 41 Link_41L. Limits: URDF; only Roll_12 is mirrored.
     dq_max and tau_max: the left URDF, for both sides: the right one has zeros for torques and for
-    the fingers' sideways joints.
+    the fingers' sideways joints. Coupled joints are derived: 16 motors for 20 joints leave four
+    each for thumb and fingers less one in each finger, and what a finger of four joints shares is
+    its two outer ones. Uncertain.
     """
     letter = "L" if side is Side.LEFT else "R"
     across = -1 if side is Side.LEFT else 1
 
     def joint(
-        name: str, low: float, high: float, flexing: int, dq_max: float, urdf: str = ""
+        name: str,
+        low: float,
+        high: float,
+        flexing: int,
+        dq_max: float,
+        urdf: str = "",
+        coupled: bool = False,
     ) -> JointSpec:
         return JointSpec(
             name,
@@ -38,6 +46,7 @@ def _joints(side: Side) -> tuple[JointSpec, ...]:
             tau_max=0.93,
             closing=flexing,
             urdf=f"{urdf or name}{letter}",
+            coupled=coupled,
             finger=_FINGERS[int(name[-2]) - 1],
         )
 
@@ -55,7 +64,7 @@ def _joints(side: Side) -> tuple[JointSpec, ...]:
             ),
             joint(f"Pitch_{finger}2", 0.0, 1.5708, 1, 3.1416),
             joint(f"Pitch_{finger}3", 0.0, 1.68424, 1, 3.3685),
-            joint(f"Pitch_{finger}4", 0.0, 1.3963, 1, 2.7925),
+            joint(f"Pitch_{finger}4", 0.0, 1.3963, 1, 2.7925, coupled=True),
         )
     ]
     low, high = sorted((0.0, across * 1.8151))
@@ -101,9 +110,8 @@ DEX5_1 = HandModel(
     min_state_rate=200.0,  # inferred: twice the client's command rate, as for the others
     command_rate=100.0,  # docs/sources/unitree-dex.md#b1
     command_timeout=1.0,  # inferred: that of its relatives
-    client_gains=(0.10, 0.001),  # docs/sources/unitree-dex.md#b1, the fingers
-    # docs/sources/unitree-dex.md#b1, the thumb
-    joint_gains=dict.fromkeys(range(16, 20), (1.0, 0.02)),
+    # docs/sources/unitree-dex.md#b1: fingers, thumb
+    client_command=ClientCommand(gains=16 * ((0.10, 0.001),) + 4 * ((1.0, 0.02),)),
     rest_q={
         side: (
             *(4 * _FINGER_REST),
@@ -111,8 +119,4 @@ DEX5_1 = HandModel(
         )
         for side in Side
     },
-    # derived: 16 motors for 20 joints (docs/sources/unitree-dex.md#b5) leave four each for thumb
-    # and fingers less one in each finger, and what a finger of four joints shares is its two outer
-    # ones. Uncertain.
-    shared_motors=((2, 3), (6, 7), (10, 11), (14, 15)),
 )

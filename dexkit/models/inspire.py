@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel, TouchArea
+from dexkit.models.profile import ClientCommand, Dialect, HandModel, TouchArea
 
 __all__ = ["INSPIRE_DFX", "INSPIRE_FTP"]
 
@@ -59,7 +59,7 @@ INSPIRE_DFX = HandModel(
     min_state_rate=32.0,
     command_rate=100.0,  # docs/sources/unitree-dex.md#j2
     command_timeout=1.0,  # docs/sources/unitree-dex.md#j2
-    client_gains=(0.0, 0.0),  # docs/sources/unitree-dex.md#j2
+    client_command=ClientCommand(gains=6 * ((0.0, 0.0),)),  # docs/sources/unitree-dex.md#j2
     rest_q=dict.fromkeys(Side, (0.85, 0.85, 0.85, 0.85, 0.9, 0.9)),
 )
 
@@ -97,8 +97,8 @@ INSPIRE_FTP = replace(
             zero_is_no_state=True,
             touch_topic="rt/inspire_hand/touch/{s}",
             touch_type="inspire::inspire_hand_touch",
+            touch_rate=50.0,  # more than the 30 Hz that clients record
+            areas=_AREAS,
         ),
     ),
-    areas=_AREAS,
-    touch_rate=50.0,  # more than the 30 Hz that clients record
 )

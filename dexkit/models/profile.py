@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dexkit.service.dialects import DialectMap
 
 __all__ = [
+    "ClientCommand",
     "Dialect",
     "HandModel",
     "ModeByte",
@@ -35,6 +36,27 @@ class ModeByte(Enum):
     UNUSED = "nothing"
     STATUS = "1 driven, 0 not"
     RIS = "RIS_Mode: id in bits 0 to 3, status in 4 to 6, time-out in 7"
+
+
+@dataclass(frozen=True)
+class TouchArea:
+    """One tactile area of a hand with a touch topic.
+
+    :param place: where it is; the finger's name comes first.
+    :param member: of the touch message: the list of its elements, row after row.
+    :param rows: of elements.
+    :param columns: elements of a row.
+    """
+
+    place: str
+    member: str
+    rows: int
+    columns: int
+
+    @property
+    def elements(self) -> int:
+        """Number of elements."""
+        return self.rows * self.columns
 
 
 @dataclass(frozen=True)
@@ -61,9 +83,12 @@ class Dialect:
     :param zero_is_no_state: clients take a state of which every q is exactly 0 for no state
         (docs/sources/unitree-dex.md#b1).
     :param low_rate_topic: topic of the low-rate copy of the state, or empty; with ``{side}``.
+    :param low_rate: Hz of that copy.
     :param touch_topic: topic of what the hand's tactile areas measure, or empty; with ``{side}`` or
         ``{s}``.
     :param touch_type: its DDS type name.
+    :param touch_rate: Hz at which dexkit publishes it.
+    :param areas: tactile areas, in the order of its message.
     :param torque_units: N·m in one unit of a motor's tau and tau_est; empty where all are in N·m.
     :param position_servo: each motor goes to q by itself: kp, kd, tau and mode of a command are not
         used, and dq is no feed-forward.
@@ -89,8 +114,11 @@ class Dialect:
     has_client: bool = True
     zero_is_no_state: bool = False
     low_rate_topic: str = ""
+    low_rate: float = 0.0
     touch_topic: str = ""
     touch_type: str = ""
+    touch_rate: float = 0.0
+    areas: tuple[TouchArea, ...] = ()
     torque_units: tuple[float, ...] = ()
     position_servo: bool = False
     speed_units: tuple[float, ...] = ()
@@ -183,24 +211,15 @@ class PressureSensor:
 
 
 @dataclass(frozen=True)
-class TouchArea:
-    """One tactile area of a hand with a touch topic.
+class ClientCommand:
+    """What xr_teleoperate sends to a hand beside positions.
 
-    :param place: where it is; the finger's name comes first.
-    :param member: of the touch message: the list of its elements, row after row.
-    :param rows: of elements.
-    :param columns: elements of a row.
+    :param gains: kp in N·m/rad and kd in N·m·s/rad of each joint.
+    :param dq: to every joint, as it is on the wire.
     """
 
-    place: str
-    member: str
-    rows: int
-    columns: int
-
-    @property
-    def elements(self) -> int:
-        """Number of elements."""
-        return self.rows * self.columns
+    gains: tuple[tuple[float, float], ...]
+    dq: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -210,27 +229,16 @@ class HandModel:
     :param unit: of q, of its limits and of all that is derived from them.
     :param torque_unit: of tau_est and tau_max: A, where a hand reports currents.
     :param limit_margin: how far beyond its joint's limits q of a genuine hand, or of its client,
-        may lie: end stops and zeros differ from hand to hand (docs/sources/real-hands.md). For the
-        kit, which states it in its requirements, and for ``dexkit replay``.
-
-    **On DDS.**
-
+        may lie: end stops and zeros differ from hand to hand (docs/sources/real-hands.md).
     :param state_rate: Hz at which the vendor's service publishes state.
     :param min_state_rate: Hz below which clients suffer.
     :param command_rate: Hz at which xr_teleoperate sends commands.
     :param command_timeout: seconds without a command after which the vendor's service brakes.
     :param vendor_ids: id on the vendor's bus, for a hand of one motor.
-    :param client_gains: kp in N·m/rad and kd in N·m·s/rad that xr_teleoperate sends, to every
-        joint that ``joint_gains`` does not name.
-    :param joint_gains: those that it sends to some joints, by index.
-    :param client_dq: dq that it sends to every joint, as it is on the wire.
+    :param client_command: what xr_teleoperate sends beside positions.
     :param rest_q: where a simulated hand rests at first, per side; never all zero, because
         clients wait for a position that is not.
     :param sensors: pressure sensor packets of a state, in order.
-    :param areas: tactile areas, in the order of the touch message.
-    :param touch_rate: Hz of the touch message that dexkit publishes, where the dialect has one.
-    :param low_rate: Hz of the low-rate copy of the state, where the dialect has one.
-    :param shared_motors: joints that one motor moves, by index; the others have one each.
     """
 
     name: str
@@ -241,32 +249,29 @@ class HandModel:
     min_state_rate: float
     command_rate: float
     command_timeout: float
-    client_gains: tuple[float, float]
+    client_command: ClientCommand
     rest_q: dict[Side, tuple[float, ...]]
     vendor_ids: dict[Side, int] = field(default_factory=dict)
     sensors: tuple[PressureSensor, ...] = ()
-    areas: tuple[TouchArea, ...] = ()
-    touch_rate: float = 0.0
-    low_rate: float = 0.0
     unit: str = "rad"
     torque_unit: str = "N m"
     limit_margin: float = 0.15
-    client_dq: float = 0.0
-    joint_gains: dict[int, tuple[float, float]] = field(default_factory=dict)
-    shared_motors: tuple[tuple[int, ...], ...] = ()
 
     @property
     def gains(self) -> tuple[tuple[float, float], ...]:
         """(kp, kd) that xr_teleoperate sends to each joint."""
-        count = len(self.joints[Side.LEFT])
-        return tuple(self.joint_gains.get(i, self.client_gains) for i in range(count))
+        return self.client_command.gains
 
     @property
     def motors(self) -> tuple[tuple[int, ...], ...]:
         """The joints of each motor, by index, in the order of the joints."""
-        shared = {i: group for group in self.shared_motors for i in group}
-        count = len(self.joints[Side.LEFT])
-        return tuple(dict.fromkeys(shared.get(i, (i,)) for i in range(count)))
+        found: list[tuple[int, ...]] = []
+        for i, joint in enumerate(self.joints[Side.LEFT]):
+            if joint.coupled:
+                found[-1] += (i,)
+            else:
+                found.append((i,))
+        return tuple(found)
 
     def spec(
         self,
@@ -283,6 +288,6 @@ class HandModel:
             joints=self.joints[side],
             io_rate=io_rate,
             exchange_timeout=exchange_timeout,
-            n_sensors=len(self.sensors) or len(self.areas),
+            n_sensors=len(self.sensors) or len(self.dialects[0].areas),
             simulated=simulated,
         )

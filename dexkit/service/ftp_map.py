@@ -18,7 +18,7 @@ from dexkit.hand import Floats, HandCommand, HandSpec, Side
 from dexkit.messages import message_type
 from dexkit.messages.inspire import inspire_hand_state
 from dexkit.messages.integer_lists import IntegerLists
-from dexkit.models import Dialect, model
+from dexkit.models import Dialect
 from dexkit.service.dialects import DialectMap, Fill, Remark, StateView
 from dexkit.wire.rh56 import FAULTS, FULL, UNCHANGED, Status
 
@@ -44,13 +44,12 @@ class FtpMap(DialectMap):
         self._full: Floats = np.array([joint.dq_max for joint in self._spec.joints])
         self._goals: Floats = np.full(n, math.nan)
         self._speeds: Floats = np.ones(n)
-        areas = model(dialect.model).areas
         self._touch = IntegerLists(
-            message_type(dialect.touch_type), {area.member: area.elements for area in areas}
+            message_type(dialect.touch_type), {area.member: area.elements for area in dialect.areas}
         )
         # which of the elements of a state's pressures there are
-        there = [range(area.elements) for area in areas]
-        self._areas = np.repeat(np.arange(len(areas)), [len(r) for r in there])
+        there = [range(area.elements) for area in dialect.areas]
+        self._areas = np.repeat(np.arange(len(dialect.areas)), [len(r) for r in there])
         self._elements = np.concatenate([np.array(r) for r in there])
 
     def command(self, message: Any, side: Side) -> HandCommand | None:

@@ -268,9 +268,9 @@ class HandService:
         for unit in self._units:
             self._open_first(unit)
         if self.low_rate_topic:
-            self._low_rate_every = max(1, round(self.state_rate / self.model.low_rate))
+            self._low_rate_every = max(1, round(self.state_rate / self.dialect.low_rate))
         if self.touch_topic:
-            self._touch_every = max(1, round(self.state_rate / self.model.touch_rate))
+            self._touch_every = max(1, round(self.state_rate / self.dialect.touch_rate))
         self._reader = node.reader(self.cmd_topic, self.dialect.cmd_type, on_data=self._wake.set)
         self._receive_watch.restart()  # from here on commands may wait to be received
         for unit in self._units:
@@ -442,8 +442,8 @@ class HandService:
             self._log_once(
                 "zero_gains",
                 "q changes, but kp, kd, dq and tau are all 0, so the hand stays limp; send gains "
-                f"(Unitree's client: kp {self.model.client_gains[0]:g}, kd "
-                f"{self.model.client_gains[1]:g}){hint}",
+                f"(Unitree's client: kp {self.model.gains[0][0]:g}, kd "
+                f"{self.model.gains[0][1]:g}){hint}",
             )
         for remark in self._map.remarks(message, unit.side):
             setattr(counters, remark.counter, getattr(counters, remark.counter) + 1)

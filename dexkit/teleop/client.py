@@ -211,7 +211,7 @@ class TeleopClient(ABC):
         self.dialect = spoken
         self.sides = tuple(s for s in (Side.LEFT, Side.RIGHT) if s in sides)
         self.rate = model(spoken.model).command_rate
-        self._kp, self._kd = model(spoken.model).client_gains
+        self._kp, self._kd = model(spoken.model).gains[0]
         shared = len({spoken.topics(s)[1] for s in self.sides}) < len(self.sides)
         self.receiver = StateReceiver([self.sides] if shared else [(s,) for s in self.sides])
         self._ready = False
@@ -283,7 +283,9 @@ class TeleopClient(ABC):
         """A command to hold the pose, with motors locked where the dialect has a mode for it."""
         hand = model(self.dialect.model)
         return tuple(
-            JointCommand(self.dialect.mode(i, JointMode.BRAKE), q, hand.client_dq, 0.0, kp, kd)
+            JointCommand(
+                self.dialect.mode(i, JointMode.BRAKE), q, hand.client_command.dq, 0.0, kp, kd
+            )
             for i, (q, (kp, kd)) in enumerate(zip(pose, hand.gains, strict=True))
         )
 
@@ -402,7 +404,7 @@ class FingerClient(TeleopClient):
     def __init__(self, spoken: Dialect, sides: Sequence[Side] = tuple(Side)) -> None:
         super().__init__(spoken, sides)
         hand = model(spoken.model)
-        self._gains, self._dq = hand.gains, hand.client_dq
+        self._gains, self._dq = hand.gains, hand.client_command.dq
         self._targets = {s: tuple(j.straight for j in hand.joints[s]) for s in self.sides}
 
     def _control(

@@ -166,7 +166,7 @@ class SubjectView:
         if not isinstance(self.model, HandModel):
             return ()
         if len(self.touch):
-            places = [area.place for area in self.model.areas]
+            places = [area.place for area in self.model.dialects[0].areas]
             return zip(places, self.touch.tolist(), strict=True)
         places = (
             [s.place for s in self.model.sensors for _ in s.slots] if len(self.pressure) else []

@@ -120,7 +120,7 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
     if kind == "touch":
         fields += [
             Field(a.member, f"{a.place} touch", "touch", i, "counts", elements=a.elements)
-            for i, a in enumerate(hand.areas)
+            for i, a in enumerate(dialect.areas)
         ]
     else:
         slots = [(first + i, j) for i, j in enumerate(joints)]
@@ -145,8 +145,8 @@ def _hand_part(dialect: Dialect, kind: str, side: Side, type_name: str) -> Part:
     rate = {
         "cmd": hand.command_rate,
         "state": hand.state_rate,
-        "low": hand.low_rate,
-        "touch": hand.touch_rate,
+        "low": dialect.low_rate,
+        "touch": dialect.touch_rate,
     }[kind]
     return Part(
         side,

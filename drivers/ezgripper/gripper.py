@@ -67,7 +67,7 @@ processor time (benchmarks/bench_serial.py); the rest is for other load on the p
 
 _BEYOND = 0.1
 """Distance beyond the stroke, as a part of it, at which a servo's zero is rejected."""
-_CLIENT_GAINS = DEX1_1.client_gains
+_CLIENT_GAINS = DEX1_1.gains[0]
 
 
 class EZGripper:

@@ -51,7 +51,12 @@ def command(dialect: Dialect, part: float) -> bytes:
     hand = model(dialect.model)
     motors = [
         JointCommand(
-            dialect.mode(i, JointMode.FOC), j.q_min + part * j.stroke, hand.client_dq, 0.0, kp, kd
+            dialect.mode(i, JointMode.FOC),
+            j.q_min + part * j.stroke,
+            hand.client_command.dq,
+            0.0,
+            kp,
+            kd,
         )
         for i, (j, (kp, kd)) in enumerate(zip(hand.joints[SIDE], hand.gains, strict=True))
     ]

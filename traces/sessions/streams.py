@@ -200,7 +200,7 @@ def pressures_of(trace: Trace, streams: Sequence[Stream]) -> list[Pressure]:
 
 
 def _touch(topic: str, samples: SampleArray, role: Role, side: Side) -> Pressure:
-    columns, areas = _columns(samples), model(role.dialect.model).areas
+    columns, areas = _columns(samples), role.dialect.areas
     whole = np.ones(len(samples.log_time_ns), dtype=np.bool_)
     for area in areas:
         whole &= columns.count(area.member) == area.elements

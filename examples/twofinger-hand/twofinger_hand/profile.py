@@ -6,7 +6,7 @@ import math
 
 from dexkit.hand import JointSpec, Side
 from dexkit.lazy import Lazy
-from dexkit.models.profile import Dialect, HandModel, ModeByte
+from dexkit.models.profile import ClientCommand, Dialect, HandModel, ModeByte
 
 __all__ = ["TWOFINGER_1"]
 
@@ -54,6 +54,6 @@ TWOFINGER_1 = HandModel(
     min_state_rate=200.0,
     command_rate=100.0,
     command_timeout=1.0,
-    client_gains=(1.5, 0.2),
+    client_command=ClientCommand(gains=6 * ((1.5, 0.2),)),
     rest_q={Side.LEFT: 2 * (0.3, 0.4, 0.4), Side.RIGHT: 2 * (-0.3, -0.4, -0.4)},
 )
