@@ -187,7 +187,7 @@ def test_speed_of_a_step_is_not_known_where_there_was_no_state() -> None:
     course: Floats = np.asarray(np.minimum(t / 0.1, 1.0), dtype=float)
 
     def step(kept: NDArray[np.bool_]) -> Step:
-        return Step("", 0, 5.4, 0.0, 0.3, 1.0, 0.0, 1.0, t[kept], course[kept], "rad")
+        return Step(0, 5.4, 0.0, 0.3, 1.0, 0.0, 1.0, t[kept], course[kept], "rad")
 
     assert fastest(step(t >= 0.0)) == pytest.approx(10.0, rel=0.1)
     assert fastest(step(t >= 0.07)) is None

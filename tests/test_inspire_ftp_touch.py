@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.conformance.checks.touch import _longest_gap
+from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.touch import CountsFromTheThumb, NoPalm, NoTouch
 from dexkit.conformance.recording import Recording
@@ -196,7 +196,7 @@ def test_touch_is_judged_by_its_topic() -> None:
 def test_gap_of_touch_is_one_while_there_are_states(
     touch: list[float], states: list[float], gap: float
 ) -> None:
-    assert _longest_gap(np.array(touch), np.array(states))[0] == pytest.approx(gap)
+    assert gap_beside_states(np.array(touch), np.array(states))[0] == pytest.approx(gap)
 
 
 def test_touch_in_a_recording_is_no_stream_of_joints() -> None:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.layers import layer
 from dexkit.conformance.measurement_error import Measure, Quantity
@@ -28,7 +29,7 @@ from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Evidence
 from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.stimulus_record import Phase
-from dexkit.hand import JointSpec, Side, Subject
+from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.unseen import UNSEEN_S
 
 __all__ = [
@@ -356,10 +357,28 @@ class Context(BaseContext[Recording, SideView]):
         inside = self.states.t[self.states.between(begin, end)]
         return float(np.diff(inside, prepend=begin, append=end).max()) <= longest
 
+    def q(self, begin: float, end: float) -> Floats:
+        """The positions in [begin, end], shape (n, n_joints)."""
+        return self.states.q[self.states.between(begin, end)]
+
+    def tau(self, begin: float, end: float) -> Floats:
+        """The torques in [begin, end], shape (n, n_joints)."""
+        return self.states.tau[self.states.between(begin, end)]
+
+    def given(self, begin: float, end: float) -> NDArray[np.bool_]:
+        """Which commands were given in [begin, end]."""
+        return np.asarray((self.commands.t >= begin) & (self.commands.t <= end))
+
     @property
     def object_at(self) -> float | None:
         """The q at which this side touches its object, or None if unknown."""
         return self.recording.stimulus.objects.get(self.side) if self.recording.stimulus else None
+
+    @property
+    def touch(self) -> float:
+        """The same, of a side that has an object."""
+        assert self.object_at is not None, "only hands with an object are judged"
+        return self.object_at
 
     @property
     def contact_unknown(self) -> Outcome | None:

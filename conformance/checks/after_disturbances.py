@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.firmness import STIFFNESS, displacement_noise, is_alike, nudges
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps, steps_of
+from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
 from dexkit.unseen import UNSEEN_S
@@ -34,17 +36,23 @@ def unchanged(ctx: Context) -> Outcome:
             if step.error > ctx.tolerance("max_error_stroke", step.joint):
                 return disobeyed(ctx, "between two phases", step)
     first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
-    wrong = _slower(ctx, first) or _other_stiffness(ctx)
-    return wrong or _longer(ctx, first)
+    speeds = judged(
+        ctx, _speeds(ctx, first), "speed_rad_s", "min_speed_part", nothing=ctx.passed("no step")
+    )
+    if not speeds.met:
+        return speeds
+    nothing = "no two steps that can be compared"
+    return _other_stiffness(ctx) or judged(
+        ctx, _durations(ctx, first), "ratio", "max_ratio", nothing=nothing
+    )
 
 
 def _like(first: list[Step], step: Step) -> list[Step]:
     return [s for s in first if s.joint == step.joint and 0.7 < step.size / s.size < 1.4]
 
 
-def _longer(ctx: Context, first: list[Step]) -> Outcome:
-    """The duration of the slowest step, as a part of that of the same step before."""
-    worst: tuple[float, Step, float, float, float] | None = None
+def _durations(ctx: Context, first: list[Step]) -> Figures:
+    """The duration of each step, as a part of that of the same step before."""
     for phase in (p for name in _AFTER_ABUSE for p in ctx.phases(name)):
         for step in steps_of(ctx, phase):
             seconds = _duration(step)
@@ -52,31 +60,14 @@ def _longer(ctx: Context, first: list[Step]) -> Outcome:
             if seconds is None or not known:
                 continue  # other requirements judge whether it arrives at all
             slack = ctx.tolerance("slack_s" if phase.name == "recover" else "soft_start_s")
-            ratio = seconds / (max(known) + slack)
-            if worst is None or ratio > worst[0]:
-                worst = ratio, step, seconds, max(known), slack
-    if worst is None:
-        return ctx.skipped("no two steps that can be compared")
-    ratio, step, seconds, before, slack = worst
-    text = (
-        f"{step.name}{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {before:.2f} s in the "
-        "same step before any bad command"
-    )
-    longest = ctx.tolerance("max_ratio") * (before + slack)
-    if ratio <= ctx.tolerance("max_ratio"):
-        met = ctx.passed(f"x {ratio:.2f}", text, ratio=ratio)
-        return met.timed(seconds, longest, span=(step.begin, step.end))
-    return (
-        ctx.failed(
-            f"x {ratio:.1f}",
-            text,
-            ctx.at(ctx.states.topic, step.begin, step.end),
-            ratio=ratio,
-        )
-        .about(step.joint)
-        .timed(seconds, longest)
-        .if_late(seconds - longest)
-    )
+            longest = ctx.tolerance("max_ratio") * (max(known) + slack)
+            yield step.figure(
+                seconds / (max(known) + slack),
+                f"{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {max(known):.2f} s in the "
+                "same step before any bad command",
+                late=seconds - longest,
+                measure=Measure(seconds, longest, span=(step.begin, step.end)),
+            )
 
 
 def _duration(step: Step) -> float | None:
@@ -87,17 +78,15 @@ def _duration(step: Step) -> float | None:
     return float(step.t[np.argmax(part >= 0.9)] - step.t[np.argmax(part >= 0.1)])
 
 
-def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
-    """The failure of a hand whose steps after bad commands, after a restart or with a second client
-    have lost speed.
+def _speeds(ctx: Context, first: list[Step]) -> Figures:
+    """The speeds of steps after bad commands, after a restart or with a second client, each with
+    the least that it may be after the same step before.
     """
     # the first step for another client, and after a restart, may begin softly
     later = [p for name in _RESTARTED for p in ctx.phases(name)[1:]]
-    for phase in (*ctx.phases("recover"), *later):
-        if not obeyed_before(ctx, phase):
-            continue
+    for phase in (p for p in (*ctx.phases("recover"), *later) if obeyed_before(ctx, p)):
         for step in steps_of(ctx, phase):
-            before = ctx.states.q[ctx.states.between(step.begin - 0.1, step.begin), step.joint]
+            before = ctx.q(step.begin - 0.1, step.begin)[:, step.joint]
             at_rest = len(before) and np.ptp(before) < _AT_REST_PART * step.stroke
             if not (at_rest and ctx.seen(step.begin - 0.1, step.begin)):
                 continue  # it was under way, so that this is not the same step
@@ -111,18 +100,14 @@ def _slower(ctx: Context, first: list[Step]) -> Outcome | None:
             ]
             if now is None or not known:
                 continue
-            was, least = min(known), ctx.tolerance("min_speed_part") * min(known)
-            if now < least:
-                text = (
-                    f"{step.name}{now:.1f} {ctx.unit}/s at its fastest in a step at "
-                    f"{step.begin:.1f} s, {was:.1f} {ctx.unit}/s in the same step before any bad "
-                    "command"
-                )
-                place = ctx.at(ctx.states.topic, step.begin, step.end)
-                outcome = ctx.failed(f"{now:.1f} {ctx.unit}/s", text, place, speed_rad_s=now)
-                late = 0.8 * abs(step.size) * (1.0 / max(now, 1e-3) - 1.0 / least)
-                return outcome.about(step.joint).if_late(late)
-    return None
+            least = ctx.tolerance("min_speed_part") * min(known)
+            yield step.figure(
+                now,
+                f"{now:.1f} {ctx.unit}/s at its fastest in a step at {step.begin:.1f} s, "
+                f"{min(known):.1f} {ctx.unit}/s in the same step before any bad command",
+                limit=least,
+                late=0.8 * abs(step.size) * (1.0 / max(now, 1e-3) - 1.0 / least),
+            )
 
 
 def fastest(step: Step) -> float | None:
@@ -167,75 +152,62 @@ def _other_stiffness(ctx: Context) -> Outcome | None:
 
 
 @check("DEX1-WDOG-05")
-def first_command_counts(ctx: Context) -> Outcome:
+@worst(
+    "motion_rad",
+    "min_motion_stroke",
+    nothing="no command after a pause was alone for long enough",
+)
+def first_command_counts(ctx: Context) -> Figures:
     """Motion of the hand by the first command after a pause, until the second command."""
-    worst: tuple[float, Step, float] | None = None
-    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
-        for step in steps_of(ctx, phase):
-            sent = ctx.commands.t[ctx.commands.t >= step.begin]
-            if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint) or len(sent) < 2:
-                continue
-            alone = float(sent[1] - sent[0])
-            if alone < ctx.tolerance("min_alone_s"):
-                continue
-            way = (step.q[step.t <= sent[1]] - step.start) * np.sign(step.size)
-            moved = float(way.max()) if len(way) else 0.0
-            if worst is None or moved < worst[0]:
-                worst = moved, step, alone
-    if worst is None:
-        return ctx.skipped("no command after a pause was alone for long enough")
-    moved, step, alone = worst
-    text = (
-        f"the first command after a pause, alone for {alone:.2f} s, moved it by {moved:.3f} "
-        f"{ctx.unit} towards {step.target:.2f} {ctx.unit}"
-    )
-    limit = ctx.tolerance("min_motion_stroke", step.joint)
-    if moved >= limit:
-        return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
-    place = ctx.at(ctx.states.topic, step.begin, step.begin + alone)
-    outcome = ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved)
-    return outcome.about(step.joint).placed(moved, limit, at_least=True).if_late(alone)
+    for step in (s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)):
+        sent = ctx.commands.t[ctx.commands.t >= step.begin]
+        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint) or len(sent) < 2:
+            continue
+        alone = float(sent[1] - sent[0])
+        if alone < ctx.tolerance("min_alone_s"):
+            continue
+        way = (step.q[step.t <= sent[1]] - step.start) * np.sign(step.size)
+        moved = float(way.max()) if len(way) else 0.0
+        text = (
+            f"the first command after a pause, alone for {alone:.2f} s, moved it by {moved:.3f} "
+            f"{ctx.unit} towards {step.target:.2f} {ctx.unit}"
+        )
+        yield Figure(moved, step.begin, step.begin + alone, step.joint, text, late=alone)
 
 
 @check("DEX1-WDOG-06")
-def in_force(ctx: Context) -> Outcome:
+@worst("part", "min_part", nothing="it neither pressed nor moved when the commands stopped")
+def in_force(ctx: Context) -> Figures:
     """Force or speed shortly before the time-out, relative to that at the last command."""
-    window, states = ctx.tolerance("window_s"), ctx.states
+    window, states, until = ctx.tolerance("window_s"), ctx.states, ctx.tolerance("until_s")
     good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
-    worst: tuple[float, str, float] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         _, end = ctx.span(phase)
         sent = good[good <= end]
-        if not len(sent) or end - sent[-1] < ctx.tolerance("until_s"):
+        if not len(sent) or end - sent[-1] < until:
             continue
         last = float(sent[-1])
-        late = last + ctx.tolerance("until_s") - window
+        late = last + until - window
         spans = [states.between(a, a + window) for a in (last - window, late)]
         if min(len(states.t[s]) for s in spans) < 5:
             continue
-        found = []
+        what = ""
         if ctx.object_at is not None:
             before, after = (median(np.abs(states.tau[s, 0])) for s in spans)
             if before >= ctx.tolerance("min_tau_nm"):
-                found.append((after / before, f"presses with {after:.2f} N m, {before:.2f} N m"))
-        before, after = (_speed(states.t[s], states.q[s, 0]) for s in spans)
-        place, spec = median(states.q[spans[1], 0]), ctx.joints[0]
-        near = _AT_A_STOP * spec.stroke
-        free = spec.q_min + near < place < spec.q_max - near
-        free = free and not _arrives(ctx, last, abs(before) * ctx.tolerance("until_s"))
-        if free and not found and abs(before) >= ctx.tolerance("min_speed_stroke"):
+                part, what = after / before, f"presses with {after:.2f} N m, {before:.2f} N m"
+        if not what:
+            before, after = (_speed(states.t[s], states.q[s, 0]) for s in spans)
+            place, spec = median(states.q[spans[1], 0]), ctx.joints[0]
+            near = _AT_A_STOP * spec.stroke
+            free = spec.q_min + near < place < spec.q_max - near
+            free = free and not _arrives(ctx, last, abs(before) * until)
+            if not free or abs(before) < ctx.tolerance("min_speed_stroke"):
+                continue
             unit = f"{ctx.unit}/s"
-            found.append((after / before, f"moves at {after:.2f} {unit}, {before:.2f} {unit}"))
-        for part, what in found:
-            if worst is None or part < worst[0]:
-                worst = part, what, late
-    if worst is None:
-        return ctx.skipped("it neither pressed nor moved when the commands stopped")
-    part, what, at = worst
-    text = f"{ctx.tolerance('until_s'):g} s after the last command it {what} at that command"
-    if part >= ctx.tolerance("min_part"):
-        return ctx.passed(f"{part:.0%}", text, part=part)
-    return ctx.failed(f"{part:.0%}", text, ctx.at(states.topic, at, at + window), part=part)
+            part, what = after / before, f"moves at {after:.2f} {unit}, {before:.2f} {unit}"
+        text = f"{until:g} s after the last command it {what} at that command"
+        yield Figure(part, late, late + window, text=text)
 
 
 def _arrives(ctx: Context, at: float, way: float) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.firmness import STIFFNESS, nudges
 from dexkit.conformance.checks.grip import Press, torque_scales, worst_of
 from dexkit.conformance.checks.motion import (
@@ -25,6 +26,7 @@ from dexkit.conformance.checks.motion import (
     steps_of,
 )
 from dexkit.conformance.checks.safety import sags
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 
@@ -68,8 +70,8 @@ class _Drive:
 
 def _drive_of(ctx: Context, step: Step) -> _Drive | None:
     """The beginning of a step: up to half of its way, from rest."""
-    joint, states = step.joint, ctx.states
-    before = states.q[states.between(step.begin - _REST_S, step.begin), joint]
+    joint = step.joint
+    before = ctx.q(step.begin - _REST_S, step.begin)[:, joint]
     if abs(step.size) < _LEAST_STEP * step.stroke or not len(before):
         return None
     if not ctx.seen(step.begin - _REST_S, step.begin):
@@ -92,7 +94,7 @@ def _drive_of(ctx: Context, step: Step) -> _Drive | None:
 def _driven(
     ctx: Context, joint: int, way: int, begin: float, end: float, *, contact: bool = False
 ) -> _Drive | None:
-    tau = ctx.states.tau[ctx.states.between(begin, end), joint] * way
+    tau = ctx.tau(begin, end)[:, joint] * way
     tau = tau[np.isfinite(tau)]
     if not len(tau):
         return None
@@ -208,38 +210,32 @@ def _one_way(ctx: Context, drive: _Drive, most: float) -> Outcome:
 
 
 @check("DEX1-FORCE-09")
-def as_commanded(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "min_part", nothing="it never pressed on the object for long enough")
+def as_commanded(ctx: Context) -> Figures:
     """The smallest tau_est in contact, relative to kp times the distance to the goal."""
-    touch = ctx.object_at
-    if touch is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, float, float, float, float] | None = None
-    for piece in contacts(ctx, touch):
+    for piece in contacts(ctx, ctx.touch):
         asked = min(piece.kp * (piece.q - piece.goal), ctx.tolerance("max_asked_nm"))
         if asked >= ctx.tolerance("min_asked_nm"):
-            found = (piece.tau / asked, piece.tau, asked, piece.begin, piece.end)
-            worst = found if worst is None else min(worst, found)
-    if worst is None:
-        return ctx.skipped("it never pressed on the object for long enough")
-    part, tau, asked, begin, end = worst
-    text = f"tau_est of {tau:.2f} N m in contact, where kp times the distance is {asked:.2f} N m"
-    limit = ctx.tolerance("min_part")
-    if part >= limit:
-        met = ctx.passed(f"{part:.0%}", text, part=part)
-        return met.pressed(tau, limit * asked, at_least=True)
-    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
-    return outcome.pressed(tau, limit * asked, at_least=True)
+            text = f"tau_est of {piece.tau:.2f} N m in contact, where kp times the distance is "
+            limit = ctx.tolerance("min_part") * asked
+            yield Figure(
+                piece.tau / asked,
+                piece.begin,
+                piece.end,
+                text=f"{text}{asked:.2f} N m",
+                measure=Measure(piece.tau, limit, "N m", Quantity.TORQUE, False),
+            )
 
 
 @check("DEX3-FORCE-05", "DEX3-FORCE-10")
+@with_object
 def joints_as_commanded(ctx: Context) -> Outcome:
     """The smallest and largest tau_est of pressing joints, relative to kp times the distance to the
     goal.
 
     A requirement without ``max_part`` has no upper limit.
     """
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     pieces = []
     least, most = ctx.tolerance("min_part"), math.inf
     if "max_part" in ctx.requirement.tolerances:
@@ -248,12 +244,10 @@ def joints_as_commanded(ctx: Context) -> Outcome:
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
-        rows = ctx.states.between(begin, end)
-        given = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
-        given &= np.isfinite(ctx.commands.q).all(axis=1)
-        if not given.any() or not len(ctx.states.t[rows]):
+        given = ctx.given(begin, end) & np.isfinite(ctx.commands.q).all(axis=1)
+        if not given.any() or not len(ctx.q(begin, end)):
             continue
-        q, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
+        q, tau = (np.median(x, axis=0) for x in (ctx.q(begin, end), ctx.tau(begin, end)))
         goal, kp = (np.median(a[given], axis=0) for a in (ctx.commands.q, ctx.commands.kp))
         for joint, spec in enumerate(ctx.joints):
             asked = float(kp[joint] * (goal[joint] - q[joint])) * spec.closing
@@ -319,7 +313,7 @@ def _place(ctx: Context, joint: int, at: float) -> float | None:
     None without states on both sides of it.
     """
     begin, end = at - _AROUND_S, at + _AROUND_S
-    q = ctx.states.q[ctx.states.between(begin, end), joint]
+    q = ctx.q(begin, end)[:, joint]
     q = q[np.isfinite(q)]
     return median(q) if len(q) and ctx.seen(begin, end, _AROUND_S) else None
 
@@ -336,21 +330,16 @@ def torque_drives(ctx: Context) -> Outcome:
     A torque towards larger q (of a gripper) or closing (of fingers) must move the joint; the
     opposite one must not move it the wrong way.
     """
-    least: tuple[float, float, int, Phase] | None = None
-    for phase in ctx.phases():
-        for joint, moved in _pushed(ctx, phase):
-            part = moved / ctx.joints[joint].stroke
-            if least is None or part < least[0]:
-                least = part, moved, joint, phase
-    if least is None:  # a part of a push can show that a joint moves enough, not that it does not
-        enough = [
-            (moved / ctx.joints[joint].stroke, moved, joint, phase)
+    found = list(_pushes(ctx))
+    if not found:  # a part of a push can show that a joint moves enough, not that it does not
+        found = [
+            one
             for phase in ctx.phases()
             for joint, moved in _pushed_before_gap(ctx, phase)
             if moved >= ctx.tolerance("min_motion_stroke", joint)
+            and (one := _push(ctx, phase, joint, moved))
         ]
-        least = min(enough, key=lambda e: e[0], default=None)
-    if least is None:
+    if not found:
         return ctx.skipped("no state shows the begin and the end of a torque command")
     for phase in ctx.phases("pull"):
         for joint, moved in _pushed(ctx, phase, after=_LATE):
@@ -361,73 +350,67 @@ def torque_drives(ctx: Context) -> Outcome:
                 )
                 place = ctx.at(ctx.states.topic, *ctx.span(phase))
                 return ctx.failed("against it", text, place, motion_rad=moved).about(joint)
-    fast = _too_fast(ctx)
-    if fast is not None:
-        return fast
-    _, moved, joint, phase = least
-    text = ctx.named(f"moved by {moved:.2f} {ctx.unit} while a torque was commanded", joint)
-    if moved >= ctx.tolerance("min_motion_stroke", joint) - _noise(ctx, joint):
-        return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
-    place = ctx.at(ctx.states.topic, *ctx.span(phase))
-    return ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
+    if "max_speed_part" in ctx.requirement.tolerances:
+        nothing = ctx.passed("no damping")
+        fast = judged(ctx, _speeds(ctx), "speed_rad_s", "max_speed_part", nothing=nothing)
+        if not fast.met:
+            return fast
+    return judged(ctx, found, "motion_rad", "min_motion_stroke", nothing="")
 
 
-def _too_fast(ctx: Context) -> Outcome | None:
-    """The failure of a joint that a torque moves faster than kd allows, where that is limited."""
-    if "max_speed_part" not in ctx.requirement.tolerances:
-        return None
+def _pushes(ctx: Context) -> Iterator[Figure]:
+    """The motions by a torque."""
+    for phase in ctx.phases():
+        for joint, moved in _pushed(ctx, phase):
+            yield _push(ctx, phase, joint, moved)
+
+
+def _push(ctx: Context, phase: Phase, joint: int, moved: float) -> Figure:
+    text = f"moved by {moved:.2f} {ctx.unit} while a torque was commanded"
+    limit = ctx.tolerance("min_motion_stroke", joint) - _noise(ctx, joint)
+    return Figure(moved, *ctx.span(phase), joint, text, limit=limit)
+
+
+def _speeds(ctx: Context) -> Iterator[Figure]:
+    """The speeds of joints that a torque moves, with the most that kd allows."""
     for phase in ctx.phases("push"):
         begin, end = ctx.span(phase)
         late = begin + _LATE * (end - begin)
-        given = (ctx.commands.t >= late) & (ctx.commands.t <= end)
+        given = ctx.given(late, end)
         for joint, moved in _pushed(ctx, phase, after=_LATE):
             kd, tau = (np.abs(a[given, joint]) for a in (ctx.commands.kd, ctx.commands.tau))
-            if not len(kd) or not kd.min() > 0:
-                continue
-            speed, most = moved / (end - late), float(np.median(tau / kd))
-            if speed > ctx.tolerance("max_speed_part") * most:
+            if len(kd) and kd.min() > 0:
+                speed, most = moved / (end - late), float(np.median(tau / kd))
                 unit = f"{ctx.unit}/s"
-                text = ctx.named(
-                    f"moved at {speed:.2f} {unit} where tau / kd is {most:.2f} {unit}", joint
-                )
-                place = ctx.at(ctx.states.topic, late, end)
-                outcome = ctx.failed(f"{speed:.2f} {unit}", text, place, speed_rad_s=speed)
-                return outcome.about(joint)
-    return None
+                text = f"moved at {speed:.2f} {unit} where tau / kd is {most:.2f} {unit}"
+                limit = ctx.tolerance("max_speed_part") * most
+                yield Figure(speed, late, end, joint, text, limit=limit)
 
 
 @check("DEX1-GAIN-07", "DEX3-GAIN-07")
-def torque_way(ctx: Context) -> Outcome:
+@worst(
+    "motion_rad",
+    "max_motion_stroke",
+    nothing="no state shows the begin and the end of a torque command",
+)
+def torque_way(ctx: Context) -> Figures:
     """Motion against a commanded torque, without a position gain and beside one.
 
     A joint that sags with zero gains may sag here.
     """
-    sag = sags(ctx)
-    found = [
-        (
-            -moved - _noise(ctx, joint) - (0.0 if sag is None else float(sag[joint])),
-            joint,
-            *ctx.span(phase),
-        )
-        for name in ("push", "pull")
-        for phase in ctx.phases(name)
-        for joint, moved in _pushed(ctx, phase, after=_LATE)
+    sag = np.zeros(len(ctx.joints)) if (known := sags(ctx)) is None else known
+    moved = [
+        (way + _noise(ctx, joint) + float(sag[joint]), joint, *ctx.span(phase))
+        for phase in (*ctx.phases("push"), *ctx.phases("pull"))
+        for joint, way in _pushed(ctx, phase, after=_LATE)
     ]
-    if not found:
-        return ctx.skipped("no state shows the begin and the end of a torque command")
-    if len(ctx.joints) == 1:
+    if moved and len(ctx.joints) == 1:
         held = nudges(ctx, [*ctx.phases(STIFFNESS), *ctx.phases("nudge")])
-        found += [(-n.way, 0, n.begin, n.end) for n in held if n.at_rest]
-    against, joint, begin, end = max(found, key=lambda f: f[0] / ctx.joints[f[1]].stroke)
-    against = max(0.0, against)
-    limit = ctx.tolerance("max_motion_stroke", joint)
-    text = ctx.named(f"moved by {against:.2f} {ctx.unit} against a commanded torque", joint)
-    figure = f"{against:.2f} {ctx.unit}"
-    if against <= limit:
-        return ctx.passed(figure, text, motion_rad=against).placed(against, limit)
-    place = ctx.at(ctx.states.topic, begin, end)
-    outcome = ctx.failed(figure, text, place, motion_rad=against).about(joint)
-    return outcome.placed(against, limit)
+        moved += [(n.way, 0, n.begin, n.end) for n in held if n.at_rest]
+    for way, joint, begin, end in moved:
+        against = max(0.0, -way)
+        text = f"moved by {against:.2f} {ctx.unit} against a commanded torque"
+        yield Figure(against, begin, end, joint, text)
 
 
 @check("DEX3-GAIN-05")
@@ -443,42 +426,37 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
     for phase in ctx.phases("soft"):
         for step in steps_of(ctx, phase):
             soft.setdefault(step.joint, step)
-    worst: tuple[float, int, float, float, str] | None = None
-    limited = 0
+    figures: list[Figure] = []
+    nothing = "no state shows how the steps got half-way"
     for step in steps(ctx):
         reference = stiff.get(step.joint)
         quick = half_way(reference) if reference is not None else None
-        if quick is None:
+        if reference is None or quick is None:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
         took, quick = least_half_way(step), max(quick, 1e-3)
-        if reference is None or not (_seen_to_half(ctx, step) and _seen_to_half(ctx, reference)):
+        if not (_seen_to_half(ctx, step) and _seen_to_half(ctx, reference)):
             continue
         soon = took < ctx.tolerance("min_ratio") * quick
-        own = limited_by_speed, limited_by_start
-        if soon and any(by(ctx, reference) for by in own):
-            limited += 1
+        if soon and any(by(ctx, reference) for by in (limited_by_speed, limited_by_start)):
+            nothing = "its own speed or start limits every joint's steps, whatever their gains are"
             continue
-        pairs = [(took, quick, "a third of the stiffness")]
+        figures.append(slower(ctx, step.joint, took, quick, "with a third of the stiffness"))
         softer = soft.get(step.joint)
         if softer is not None and half_way(step) is not None and _seen_to_half(ctx, softer):
-            text = "a tenth of the stiffness, compared with a third,"
-            pairs.append((least_half_way(softer), max(took, 1e-3), text))
-        for slower, faster, text in pairs:
-            if worst is None or slower / faster < worst[0]:
-                worst = slower / faster, step.joint, slower, faster, text
-    if worst is None and limited:
-        return ctx.skipped(
-            "its own speed or start limits every joint's steps, whatever their gains are"
-        )
-    if worst is None:
-        return ctx.skipped("no state shows how the steps got half-way")
-    ratio, joint, took, quick, which = worst
-    least = ctx.tolerance("min_ratio") * quick
-    text = ctx.named(f"a step with {which} takes {ratio:.1f} times as long to half-way", joint)
-    if ratio >= ctx.tolerance("min_ratio"):
-        return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
-    outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
-    return outcome.timed(took, least, at_least=True)
+            how = "with a tenth of the stiffness, compared with a third,"
+            took, quick = least_half_way(softer), max(took, 1e-3)
+            figures.append(slower(ctx, step.joint, took, quick, how))
+    return judged(ctx, figures, "ratio", "min_ratio", nothing=nothing)
+
+
+def slower(ctx: Context, joint: int, took: float, quick: float, how: str) -> Figure:
+    """How many times as long a softer step takes to half-way, with the seconds of both."""
+    return Figure(
+        took / quick,
+        joint=joint,
+        text=f"a step {how} takes {took / quick:.1f} times as long to half-way",
+        measure=Measure(took, ctx.tolerance("min_ratio") * quick, larger_is_worse=False),
+    )
 
 
 def _seen_to_half(ctx: Context, step: Step) -> bool:
@@ -506,13 +484,5 @@ def fed_commands(ctx: Context) -> Outcome:
 def _progress(ctx: Context, how: str) -> Outcome:
     """The least progress of the steps of the phases that the requirement needs."""
     found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * s.stroke]
-    if not found:
-        return ctx.skipped(f"no state during a step {how}")
-    worst = min(found, key=lambda s: (s.final - s.start) / s.size)
-    part = (worst.final - worst.start) / worst.size
-    text = f"{how} {worst}"
-    limit = ctx.tolerance("min_progress")
-    if part >= limit:
-        return ctx.passed(f"{part:.0%}", text, progress=part)
-    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
-    return ctx.failed(f"{part:.0%}", text, place, progress=part)
+    figures = [s.figure(s.progress, f"{how} {s}") for s in found]
+    return judged(ctx, figures, "progress", "min_progress", nothing=f"no state during a step {how}")

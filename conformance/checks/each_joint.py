@@ -9,10 +9,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.grip import torque_scales
 from dexkit.conformance.checks.motion import Step, own_speed, steps
 from dexkit.conformance.checks.safety import stays
+from dexkit.conformance.checks.timing import gap_beside_states
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte
 
@@ -31,19 +34,9 @@ def whole_range(ctx: Context) -> Outcome:
     found = steps(ctx)
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
-    short = [s for s in found if not _held(ctx, s)]
-    if not short:
-        return ctx.skipped("the object held every joint back")
-    worst = max(short, key=lambda s: s.error / s.stroke)
-    limit = ctx.tolerance("max_error_stroke", worst.joint)
-    if worst.error <= limit:
-        text = f"{len(short)} ends of a joint's range, at most {worst.error:.3f} {ctx.unit} off"
-        met = ctx.passed(f"{worst.error:.3f} {ctx.unit}", text, error_rad=worst.error)
-        return met.placed(worst.error, limit)
-    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
-    outcome = ctx.failed(f"{worst.error:.2f} {ctx.unit}", str(worst), place, error_rad=worst.error)
-    outcome = outcome.about(worst.joint).placed(worst.error, limit)
-    return outcome.if_late(STROKE_S * worst.error / worst.stroke)
+    figures = [s.error_figure(str(s)) for s in found if not _held(ctx, s)]
+    nothing = "the object held every joint back"
+    return judged(ctx, figures, "error_rad", "max_error_stroke", nothing=nothing)
 
 
 def _held(ctx: Context, step: Step) -> bool:
@@ -51,8 +44,8 @@ def _held(ctx: Context, step: Step) -> bool:
     spec = ctx.joints[step.joint]
     if ctx.object_at is None or (step.target - step.start) * spec.closing <= 0:
         return False
-    tau = ctx.states.tau[ctx.states.between(step.end - _BEFORE_S, step.end), step.joint]
-    given = ctx.commands.kp[(ctx.commands.t >= step.begin) & (ctx.commands.t <= step.end)]
+    tau = ctx.tau(step.end - _BEFORE_S, step.end)[:, step.joint]
+    given = ctx.commands.kp[ctx.given(step.begin, step.end)]
     given = given[np.isfinite(given).all(axis=1)]
     if not len(tau) or not len(given):
         return False
@@ -65,8 +58,7 @@ def _held(ctx: Context, step: Step) -> bool:
 
 def _mode_at(ctx: Context, begin: float, end: float) -> NDArray[np.intp] | None:
     """The mode bytes of the last command in [begin, end]."""
-    rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
-    mode = ctx.commands.mode[rows]
+    mode = ctx.commands.mode[ctx.given(begin, end)]
     mode = mode[np.isfinite(mode).all(axis=1)]
     return mode[-1].astype(np.intp) if len(mode) else None
 
@@ -82,12 +74,12 @@ _GOING = 0.9  # of a phase's time; a step may begin with it
 
 
 @check("DEX3-MODE-05")
-def own_mode(ctx: Context) -> Outcome:
+@worst("part", "min_progress", nothing="no state while some joints were driven and others were not")
+def own_mode(ctx: Context) -> Figures:
     """Progress of driven joints while others are locked, have tripped or are protected.
 
     Protection that has not tripped changes nothing: in those steps all joints count.
     """
-    worst: tuple[float, float, float, int, float] | None = None
     for phase in (*ctx.phases(), *ctx.phases("guard-latch"), *ctx.phases("guarded-step")):
         begin, end = ctx.span(phase)
         mode = _mode_at(ctx, begin, end)
@@ -96,49 +88,37 @@ def own_mode(ctx: Context) -> Outcome:
         status, tripped = _status(ctx, mode)
         if phase.name == "guarded-step":
             tripped = np.zeros_like(tripped)
-        rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
-        target = ctx.commands.q[rows][-1]
+        target = ctx.commands.q[ctx.given(begin, end)][-1]
         # a step may have begun before some of its joints were locked
-        before = ctx.states.q[ctx.states.between(begin - 0.25, begin - 0.15)]
-        after = ctx.states.q[ctx.states.between(end - _BEFORE_S, end)]
+        before, after = ctx.q(begin - 0.25, begin - 0.15), ctx.q(end - _BEFORE_S, end)
         if not len(before) or not len(after):
             continue
         start, final = np.median(before, axis=0), np.median(after, axis=0)
-        for joint, spec in enumerate(ctx.joints):
-            driven = status[joint] == JointMode.FOC and not tripped[joint]
+        for joint in np.flatnonzero((status == JointMode.FOC) & ~tripped).tolist():
             size = float(target[joint] - start[joint])
-            if not driven or abs(size) < ctx.requirement.tolerance("min_step_stroke") * spec.stroke:
+            least = ctx.tolerance("min_step_stroke", joint)
+            if abs(size) < least:
                 continue
             # a slow joint moves as far as its speed allows, less the time to start
-            least = ctx.requirement.tolerance("min_step_stroke")
-            speed = own_speed(ctx, joint, least)
+            speed = own_speed(ctx, joint, ctx.requirement.tolerance("min_step_stroke"))
             if speed is not None:
                 reach = _GOING * max(speed, ctx.tolerance("min_speed_rad_s")) * (end - begin)
-                size = math.copysign(min(abs(size), max(reach, least * spec.stroke)), size)
+                size = math.copysign(min(abs(size), max(reach, least)), size)
             part = float(final[joint] - start[joint]) / size
-            found = (part, begin, end, joint, size)
-            worst = found if worst is None or found < worst else worst
-    if worst is None:
-        return ctx.skipped("no state while some joints were driven and others were not")
-    part, begin, end, joint, size = worst
-    text = ctx.named(
-        f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were locked, had "
-        "tripped or were protected",
-        joint,
-    )
-    if part >= ctx.tolerance("min_progress"):
-        return ctx.passed(f"{part:.0%}", text, part=part)
-    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
-    return outcome.about(joint)
+            text = (
+                f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were "
+                "locked, had tripped or were protected"
+            )
+            yield Figure(part, begin, end, joint, text)
 
 
 @check("DEX3-MODE-06")
-def lock_stops(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_run_stroke", nothing="no state while joints were locked under way")
+def lock_stops(ctx: Context) -> Figures:
     """Run-out of a joint that is locked while it moves, and whether it then stands still.
 
     It may take as long to obey the lock as it took to begin the step.
     """
-    worst: tuple[float, str, int, float, float, float] | None = None
     # of the first one: it begins at rest
     delay = max((_delay(ctx, *ctx.span(p)) for p in ctx.phases()[:1]), default=0.0)
     for phase in ctx.phases():
@@ -157,21 +137,11 @@ def lock_stops(ctx: Context) -> Outcome:
                 (max(runs, 0.0), "max_run_stroke", "ran on by"),
                 (still, "max_motion_stroke", "still moved by"),
             ):
-                found = (far / ctx.tolerance(name, joint), what, joint, far, begin, speed)
-                worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.skipped("no state while joints were locked under way")
-    ratio, what, joint, far, begin, speed = worst
-    text = ctx.named(f"{what} {far:.3f} {ctx.unit} after it was locked", joint)
-    limit = far / ratio if ratio else 0.0
-    if ratio <= 1.0:
-        return ctx.passed(f"{far:.3f} {ctx.unit}", text, motion_rad=far)
-    outcome = ctx.failed(
-        f"{far:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin), motion_rad=far
-    )
-    # a late lock extends the run-out
-    late_by = (far - limit) / speed if speed else STROKE_S * far / ctx.joints[joint].stroke
-    return outcome.about(joint).placed(far, limit).if_late(late_by)
+                limit = ctx.tolerance(name, joint)
+                text = f"{what} {far:.3f} {ctx.unit} after it was locked"
+                # a late lock extends the run-out
+                by = (far - limit) / speed if speed else None
+                yield Figure(far, begin, None, joint, text, limit=limit, late=by)
 
 
 _SPEED_S = 0.02  # s over which a speed is taken
@@ -242,15 +212,14 @@ def _first_force(ctx: Context, begin: float, end: float) -> tuple[Floats, Floats
 
 
 @check("DEX3-FORCE-06")
-def keeps_gripping(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "min_part", nothing="no joint pressed on the object for long enough")
+def keeps_gripping(ctx: Context) -> Figures:
     """The smallest tau_est later in a long grip, relative to its beginning.
 
     A value that a fifth of the states do not reach does not count as held, since a chattering limit
     lets go as often.
     """
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, int, float, float, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         if end - begin < ctx.tolerance("min_hold_s"):
@@ -258,33 +227,23 @@ def keeps_gripping(ctx: Context) -> Outcome:
         # the motors' own time-outs are a second after the last command
         quiet = [p for p in ctx.phases("guard") if p.begin_ns >= phase.end_ns]
         until = ctx.span(quiet[0])[0] + 0.7 if quiet else end
-        then, since = _first_force(ctx, begin + _FORCE_S, end - _FORCE_S)
+        first, since = _first_force(ctx, begin + _FORCE_S, end - _FORCE_S)
         least = ctx.tolerance("min_tau_nm")
-        pressing = np.flatnonzero(then / torque_scales(ctx, least) >= least).tolist()
+        pressing = np.flatnonzero(first / torque_scales(ctx, least) >= least).tolist()
         later = np.arange(begin + 2 * _FORCE_S, end - _FORCE_S, _FORCE_S).tolist()
         spans = [*((at, at + _FORCE_S) for at in later), (end - _FORCE_S, end)]
         spans.append((until - _FORCE_S, until))
         for a, b in spans:
-            last = ctx.states.between(a, b)
-            if not len(ctx.states.t[last]):
+            tau = ctx.tau(a, b)
+            if not len(tau):
                 continue
-            now = np.quantile(np.abs(ctx.states.tau[last]), _HELD, axis=0)
-            for joint in pressing:
-                if a < since[joint] - 1e-9:
-                    continue
-                part = float(now[joint] / then[joint])
-                found = (part, joint, float(then[joint]), float(now[joint]), a, b)
-                worst = found if worst is None or found < worst else worst
-    if worst is None:
-        return ctx.skipped("no joint pressed on the object for long enough")
-    part, joint, then_nm, now_nm, a, b = worst
-    text = ctx.named(f"tau_est of {then_nm:.2f} N m at first, and of {now_nm:.2f} N m later", joint)
-    limit = ctx.tolerance("min_part")
-    if part >= limit:
-        met = ctx.passed(f"{part:.0%}", text, part=part)
-        return met.pressed(now_nm, limit * then_nm, at_least=True)
-    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, a, b), part=part)
-    return outcome.about(joint).pressed(now_nm, limit * then_nm, at_least=True)
+            held = np.quantile(np.abs(tau), _HELD, axis=0)
+            for joint in (j for j in pressing if a >= since[j] - 1e-9):
+                then, now = float(first[joint]), float(held[joint])
+                text = f"tau_est of {then:.2f} N m at first, and of {now:.2f} N m later"
+                limit = ctx.tolerance("min_part") * then
+                measure = Measure(now, limit, "N m", Quantity.TORQUE, False)
+                yield Figure(now / then, a, b, joint, text, measure=measure)
 
 
 # ----------------------------------------------------------------------------------- low rate
@@ -336,23 +295,10 @@ def low_rate_goes_on(ctx: Context) -> Outcome:
     slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
     if slow is None or len(slow) < 3 or not len(fast):
         return ctx.absent("there is no low-rate topic")
-    limit = ctx.tolerance("max_gap_s")
-    times = np.concatenate((slow.t, fast.t[-1:]))
-    worst = (0.0, float(times[0]))
-    for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
-        if end - begin <= worst[0]:
-            continue
-        # a restarted service or a paused machine is silent on both
-        rows = np.searchsorted(fast.t, begin, "right"), np.searchsorted(fast.t, end)
-        own = fast.t[rows[0] : rows[1]]
-        quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
-        worst = max(worst, (end - begin - quiet, begin))
-    gap, at = worst
+    gap, at = gap_beside_states(slow.t, fast.t)
     text = f"no state on {slow.topic} for {gap:.2f} s, while the fast topic had states"
-    if gap <= limit:
-        return ctx.passed(f"{gap:.2f} s", text, gap_s=gap).timed(gap, limit)
-    outcome = ctx.failed(f"{gap:.2f} s", text, ctx.at(slow.topic, at, at + gap), gap_s=gap)
-    return outcome.timed(gap, limit).if_late(gap - limit)
+    figure = Figure(gap, at, at + gap, text=text, topic=slow.topic)
+    return judged(ctx, [figure], "gap_s", "max_gap_s", nothing="")
 
 
 _AHEAD_S = 0.05  # s by which the low-rate topic may be received before the fast one

@@ -13,8 +13,10 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.checks.grip import Press, worst_of
 from dexkit.conformance.checks.motion import noise_at_rest
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
@@ -57,8 +59,7 @@ def nudges(ctx: Context, phases: list[Phase] | None = None) -> list[Nudge]:
     found = []
     for phase in ctx.phases() if phases is None else phases:
         begin, end = ctx.span(phase)
-        before = ctx.states.q[ctx.states.between(begin - 0.15, begin), 0]
-        after = ctx.states.q[ctx.states.between(end - 0.1, end), 0]
+        before, after = ctx.q(begin - 0.15, begin)[:, 0], ctx.q(end - 0.1, end)[:, 0]
         given = (ctx.commands.t >= begin) & (ctx.commands.t < end)
         if not len(before) or not len(after) or not given.any():
             continue
@@ -125,23 +126,19 @@ def held(ctx: Context) -> Outcome:
 
 
 @check("DEX1-GAIN-05")
-def stiffness(ctx: Context) -> Outcome:
+@worst("part", "max_part", nothing="no state while it was pushed")
+def stiffness(ctx: Context) -> Figures:
     """The largest displacement by a torque, relative to torque / kp."""
-    found = nudges(ctx, [*ctx.phases(), *ctx.phases(STIFFNESS)])
-    if not found:
-        return ctx.skipped("no state while it was pushed")
-    worst = max(found, key=lambda n: n.way / n.asked)
-    part = worst.way / worst.asked
-    text = (
-        f"a torque displaced it by {worst.way:.3f} {ctx.unit}, through kp by {worst.asked:.3f} "
-        f"{ctx.unit}"
-    )
-    limit = ctx.tolerance("max_part")
-    if part <= limit:
-        return ctx.passed(f"{part:.0%}", text, part=part).placed(worst.way, limit * worst.asked)
-    place = ctx.at(ctx.states.topic, worst.begin, worst.end)
-    outcome = ctx.failed(f"{part:.0%}", text, place, part=part)
-    return outcome.placed(worst.way, limit * worst.asked)
+    for nudge in nudges(ctx, [*ctx.phases(), *ctx.phases(STIFFNESS)]):
+        limit = ctx.tolerance("max_part") * nudge.asked
+        yield Figure(
+            nudge.way / nudge.asked,
+            nudge.begin,
+            nudge.end,
+            text=f"a torque displaced it by {nudge.way:.3f} {ctx.unit}, through kp by "
+            f"{nudge.asked:.3f} {ctx.unit}",
+            measure=Measure(nudge.way, limit, "rad", Quantity.POSITION),
+        )
 
 
 @dataclass(frozen=True)
@@ -175,13 +172,11 @@ def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
 
 
 @check("DEX1-FORCE-18")
+@with_object
 def contact_force_fits_stiffness(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, relative to the hand's measured stiffness times the
     error.
     """
-    touch = ctx.object_at
-    if touch is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = nudges(ctx, [*ctx.phases(), *ctx.phases("nudge")])
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not found:
@@ -194,7 +189,7 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
     pieces: list[Press] = []
     peaks: list[_Peak] = []
-    for piece in contacts(ctx, touch):
+    for piece in contacts(ctx, ctx.touch):
         asked = piece.kp * (piece.q - piece.goal)
         if asked < ctx.tolerance("min_asked_nm"):
             continue
@@ -202,7 +197,7 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
         high = most * stiffest * asked
         span = piece.begin, piece.end
         pieces.append(Press.within((piece.tau, piece.tau), (low, high), span))
-        felt = np.abs(ctx.states.tau[ctx.states.between(*span), 0])
+        felt = np.abs(ctx.tau(*span)[:, 0])
         peak = most * stiffest * piece.most
         above = felt[felt > peak]
         peaks.append(_Peak(*span, len(felt), len(above), peak, above))

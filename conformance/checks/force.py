@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.checks.firmness import has_own_force
 from dexkit.conformance.checks.motion import obeyed_before
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.median import median, medians
 from dexkit.conformance.results import Evidence
+from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 from dexkit.models import HandModel
 
@@ -45,22 +49,14 @@ def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
 
 
 @check("DEX1-FORCE-01")
-def in_contact(ctx: Context) -> Outcome:
-    """tau_est while squeezing an object."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
+@with_object
+@worst("tau_nm", "min_tau_nm", nothing="no state while it squeezed")
+def in_contact(ctx: Context) -> Figures:
+    """tau_est in size while squeezing an object."""
     found = _squeeze(ctx)
-    if found is None:
-        return ctx.skipped("no state while it squeezed")
-    tau, begin, end = found
-    text = f"tau_est {tau:.3f} N m while squeezing"
-    limit = ctx.tolerance("min_tau_nm")
-    if abs(tau) >= limit:
-        met = ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
-        return met.pressed(abs(tau), limit, at_least=True)
-    place = ctx.at(ctx.states.topic, begin, end)
-    outcome = ctx.failed(f"{tau:.2f} N m", text, place, tau_nm=tau)
-    return outcome.pressed(abs(tau), limit, at_least=True)
+    if found is not None:
+        tau, begin, end = found
+        yield Figure(abs(tau), begin, end, text=f"tau_est {tau:.3f} N m while squeezing")
 
 
 _HELD = 0.2
@@ -76,7 +72,7 @@ def _felt(
     """
     found = []
     for at in np.arange(begin, end - window + 1e-9, window):
-        tau = np.abs(ctx.states.tau[ctx.states.between(float(at), float(at) + window), 0])
+        tau = np.abs(ctx.tau(float(at), float(at) + window)[:, 0])
         tau = np.sort(tau[np.isfinite(tau)])
         if len(tau) >= 3:
             found.append((float(at), median(tau), float(tau[int(_HELD * len(tau))])))
@@ -84,12 +80,11 @@ def _felt(
 
 
 @check("DEX1-FORCE-10")
-def lasts(ctx: Context) -> Outcome:
+@with_object
+@worst("change_part", "max_change_part", nothing="it did not press on the object for long enough")
+def lasts(ctx: Context) -> Figures:
     """Rise and fall of the force of a long grip under a constant command."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     window = ctx.tolerance("window_s")
-    worst: tuple[float, float, float, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         touched = _touched(ctx, begin, end)
@@ -108,17 +103,9 @@ def lasts(ctx: Context) -> Outcome:
                 (tau, least, tau / least - 1.0),
                 (kept, held, 1.0 - kept / held),
             ):
-                counts = was == least or at >= settled
-                if counts and (worst is None or change > worst[0]):
-                    worst = change, at, now, was, begin
-    if worst is None:
-        return ctx.skipped("it did not press on the object for long enough")
-    change, at, tau, was, begin = worst
-    text = f"tau_est of {tau:.2f} N m {at - begin:.1f} s after the command, where it was {was:.2f}"
-    if change <= ctx.tolerance("max_change_part"):
-        return ctx.passed(f"{change:.0%}", text, change_part=change)
-    place = ctx.at(ctx.states.topic, at, at + window)
-    return ctx.failed(f"{tau:.2f} N m", text, place, change_part=change)
+                if was == least or at >= settled:
+                    text = f"tau_est of {now:.2f} N m {at - begin:.1f} s after the command, where "
+                    yield Figure(change, at, at + window, text=f"{text}it was {was:.2f}")
 
 
 def _touched(ctx: Context, begin: float, end: float) -> float | None:
@@ -135,88 +122,93 @@ def _touched(ctx: Context, begin: float, end: float) -> float | None:
 
 
 @check("DEX1-FORCE-17")
-def again(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "min_part", nothing="no state during a later grip")
+def again(ctx: Context) -> Figures:
     """The smallest force of later grips, relative to the first."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-
-    def force(begin: float, end: float) -> float | None:
-        tau = np.abs(ctx.states.tau[ctx.states.between(max(begin, end - 0.5), end), 0])
-        tau = tau[np.isfinite(tau)]
-        return median(tau) if len(tau) else None
-
     grips = ctx.phases("grip")
-    first = force(*ctx.span(grips[0])) if grips else None
+    first = _force(ctx, grips[0]) if grips else None
     if first is None or first < ctx.tolerance("min_tau_nm"):
-        return ctx.skipped("it did not grip before")
+        yield ctx.skipped("it did not grip before")
+        return
     # a driver may lower its effort at first (DEX1-FORCE-10): the least of the first grip's end
     begin, end = ctx.span(grips[0])
     pieces = _felt(ctx, max(begin, end - 0.5), end, 0.1)
     first = max(min((tau for _, tau, _ in pieces), default=first), ctx.tolerance("min_tau_nm"))
-    judged = [
-        p for p in (*grips[1:], *ctx.phases(), *ctx.phases("regrip")) if obeyed_before(ctx, p)
-    ]
-    later = [(tau, *s) for s in map(ctx.span, judged) if (tau := force(*s)) is not None]
-    if not later:
-        return ctx.skipped("no state during a later grip")
-    tau, begin, end = min(later)
-    limit = ctx.tolerance("min_part") * first
-    text = f"tau_est of {tau:.2f} N m in a later grip, {first:.2f} N m in the first"
-    if tau >= limit:
-        met = ctx.passed(f"{tau / first:.0%}", text, part=tau / first)
-        return met.pressed(tau, limit, at_least=True)
-    place = ctx.at(ctx.states.topic, begin, end)
-    outcome = ctx.failed(f"{tau / first:.0%}", text, place, part=tau / first)
-    return outcome.pressed(tau, limit, at_least=True)
+    for phase in (*grips[1:], *ctx.phases(), *ctx.phases("regrip")):
+        tau = _force(ctx, phase)
+        if tau is not None and obeyed_before(ctx, phase):
+            text = f"tau_est of {tau:.2f} N m in a later grip, {first:.2f} N m in the first"
+            least = ctx.tolerance("min_part") * first
+            measure = Measure(tau, least, "N m", Quantity.TORQUE, False)
+            yield Figure(tau / first, *ctx.span(phase), text=text, measure=measure)
+
+
+def _force(ctx: Context, phase: Phase) -> float | None:
+    """The median abs(tau_est) of the last half second of a grip; None without states."""
+    begin, end = ctx.span(phase)
+    tau = np.abs(ctx.tau(max(begin, end - 0.5), end)[:, 0])
+    tau = tau[np.isfinite(tau)]
+    return median(tau) if len(tau) else None
+
+
+@dataclass(frozen=True)
+class _Grip:
+    """The end of a grip with another stiffness than the client's.
+
+    :param tau: median abs(tau_est), N m.
+    :param asked: the torque that its command asks for, N m.
+    """
+
+    tau: float
+    asked: float
+    kp: float
+    begin: float
+    end: float
+
+    @property
+    def part(self) -> float:
+        """Its torque relative to the commanded one."""
+        return self.tau / self.asked
 
 
 @check("DEX1-FORCE-11")
-def soft_grips(ctx: Context) -> Outcome:
+@with_object
+@worst("tau_nm", "min_tau_nm", nothing="no state during grips with little stiffness")
+def soft_grips(ctx: Context) -> Figures:
     """The smallest tau_est of grips with low stiffness."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    found = _soft(ctx)
-    if not found:
-        return ctx.skipped("no state during grips with little stiffness")
-    _, tau, asked, kp, begin, end = min(found, key=lambda f: f[1])
-    text = (
-        f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, where kp times the distance is "
-        f"{asked:.2f} N m"
-    )
-    limit = ctx.tolerance("min_tau_nm")
-    if tau >= limit:
-        met = ctx.passed(f"{tau:.2f} N m", text, tau_nm=tau)
-        return met.pressed(tau, limit, at_least=True)
-    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
-    return outcome.pressed(tau, limit, at_least=True)
+    for grip in _soft(ctx):
+        text = (
+            f"tau_est of {grip.tau:.2f} N m with a kp of {grip.kp:g} N m/rad, where kp times the "
+            f"distance is {grip.asked:.2f} N m"
+        )
+        yield Figure(grip.tau, grip.begin, grip.end, text=text)
 
 
-def _soft(ctx: Context) -> list[tuple[float, float, float, float, float, float]]:
-    """(part, tau_est, torque asked for, kp, begin, end) of the end of each soft grip."""
+def _soft(ctx: Context) -> list[_Grip]:
+    """The soft grips that ask for enough torque to tell."""
     found = []
     for phase in ctx.phases("soft-grip"):
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.3)
-        rows = ctx.states.between(begin, end)
-        asked = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
-        tau, q = np.abs(ctx.states.tau[rows, 0]), ctx.states.q[rows, 0]
-        if not asked.any() or not (np.isfinite(tau) & np.isfinite(q)).any():
+        given = ctx.given(begin, end)
+        tau, q = np.abs(ctx.tau(begin, end)[:, 0]), ctx.q(begin, end)[:, 0]
+        if not given.any() or not (np.isfinite(tau) & np.isfinite(q)).any():
             continue
-        kp = median(ctx.commands.kp[asked, 0])
-        wanted = kp * (median(q) - median(ctx.commands.q[asked, 0]))
-        if wanted >= ctx.tolerance("min_asked_nm"):
-            felt = median(tau)
-            found.append((felt / wanted, felt, wanted, kp, begin, end))
+        kp = median(ctx.commands.kp[given, 0])
+        asked = kp * (median(q) - median(ctx.commands.q[given, 0]))
+        if asked >= ctx.tolerance("min_asked_nm"):
+            found.append(_Grip(median(tau), asked, kp, begin, end))
     return found
 
 
-def _softer(ctx: Context) -> list[tuple[float, float, float, float, float, float]]:
+def _softer(ctx: Context) -> list[_Grip]:
     """The grips of :func:`_soft` with less stiffness than the client's; with more, a coarse goal
     has a large effect.
     """
     hand = ctx.recording.model
     assert isinstance(hand, HandModel)  # a robot grips nothing
-    return [grip for grip in _soft(ctx) if grip[3] < hand.gains[0][0]]
+    return [grip for grip in _soft(ctx) if grip.kp < hand.gains[0][0]]
 
 
 _OWN = "this gripper has a force of its own"
@@ -228,87 +220,79 @@ def _usual(ctx: Context) -> float | None:
     for phase in ctx.phases("grip"):
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
-        rows = ctx.states.between(begin, end)
-        asked = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
-        if asked.any() and len(ctx.states.t[rows]):
-            away = median(ctx.states.q[rows, 0]) - median(ctx.commands.q[asked, 0])
-            wanted = median(ctx.commands.kp[asked, 0]) * away
+        given = ctx.given(begin, end)
+        if given.any() and len(ctx.q(begin, end)):
+            away = median(ctx.q(begin, end)[:, 0]) - median(ctx.commands.q[given, 0])
+            wanted = median(ctx.commands.kp[given, 0]) * away
             if wanted >= ctx.tolerance("min_asked_nm"):
-                stiff.append(median(np.abs(ctx.states.tau[rows, 0])) / wanted)
+                stiff.append(median(np.abs(ctx.tau(begin, end)[:, 0])) / wanted)
     return min(stiff) if stiff else None
 
 
 @check("DEX1-FORCE-12")
-def in_proportion(ctx: Context) -> Outcome:
+@worst("change", "max_change_part", nothing="no grips with little stiffness")
+def in_proportion(ctx: Context) -> Figures:
     """The force of soft grips compared with a stiff one, each relative to the commanded force."""
-    soft = _softer(ctx)
-    if not soft:
-        return ctx.skipped("no grips with little stiffness")
     usual, part = _usual(ctx), ctx.tolerance("max_change_part")
-    if usual is None:
-        return ctx.skipped("no grip with the client's stiffness")
-    if abs(usual - 1.0) > part or has_own_force(ctx):
-        return ctx.skipped(_OWN)
-    worst = max(soft, key=lambda f: abs(f[0] - 1.0))
-    ratio, tau, torque, kp, begin, end = worst
-    text = (
-        f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, where kp times the distance is "
-        f"{torque:.2f} N m; with the client's kp it is {usual:.0%} of that"
-    )
-    if abs(ratio - 1.0) <= part:
-        return ctx.passed(f"{ratio:.0%}", text, part=ratio)
-    return ctx.failed(f"{ratio:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=ratio)
+    for grip in _softer(ctx):
+        if usual is None:
+            yield ctx.skipped("no grip with the client's stiffness")
+        elif abs(usual - 1.0) > part or has_own_force(ctx):
+            yield ctx.skipped(_OWN)
+        else:
+            text = (
+                f"tau_est of {grip.tau:.2f} N m with a kp of {grip.kp:g} N m/rad, where kp times "
+                f"the distance is {grip.asked:.2f} N m; with the client's kp it is {usual:.0%} of "
+                "that"
+            )
+            change, shown = abs(grip.part - 1.0), f"{grip.part:.0%}"
+            yield Figure(change, grip.begin, grip.end, text=text, shown=shown)
 
 
 @check("DEX1-FORCE-14")
-def no_more_than_asked(ctx: Context) -> Outcome:
+@worst("part", "max_part", nothing="no grips to compare, one of them with the client's stiffness")
+def no_more_than_asked(ctx: Context) -> Figures:
     """The greatest force of soft grips, relative to the commanded one."""
     soft, usual = _softer(ctx), _usual(ctx)
     if not soft or usual is None:
-        return ctx.skipped("no grips to compare, one of them with the client's stiffness")
+        return
     if abs(usual - 1.0) > ctx.tolerance("max_own_part") or has_own_force(ctx):
-        return ctx.skipped(_OWN)
-    ratio, tau, torque, kp, begin, end = max(soft)
-    text = f"tau_est of {tau:.2f} N m with a kp of {kp:g} N m/rad, which asks for {torque:.2f} N m"
-    limit = ctx.tolerance("max_part") * torque
-    if tau <= limit:
-        return ctx.passed(f"{ratio:.0%}", text, tau_nm=tau).pressed(tau, limit)
-    outcome = ctx.failed(f"{tau:.2f} N m", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
-    return outcome.pressed(tau, limit)
+        yield ctx.skipped(_OWN)
+    for grip in soft:
+        text = (
+            f"tau_est of {grip.tau:.2f} N m with a kp of {grip.kp:g} N m/rad, which asks for "
+            f"{grip.asked:.2f} N m"
+        )
+        limit = ctx.tolerance("max_part") * grip.asked
+        measure = Measure(grip.tau, limit, "N m", Quantity.TORQUE)
+        yield Figure(grip.part, grip.begin, grip.end, text=text, measure=measure)
 
 
 @check("DEX1-FORCE-15")
-def releases_with_zero_gains(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "max_part", nothing="no force was reported while it squeezed")
+def releases_with_zero_gains(ctx: Context) -> Figures:
     """tau_est after zero gains at the q of a grip, relative to that of the grip."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, float, float, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before = np.abs(ctx.states.tau[ctx.states.between(begin - 0.3, begin), 0])
-        after = np.abs(ctx.states.tau[ctx.states.between(end - 0.1, end), 0])
-        before, after = before[np.isfinite(before)], after[np.isfinite(after)]
+        before, after = (
+            np.abs(tau[np.isfinite(tau)])
+            for tau in (ctx.tau(begin - 0.3, begin)[:, 0], ctx.tau(end - 0.1, end)[:, 0])
+        )
         if len(before) < 3 or len(after) < 3 or median(before) < ctx.tolerance("min_tau_nm"):
             continue
-        part = median(after) / median(before)
-        if worst is None or part > worst[0]:
-            worst = part, median(after), median(before), begin, end
-    if worst is None:
-        return ctx.skipped("no force was reported while it squeezed")
-    part, left, had, begin, end = worst
-    limit = ctx.tolerance("max_part") * had
-    text = f"tau_est {left:.2f} N m after zero gains at the same q, {had:.2f} N m before"
-    if left <= limit:
-        return ctx.passed(f"{part:.0%}", text, tau_nm=left).pressed(left, limit)
-    outcome = ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), tau_nm=left)
-    return outcome.pressed(left, limit)
+        left, had = median(after), median(before)
+        text = f"tau_est {left:.2f} N m after zero gains at the same q, {had:.2f} N m before"
+        measure = Measure(left, ctx.tolerance("max_part") * had, "N m", Quantity.TORQUE)
+        yield Figure(left / had, begin, end, text=text, measure=measure)
 
 
 @check("DEX1-FORCE-13")
-def zero(ctx: Context) -> Outcome:
-    """The median of tau_est without contact, before the first command."""
+@worst("tau_nm", "max_tau_nm", nothing="it was never without contact before the first command")
+def zero(ctx: Context) -> Figures:
+    """The median of tau_est, in size, without contact, before the first command."""
     if (unknown := ctx.contact_unknown) is not None:
-        return unknown
+        yield unknown
     states, asked = ctx.states, ctx.commands.t
     q, tau = states.q[:, 0], states.tau[:, 0]
     ends = ctx.tolerance("clear_stroke")
@@ -317,15 +301,10 @@ def zero(ctx: Context) -> Outcome:
         free = np.isfinite(tau) & (q > low) & (q < ctx.joints[0].q_max - ends)
     if len(asked):
         free &= states.t < asked[0]
-    if int(free.sum()) < 20:
-        return ctx.skipped("it was never without contact before the first command")
-    level = median(tau[free])
-    text = f"tau_est of {level:.3f} N m before the first command"
-    limit = ctx.tolerance("max_tau_nm")
-    if abs(level) <= limit:
-        return ctx.passed(f"{level:.3f} N m", text, tau_nm=level).pressed(abs(level), limit)
-    place = ctx.at(states.topic, float(states.t[free][0]))
-    return ctx.failed(f"{level:.2f} N m", text, place, tau_nm=level).pressed(abs(level), limit)
+    if int(free.sum()) >= 20:
+        level = median(tau[free])
+        text = f"tau_est of {level:.3f} N m before the first command"
+        yield Figure(abs(level), float(states.t[free][0]), text=text)
 
 
 def _ranges(t: Floats, begins: Floats, ends: Floats, side: Literal["left", "right"]) -> Ranges:
@@ -356,13 +335,14 @@ def _still(ctx: Context) -> Floats:
 
 
 @check("DEX1-FORCE-02")
-def at_rest(ctx: Context) -> Outcome:
+@worst("tau_nm", "max_tau_nm", nothing="the gripper never rests at its target in this recording")
+def at_rest(ctx: Context) -> Figures:
     """tau_est while the gripper rests at its target without contact."""
     states, commands = ctx.states, ctx.commands
     if (unknown := ctx.contact_unknown) is not None:
-        return unknown
+        yield unknown
     if len(commands) < 2:
-        return ctx.skipped("no commands to this hand")
+        yield ctx.skipped("no commands to this hand")
     window = ctx.tolerance("min_rest_s")
     begins = _still(ctx)
     rows = _ranges(states.t, begins, begins + window, "right")
@@ -381,24 +361,17 @@ def at_rest(ctx: Context) -> Outcome:
     near = np.abs(errors) <= ctx.tolerance("max_error_stroke")
     sizes = medians(np.abs(states.tau[:, 0]), rows[near])
     taus = list(zip(sizes.tolist(), begins[near].tolist(), strict=True))
-    if not taus:
-        return ctx.skipped("the gripper never rests at its target in this recording")
-    # the median of all rests: one of them may be an unannounced contact
-    level, begin = sorted(taus)[len(taus) // 2]
-    text = f"tau_est {level:.3f} N m at rest (median of {len(taus)} rests)"
-    limit = ctx.tolerance("max_tau_nm")
-    if level <= limit:
-        return ctx.passed(f"{level:.3f} N m", text, tau_nm=level).pressed(level, limit)
-    return ctx.failed(
-        f"{level:.2f} N m", text, ctx.at(states.topic, begin, begin + window), tau_nm=level
-    ).pressed(level, limit)
+    if taus:
+        # the median of all rests: one of them may be an unannounced contact
+        level, begin = sorted(taus)[len(taus) // 2]
+        text = f"tau_est {level:.3f} N m at rest (median of {len(taus)} rests)"
+        yield Figure(level, begin, begin + window, text=text)
 
 
 @check("DEX1-FORCE-03")
+@with_object
 def sign(ctx: Context) -> Outcome:
     """Sign of tau_est while squeezing."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = _squeeze(ctx)
     if found is None or found[0] == 0.0:
         return ctx.skipped("no force was reported while it squeezed")
@@ -442,16 +415,13 @@ def raw_counts(
 
 
 @check("DEX1-FORCE-05")
-def unsigned(ctx: Context) -> Outcome:
+@worst("tau_nm", "max_below_nm", nothing="no state with a tau_est")
+def unsigned(ctx: Context) -> Figures:
     """The smallest tau_est in a dialect where it is the strength of the grip."""
     tau = ctx.states.tau[:, 0]
-    if not np.isfinite(tau).any():
-        return ctx.skipped("no state with a tau_est")
-    i = int(np.nanargmin(tau))
-    least = float(tau[i])
-    text = f"tau_est from {least:.2f} to {float(np.nanmax(tau)):.2f} N m"
-    if least >= -ctx.tolerance("min_tau_nm"):
-        return ctx.passed(f"{least:.2f} N m", text, tau_nm=least)
-    return ctx.failed(
-        f"{least:.2f} N m", text, ctx.at(ctx.states.topic, float(ctx.states.t[i])), tau_nm=least
-    )
+    if np.isfinite(tau).any():
+        i = int(np.nanargmin(tau))
+        text = f"tau_est from {tau[i]:.2f} to {float(np.nanmax(tau)):.2f} N m"
+        limit, shown = ctx.tolerance("min_tau_nm"), f"{tau[i]:.2f} N m"
+        at = float(ctx.states.t[i])
+        yield Figure(-float(tau[i]), at, text=text, limit=limit, shown=shown)

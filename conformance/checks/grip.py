@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.figures import with_object
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.row_selection import Rows
 from dexkit.conformance.stimulus_record import Phase
@@ -242,10 +243,9 @@ def one_scale(ctx: Context) -> Outcome:
 
 
 @check("DEX3-FORCE-08")
+@with_object
 def presses_as_it_moves(ctx: Context) -> Outcome:
     """tau_est of each standing joint that presses on the object, relative to the law."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     phases = [p for name in ("squeeze", "touch", "firmer", "regrip") for p in ctx.phases(name)]
     worst = worst_of(piece for phase in phases for piece in _presses(ctx, *ctx.span(phase)))
     if worst is None or worst.joint is None:
@@ -294,16 +294,14 @@ def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
 
 
 @check("DEX3-FORCE-11", "BRAINCO-FORCE-11")
+@with_object
 def stops_at_object(ctx: Context) -> Outcome:
     """The least part of the way from the object to its goal that a joint goes.
 
     One joint is enough, as an object need not touch all. A requirement with ``min_tau_nm`` also
     limits the torque of the joints that go farther.
     """
-    touch = ctx.object_at
-    if touch is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    most = 0.0
+    touch, most = ctx.touch, 0.0
     judged = False
     for phase in ctx.phases():
         begin, end = max(ctx.span(phase)[0], ctx.span(phase)[1] - _PRESSED_S), ctx.span(phase)[1]
@@ -440,11 +438,9 @@ def _fitted(x: Floats, y: Floats) -> _Spring | None:
 
 
 @check("DEX1-FORCE-19")
+@with_object
 def grips_as_it_moves(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, relative to the spring that moves the gripper freely."""
-    touch = ctx.object_at
-    if touch is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     spring = _spring(ctx)
     if (
         spring is None
@@ -456,7 +452,7 @@ def grips_as_it_moves(ctx: Context) -> Outcome:
     softest = min(spring.stiffness, spring.least)
     stiffest = max(spring.stiffness, spring.most)
     pieces = []
-    for piece in contacts(ctx, touch):
+    for piece in contacts(ctx, ctx.touch):
         depth = piece.q - piece.goal
         if stiffest * depth < ctx.tolerance("min_asked_nm"):
             continue

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.hands import under_test
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.median import median
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.sums import mean
@@ -20,14 +23,12 @@ from dexkit.hand import Floats
 class Step:
     """A step of one joint's target, and the course of q.
 
-    :param name: of the joint, where the hand has several.
     :param stroke: of the joint, rad.
     :param start: q before it.
     :param final: q at its end (median of the last 0.2 s).
     :param unit: of q.
     """
 
-    name: str
     joint: int
     stroke: float
     begin: float
@@ -49,6 +50,19 @@ class Step:
         """Distance from the target at the end, rad."""
         return abs(self.final - self.target)
 
+    @property
+    def progress(self) -> float:
+        """The part of the step that was made; negative in the wrong direction."""
+        return (self.final - self.start) / self.size
+
+    def figure(self, value: float, text: str, **more: Any) -> Figure:
+        """A figure of this step, with other parameters of :class:`Figure`."""
+        return Figure(value, self.begin, self.end, self.joint, text, **more)
+
+    def error_figure(self, text: str) -> Figure:
+        """Its distance from the target."""
+        return self.figure(self.error, text)
+
     def arrives_within(self, seconds: float) -> bool:
         """Whether it still moves to its target at the end, fast enough to arrive within
         ``seconds``.
@@ -63,8 +77,8 @@ class Step:
 
     def __str__(self) -> str:
         return (
-            f"{self.name}commanded from {self.start:.2f} to {self.target:.2f} {self.unit}, q went "
-            f"to {self.final:.2f}"
+            f"commanded from {self.start:.2f} to {self.target:.2f} {self.unit}, q went to "
+            f"{self.final:.2f}"
         )
 
 
@@ -90,7 +104,6 @@ def _steps_to(ctx: Context, phase: Phase, targets: Mapping[int, float]) -> Itera
             continue
         late = t >= end - 0.2
         yield Step(
-            name=ctx.named("", joint),
             joint=joint,
             stroke=ctx.joints[joint].stroke,
             begin=begin,
@@ -253,7 +266,6 @@ def _motions(
             continue
         after = states.q[rows, joint]
         motion = Step(
-            name=ctx.named("", joint),
             joint=joint,
             stroke=spec.stroke,
             begin=begin,
@@ -314,18 +326,8 @@ _DISOBEYS = 0.1  # of the stroke
 
 def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
     """The failure of a hand that ends a step away from its target."""
-    limit = ctx.tolerance("max_error_stroke", step.joint)
-    return (
-        ctx.failed(
-            "disobeys",
-            f"{when}: {step}",
-            ctx.at(ctx.states.topic, step.begin, step.end),
-            error_rad=step.error,
-        )
-        .about(step.joint)
-        .placed(step.error, limit)
-        .if_late(STROKE_S * step.error / step.stroke)
-    )
+    figure = replace(step.error_figure(f"{when}: {step}"), shown="disobeys")
+    return judged(ctx, [figure], "error_rad", "max_error_stroke", nothing="")
 
 
 def obeyed_before(ctx: Context, phase: Phase) -> bool:
@@ -348,62 +350,37 @@ def obeyed_before(ctx: Context, phase: Phase) -> bool:
 def direction(ctx: Context) -> Outcome:
     """Progress towards the target, as a part of the step."""
     found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * s.stroke]
-    if not found:
-        return ctx.failed(
-            "no step",
-            "no step could be made: there is no state during the steps, or q already "
-            "was at every target",
+    figures = [
+        s.figure(
+            s.progress,
+            f"{s}: {_how_it_missed(s)}",
+            met=f"{len(found)} steps, all in the right direction",
         )
-    progress = [(s.final - s.start) / s.size for s in found]
-    worst = int(np.argmin(progress))
-    if progress[worst] >= ctx.tolerance("min_progress"):
-        return ctx.passed(
-            f"{len(found)} of {len(found)}",
-            f"{len(found)} steps, all in the right direction",
-            steps=len(found),
-        )
-    step = found[worst]
-    moved = float(np.ptp(step.q))
-    verdict = "it did not move" if moved < 0.02 * step.stroke else "that is the wrong direction"
-    if progress[worst] > -0.05 and moved >= 0.02 * step.stroke:
-        verdict = "it did not reach its target"
-    return (
-        ctx.failed(
-            f"{progress[worst]:+.0%}",
-            f"{step}: {verdict}",
-            ctx.at(ctx.states.topic, step.begin, step.end),
-            progress=progress[worst],
-        )
-        .about(step.joint)
-        .because(_cause(found))
+        for s in found
+    ]
+    nothing = ctx.failed(
+        "no step",
+        "no step could be made: there is no state during the steps, or q already was at every "
+        "target",
     )
+    outcome = judged(ctx, figures, "progress", "min_progress", nothing=nothing)
+    return outcome.because(_cause(found)) if found else outcome
+
+
+def _how_it_missed(step: Step) -> str:
+    if float(np.ptp(step.q)) < 0.02 * step.stroke:
+        return "it did not move"
+    return "it did not reach its target" if step.progress > -0.05 else "that is the wrong direction"
 
 
 @check("DEX1-MOVE-02", "DEX3-MOVE-02")
 def arrives(ctx: Context) -> Outcome:
     """Distance from the target at the end of each step."""
     found = steps(ctx)
-    if not found:
-        return ctx.failed("no state", f"no state of the {ctx.side} hand during the steps")
-    worst = max(found, key=lambda s: s.error / s.stroke)
-    limit = ctx.tolerance("max_error_stroke", worst.joint)
-    if worst.error <= limit:
-        return ctx.passed(
-            f"{worst.error:.3f} {ctx.unit}",
-            f"{len(found)} steps, ending at most {worst.error:.3f} {ctx.unit} off",
-            error_rad=worst.error,
-        ).placed(worst.error, limit)
-    return (
-        ctx.failed(
-            f"{worst.error:.2f} {ctx.unit}",
-            f"{worst}",
-            ctx.at(ctx.states.topic, worst.begin, worst.end),
-            error_rad=worst.error,
-        )
-        .about(worst.joint)
-        .placed(worst.error, limit)
-        .because(_cause(found))
-    )
+    nothing = ctx.failed("no state", f"no state of the {ctx.side} hand during the steps")
+    figures = [s.error_figure(str(s)) for s in found]
+    outcome = judged(ctx, figures, "error_rad", "max_error_stroke", nothing=nothing)
+    return outcome.because(_cause(found)) if found else outcome
 
 
 def _cause(found: Sequence[Step]) -> str:
@@ -422,98 +399,50 @@ def _cause(found: Sequence[Step]) -> str:
 
 
 @check("DEX1-MOVE-03", "DEX3-MOVE-03")
-def settles(ctx: Context) -> Outcome:
+@worst("ripple_rad", "max_ripple_stroke", nothing="too few states at the end of the steps")
+def settles(ctx: Context) -> Figures:
     """Ripple of q at the end of each step."""
-    ripples = []
-    window = ctx.tolerance("window_s")
     for step in steps(ctx):
-        tail = step.q[step.t >= step.end - window]
+        begin = step.end - ctx.tolerance("window_s")
+        tail = step.q[step.t >= begin]
         if len(tail) >= 5:
-            ripples.append((float(np.ptp(tail)), step))
-    if not ripples:
-        return ctx.skipped("too few states at the end of the steps")
-    ripple, step = max(ripples, key=lambda r: r[0] / r[1].stroke)
-    limit = ctx.tolerance("max_ripple_stroke", step.joint)
-    if ripple <= limit:
-        return ctx.passed(
-            f"{ripple:.3f} {ctx.unit}",
-            f"ripple of at most {ripple:.3f} {ctx.unit}",
-            ripple_rad=ripple,
-        ).placed(ripple, limit)
-    outcome = ctx.failed(
-        f"{ripple:.2f} {ctx.unit}",
-        f"{step.name}at the target {step.target:.2f} {ctx.unit} q still moves by {ripple:.2f} "
-        f"{ctx.unit}, peak "
-        "to peak",
-        ctx.at(ctx.states.topic, step.end - window, step.end),
-        ripple_rad=ripple,
-    )
-    return outcome.about(step.joint).placed(ripple, limit)
+            ripple = float(np.ptp(tail))
+            text = f"at the target {step.target:.2f} {ctx.unit} q still moves by {ripple:.3f} "
+            text += f"{ctx.unit}, peak to peak"
+            yield Figure(ripple, begin, step.end, step.joint, text)
 
 
 @check("DEX1-MOVE-04", "DEX3-MOVE-04")
-def speed(ctx: Context) -> Outcome:
+@worst("speed_rad_s", "min_speed_rad_s", nothing="no step of that size was finished")
+def speed(ctx: Context) -> Figures:
     """Speed from 10 to 90 % of each large step."""
-    found = []
     for step in steps(ctx):
-        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
-            continue
         shown = speed_of(step)
-        if shown is not None:
-            found.append((shown, step))
-    if not found:
-        return ctx.skipped("no step of that size was finished")
-    slowest, step = min(found, key=lambda f: f[0])
-    text = f"{step.name}{slowest:.2f} {ctx.unit}/s in the slowest of {len(found)} large steps"
-    way = 0.8 * abs(step.size)
-    if slowest >= ctx.tolerance("min_speed_rad_s"):
-        return ctx.passed(f"{slowest:.1f} {ctx.unit}/s", text, speed_rad_s=slowest)
-    return (
-        ctx.failed(
-            f"{slowest:.1f} {ctx.unit}/s",
-            text,
-            ctx.at(ctx.states.topic, step.begin, step.end),
-            speed_rad_s=slowest,
-        )
-        .about(step.joint)
-        .if_late(way / slowest - way / ctx.tolerance("min_speed_rad_s"))
-    )
+        if shown is not None and abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
+            way = 0.8 * abs(step.size)
+            late = way / shown - way / ctx.tolerance("min_speed_rad_s")
+            yield step.figure(
+                shown, f"{shown:.2f} {ctx.unit}/s in the slowest large step", late=late
+            )
 
 
 @check("DEX1-MOVE-05", "DEX3-MOVE-05")
-def overshoot(ctx: Context) -> Outcome:
+@worst("overshoot_rad", "max_overshoot_stroke", nothing="no step of that size")
+def overshoot(ctx: Context) -> Figures:
     """Overshoot of q beyond the target."""
-    found = [
-        (float(np.max((s.q - s.target) * np.sign(s.size))), s)
-        for s in steps(ctx)
-        if abs(s.size) >= 0.1 * s.stroke
-    ]
-    if not found:
-        return ctx.skipped("no step of that size")
-    beyond, step = max(found, key=lambda f: f[0] / f[1].stroke)
-    beyond = max(beyond, 0.0)
-    if beyond <= ctx.tolerance("max_overshoot_stroke", step.joint):
-        return ctx.passed(
-            f"{beyond:.3f} {ctx.unit}",
-            f"at most {beyond:.3f} {ctx.unit} beyond the target",
-            overshoot_rad=beyond,
-        )
-    return (
-        ctx.failed(
-            f"{beyond:.2f} {ctx.unit}",
-            f"{step.name}{beyond:.2f} {ctx.unit} beyond the target {step.target:.2f} {ctx.unit}",
-            ctx.at(ctx.states.topic, step.begin, step.end),
-            overshoot_rad=beyond,
-        )
-        .about(step.joint)
-        .if_late(STROKE_S * beyond / step.stroke)
-    )
+    for step in steps(ctx):
+        if abs(step.size) >= 0.1 * step.stroke:
+            beyond = max(float(np.max((step.q - step.target) * np.sign(step.size))), 0.0)
+            yield step.figure(
+                beyond,
+                f"{beyond:.3f} {ctx.unit} beyond the target {step.target:.2f} {ctx.unit}",
+            )
 
 
 @check("DEX1-MOVE-06", "DEX3-MOVE-06")
-def monotonous(ctx: Context) -> Outcome:
+@worst("back_rad", "max_back_stroke", nothing="no step of that size")
+def monotonous(ctx: Context) -> Figures:
     """Largest reversal of q on the way to the target."""
-    found = []
     for step in steps(ctx):
         if abs(step.size) < 0.1 * step.stroke:
             continue
@@ -522,102 +451,60 @@ def monotonous(ctx: Context) -> Outcome:
         way = way[: int(there[0]) + 1] if len(there) else way
         back = np.maximum.accumulate(np.maximum(way, 0.0)) - way
         i = int(np.argmax(back))
-        found.append((float(back[i]), float(step.t[i]), step))
-    if not found:
-        return ctx.skipped("no step of that size")
-    back_by, at, step = max(found, key=lambda f: f[0] / f[2].stroke)
-    text = f"{step.name}turned back by at most {back_by:.3f} {ctx.unit} in {len(found)} steps"
-    if back_by <= ctx.tolerance("max_back_stroke", step.joint):
-        return ctx.passed(f"{back_by:.3f} {ctx.unit}", text, back_rad=back_by)
-    return (
-        ctx.failed(
-            f"{back_by:.2f} {ctx.unit}",
-            f"{step.name}on its way from {step.start:.2f} to {step.target:.2f} {ctx.unit} q "
-            "went back by "
-            f"{back_by:.2f} {ctx.unit}",
-            ctx.at(ctx.states.topic, at, step.end),
-            back_rad=back_by,
+        text = (
+            f"on its way from {step.start:.2f} to {step.target:.2f} {ctx.unit} q went back by "
+            f"{back[i]:.3f} {ctx.unit}"
         )
-        .about(step.joint)
-        .if_late(STROKE_S * back_by / step.stroke)
-    )
+        yield Figure(float(back[i]), float(step.t[i]), step.end, step.joint, text)
 
 
 @check("DEX1-MOVE-07", "DEX3-MOVE-07")
-def settling(ctx: Context) -> Outcome:
+@worst("settle_s", "max_settle_s", nothing="no step of that size")
+def settling(ctx: Context) -> Figures:
     """Time from the command until q stays near the target."""
-    found = []
     for step in steps(ctx):
         if abs(step.size) < 0.1 * step.stroke:
             continue
         away = np.abs(step.q - step.target) > ctx.tolerance("max_error_stroke", step.joint)
         last = np.flatnonzero(away)
         seconds = float(step.t[last[-1]]) - step.begin if len(last) else 0.0
-        found.append((seconds, step))
-    if not found:
-        return ctx.skipped("no step of that size")
-    longest, step = max(found, key=lambda f: f[0])
-    text = f"{step.name}{longest:.2f} s in the slowest of {len(found)} steps"
-    limit = ctx.tolerance("max_settle_s")
-    if longest <= limit:
-        return ctx.passed(f"{longest:.2f} s", text, settle_s=longest).timed(longest, limit)
-    return (
-        ctx.failed(
-            f"{longest:.2f} s",
-            f"{step}: after {longest:.2f} s it was still away from its target",
-            ctx.at(ctx.states.topic, step.begin, step.begin + longest),
-            settle_s=longest,
+        yield Figure(
+            seconds,
+            step.begin,
+            step.begin + seconds,
+            step.joint,
+            f"{step}: after {seconds:.2f} s it was still away from its target",
+            met=f"{seconds:.2f} s in the slowest step",
         )
-        .about(step.joint)
-        .timed(longest, limit)
-        .if_late(longest - limit)
-    )
 
 
 @check("DEX1-MOVE-09", "DEX3-MOVE-08")
-def begins(ctx: Context) -> Outcome:
+@worst("reaction_s", "max_reaction_s", nothing="no step of that size was finished")
+def begins(ctx: Context) -> Figures:
     """Time from the command until the hand moves, for every step that arrives."""
-    slowest: tuple[float, float, Step] | None = None
     first = [p for name in _AFTER_A_PAUSE for p in ctx.phases(name)[:1]]
     for phase in (p for name in _PROMPT for p in ctx.phases(name)):
+        limit = ctx.tolerance("max_first_s" if phase in first else "max_reaction_s")
         for step in steps_of(ctx, phase):
-            before = ctx.states.between(step.begin - 0.1, step.begin)
-            if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
-                continue  # it was still under way
             way = (step.q - step.start) * np.sign(step.size) >= _BEGUN * step.stroke
             if (
-                abs(step.size) < ctx.tolerance("min_step_stroke", step.joint)
+                not _rests_before(ctx, step)
+                or abs(step.size) < ctx.tolerance("min_step_stroke", step.joint)
                 or step.error > _DISOBEYS * step.stroke
                 or not way.any()
             ):
                 continue  # other requirements judge whether it arrives
             after = float(step.t[np.argmax(way)]) - step.begin
-            limit = ctx.tolerance("max_first_s" if phase in first else "max_reaction_s")
-            if slowest is None or after / limit > slowest[0] / slowest[1]:
-                slowest = after, limit, step
-    if slowest is None:
-        return ctx.skipped("no step of that size was finished")
-    after, limit, step = slowest
-    text = f"{step.name}after {after:.2f} s in the step to {step.target:.2f} {ctx.unit}"
-    span = step.begin, step.begin + after
-    if after <= limit:
-        met = ctx.passed(f"{after:.2f} s", text, reaction_s=after)
-        return met.timed(after, limit, span=span)
-    return (
-        ctx.failed(
-            f"{after:.2f} s",
-            f"{step}, but it began to move only after {after:.2f} s",
-            ctx.at(ctx.states.topic, *span),
-            reaction_s=after,
-        )
-        .about(step.joint)
-        .timed(after, limit)
-        .if_late(after - limit)
-    )
+            text = f"{step}, but it began to move only after {after:.2f} s"
+            met = f"after {after:.2f} s in the step to {step.target:.2f} {ctx.unit}"
+            end = step.begin + after
+            yield Figure(after, step.begin, end, step.joint, text, met, limit)
 
 
-def _range(q: Floats) -> float:
-    return float(np.ptp(q)) if len(q) else 0.0
+def _rests_before(ctx: Context, step: Step) -> bool:
+    """Whether a joint stands before a step; without states, too."""
+    q = ctx.q(step.begin - 0.1, step.begin)[:, step.joint]
+    return not len(q) or bool(np.ptp(q) < 0.01 * step.stroke)
 
 
 _BEGUN = 0.02
@@ -633,49 +520,35 @@ commands to the other hand."""
 
 
 @check("DEX1-MOVE-10")
-def dead_zones(ctx: Context) -> Outcome:
+@worst("part", "max_part", nothing="no command in a dead zone, or none to its end")
+def dead_zones(ctx: Context) -> Figures:
     """Size of a dead zone between the gripper's reached position and its end."""
-    worst: tuple[float, float, float, float, float] | None = None
     reached = {s.target: s.final for p in ctx.phases("ends") for s in steps_of(ctx, p)}
-    for phase in ctx.phases():
-        for step in steps_of(ctx, phase):
-            rows = (ctx.commands.t >= step.begin) & (ctx.commands.t <= step.end)
-            asked = ctx.commands.q[rows, step.joint]
-            if not len(asked) or step.target not in reached:
-                continue
-            zone = abs(float(asked[-1]) - step.target)
-            part = abs(step.final - reached[step.target]) / zone if zone > 0 else 0.0
-            found = (part, float(asked[-1]), step.final, step.begin, step.end)
-            worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.skipped("no command in a dead zone, or none to its end")
-    part, asked_q, final, begin, end = worst
-    text = f"commanded to {asked_q:g} rad, q ends at {final:.3f} rad: {part:.0%} of the zone short"
-    if part <= ctx.tolerance("max_part"):
-        return ctx.passed(f"{part:.0%}", text, part=part)
-    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, begin, end), part=part)
+    for step in steps(ctx):
+        asked = ctx.commands.q[ctx.given(step.begin, step.end), step.joint]
+        if not len(asked) or step.target not in reached:
+            continue
+        zone = abs(float(asked[-1]) - step.target)
+        part = abs(step.final - reached[step.target]) / zone if zone > 0 else 0.0
+        yield step.figure(
+            part,
+            f"commanded to {asked[-1]:g} rad, q ends at {step.final:.3f} rad: {part:.0%} of the "
+            "zone short",
+        )
 
 
 @check("DEX1-MOVE-08")
 def ends(ctx: Context) -> Outcome:
     """Distance from fully open and fully closed."""
     found = steps(ctx)
-    if not found:
-        return ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
-    worst = max(found, key=lambda s: s.error)
     text = "; ".join(
         f"commanded to {s.target:.2f} {ctx.unit}, q went to {s.final:.2f}" for s in found
     )
-    limit = ctx.tolerance("max_error_stroke")
-    if worst.error <= limit:
-        met = ctx.passed(f"{worst.error:.3f} {ctx.unit}", text, error_rad=worst.error)
-        return met.placed(worst.error, limit)
-    outcome = ctx.failed(
-        f"{worst.error:.2f} {ctx.unit}",
-        text,
-        ctx.at(ctx.states.topic, worst.begin, worst.end),
-        error_rad=worst.error,
-    ).placed(worst.error, limit)
+    nothing = ctx.failed("no state", f"no state of the {ctx.side} hand at its ends")
+    figures = [s.error_figure(text) for s in found]
+    outcome = judged(ctx, figures, "error_rad", "max_error_stroke", nothing=nothing)
+    if not found:
+        return outcome
     reached = max(s.final for s in found) / max(s.target for s in found)
     if abs(reached - 5.4 / (2 * np.pi)) < 0.02 or abs(reached - 2 * np.pi / 5.4) < 0.02:
         return outcome.because(
@@ -685,19 +558,21 @@ def ends(ctx: Context) -> Outcome:
 
 
 @check("DEX1-SIDE-01", "DEX3-SIDE-01")
-def independent(ctx: Context) -> Outcome:
+@worst(
+    "motion_rad", "max_motion_stroke", nothing="no state of this hand while only the other moved"
+)
+def independent(ctx: Context) -> Figures:
     """Motion of this hand while only the other hand's target changes."""
     first = ctx.requirement.phase or ""
     names = (first, "company", *_AFTER_A_PAUSE)
     others = [(n, p) for n in names for p in ctx.recording.phases(n) if ctx.side not in p.sides]
     if not others:
-        return ctx.skipped("only one side was commanded")
-    moved: list[tuple[float, float, int, float, float]] = []
+        yield ctx.skipped("only one side was commanded")
     for name, phase in others:
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
         t, positions = ctx.states.t[rows], ctx.states.q[rows]
-        before = ctx.states.q[ctx.states.between(begin - 0.25, begin)]
+        before = ctx.q(begin - 0.25, begin)
         if len(t) < 2 or not len(before):
             continue
         # the mean of each quarter of a second: a hand that oscillates about its target is
@@ -715,43 +590,26 @@ def independent(ctx: Context) -> Outcome:
             end_q = float(np.clip(goal, start - rest, start + rest))
             low, high = min(start, end_q), max(start, end_q)
             most = float(np.maximum(low - means, means - high).max(initial=0.0))
-            moved.append((most / spec.stroke, most, joint, begin, end))
-    if not moved:
-        return ctx.skipped("no state of this hand while the other one moved")
-    _, most, joint, begin, end = max(moved)
-    other = "right" if ctx.side == "left" else "left"
-    limit = ctx.tolerance("max_motion_stroke", joint)
-    if most <= limit:
-        return ctx.passed(
-            f"{most:.3f} {ctx.unit}",
-            f"moved by {most:.3f} {ctx.unit} in {len(others)} steps of the {other} hand",
-            motion_rad=most,
-        ).placed(most, limit)
-    outcome = ctx.failed(
-        f"{most:.2f} {ctx.unit}",
-        ctx.named(
-            f"moved by {most:.2f} {ctx.unit} while only the {other} hand was commanded to move",
-            joint,
-        ),
-        ctx.at(ctx.states.topic, begin, end),
-        motion_rad=most,
-    )
-    return outcome.about(joint).placed(most, limit)
+            text = (
+                f"moved by {most:.3f} {ctx.unit} while only the {ctx.other} hand was commanded to "
+                "move"
+            )
+            yield Figure(most, begin, end, joint, text)
 
 
 @check("DEX3-SIDE-03")
-def beside_grip(ctx: Context) -> Outcome:
+@worst("part", "min_part", nothing="no step that can be compared with an earlier one")
+def beside_grip(ctx: Context) -> Figures:
     """The way of each joint's step beside a grip, as a part of its way in the same time of the same
     step before. So a slow hand passes.
     """
     known = [s for n in ("joint", "step") for p in ctx.phases(n) for s in steps_of(ctx, p)]
-    slack = ctx.tolerance("slack_s")
-    worst: tuple[float, Step, float, float] | None = None
+    slack, limit = ctx.tolerance("slack_s"), ctx.tolerance("min_part")
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         found = steps_of(ctx, phase)
         if not found:
             when = "while the other hand pressed on an object"
-            return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
+            yield ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
         for step in found:
             if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
                 continue
@@ -761,26 +619,14 @@ def beside_grip(ctx: Context) -> Outcome:
                 seconds, way = _most_of_way(like, step.end - step.begin - slack)
                 if way < _CLEAR_WAY:
                     continue
-                now = _way_within(step, seconds + slack)
-                if worst is None or now / way < worst[0]:
-                    worst = now / way, step, seconds, way
-    if worst is None:
-        return ctx.skipped("no step that can be compared with an earlier one")
-    part, step, seconds, way = worst
-    limit = ctx.tolerance("min_part")
-    text = (
-        f"{step.name}after {seconds + slack:.2f} s it had made {part:.0%} of the way that it made "
-        f"in {seconds:.2f} s without a grip of the other hand"
-    )
-    made, least = part * way * abs(step.size), limit * way * abs(step.size)
-    if part >= limit:
-        met = ctx.passed(f"{part:.0%}", text, part=part)
-        return met.placed(made, least, at_least=True)
-    outcome = ctx.failed(
-        f"{part:.0%}", text, ctx.at(ctx.states.topic, step.begin, step.end), part=part
-    )
-    late = seconds * (limit - part)
-    return outcome.about(step.joint).placed(made, least, at_least=True).if_late(late)
+                part = _way_within(step, seconds + slack) / way
+                text = (
+                    f"after {seconds + slack:.2f} s it had made {part:.0%} of the way that it made "
+                    f"in {seconds:.2f} s without a grip of the other hand"
+                )
+                rad = way * abs(step.size)
+                made = Measure(part * rad, limit * rad, "rad", Quantity.POSITION, False)
+                yield step.figure(part, text, late=seconds * (limit - part), measure=made)
 
 
 def _way_within(step: Step, seconds: float) -> float:
@@ -802,37 +648,26 @@ def _most_of_way(step: Step, longest: float) -> tuple[float, float]:
 
 
 @check("DEX1-SIDE-03")
-def by_its_own(ctx: Context) -> Outcome:
+@worst(
+    "progress",
+    "min_progress",
+    nothing="no step to judge: only one side was commanded, the hand had stopped obeying before, "
+    "or no state shows the end of a step",
+)
+def by_its_own(ctx: Context) -> Figures:
     """Steps of this hand while the other hand gets other values in the same members."""
-    worst: tuple[float, Step] | None = None
-    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
-        for step in steps_of(ctx, phase):
-            before = ctx.states.between(step.begin - 0.1, step.begin)
-            if not _range(ctx.states.q[before, step.joint]) < 0.01 * step.stroke:
-                continue  # it was still under way, from where it was limp
-            last = step.q[step.t >= step.end - 0.03]
-            if len(last) and abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
-                # the step is short: its last states, not the median of some; RATE-03 judges gaps
-                final = median(last)
-                step = replace(step, final=final)
-                part = (final - step.start) / step.size
-                if worst is None or part < worst[0]:
-                    worst = part, step
-                if step.error > ctx.tolerance("max_error_stroke", step.joint):
-                    return disobeyed(ctx, "while the other hand was commanded otherwise", step)
-    if worst is None:
-        return ctx.skipped(
-            "no step to judge: only one side was commanded, the hand had stopped obeying before, "
-            "or no state shows the end of a step"
-        )
-    part, step = worst
-    text = f"while the other hand had zero gains: {step}"
-    limit = ctx.tolerance("min_progress")
-    if part >= limit:
-        return ctx.passed(f"{part:.0%}", text, progress=part)
-    place = ctx.at(ctx.states.topic, step.begin, step.end)
-    outcome = ctx.failed(f"{part:.0%}", text, place, progress=part).about(step.joint)
-    return outcome.if_late(STROKE_S * abs(step.size) / step.stroke)
+    for step in (s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)):
+        # the step is short: its last states, not the median of some; RATE-03 judges gaps
+        last = step.q[step.t >= step.end - 0.03]
+        large = abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint)
+        # it may still be under way, from where it was limp
+        if not _rests_before(ctx, step) or not len(last) or not large:
+            continue
+        made = replace(step, final=median(last))
+        if made.error > ctx.tolerance("max_error_stroke", step.joint):
+            yield disobeyed(ctx, "while the other hand was commanded otherwise", made)
+        late = STROKE_S * abs(step.size) / step.stroke
+        yield made.figure(made.progress, f"while the other hand had zero gains: {made}", late=late)
 
 
 @check("DEX1-GAIN-01", "DEX3-GAIN-01")
@@ -846,41 +681,26 @@ def not_driven(ctx: Context, how: str) -> Outcome:
     given = steps(ctx)
     if not given:
         return ctx.skipped("no state during this stimulus")
-    # joints already at q prove nothing
-    limit = [2 * ctx.tolerance("max_motion_stroke", s.joint) for s in given]
-    away = [s for s, least in zip(given, limit, strict=True) if abs(s.size) > least]
-    if not away:
-        return ctx.skipped("the hand was already at the q that must have no effect")
     # gravity pulls a joint the same way whatever q is, so q is commanded on both sides and both
     # must count
-    ways: dict[tuple[int, bool], tuple[float, Step]] = {}
-    for s in away:
-        towards = float(np.max((s.q - s.start) * np.sign(s.size)))
-        key = s.joint, s.size > 0
-        if key not in ways or towards > ways[key][0]:
-            ways[key] = towards, s
-    found = [
-        min((ways[joint, way] for way in (True, False) if (joint, way) in ways), key=lambda f: f[0])
-        for joint in dict.fromkeys(joint for joint, _ in ways)
-    ]
-    towards, step = max(found, key=lambda f: f[0] / f[1].stroke)
-    towards = max(0.0, towards)
-    most = ctx.tolerance("max_motion_stroke", step.joint)
-    if towards <= most:
-        return ctx.passed(
-            f"{towards:.3f} {ctx.unit}",
-            f"{step.name}moved {towards:.3f} {ctx.unit} towards a q that was "
-            f"{abs(step.size):.2f} {ctx.unit} "
-            "away",
-            motion_rad=towards,
-        ).placed(towards, most)
-    outcome = ctx.failed(
-        f"{towards:.2f} {ctx.unit}",
-        f"{step.name}moved {towards:.2f} {ctx.unit} towards q = {step.target:.2f} {how}",
-        ctx.at(ctx.states.topic, step.begin, step.end),
-        motion_rad=towards,
+    ways: dict[int, dict[bool, Figure]] = {}
+    for s in given:
+        # joints already at q prove nothing
+        if abs(s.size) <= 2 * ctx.tolerance("max_motion_stroke", s.joint):
+            continue
+        towards = max(float(np.max((s.q - s.start) * np.sign(s.size))), 0.0)
+        text = f"moved {towards:.3f} {ctx.unit} towards q = {s.target:.2f} {how}, which was "
+        text += f"{abs(s.size):.2f} {ctx.unit} away"
+        found, up = ways.setdefault(s.joint, {}), s.size > 0
+        if up not in found or towards > found[up].value:
+            found[up] = s.figure(towards, text)
+    return judged(
+        ctx,
+        [min(found.values(), key=lambda f: f.value) for found in ways.values()],
+        "motion_rad",
+        "max_motion_stroke",
+        nothing="the hand was already at the q that must have no effect",
     )
-    return outcome.about(step.joint).placed(towards, most)
 
 
 @check("DEX1-CMD-01", "DEX3-CMD-01")
@@ -889,8 +709,7 @@ def every_command(ctx: Context) -> Outcome:
     judged, missed = 0, []
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before = ctx.states.q[ctx.states.between(begin - 0.03, begin)]
-        after = ctx.states.q[ctx.states.between(end - 0.03, end)]
+        before, after = ctx.q(begin - 0.03, begin), ctx.q(end - 0.03, end)
         if not len(before) or not len(after):
             continue
         start, final = np.median(before, axis=0), np.median(after, axis=0)
@@ -932,61 +751,37 @@ def _driven(ctx: Context) -> list[tuple[int, int]]:
     return [(i, 1 if ctx.joints[i].closing > 0 else -1) for i in roles.driven]
 
 
-def _least_driven(ctx: Context) -> tuple[float, int, Phase] | None:
-    """The smallest motion under a commanded velocity without position gain, rad, with joint and
-    phase.
-
-    Negative where a joint has moved the other way; None without states.
+def _driven_ways(ctx: Context) -> Iterator[tuple[float, int, Phase]]:
+    """Each motion under a commanded velocity without position gain, rad, with joint and phase;
+    negative where the joint has moved the other way.
     """
-    far: tuple[float, float, int, Phase] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         begin, end = ctx.span(phase)
-        rows = ctx.states.between(begin, end)
-        given = ctx.commands.dq[(ctx.commands.t >= begin) & (ctx.commands.t <= end)]
+        given = ctx.commands.dq[ctx.given(begin, end)]
         for joint, way in _driven(ctx):
             if len(given) and not given[:, joint].any():
                 continue  # driven by torque in this phase
-            q = ctx.states.q[rows, joint]
-            if len(q) < 2 or not np.isfinite(q).all():
-                continue
-            moved = (float(q[-1]) - float(q[0])) * way
-            part = moved / ctx.joints[joint].stroke
-            far = (part, moved, joint, phase) if far is None or part < far[0] else far
-    return far[1:] if far is not None else None
+            q = ctx.q(begin, end)[:, joint]
+            if len(q) >= 2 and np.isfinite(q).all():
+                yield (float(q[-1]) - float(q[0])) * way, joint, phase
 
 
 @check("DEX1-GAIN-02", "DEX3-GAIN-03")
-def velocity_drives(ctx: Context) -> Outcome:
+@worst("motion_rad", "min_motion_stroke", nothing="no state while a velocity was commanded")
+def velocity_drives(ctx: Context) -> Figures:
     """Motion by a commanded velocity without a position gain."""
-    found = _least_driven(ctx)
-    if found is None:
-        return ctx.skipped("no state while a velocity was commanded")
-    moved, joint, phase = found
-    text = ctx.named(f"moved by {moved:.2f} {ctx.unit} while a velocity was commanded", joint)
-    if moved >= ctx.tolerance("min_motion_stroke", joint):
-        return ctx.passed(f"{moved:.2f} {ctx.unit}", text, motion_rad=moved)
-    place = ctx.at(ctx.states.topic, *ctx.span(phase))
-    return ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
+    for moved, joint, phase in _driven_ways(ctx):
+        text = f"moved by {moved:.2f} {ctx.unit} while a velocity was commanded"
+        yield Figure(moved, *ctx.span(phase), joint, text)
 
 
 @check("DEX1-GAIN-06", "DEX3-GAIN-06")
-def velocity_way(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_motion_stroke", nothing="no state while a velocity was commanded")
+def velocity_way(ctx: Context) -> Figures:
     """Motion against a commanded velocity without a position gain."""
-    found = _least_driven(ctx)
-    if found is None:
-        return ctx.skipped("no state while a velocity was commanded")
-    moved, joint, phase = found
-    limit = ctx.tolerance("max_motion_stroke", joint)
-    against = max(0.0, -moved)
-    if against <= limit:
-        text = ctx.named(f"moved by {moved:.2f} {ctx.unit} with a commanded velocity", joint)
-        return ctx.passed(f"{against:.2f} {ctx.unit}", text, motion_rad=moved).placed(
-            against, limit
-        )
-    text = ctx.named(f"moved by {against:.2f} {ctx.unit} against a commanded velocity", joint)
-    place = ctx.at(ctx.states.topic, *ctx.span(phase))
-    outcome = ctx.failed(f"{against:.2f} {ctx.unit}", text, place, motion_rad=moved).about(joint)
-    return outcome.placed(against, limit)
+    for moved, joint, phase in _driven_ways(ctx):
+        text = f"moved by {moved:.2f} {ctx.unit} with a commanded velocity"
+        yield Figure(max(0.0, -moved), *ctx.span(phase), joint, text)
 
 
 def noise_at_rest(ctx: Context, joint: int, phases: Sequence[Phase]) -> float:
@@ -997,7 +792,7 @@ def noise_at_rest(ctx: Context, joint: int, phases: Sequence[Phase]) -> float:
     quiet = _MOST_NOISE * ctx.joints[joint].stroke
     for phase in phases:
         begin, _ = ctx.span(phase)
-        q = ctx.states.q[ctx.states.between(begin - _REST_S, begin), joint]
+        q = ctx.q(begin - _REST_S, begin)[:, joint]
         q = q[np.isfinite(q)]
         if len(q) >= _NOISE_STATES:
             quiet = min(quiet, 0.5 * float(np.ptp(q)))

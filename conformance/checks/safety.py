@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dexkit.conformance.checks import (
-    STROKE_S,
-    Context,
-    Outcome,
-    causes,
-    check,
-    rate_measure,
-)
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check, rate_measure
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.motion import Step, disobeyed, obeyed_before, steps_of
 from dexkit.conformance.checks.timing import (
     gap_measures,
@@ -52,34 +46,28 @@ def unharmed(ctx: Context, what: str) -> Outcome:
         limit = ctx.tolerance("max_gap_s")
         found = gaps(ctx, limit, begin - 0.05, end + 0.2)
         if found:
-            a, b = found[0]
-            outcome = ctx.failed(
-                "state stops",
-                f"state stopped at {a:.3f} s, during {what}",
-                ctx.at(topic, a, b),
-            )
-            return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
+            text = f"state stopped at {found[0][0]:.3f} s, during {what}"
+            return silent(ctx, found, limit, "state stops", text)
         measures.append(longest_gap(ctx, limit, begin - 0.05, end + 0.2))
         step = _recovery(ctx, phase)
         if step is None:
-            return ctx.failed(
-                "no state",
-                f"no state after {what}, when a good command was sent",
-                ctx.at(topic, end),
-            )
+            text = f"no state after {what}, when a good command was sent"
+            return ctx.failed("no state", text, ctx.at(topic, end))
         if step.error > ctx.tolerance("max_error_stroke", step.joint):
-            return (
-                ctx.failed(
-                    "disobeys",
-                    f"after {what}: {step}",
-                    ctx.at(topic, step.begin, step.end),
-                    error_rad=step.error,
-                )
-                .about(step.joint)
-                .placed(step.error, ctx.tolerance("max_error_stroke", step.joint))
-                .if_late(STROKE_S * step.error / step.stroke)
-            )
+            return disobeyed(ctx, f"after {what}", step)
     return Outcome(None).resting_on(*measures)
+
+
+def silent(
+    ctx: Context, found: Sequence[tuple[float, float]], limit: float, figure: str, text: str
+) -> Outcome:
+    """The failure of a hand whose state stopped; its place is the first of these gaps.
+
+    :param limit: of a gap, seconds.
+    """
+    a, b = found[0]
+    outcome = ctx.failed(figure, text, ctx.at(ctx.states.topic, a, b), max_gap_s=b - a)
+    return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
 
 
 def moves(
@@ -90,48 +78,33 @@ def moves(
     :param joints: those that must not move; None for all.
     :param sags: allowed motion of each joint by gravity, rad; None for none.
     """
-    far: tuple[float, float, int] = (0.0, 0.0, 0)
+    nothing = ctx.passed(f"0.000 {ctx.unit}", f"no state shows motion during {what}")
+    figures = _motions(ctx, what, joints, sags)
+    return judged(ctx, figures, "motion_rad", "max_motion_stroke", nothing=nothing)
+
+
+def _motions(ctx: Context, what: str, joints: Sequence[int] | None, sags: Floats | None) -> Figures:
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
-        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
-        q = ctx.states.q[rows]
+        before, q = ctx.q(begin - 0.1, begin), ctx.states.q[rows]
         if not len(before) or not len(q):
             continue
         with np.errstate(invalid="ignore"):
             deviation = np.abs(q - np.median(before, axis=0))
         for joint in range(len(ctx.joints)) if joints is None else joints:
             column = deviation[:, joint]
-            if not np.isfinite(column).all():
-                i = int(np.argmin(np.isfinite(column)))
-                return ctx.failed(
-                    "q not finite",
-                    ctx.named(f"q became {q[i, joint]} during {what}", joint),
-                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                ).about(joint)
-            i = int(np.argmax(column))
+            known = np.isfinite(column)
+            i = int(np.argmax(column)) if known.all() else int(np.argmin(known))
+            at = float(ctx.states.t[rows][i])
+            if not known.all():
+                text = ctx.named(f"q became {q[i, joint]} during {what}", joint)
+                failed = ctx.failed("q not finite", text, ctx.at(ctx.states.topic, at))
+                yield failed.about(joint)
             most = float(column[i])
             if sags is not None:
                 most = max(0.0, most - float(sags[joint]))
-            if most > ctx.tolerance("max_motion_stroke", joint):
-                return (
-                    ctx.failed(
-                        f"{most:.2f} {ctx.unit}",
-                        ctx.named(f"moved by {most:.2f} {ctx.unit} during {what}", joint),
-                        ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                        motion_rad=most,
-                    )
-                    .about(joint)
-                    .placed(most, ctx.tolerance("max_motion_stroke", joint))
-                    .if_late(STROKE_S * most / ctx.joints[joint].stroke)
-                )
-            far = max(far, (most / ctx.joints[joint].stroke, most, joint))
-    _, most, joint = far
-    return ctx.passed(
-        f"{most:.3f} {ctx.unit}",
-        ctx.named(f"moved by {most:.3f} {ctx.unit} during {what}", joint),
-        motion_rad=most,
-    ).placed(most, ctx.tolerance("max_motion_stroke", joint))
+            yield Figure(most, at, None, joint, f"moved by {most:.3f} {ctx.unit} during {what}")
 
 
 def stays(
@@ -158,8 +131,7 @@ def not_finite(ctx: Context) -> Outcome:
 def out_of_range(ctx: Context) -> Outcome:
     """Commands to positions far outside the stroke."""
     margin = ctx.tolerance("margin_rad")
-    reached: list[str] = []
-    values: dict[str, float] = {}
+    reached: list[tuple[float, float]] = []
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end + 0.1)
@@ -170,75 +142,60 @@ def out_of_range(ctx: Context) -> Outcome:
             bad = ~((q >= spec.q_min - margin) & (q <= spec.q_max + margin))
             if bad.any():
                 i = int(np.argmax(bad))
-                return (
-                    ctx.failed(
-                        f"{q[i]:.2f} {ctx.unit}",
-                        ctx.named(
-                            f"q became {q[i]:.2f} {ctx.unit}; the stroke is {spec.q_min:g} to "
-                            f"{spec.q_max:.2f} {ctx.unit}",
-                            joint,
-                        ),
-                        ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                    )
-                    .about(joint)
-                    .because(causes.of_range(float(np.nanmax(q))))
+                text = (
+                    f"q became {q[i]:.2f} {ctx.unit}; the stroke is {spec.q_min:g} to "
+                    f"{spec.q_max:.2f} {ctx.unit}"
                 )
-            wrong = _other_way(ctx, phase, joint)
-            if wrong is not None:
+                place = ctx.at(ctx.states.topic, float(ctx.states.t[rows][i]))
+                outcome = ctx.failed(f"{q[i]:.2f} {ctx.unit}", ctx.named(text, joint), place)
+                return outcome.about(joint).because(causes.of_range(float(np.nanmax(q))))
+            wrong = judged(
+                ctx,
+                _other_ways(ctx, phase, joint),
+                "back_rad",
+                "max_back_stroke",
+                nothing=ctx.passed(""),
+            )
+            if not wrong.met:
                 return wrong
-            reached.append(f"{float(q.min()):.2f} .. {float(q.max()):.2f} {ctx.unit}")
-            values = {"q_min": float(q.min()), "q_max": float(q.max())}
+            reached.append((float(q.min()), float(q.max())))
     outcome = unharmed(ctx, "commands far out of range")
     if outcome.met is False or outcome.reason:
         return outcome
-    figure = reached[0] if len(ctx.joints) == 1 and reached else "within limits"
-    return ctx.passed(
-        figure,
-        "q stayed within the stroke, then obeyed",
-        **(values if len(ctx.joints) == 1 else {}),
-    ).resting_on(*outcome.measures)
+    figure, values = "within limits", {}
+    if len(ctx.joints) == 1 and reached:
+        figure = f"{reached[0][0]:.2f} .. {reached[0][1]:.2f} {ctx.unit}"
+        values = {"q_min": reached[-1][0], "q_max": reached[-1][1]}
+    met = ctx.passed(figure, "q stayed within the stroke, then obeyed", **values)
+    return met.resting_on(*outcome.measures)
 
 
 _TURNS_S = 0.25  # s for a moving hand to reverse, with its allowed delay
 
 
-def _other_way(ctx: Context, phase: Phase, joint: int) -> Outcome | None:
-    """The failure of a joint that moves away from the end beyond which its goal lies."""
+def _other_ways(ctx: Context, phase: Phase, joint: int) -> Iterator[Figure]:
+    """How far a joint moves away from the end beyond which its goal lies."""
     begin, end = ctx.span(phase)
     spec = ctx.joints[joint]
-    rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+    rows = ctx.given(begin, end)
     t, q = ctx.commands.t[rows], ctx.commands.q[rows, joint]
     far = (q > spec.q_max + 0.1 * spec.stroke) * 1 - (q < spec.q_min - 0.1 * spec.stroke) * 1
     t, far = t[far != 0], far[far != 0]
-    if not len(far):
-        return None
     turns = np.flatnonzero(np.diff(far, prepend=0))
     for a, b, way in zip(t[turns], [*t[turns[1:]], end], far[turns], strict=True):
         # before the first of them it was at rest
         since = a + _TURNS_S if a > t[0] else a
-        turning = ctx.states.q[ctx.states.between(a - 0.05, since), joint] * way
+        turning = ctx.q(a - 0.05, since)[:, joint] * way
         later = ctx.states.between(since, b)
         if not len(turning) or not len(ctx.states.t[later]):
             continue
         back = float(turning.min()) - ctx.states.q[later, joint] * way
         i = int(np.argmax(back))
-        if back[i] > ctx.tolerance("max_back_stroke", joint):
-            return (
-                ctx.failed(
-                    f"{back[i]:.2f} {ctx.unit}",
-                    ctx.named(
-                        f"commanded far {'above' if way > 0 else 'below'} its range it went the "
-                        f"other way by {back[i]:.2f} {ctx.unit}",
-                        joint,
-                    ),
-                    ctx.at(ctx.states.topic, float(ctx.states.t[later][i])),
-                    back_rad=float(back[i]),
-                )
-                .about(joint)
-                .placed(float(back[i]), ctx.tolerance("max_back_stroke", joint))
-                .if_late(STROKE_S * float(back[i]) / spec.stroke)
-            )
-    return None
+        text = (
+            f"commanded far {'above' if way > 0 else 'below'} its range it went the other way by "
+            f"{back[i]:.2f} {ctx.unit}"
+        )
+        yield Figure(float(back[i]), float(ctx.states.t[later][i]), None, joint, text)
 
 
 @check("DEX1-SAFE-03", "DEX3-SAFE-03")
@@ -271,43 +228,30 @@ def brakes(ctx: Context) -> Outcome:
     0.
     """
     timeout = ctx.tolerance("timeout_s")
-    states = ctx.states
+    states, stroke = ctx.states, ctx.joints[0].stroke
     proofs: list[str] = []
     values: dict[str, float] = {}
     measures: list[Measure] = []
     for last, end in _silences(ctx):
-        free = states.between(last, last + timeout)
-        late = states.between(last + timeout + ctx.tolerance("grace_s"), end)
-        q_free, q_late = states.q[free, 0], states.q[late, 0]
-        before = states.tau[states.between(last - 0.2, last), 0]
+        due = last + timeout + ctx.tolerance("grace_s")
+        q_free, q_late = ctx.q(last, last + timeout)[:, 0], ctx.q(due, end)[:, 0]
+        before = ctx.tau(last - 0.2, last)[:, 0]
         if len(q_late) < 5 or not len(q_free) or not len(before):
             continue
-        moved = float(np.ptp(q_late))
-        stop = stopped(
-            *(states.t[states.between(last, end)], states.q[states.between(last, end), 0]),
-            last,
-            ctx.tolerance("max_motion_stroke"),
-            timeout + ctx.tolerance("grace_s"),
-        )
-        if moved > ctx.tolerance("max_motion_stroke"):
-            outcome = ctx.failed(
-                f"{moved:.2f} {ctx.unit}",
-                f"moved by {moved:.2f} {ctx.unit} more than {timeout:g} s after the last command",
-                ctx.at(states.topic, last + timeout, end),
-                motion_rad=moved,
-            )
+        place = ctx.at(states.topic, last + timeout, end)
+        moved, still = float(np.ptp(q_late)), ctx.tolerance("max_motion_stroke")
+        rows = states.between(last, end)
+        stop = stopped(states.t[rows], states.q[rows, 0], last, still, due - last)
+        if moved > still:
+            text = f"moved by {moved:.2f} {ctx.unit} more than {timeout:g} s after the last command"
+            outcome = ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved)
             return outcome.resting_on(stop)
         jump, allowed = _jump(ctx, last + timeout, q_late)
         if jump > allowed:
-            outcome = ctx.failed(
-                f"{jump:.2f} {ctx.unit}",
-                f"moved by {jump:.2f} {ctx.unit} while it braked",
-                ctx.at(states.topic, last + timeout, end),
-                motion_rad=jump,
-            ).placed(jump, allowed)
-            return outcome.if_late(STROKE_S * (jump - allowed) / ctx.joints[0].stroke)
+            text = f"moved by {jump:.2f} {ctx.unit} while it braked"
+            outcome = ctx.failed(f"{jump:.2f} {ctx.unit}", text, place, motion_rad=jump)
+            return outcome.placed(jump, allowed).if_late(STROKE_S * (jump - allowed) / stroke)
         # at its stop it stands still even without a brake
-        stroke = ctx.joints[0].stroke
         at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
         if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
             proofs.append(f"was moving, then moved only {moved:.3f} {ctx.unit}")
@@ -315,39 +259,20 @@ def brakes(ctx: Context) -> Outcome:
             measures.append(stop)
         pressed = float(np.median(np.abs(before)))
         if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_at is not None:
-            still = _presses(ctx, last + timeout, end)
-            usual = float(np.median(states.tau[states.between(last - 0.2, last), 0]))
-            back = _opposes(ctx, last + timeout, end, usual)
-            if back is not None:
-                return ctx.failed(
-                    f"{back[1]:.2f} N m",
-                    f"pressed with {pressed:.2f} N m at the last command, and drove the other way "
-                    f"with {back[1]:.2f} N m after the time-out",
-                    ctx.at(states.topic, back[0], end),
-                    tau_nm=back[1],
-                ).pressed(back[1], ctx.tolerance("max_back_nm"))
-            due = last + timeout + ctx.tolerance("grace_s")
-            limits = (
-                (_first_size(ctx, due), "begun_part", f"{due - last:.2f} s later"),
-                (still, "max_tau_part", "after the time-out"),
-            )
-            for felt, part, when in limits:
-                most = ctx.tolerance(part) * pressed
-                if felt > most:
-                    return ctx.failed(
-                        f"{felt:.2f} N m",
-                        f"pressed with {pressed:.2f} N m at the last command, and still with "
-                        f"{felt:.2f} N m {when}",
-                        ctx.at(states.topic, last + timeout, end),
-                        tau_nm=felt,
-                    ).pressed(felt, most)
-            measures.append(
-                Measure(still, ctx.tolerance("max_tau_part") * pressed, "N m", Quantity.TORQUE)
-            )
-            proofs.append(f"pressed with {pressed:.2f} N m, then with {still:.2f} N m")
-            values["tau_nm"] = still
-        driven = states.mode[states.between(last - 0.2, last), 0]
-        if not proofs and (driven > 0).all() and (states.mode[late, 0] == 0).all():
+            found = list(_forces_left(ctx, last, end, before))
+            wrong = judged(ctx, found, "tau_nm", "max_back_nm", nothing="")
+            if not wrong.met:
+                return wrong
+            left = found[-1]
+            measures.append(Measure(left.value, left.limit or 0.0, "N m", Quantity.TORQUE))
+            proofs.append(f"pressed with {pressed:.2f} N m, then with {left.value:.2f} N m")
+            values["tau_nm"] = left.value
+        driven = ctx.states.mode[states.between(last - 0.2, last), 0]
+        if (
+            not proofs
+            and (driven > 0).all()
+            and (states.mode[states.between(due, end), 0] == 0).all()
+        ):
             proofs.append(f"stood still, and reports the brake: mode {driven[-1]:.0f}, then 0")
     if not proofs:
         return ctx.skipped(
@@ -359,40 +284,42 @@ def brakes(ctx: Context) -> Outcome:
     return ctx.passed(figure, "; ".join(proofs), **values).resting_on(*measures)
 
 
-def _presses(ctx: Context, since: float, end: float) -> float:
-    """The largest abs(tau_est) in any piece of a braked stretch: torque must not return."""
-    begin = min(since + ctx.tolerance("release_s"), end - 0.1)
-    return max((size for _, size in _pieces(ctx, begin, end)), key=abs, default=0.0)
+def _forces_left(ctx: Context, last: float, end: float, before: Floats) -> Iterator[Figure]:
+    """The forces of a hand that pressed, after its time-out: the other way, soon, and then.
 
-
-def _opposes(ctx: Context, since: float, end: float, before: float) -> tuple[float, float] | None:
-    """Time and torque at which a hand that pressed drives in the opposite direction while
-    braking.
+    :param before: its tau_est until the last command, N m.
     """
-    for at, _ in _pieces(ctx, since, end):
-        tau = ctx.states.tau[ctx.states.between(at, at + _PIECE_S), 0]
-        back = -float(np.median(tau)) * (1 if before > 0 else -1)
-        if back > ctx.tolerance("max_back_nm"):
-            return at, back
-    return None
+    since = last + ctx.tolerance("timeout_s")
+    due = since + ctx.tolerance("grace_s")
+    pressed = float(np.median(np.abs(before)))
+    sign = 1 if float(np.median(before)) > 0 else -1
+    had = f"pressed with {pressed:.2f} N m at the last command, and"
+    for at, tau in _pieces(ctx, since, end):
+        back = max(-float(np.median(tau)) * sign, 0.0)
+        yield Figure(
+            back, at, end, text=f"{had} drove the other way with {back:.2f} N m after the time-out"
+        )
+    # torque must not return, either
+    begin = min(since + ctx.tolerance("release_s"), end - 0.1)
+    for first, until, part, when in (
+        (due, due + _PIECE_S, "begun_part", f"{due - last:.2f} s later"),
+        (begin, end, "max_tau_part", "after the time-out"),
+    ):
+        sizes = [float(np.median(np.abs(tau))) for _, tau in _pieces(ctx, first, until)]
+        felt, limit = max(sizes, default=0.0), ctx.tolerance(part) * pressed
+        text = f"{had} still with {felt:.2f} N m {when}"
+        yield Figure(felt, since, end, text=text, limit=limit)
 
 
 _PIECE_S = 0.1
 
 
-def _first_size(ctx: Context, begin: float) -> float:
-    """The median abs(tau_est) of the piece that begins then, N m; 0 without states."""
-    return max((size for _, size in _pieces(ctx, begin, begin + _PIECE_S)), default=0.0)
-
-
-def _pieces(ctx: Context, begin: float, end: float) -> list[tuple[float, float]]:
-    """(time, median abs(tau_est)) of the consecutive pieces of a stretch."""
-    found = []
-    for at in np.arange(begin, end - 0.99 * _PIECE_S, _PIECE_S):
-        tau = ctx.states.tau[ctx.states.between(float(at), float(at) + _PIECE_S), 0]
+def _pieces(ctx: Context, begin: float, end: float) -> Iterator[tuple[float, Floats]]:
+    """(time, tau_est) of the consecutive pieces of a stretch."""
+    for at in np.arange(begin, end - 0.99 * _PIECE_S, _PIECE_S).tolist():
+        tau = ctx.tau(at, at + _PIECE_S)[:, 0]
         if len(tau) >= 3 and np.isfinite(tau).all():
-            found.append((float(at), float(np.median(np.abs(tau)))))
-    return found
+            yield at, tau
 
 
 def stopped(t: Floats, q: Floats, last: float, still: float, limit: float) -> Measure:
@@ -442,14 +369,9 @@ def state_in_silence(ctx: Context) -> Outcome:
         found = gaps(ctx, limit, begin, end)
         if found:
             a, b = found[0]
-            outcome = ctx.failed(
-                f"{b - a:.2f} s",
-                f"no state from {a:.3f} s to {b:.3f} s, in the pause that began at {begin:.3f} s",
-                ctx.at(ctx.states.topic, a, b),
-                max_gap_s=b - a,
-            )
-            outcome = survived(ctx, outcome, max(b - a for a, b in found))
-            return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
+            text = f"no state from {a:.3f} s to {b:.3f} s, in the pause that began at {begin:.3f} s"
+            outcome = silent(ctx, found, limit, f"{b - a:.2f} s", text)
+            return survived(ctx, outcome, max(b - a for a, b in found))
         clock = ctx.states.clock
         inside = clock[(clock >= begin) & (clock <= end)]
         longest = max(longest, float(np.diff(inside).max()) if len(inside) > 1 else 0.0)
@@ -461,56 +383,48 @@ def state_in_silence(ctx: Context) -> Outcome:
 @check("DEX1-WDOG-03", "DEX3-WDOG-03")
 def resumes(ctx: Context) -> Outcome:
     """The step after a pause of commands."""
-    limit = ctx.tolerance("max_reaction_s")
-    slowest: tuple[float, Step] | None = None
-    judged = [p for p in ctx.phases() if obeyed_before(ctx, p)]
-    for step in (s for p in judged for s in steps_of(ctx, p)):
-        if abs(step.size) >= ctx.tolerance("min_step_stroke", step.joint):
-            begun = (step.q - step.start) / step.size >= ctx.tolerance("begun_part")
-            after = float(step.t[np.argmax(begun)] if begun.any() else step.end) - step.begin
-            if slowest is None or after > slowest[0]:
-                slowest = after, step
-    if slowest is not None and slowest[0] > limit:
-        after, step = slowest
-        return (
-            ctx.failed(
-                f"after {after:.2f} s",
-                f"after a pause: {step}, but it began to move only after {after:.2f} s",
-                ctx.at(ctx.states.topic, step.begin, step.begin + after),
-                reaction_s=after,
-            )
-            .about(step.joint)
-            .timed(after, limit)
-            .if_late(after - limit)
-        )
-    for phase in judged:
-        wrong = away_first(ctx, phase, "after a pause of commands")
-        if wrong is not None:
-            return wrong
+    begun = judged(
+        ctx, _reactions(ctx), "reaction_s", "max_reaction_s", nothing=ctx.passed("no step")
+    )
+    if not begun.met:
+        return begun
+    for phase in ctx.phases():
+        if obeyed_before(ctx, phase):
+            wrong = away_first(ctx, phase, "after a pause of commands")
+            if wrong is not None:
+                return wrong
     outcome = arrival(ctx, "after a pause of commands")
-    if outcome.met and slowest is not None:
-        span = slowest[1].begin, slowest[1].end
-        return outcome.timed(slowest[0], limit, span=span)
-    return outcome
+    return outcome.resting_on(*begun.measures) if outcome.met and begun.measures else outcome
+
+
+def _reactions(ctx: Context) -> Figures:
+    """When the steps after a pause begin."""
+    for step in (s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)):
+        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
+            continue
+        begun = (step.q - step.start) / step.size >= ctx.tolerance("begun_part")
+        after = float(step.t[np.argmax(begun)] if begun.any() else step.end) - step.begin
+        text = f"after a pause: {step}, but it began to move only after {after:.2f} s"
+        shown = f"after {after:.2f} s"
+        yield Figure(after, step.begin, step.begin + after, step.joint, text, shown=shown)
 
 
 def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
     """The failure of a hand that first moves or pulls away from the first goal after a pause."""
+    figures = []
     for step in steps_of(ctx, phase):
-        limit = ctx.tolerance("max_away_stroke", step.joint)
-        if abs(step.size) < limit:
+        if abs(step.size) < ctx.tolerance("max_away_stroke", step.joint):
             continue
         way = 1 if step.size > 0 else -1
         # before it obeys; other requirements judge its motion near the goal
         near = np.flatnonzero((step.q - step.target) * way > -0.5 * abs(step.size))
         course = step.q[: int(near[0]) + 1] if len(near) else step.q
         away = float(np.max((step.start - course) * way))
-        if away > limit:
-            text = f"{when}, {step}, but it first went {away:.2f} {ctx.unit} the other way"
-            place = ctx.at(ctx.states.topic, step.begin, step.end)
-            outcome = ctx.failed(f"{away:.2f} {ctx.unit} away", text, place, away_rad=away)
-            return outcome.about(step.joint).placed(away, limit)
-    return None
+        text = f"{when}, {step}, but it first went {away:.2f} {ctx.unit} the other way"
+        figures.append(step.figure(away, text, shown=f"{away:.2f} {ctx.unit} away"))
+    nothing = ctx.passed("no step")
+    outcome = judged(ctx, figures, "away_rad", "max_away_stroke", nothing=nothing)
+    return None if outcome.met else outcome
 
 
 _SOON_S = 0.25  # s after the end of a step within which a moving hand must arrive
@@ -524,20 +438,17 @@ def arrival(
     :param phases: None for those that the requirement needs.
     :param soon_s: a joint that arrives in this time, at the speed that it has, counts as there.
     """
-    judged = [p for p in (ctx.phases() if phases is None else phases) if obeyed_before(ctx, p)]
-    if not judged:
+    obeyed = [p for p in (ctx.phases() if phases is None else phases) if obeyed_before(ctx, p)]
+    if not obeyed:
         return ctx.skipped("the hand had stopped obeying before this stimulus")
-    found = [s for p in judged for s in steps_of(ctx, p)]
+    found = [s for p in obeyed for s in steps_of(ctx, p)]
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
     there = [s for s in found if not (soon_s and s.arrives_within(soon_s))]
-    worst = max(there or found, key=lambda s: s.error / s.stroke)
-    if not there:
-        return ctx.passed("under way", f"{when}: {worst}, and is about to arrive")
-    if worst.error <= ctx.tolerance("max_error_stroke", worst.joint):
-        met = ctx.passed("obeys", f"{when}: {worst}", error_rad=worst.error)
-        return met.placed(worst.error, ctx.tolerance("max_error_stroke", worst.joint))
-    return disobeyed(ctx, when, worst)
+    figures = [s.error_figure(f"{when}: {s}") for s in there]
+    nothing = ctx.passed("under way", f"{when}: all are about to arrive")
+    outcome = judged(ctx, figures, "error_rad", "max_error_stroke", nothing=nothing)
+    return replace(outcome, figure="obeys" if outcome.met else "disobeys") if there else outcome
 
 
 @check("DEX1-SIDE-02", "DEX3-SIDE-02")
@@ -566,37 +477,24 @@ def negative_gains(ctx: Context) -> Outcome:
 
 
 @check("DEX1-SAFE-10", "DEX3-SAFE-11")
-def driven_away(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_motion_stroke", nothing="no state during commands with negative gains")
+def driven_away(ctx: Context) -> Figures:
     """Motion away from q during commands with negative gains."""
     sag = sags(ctx)
-    worst: tuple[float, float, int, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
-        q = ctx.states.q[ctx.states.between(begin, end)]
-        given = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
-        given &= (ctx.commands.kp < 0).any(axis=1)
+        before, q = ctx.q(begin - 0.1, begin), ctx.q(begin, end)
+        given = ctx.given(begin, end) & (ctx.commands.kp < 0).any(axis=1)
         if not len(before) or not len(q) or not given.any():
             continue
         start = np.median(before, axis=0)
         way = np.sign(np.median(ctx.commands.q[given], axis=0) - start)
         with np.errstate(invalid="ignore"):
             away = np.max((start - q) * way, axis=0) - (0.0 if sag is None else sag)
-        for joint, spec in enumerate(ctx.joints):
-            found = (float(away[joint]) / spec.stroke, float(away[joint]), joint, begin, end)
-            if np.isfinite(found[0]) and (worst is None or found > worst):
-                worst = found
-    if worst is None:
-        return ctx.skipped("no state during commands with negative gains")
-    _, most, joint, begin, end = worst
-    most = max(0.0, most)
-    text = ctx.named(f"moved by {most:.2f} {ctx.unit} away from q with negative gains", joint)
-    figure, limit = f"{most:.2f} {ctx.unit}", ctx.tolerance("max_motion_stroke", joint)
-    if most <= limit:
-        return ctx.passed(figure, text, motion_rad=most).placed(most, limit)
-    place = ctx.at(ctx.states.topic, begin, end)
-    outcome = ctx.failed(figure, text, place, motion_rad=most).about(joint)
-    return outcome.placed(most, limit).if_late(STROKE_S * most / ctx.joints[joint].stroke)
+        for joint in np.flatnonzero(np.isfinite(away)).tolist():
+            most = max(0.0, float(away[joint]))
+            text = f"moved by {most:.2f} {ctx.unit} away from q with negative gains"
+            yield Figure(most, begin, end, joint, text)
 
 
 _SAGS_AGAIN = 1.5  # factor on the sag of a limp joint, for other poses
@@ -610,8 +508,7 @@ def sags(ctx: Context) -> Floats | None:
     moved = []
     for phase in ctx.phases("limp"):
         begin, end = ctx.span(phase)
-        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
-        q = ctx.states.q[ctx.states.between(begin, end)]
+        before, q = ctx.q(begin - 0.1, begin), ctx.q(begin, end)
         if len(before) and len(q):
             moved.append(q[-1] - np.median(before, axis=0))
     if len(moved) < 2:
@@ -630,83 +527,57 @@ def foreign_type(ctx: Context) -> Outcome:
 
 
 @check("DEX1-SAFE-07", "DEX3-SAFE-08")
-def burst(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_motion_stroke", nothing="no state around the burst")
+def burst(ctx: Context) -> Figures:
     """Distance from the last command's goal after a burst of hundreds of commands."""
-    topic = ctx.states.topic
-    wait = ctx.tolerance("settle_s")
-    far: tuple[float, float, int] = (0.0, 0.0, 0)
+    wait, limit = ctx.tolerance("settle_s"), ctx.tolerance("max_gap_s")
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        silent = gaps(ctx, ctx.tolerance("max_gap_s"), begin - 0.05, end)
-        if silent:
-            a, b = silent[0]
-            outcome = ctx.failed("state stops", f"no state from {a:.3f} s on", ctx.at(topic, a, b))
-            outcome = outcome.resting_on(*gap_measures(silent, ctx.tolerance("max_gap_s")))
-            return outcome.if_late(b - a - ctx.tolerance("max_gap_s"))
-        before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
-        sent = begin + (phase.observed.get("sent_s") or 0.0)
-        q = ctx.states.q[ctx.states.between(sent + wait, end)]
+        found = gaps(ctx, limit, begin - 0.05, end)
+        if found:
+            text = f"no state from {found[0][0]:.3f} s on"
+            yield silent(ctx, found, limit, "state stops", text)
+        since = begin + (phase.observed.get("sent_s") or 0.0) + wait
+        before, q = ctx.q(begin - 0.15, begin), ctx.q(since, end)
         if not len(before) or not len(q):
-            return ctx.skipped("no state around the burst")
+            yield ctx.skipped("no state around the burst")
         away = np.abs(q - np.median(before, axis=0)).max(axis=0)
-        for joint, spec in enumerate(ctx.joints):
-            far = max(far, (float(away[joint]) / spec.stroke, float(away[joint]), joint))
-            if away[joint] > ctx.tolerance("max_motion_stroke", joint):
-                return (
-                    ctx.failed(
-                        f"{away[joint]:.2f} {ctx.unit}",
-                        ctx.named(
-                            f"{wait:g} s after the last command of the burst it was still up to "
-                            f"{away[joint]:.2f} {ctx.unit} away",
-                            joint,
-                        ),
-                        ctx.at(topic, sent + wait, end),
-                        motion_rad=float(away[joint]),
-                    )
-                    .about(joint)
-                    .placed(float(away[joint]), ctx.tolerance("max_motion_stroke", joint))
-                    .if_late(STROKE_S * float(away[joint]) / spec.stroke)
-                )
-    return ctx.passed(
-        f"{far[1]:.3f} {ctx.unit}",
-        ctx.named(f"within {far[1]:.3f} {ctx.unit} {wait:g} s after the burst", far[2]),
-        motion_rad=far[1],
-    ).placed(far[1], ctx.tolerance("max_motion_stroke", far[2]))
+        for joint, most in enumerate(away.tolist()):
+            text = (
+                f"{wait:g} s after the last command of the burst it was still up to "
+                f"{most:.3f} {ctx.unit} away"
+            )
+            yield Figure(most, since, end, joint, text)
 
 
 @check("DEX1-SAFE-08", "DEX3-SAFE-09")
 def two_writers(ctx: Context) -> Outcome:
     """Motion while two clients command two positions, and after one of them has ended."""
-    margin = ctx.tolerance
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before = ctx.states.q[ctx.states.between(begin - 0.15, begin)]
+        before = ctx.q(begin - 0.15, begin)
         rows = ctx.states.between(begin, end)
         if not len(before):
             return ctx.skipped("no state before the second client")
         here = np.median(before, axis=0)
         for joint, there in phase.targets.get(ctx.side, {}).items():
             low, high = sorted((float(here[joint]), there))
-            beyond = margin("max_beyond_stroke", joint)
+            beyond = ctx.tolerance("max_beyond_stroke", joint)
             q = ctx.states.q[rows, joint]
             outside = ~((q >= low - beyond) & (q <= high + beyond))
             if outside.any():
                 i = int(np.argmax(outside))
+                text = f"commanded to {low:.2f} and {high:.2f} {ctx.unit} it went to {q[i]:.2f}"
                 return ctx.failed(
                     f"{q[i]:.2f} {ctx.unit}",
-                    ctx.named(
-                        f"commanded to {low:.2f} and {high:.2f} {ctx.unit} it went to "
-                        f"{q[i]:.2f} {ctx.unit}",
-                        joint,
-                    ),
+                    ctx.named(f"{text} {ctx.unit}", joint),
                     ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
                 ).about(joint)
     outcome = unharmed(ctx, "two clients at once")
     if outcome.met is False or outcome.reason:
         return outcome
-    return ctx.passed(
-        "between", "stayed between the two positions, and obeyed the remaining client"
-    ).resting_on(*outcome.measures)
+    text = "stayed between the two positions, and obeyed the remaining client"
+    return ctx.passed("between", text).resting_on(*outcome.measures)
 
 
 @check("DEX1-SAFE-09", "DEX3-SAFE-10")
@@ -736,17 +607,11 @@ def load(ctx: Context) -> Outcome:
         text = f"{rate:.1f} Hz under load"
         if found:
             a, b = found[0]
-            outcome = ctx.failed(
-                f"{b - a:.2f} s",
-                f"{text}; no state from {a:.3f} to {b:.3f} s",
-                ctx.at(ctx.states.topic, a, b),
-                rate_hz=rate,
-            )
-            return outcome.resting_on(*gap_measures(found, limit)).if_late(b - a - limit)
+            text = f"{text}; no state from {a:.3f} to {b:.3f} s"
+            return silent(ctx, found, limit, f"{b - a:.2f} s", text)
         if slow(ctx, rate):
-            outcome = ctx.failed(
-                f"{rate:.1f} Hz", text, ctx.at(ctx.states.topic, begin, end), rate_hz=rate
-            )
+            place = ctx.at(ctx.states.topic, begin, end)
+            outcome = ctx.failed(f"{rate:.1f} Hz", text, place, rate_hz=rate)
             outcome = outcome.rated(rate, least_rate(ctx), end - begin)
             return too_slow(ctx, outcome, rate, np.diff(inside))
     span = begin, end
@@ -755,31 +620,19 @@ def load(ctx: Context) -> Outcome:
 
 
 @check("DEX1-LOAD-03", "DEX3-LOAD-03")
-def late_under_load(ctx: Context) -> Outcome:
+@worst("more_s", "max_more_s", nothing="no motion under load, or none without it to compare with")
+def late_under_load(ctx: Context) -> Figures:
     """How much later than without load the states show a motion that is commanded under load."""
-    worst: tuple[float, int, float, float, float, float] | None = None
     usual = _usual_lags(ctx)
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
-        begin, end = ctx.span(phase)
-        for joint in usual:
-            lag = _lag(ctx, joint, begin, end)
-            if lag is None:
-                continue
-            found = (lag - usual[joint], joint, begin, end, lag, usual[joint])
-            worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.skipped("no motion under load, or none without it to compare with")
-    more, joint, begin, end, lag, before = worst
-    more = max(0.0, more)
-    text = ctx.named(
-        f"q follows {lag:.2f} s behind the command under load, {before:.2f} s without", joint
-    )
-    figure, limit = f"{more:.2f} s", ctx.tolerance("max_more_s")
-    if more <= limit:
-        return ctx.passed(figure, text, lag_s=lag).timed(more, limit, span=(begin, end))
-    place = ctx.at(ctx.states.topic, begin, end)
-    outcome = ctx.failed(figure, text, place, lag_s=lag).about(joint)
-    return outcome.timed(more, limit).if_late(more - limit)
+        for joint, before in usual.items():
+            lag = _lag(ctx, joint, *ctx.span(phase))
+            if lag is not None:
+                text = (
+                    f"q follows {lag:.2f} s behind the command under load, {before:.2f} s without"
+                )
+                more, values = max(0.0, lag - before), {"lag_s": lag}
+                yield Figure(more, *ctx.span(phase), joint, text, values=values)
 
 
 _FREE_STEPS = ("fingerprint", "step", "joint", "center", "recover")
@@ -830,14 +683,14 @@ def _lag(ctx: Context, joint: int, begin: float, end: float) -> float | None:
 
 
 @check("DEX1-LOAD-02", "DEX3-LOAD-02")
-def obeys_under_load(ctx: Context) -> Outcome:
+@worst("part", "min_part", nothing="no way under load, or the hand had stopped obeying before")
+def obeys_under_load(ctx: Context) -> Figures:
     """How far the hand follows the way out and back that it is commanded under load."""
-    worst: tuple[float, int, float, float, float] | None = None
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         begin, end = ctx.span(phase)
-        rows = (ctx.commands.t >= begin) & (ctx.commands.t <= end)
+        rows = ctx.given(begin, end)
         t, goals = ctx.commands.t[rows], ctx.commands.q[rows]
-        before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+        before = ctx.q(begin - 0.1, begin)
         if not len(t) or not len(before) or not np.isfinite(goals).all():
             continue
         start = np.median(before, axis=0)
@@ -852,17 +705,7 @@ def obeys_under_load(ctx: Context) -> Outcome:
             if (float(start[joint]) - origin) * size < 0:
                 origin = float(start[joint])
             until = float(t[turn]) + ctx.tolerance("max_delay_s")
-            q = ctx.states.q[ctx.states.between(float(t[turn]), until), joint]
+            q = ctx.q(float(t[turn]), until)[:, joint]
             made = float(((q - origin) / size).max()) if len(q) else 0.0
-            found = (made, joint, begin, until, size)
-            worst = found if worst is None or found < worst else worst
-    if worst is None:
-        return ctx.skipped("no way under load, or the hand had stopped obeying before")
-    made, joint, begin, until, size = worst
-    text = ctx.named(f"made {made:.0%} of a way of {size:.2f} {ctx.unit} under load", joint)
-    limit = ctx.tolerance("min_part")
-    if made >= limit:
-        return ctx.passed(f"{made:.0%}", text, part=made)
-    place = ctx.at(ctx.states.topic, begin, until)
-    outcome = ctx.failed(f"{made:.0%}", text, place, part=made).about(joint)
-    return outcome.if_late(until - begin)
+            text = f"made {made:.0%} of a way of {size:.2f} {ctx.unit} under load"
+            yield Figure(made, begin, until, joint, text, late=until - begin)

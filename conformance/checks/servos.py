@@ -6,9 +6,12 @@ by position: the joints stand at the object while their goals lie beyond it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.motion import Step, steps_of
 from dexkit.conformance.checks.timing import longest_gap
 from dexkit.conformance.stimulus_record import Phase
@@ -25,9 +28,9 @@ _CHANCE = 1e-7  # probability with which white noise is taken for one, in each s
 
 
 @check("BRAINCO-SPEED-01")
-def slow_command(ctx: Context) -> Outcome:
+@worst("part", "max_part", nothing="no joint was commanded to move slowly")
+def slow_command(ctx: Context) -> Figures:
     """The top speed of a joint that is commanded to move slowly."""
-    worst: tuple[float, int, tuple[float, float]] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin + _TURNS_S, end)
@@ -36,15 +39,7 @@ def slow_command(ctx: Context) -> Outcome:
             continue
         for joint in phase.targets.get(ctx.side, {}):
             part = float(np.ptp(q[:, joint])) / float(t[-1] - t[0]) / ctx.joints[joint].dq_max
-            if worst is None or part > worst[0]:
-                worst = part, joint, (begin, end)
-    if worst is None:
-        return ctx.skipped("no joint was commanded to move slowly")
-    part, joint, span = worst
-    text = ctx.named(f"moved with {part:.0%} of its full speed", joint)
-    if part <= ctx.tolerance("max_part"):
-        return ctx.passed(f"{part:.0%}", text, part=part)
-    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *span), part=part).about(joint)
+            yield Figure(part, begin, end, joint, f"moved with {part:.0%} of its full speed")
 
 
 def _commanded_speeds(ctx: Context) -> list[tuple[Step, float]]:
@@ -60,30 +55,23 @@ def _commanded_speeds(ctx: Context) -> list[tuple[Step, float]]:
 
 
 @check("BRAINCO-SPEED-02")
-def no_speed(ctx: Context) -> Outcome:
+@worst(
+    "motion_rad",
+    "max_motion_stroke",
+    nothing="no joint was commanded with a speed of 0 or less",
+)
+def no_speed(ctx: Context) -> Figures:
     """Motion of a joint that is commanded to another position with a speed of 0 or less."""
-    moved = [
-        (float(np.abs(step.q - step.start).max()) / step.stroke, step)
-        for step, asked in _commanded_speeds(ctx)
-        if asked <= 0.0
-    ]
-    if not moved:
-        return ctx.skipped("no joint was commanded with a speed of 0 or less")
-    part, step = max(moved, key=lambda m: m[0])
-    way, limit = part * step.stroke, ctx.tolerance("max_motion_stroke", step.joint)
-    text = f"{step.name}moved by {way:.3f} {ctx.unit} with a speed of 0 or less"
-    figure = f"{way:.3f} {ctx.unit}"
-    if way <= limit:
-        return ctx.passed(figure, text, motion_rad=way).placed(way, limit)
-    place = ctx.at(ctx.states.topic, step.begin, step.end)
-    outcome = ctx.failed(figure, text, place, motion_rad=way)
-    return outcome.about(step.joint).placed(way, limit).if_late(STROKE_S * part)
+    for step, asked in _commanded_speeds(ctx):
+        if asked <= 0.0:
+            way = float(np.abs(step.q - step.start).max())
+            yield step.figure(way, f"moved by {way:.3f} {ctx.unit} with a speed of 0 or less")
 
 
 @check("BRAINCO-SPEED-03")
-def own_speeds(ctx: Context) -> Outcome:
+@worst("excess", "max_ratio", nothing="no joint was commanded with a speed of its own")
+def own_speeds(ctx: Context) -> Figures:
     """Speed of each joint relative to the one that it is commanded to move with."""
-    worst: tuple[float, Step, float, float] | None = None
     slack = ctx.tolerance("slack")
     for step, asked in _commanded_speeds(ctx):
         way = (step.q - step.start) * np.sign(step.size)
@@ -97,55 +85,42 @@ def own_speeds(ctx: Context) -> Outcome:
             part / (ctx.tolerance("max_ratio") * asked + slack),
             (ctx.tolerance("min_ratio") * asked - slack) / max(part, 1e-6),
         )
-        if worst is None or excess > worst[0]:
-            worst = excess, step, asked, part
-    if worst is None:
-        return ctx.skipped("no joint was commanded with a speed of its own")
-    excess, step, asked, part = worst
-    text = f"{step.name}moved with {part:.0%} of its full speed, commanded with {asked:.0%}"
-    if excess <= 1.0:
-        return ctx.passed(f"{part:.0%} of {asked:.0%}", text, part=part)
-    place = ctx.at(ctx.states.topic, step.begin, step.end)
-    return ctx.failed(f"{part:.0%} of {asked:.0%}", text, place, part=part).about(step.joint)
+        yield step.figure(
+            excess,
+            f"moved with {part:.0%} of its full speed, commanded with {asked:.0%}",
+            shown=f"{part:.0%} of {asked:.0%}",
+            limit=1.0,
+            values={"part": part},
+        )
 
 
 @check("BRAINCO-GRIP-01")
+@with_object
 def keeps_grip(ctx: Context) -> Outcome:
     """Opening of a joint that presses on the object while it is commanded to close."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, int, float] | None = None
+    nothing = "no joint was held back by the object"
+    outcome = judged(ctx, _openings(ctx), "motion_rad", "max_back_stroke", nothing=nothing)
+    return outcome.tolerated() if outcome.met is False and outcome.joints else outcome
+
+
+def _openings(ctx: Context) -> Figures:
+    limit = ctx.tolerance("max_gap_s")
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        for joint, opened, at in _gives_way(ctx, phase, begin + _CONTACT_S, end):
-            if worst is None or opened > worst[0]:
-                worst = opened, joint, at
-        gap = longest_gap(ctx, ctx.tolerance("max_gap_s"), begin, end)
-        if gap.value > gap.limit:
+        yield from _gives_way(ctx, phase, begin + _CONTACT_S, end)
+        gap = longest_gap(ctx, limit, begin, end)
+        if gap.value > limit:
             text = f"no state for {gap.value:.2f} s while it grips"
             outcome = ctx.failed(f"{gap.value:.2f} s", text, ctx.at(ctx.states.topic, begin, end))
-            return outcome.resting_on(gap).if_late(gap.value - gap.limit)
-    if worst is None:
-        return ctx.skipped("no joint was held back by the object")
-    opened, joint, at = worst
-    limit = ctx.tolerance("max_back_stroke", joint)
-    text = ctx.named(f"opened by {opened:.3f} {ctx.unit} while it was commanded to grip", joint)
-    if opened <= limit:
-        return ctx.passed(f"{opened:.3f} {ctx.unit}", text, motion_rad=opened).placed(opened, limit)
-    place = ctx.at(ctx.states.topic, at)
-    outcome = ctx.failed(f"{opened:.2f} {ctx.unit}", text, place, motion_rad=opened).tolerated()
-    return outcome.about(joint).placed(opened, limit).if_late(STROKE_S * opened)
+            yield outcome.resting_on(gap).if_late(gap.value - limit)
 
 
-def _gives_way(
-    ctx: Context, phase: Phase, begin: float, end: float
-) -> list[tuple[int, float, float]]:
-    """Joint, how far it opens, and when, of each joint that the object holds back."""
+def _gives_way(ctx: Context, phase: Phase, begin: float, end: float) -> Iterator[Figure]:
+    """How far each joint that the object holds back opens."""
     rows = ctx.states.between(begin, end)
     t, q = ctx.states.t[rows], ctx.states.q[rows]
     if len(t) < 5:
-        return []
-    found = []
+        return
     for joint, target in phase.targets.get(ctx.side, {}).items():
         spec = ctx.joints[joint]
         closed = q[:, joint] * spec.closing
@@ -153,17 +128,17 @@ def _gives_way(
             continue  # it arrived, or nearly
         opened = np.maximum.accumulate(closed) - closed
         i = int(np.argmax(opened))
-        found.append((joint, float(opened[i]), float(t[i])))
-    return found
+        text = f"opened by {opened[i]:.3f} {ctx.unit} while it was commanded to grip"
+        yield Figure(float(opened[i]), float(t[i]), None, joint, text)
 
 
 @check("BRAINCO-STILL-02")
-def vibrates(ctx: Context) -> Outcome:
+@worst("turns_hz", "max_turns_hz", nothing="no joint stood for long enough")
+def vibrates(ctx: Context) -> Figures:
     """The most reversals of q per second of a joint with a constant goal.
 
     Those of small size count where one frequency explains q, and noise of the measurement does not.
     """
-    worst: tuple[float, int, tuple[float, float], float] | None = None
     limit = ctx.tolerance("max_turns_hz")
     for begin, end in _rests(ctx):
         rows = ctx.states.between(begin, end)
@@ -175,16 +150,9 @@ def vibrates(ctx: Context) -> Outcome:
             rate = _turn_rate(ctx, t, q, "min_turn_stroke", joint)
             if rate > limit and not _repeats(t, q, 0.5 * limit):
                 rate = _turn_rate(ctx, t, q, "max_noise_stroke", joint)
-            if worst is None or rate > worst[0]:
-                worst = rate, joint, (begin, end), float(np.ptp(q)) if len(q) else 0.0
-    if worst is None:
-        return ctx.skipped("no joint stood for long enough")
-    rate, joint, span, size = worst
-    text = ctx.named(f"turns {rate:.1f} times a second at rest, over {size:.3f} {ctx.unit}", joint)
-    if rate <= limit:
-        return ctx.passed(f"{rate:.1f} /s", text, turns_hz=rate)
-    place = ctx.at(ctx.states.topic, *span)
-    return ctx.failed(f"{rate:.0f} /s", text, place, turns_hz=rate).about(joint)
+            size = float(np.ptp(q)) if len(q) else 0.0
+            text = f"turns {rate:.1f} times a second at rest, over {size:.3f} {ctx.unit}"
+            yield Figure(rate, begin, end, joint, text, shown=f"{rate:.1f} /s")
 
 
 def _turn_rate(ctx: Context, t: Floats, q: Floats, least: str, joint: int) -> float:
@@ -242,67 +210,37 @@ def _turns(q: Floats, least: float) -> int:
 
 
 @check("BRAINCO-WDOG-01")
-def takes_no_detour(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_motion_stroke", nothing="no pause of commands with states")
+def takes_no_detour(ctx: Context) -> Figures:
     """Deviation of a joint from the way to its last goal while there are no commands."""
-    worst: tuple[float, int, float] | None = None
     for begin, end, goal in _silences(ctx):
         rows = ctx.states.between(begin, end)
         t, q = ctx.states.t[rows], ctx.states.q[rows]
         if len(t) < 5:
             continue
-        here = q[0]
-        low, high = np.minimum(here, goal), np.maximum(here, goal)
+        low, high = np.minimum(q[0], goal), np.maximum(q[0], goal)
         beyond = np.maximum(low - q, q - high)
-        for joint, spec in enumerate(ctx.joints):
+        for joint in range(len(ctx.joints)):
             i = int(np.nanargmax(beyond[:, joint]))
-            part = float(beyond[i, joint]) / spec.stroke
-            if worst is None or part > worst[0]:
-                worst = part, joint, float(t[i])
-    if worst is None:
-        return ctx.skipped("no pause of commands with states")
-    part, joint, at = worst
-    beyond_rad = max(part, 0.0) * ctx.joints[joint].stroke
-    limit = ctx.tolerance("max_motion_stroke", joint)
-    text = ctx.named(
-        f"left the way to its last goal by {beyond_rad:.3f} {ctx.unit} without a command", joint
-    )
-    if beyond_rad <= limit:
-        met = ctx.passed(f"{beyond_rad:.3f} {ctx.unit}", text, motion_rad=beyond_rad)
-        return met.placed(beyond_rad, limit)
-    place = ctx.at(ctx.states.topic, at)
-    outcome = ctx.failed(f"{beyond_rad:.2f} {ctx.unit}", text, place, motion_rad=beyond_rad)
-    return outcome.about(joint).placed(beyond_rad, limit).if_late(STROKE_S * part)
+            rad = max(float(beyond[i, joint]), 0.0)
+            text = f"left the way to its last goal by {rad:.3f} {ctx.unit} without a command"
+            yield Figure(rad, float(t[i]), None, joint, text)
 
 
 @check("BRAINCO-WDOG-04")
-def stops_in_silence(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_motion_stroke", nothing="no joint was on its way at the time-out")
+def stops_in_silence(ctx: Context) -> Figures:
     """Whether a moving joint stands still after the time-out."""
-    least = ctx.requirement.tolerance("min_left_stroke")
-    seen = False
     for begin, end, goal in _silences(ctx):
         late = begin + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
-        q = ctx.states.q[ctx.states.between(late, end)]
+        q = ctx.q(late, end)
         if len(q) < 5:
             continue
-        for joint, spec in enumerate(ctx.joints):
-            if abs(goal[joint] - q[0, joint]) < least * spec.stroke:
-                continue
-            moved = float(np.ptp(q[:, joint]))
-            if moved > ctx.tolerance("max_motion_stroke", joint):
-                return ctx.failed(
-                    "goes on",
-                    ctx.named(
-                        f"moved by {moved:.2f} {ctx.unit} more than "
-                        f"{ctx.tolerance('timeout_s'):g} s after the last command",
-                        joint,
-                    ),
-                    ctx.at(ctx.states.topic, late, end),
-                    motion_rad=moved,
-                ).about(joint)
-            seen = True
-    if not seen:
-        return ctx.skipped("no joint was on its way at the time-out")
-    return ctx.passed("stops", "what was on its way stands still after the time-out")
+        for joint in range(len(ctx.joints)):
+            if abs(goal[joint] - q[0, joint]) >= ctx.tolerance("min_left_stroke", joint):
+                moved = float(np.ptp(q[:, joint]))
+                text = f"moved by {moved:.2f} {ctx.unit} more than {ctx.tolerance('timeout_s'):g} s"
+                yield Figure(moved, late, end, joint, f"{text} after the last command")
 
 
 def _silences(ctx: Context) -> list[tuple[float, float, Floats]]:

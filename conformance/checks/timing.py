@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -79,6 +80,21 @@ def longest_gap(ctx: Context, limit: float, begin: float, end: float) -> Measure
         edges = np.concatenate(([begin], inside, [end]))
         longest = max(longest, float(np.diff(edges).max()))
     return Measure(longest, limit, span=(begin, end))
+
+
+def gap_beside_states(times: Floats, states: Floats) -> tuple[float, float]:
+    """The longest interval between times beyond pauses of the states, and its begin.
+
+    A restarted service or a paused machine is silent on all topics.
+    """
+    times = np.concatenate((times, states[-1:]))
+    found = (0.0, float(times[0]))
+    for begin, end in pairwise(times.tolist()):
+        if end - begin > found[0]:
+            own = states[(states > begin) & (states < end)]
+            quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
+            found = max(found, (end - begin - quiet, begin))
+    return found
 
 
 def survived(ctx: Context, outcome: Outcome, gap: float) -> Outcome:

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measure
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.servo_force import FEW_STANDS, stands
+from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.touch import Touch
 from dexkit.hand import Floats
 
@@ -75,27 +77,10 @@ def touch_goes_on(ctx: Context) -> Outcome:
     touch = _touch(ctx)
     if touch is None or not len(ctx.states):
         return ctx.absent(_NOTHING)
-    limit = ctx.tolerance("max_gap_s")
-    gap, at = _longest_gap(touch.t, ctx.states.t)
+    gap, at = gap_beside_states(touch.t, ctx.states.t)
     text = f"nothing on {touch.topic} for {gap:.2f} s, while there were states"
-    if gap <= limit:
-        return ctx.passed(f"{gap:.2f} s", text, gap_s=gap).timed(gap, limit)
-    outcome = ctx.failed(f"{gap:.2f} s", text, ctx.at(touch.topic, at, at + gap), gap_s=gap)
-    return outcome.timed(gap, limit).if_late(gap - limit)
-
-
-def _longest_gap(touch: Floats, states: Floats) -> tuple[float, float]:
-    """The longest time without ``touch`` beyond pauses of the state, and its begin."""
-    times = np.concatenate((touch, states[-1:]))
-    worst = (0.0, float(times[0]))
-    for begin, end in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
-        if end - begin <= worst[0]:
-            continue
-        # a restarted service or a paused machine is silent on both
-        own = states[(states > begin) & (states < end)]
-        quiet = float(np.diff(np.concatenate(([begin], own, [end]))).max())
-        worst = max(worst, (end - begin - quiet, begin))
-    return worst
+    figure = Figure(gap, at, at + gap, text=text, topic=touch.topic)
+    return judged(ctx, [figure], "gap_s", "max_gap_s", nothing="")
 
 
 @check("FTP-TOUCH-04")
@@ -113,15 +98,17 @@ def touch_rate(ctx: Context) -> Outcome:
     ]
     rate = float(np.median(counts)) / _WINDOW_S
     limit = ctx.tolerance("min_rate_hz")
-    text = f"{rate:.0f} Hz on {touch.topic} in most seconds"
-    seconds = len(begins) * _WINDOW_S
-    if rate >= limit:
-        return ctx.passed(f"{rate:.0f} Hz", text, rate_hz=rate).rated(rate, limit, seconds)
-    outcome = ctx.failed(
-        f"{rate:.0f} Hz", text, ctx.at(touch.topic, float(begins[0])), rate_hz=rate
-    )
     late = 1.0 / max(rate, 0.5) - 1.0 / limit
-    return outcome.rated(rate, limit, seconds).if_late(late, how="mean", best=late)
+    figure = Figure(
+        rate,
+        float(begins[0]),
+        text=f"{rate:.0f} Hz on {touch.topic} in most seconds",
+        shown=f"{rate:.0f} Hz",
+        late=Late((late,), "mean", late),
+        measure=rate_measure(rate, limit, len(begins) * _WINDOW_S),
+        topic=touch.topic,
+    )
+    return judged(ctx, [figure], "rate_hz", "min_rate_hz", nothing="")
 
 
 def _rises(ctx: Context, touch: Touch) -> dict[str, Floats]:
@@ -137,14 +124,13 @@ def _rises(ctx: Context, touch: Touch) -> dict[str, Floats]:
 
 
 @check("FTP-TOUCH-05")
+@with_object
 def touch_in_grips(ctx: Context) -> Outcome:
     """The touch of each finger in its grips, and where nothing touches it."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     touch = _touch(ctx)
     if touch is None:
         return ctx.absent(_NOTHING)
-    judged = False
+    some = False
     for finger, rise in _rises(ctx, touch).items():
         joints = [i for i, j in enumerate(ctx.joints) if j.name.startswith(finger)]
         grips = [s for s in stands(ctx) if s.presses[joints].any()]
@@ -161,7 +147,7 @@ def touch_in_grips(ctx: Context) -> Outcome:
         )
         if most <= 0.0:
             continue
-        judged = True
+        some = True
         weak = [s for part, s in held if part < ctx.tolerance("min_part") * most]
         if len(weak) >= FEW_STANDS:
             text = f"of its touch in other grips hardly any is left while the {finger} grips"
@@ -177,7 +163,7 @@ def touch_in_grips(ctx: Context) -> Outcome:
         if len(kept) >= FEW_STANDS:
             text = f"the touch of a grip is there while nothing touches the {finger}"
             return ctx.failed("touch", text, ctx.at(touch.topic, kept[0].begin, kept[-1].end))
-    if not judged:
+    if not some:
         return ctx.skipped("no finger's areas rose at the object")
     return ctx.passed("as gripped", "each finger's areas tell its grips")
 
@@ -194,27 +180,26 @@ def _last(touch: Touch, rise: Floats, begin: float, end: float) -> float:
 
 
 @check("FTP-TOUCH-06")
-def untouched(ctx: Context) -> Outcome:
+@with_object
+@worst("counts", "max_part", nothing="no message before the first command, or no touch in a grip")
+def untouched(ctx: Context) -> Figures:
     """The largest count of an element before the first command, relative to the most in a grip."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     touch = _touch(ctx)
     if touch is None or not len(ctx.commands):
-        return ctx.absent(_NOTHING)
+        yield ctx.absent(_NOTHING)
+        return
     before = int(np.searchsorted(touch.t, float(ctx.commands.t[0])))
     held = [touch.median(max(b, e - _HELD_S), e) for b, e in map(ctx.span, ctx.phases())]
     most = max((float(np.nanmax(m)) for m in held if m is not None), default=0.0)
     if not before or most <= 0.0:
-        return ctx.skipped("no message before the first command, or no touch in a grip")
+        return
     rest = np.nan_to_num(np.median(touch.values[:before], axis=0))
     area, element = (int(i) for i in np.unravel_index(int(np.argmax(rest)), rest.shape))
     level = float(rest[area, element])
-    limit = ctx.tolerance("max_part") * most
     text = (
         f"{touch.areas[area].member} has {level:.0f} before the first command, where the most in a "
         f"grip is {most:.0f}"
     )
-    if level <= limit:
-        return ctx.passed(f"{level:.0f}", text, counts=level)
-    place = ctx.at(touch.topic, float(touch.t[0]), float(touch.t[before - 1]))
-    return ctx.failed(f"{level:.0f}", text, place, counts=level)
+    limit, shown = ctx.tolerance("max_part") * most, f"{level:.0f}"
+    begin, end = float(touch.t[0]), float(touch.t[before - 1])
+    yield Figure(level, begin, end, text=text, limit=limit, shown=shown, topic=touch.topic)
