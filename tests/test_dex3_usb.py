@@ -21,8 +21,9 @@ from dexkit.errors import (
 from dexkit.hand import Side
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
+from tests.dex3_worked_example import worked_example
 from tests.each import each
-from tools.generate.dex3_protocol_page import BLOCKS, PAGE, worked_example
+from tools.generate.dex3_protocol_page import BLOCKS, PAGE
 
 # --- layouts, against the numbers of docs/sources/unitree-dex.md#c
 

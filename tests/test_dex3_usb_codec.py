@@ -32,8 +32,8 @@ from dexkit.models import DEX3_1
 from dexkit.wire import dex3_usb as d
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import units
+from tests.dex3_worked_example import worked_example
 from tests.each import each
-from tools.generate.dex3_protocol_page import worked_example
 
 JOINTS = DEX3_1.joints[Side.LEFT]
 RATIOS = [j.gear_ratio for j in JOINTS]

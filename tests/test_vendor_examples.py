@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import textwrap
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -171,9 +172,9 @@ def test_the_gripper_of_the_guide_meets_what_its_maker_claims(
 def test_the_document_shows_the_hand_as_it_is() -> None:
     document = (EXAMPLES.parent / "docs" / "certify-your-gripper.md").read_text()
     source = (ACME / "acme_gripper" / "hand.py").read_text()
-    for begin in ("STROKE = ", "def make"):
+    for begin, indent in (("def exchange", "    "), ("def make", "")):
         shown = document[document.index(begin) :]
-        assert shown[: shown.index("```")].strip() in source
+        assert textwrap.indent(shown[: shown.index("```")].strip(), indent) in source
     claims = (ACME / "capabilities.toml").read_text()
     shown = document[document.index("[hand]") :]
     assert shown[: shown.index("```")].strip() in claims

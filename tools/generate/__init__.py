@@ -6,7 +6,6 @@ in the repository
 :mod:`~.message_modules`       dexkit/messages/unitree_*.py, from dexkit/messages/idl/*.idl
 :mod:`~.models_page`           docs/images/model-*.svg, from the model profiles
 :mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
-:mod:`~.doctor_page`           the table of docs/doctor.md, from the doctor's diagnoses
 :mod:`~.real_hands_page`       docs/sources/real-hands.md, from real_hands.toml
 :mod:`~.layouts`               docs/layouts, for Foxglove and PlotJuggler, from the model profiles
 in build/docs and on the site
@@ -14,6 +13,7 @@ in build/docs and on the site
 :mod:`~.models_page`           models.md: joints, limits, topics and rates
 :mod:`~.requirement_pages`     requirements/: a page for each requirement
 :mod:`~.conformity_page`       conformity.md, from conformity.toml
+:mod:`~.doctor_page`           diagnoses.md, of the doctor
 :mod:`~.real_hands_page`       bases.md: what carries the MUSTs of each model
 =============================  ==================================================================
 
@@ -43,7 +43,6 @@ def generated_files() -> dict[Path, str]:
     # the generators import ROOT and DOCS from here
     from tools.generate import (
         dex3_protocol_page,
-        doctor_page,
         layouts,
         message_modules,
         models_page,
@@ -54,7 +53,6 @@ def generated_files() -> dict[Path, str]:
         **message_modules.files(),
         **models_page.files(),
         **dex3_protocol_page.files(),
-        **doctor_page.files(),
         **real_hands_page.files(),
         **layouts.files(),
     }
@@ -73,12 +71,19 @@ def built_pages() -> dict[str, str]:
     """Markdown of the pages that are not in the repository, by the path that they have on the site:
     their links are seen from docs/.
     """
-    from tools.generate import conformity_page, models_page, real_hands_page, requirement_pages
+    from tools.generate import (
+        conformity_page,
+        doctor_page,
+        models_page,
+        real_hands_page,
+        requirement_pages,
+    )
 
     return {
         "models.md": models_page.page(),
         "conformity.md": conformity_page.page(),
         "bases.md": real_hands_page.bases(),
+        "diagnoses.md": doctor_page.page(),
         **requirement_pages.pages(),
     }
 

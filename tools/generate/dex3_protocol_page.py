@@ -1,20 +1,16 @@
-"""The tables of docs/dex3-protocol.md, from layouts, scaling, bus map and packers of the codec."""
+"""The tables of docs/dex3-protocol.md, from layouts, scaling and bus map of the codec."""
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dexkit.hand import MotorError
 from dexkit.models import DEX3_1
-from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import units
 from dexkit.wire.dex3_usb.codec import DEFAULT_BUS_MAP
 from dexkit.wire.dex3_usb.layout import (
-    COMMAND_734,
-    COMMAND_1234,
     COMMAND_LAYOUTS,
     MANUFACTURER,
     MOTOR_CMD,
@@ -26,19 +22,11 @@ from dexkit.wire.dex3_usb.layout import (
     STATE,
     STATE_BUS_SIZE,
     VENDOR_ID,
-    CommandLayout,
-)
-from dexkit.wire.dex3_usb.packets import (
-    CommandFrame,
-    MotorCmd,
-    MotorState,
-    SensorState,
-    pack_command,
 )
 from dexkit.wire.ris import RIS_MODE, Structure
 from tools.generate import DOCS
 
-__all__ = ["BLOCKS", "PAGE", "files", "worked_example"]
+__all__ = ["BLOCKS", "PAGE", "files"]
 
 PAGE = DOCS / "dex3-protocol.md"
 
@@ -179,97 +167,6 @@ def _bus_map() -> str:
     return _table(["bus", "motors (id, joint)", "sensor packets (id, place)"], rows)
 
 
-def _crc_vectors() -> str:
-    inputs = [
-        ("`00000000`", bytes(4)),
-        ("`FFFFFFFF`", b"\xff" * 4),
-        ("`01000000`", b"\x01\0\0\0"),
-        ('`3132333435363738` ("12345678")', b"12345678"),
-        ("bytes 00 to 0F", bytes(range(16))),
-        ("bytes 00 to FF, four times", bytes(range(256)) * 4),
-        ("728 zero bytes: an empty 734-byte command, mode 0", bytes(728)),
-        ("1228 zero bytes: an empty 1234-byte command, mode 0", bytes(1228)),
-        ("1264 zero bytes: an empty state frame", bytes(1264)),
-    ]
-    return _table(
-        ["bytes as they lie in memory", "CRC"],
-        [[name, f"`{crc32_words(data):08X}`"] for name, data in inputs],
-    )
-
-
-def worked_example(layout: CommandLayout) -> bytes:
-    """Seven motors in FOC, kp 1.5, kd 0.2; all of ratio 108, head FC FD
-    (docs/sources/unitree-dex.md#c10).
-    """
-    targets = ((0.0, 0.2, 0.5), (-0.3, -0.6), (-0.4, -0.8), (), ())
-    buses = [
-        [
-            MotorCmd(
-                id=number,
-                status=1,
-                timeout=False,
-                tor_des=0,
-                spd_des=0,
-                pos_des=units.POSITION.encode(q, 108),
-                k_pos=units.STIFFNESS.encode(1.5, 108),
-                k_spd=units.DAMPING.encode(0.2, 108),
-            )
-            for number, q in enumerate(bus)
-        ]
-        for bus in targets
-    ]
-    return pack_command(CommandFrame(buses, head=b"\xfc\xfd"), layout)
-
-
-def _example() -> str:
-    lines = []
-    data = worked_example(COMMAND_1234)
-
-    def line(at: int, parts: list[int], comment: str) -> None:
-        cut, texts = at, []
-        for part in parts:
-            texts.append(data[cut : cut + part].hex())
-            cut += part
-        lines.append(f"{at:<5}{' '.join(texts):<61}{comment}")
-
-    line(0, [2, 4, 4, 4, 4, 4, 4], "head, mode, cmd_size[5]")
-    sizes = [len(part) for part in ((0,) * 60, (0,) * 40, (0,) * 40)]
-    for bus, size in enumerate(sizes):
-        for number in range(size // MOTOR_CMD.size):
-            at = COMMAND_1234.bus_offset(bus) + number * MOTOR_CMD.size
-            packet = MotorCmd.parse(data[at : at + MOTOR_CMD.size])
-            q = units.POSITION.decode(packet.pos_des, 108)
-            line(
-                at,
-                [4, 2, 2, 4, 2, 2, 4],
-                f"bus {bus} id {number}: q = {q:.4f} rad ({packet.pos_des})",
-            )
-    line(1226, [4, 4], "reserve, crc")
-    digests = [
-        f"{layout.name} bytes: SHA-256 `{hashlib.sha256(worked_example(layout)).hexdigest()}`"
-        for layout in (COMMAND_1234, COMMAND_734)
-    ]
-    return "```text\n" + "\n".join(lines) + "\n```\n\n" + "  \n".join(digests)
-
-
-def _packets() -> str:
-    motor = MotorState(0, 1, False, 30, 40, 48, 0, 0, 11000)
-    sensor = SensorState(1, 0, tuple(range(1000, 1012)), (25,) * 12)
-    return _table(
-        ["packet", "bytes"],
-        [
-            [
-                "motor state, id 0, FOC, case 30 °C, winding 40 °C, 24 V, position 11000",
-                f"`{motor.pack().hex()}`",
-            ],
-            [
-                "sensor state, id 1, pressures 1000 to 1011, temperatures 25 °C",
-                f"`{sensor.pack().hex()}`",
-            ],
-        ],
-    )
-
-
 BLOCKS: dict[str, Callable[[], str]] = {
     "identity": _identity,
     "ris-mode": _mode,
@@ -286,9 +183,6 @@ BLOCKS: dict[str, Callable[[], str]] = {
     ),
     "units": _units,
     "bus-map": _bus_map,
-    "crc-vectors": _crc_vectors,
-    "example": _example,
-    "packets": _packets,
 }
 """What is between ``<!-- made: NAME -->`` and ``<!-- end -->``."""
 
