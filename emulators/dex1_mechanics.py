@@ -14,10 +14,8 @@ kp 5, kd 0.05, 500 Hz state) the gripper reaches 6.5 rad/s, moves from 10 to 90 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from dexkit.emulators.joint_mechanics import Joint, Wall
-from dexkit.emulators.wear import JointWear
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, Side
 from dexkit.models import DEX1_1
@@ -81,7 +79,6 @@ class Dex1Mechanics:
             q=self.limits.q_min + self.limits.stroke * start_pct / 100,
         )
         self.torque = 0.0
-        self._powered = True
         self.brake()
 
     def brake(self) -> None:
@@ -94,12 +91,6 @@ class Dex1Mechanics:
         """Set the setpoint and gains of the control law; SI units."""
         self.mode = JointMode.FOC
         self._q, self._dq, self._tau, self._kp, self._kd = q, dq, tau, kp, kd
-
-    def wear(self, joint: int, wear: JointWear) -> None:
-        """Wear the gripper: friction, top speed, and whether its motor has power."""
-        self.joint.coulomb *= wear.friction
-        self.limits = replace(self.limits, dq_max=self.limits.dq_max * wear.speed)
-        self._powered = not wear.dead
 
     def place(self, q: Sequence[float]) -> None:
         """Put the joint at ``q[0]``, rad, at rest."""
@@ -142,8 +133,6 @@ class Dex1Mechanics:
 
     def _motor(self) -> float:
         """Torque of the motor, N·m."""
-        if not self._powered:
-            return 0.0
         joint = self.joint
         stiffness, damping = self._kp, self._kd
         torque = stiffness * (self._q - joint.q) + damping * (self._dq - joint.dq) + self._tau

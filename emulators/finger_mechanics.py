@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from dexkit.emulators.joint_mechanics import Joint, Wall, check_closing
-from dexkit.emulators.wear import JointWear
 from dexkit.hand import (
     Floats,
     HandCommand,
@@ -366,14 +365,6 @@ class FingerMechanics:
         """Lock a joint where it is, or free it."""
         self.joints[joint].locked = stuck
         self._motors[joint].rests_at = math.nan
-
-    def wear(self, joint: int, wear: JointWear) -> None:
-        """Wear a joint: friction, top speed, and whether its motor has power."""
-        motor = self._motors[joint]
-        motor.joint.coulomb *= wear.friction
-        motor.droop /= wear.speed
-        if wear.dead:
-            self.power(joint, False)
 
     # -- measured values ----------------------------------------------------------------------
 

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from dexkit.emulators.finger_mechanics import SETTINGS
 from dexkit.emulators.joint_mechanics import check_closing
-from dexkit.emulators.wear import JointWear
 from dexkit.hand import Floats, HandCommand, HandState, JointMode, JointSpec, Side
 from dexkit.models import HandModel
 
@@ -51,15 +50,9 @@ class _Servo:
     still: bool = False
     contact: float = 0.0
     """Current with which it presses on the object, as a part of the limit."""
-    friction: float = 1.0
-    """Factor of the current that it takes to move."""
-    dead: bool = False
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds."""
-        if self.dead:
-            self.still = True
-            return
         full = self.spec.dq_max
         speed = min(self.speed, full)
         want = 0.0
@@ -92,7 +85,7 @@ class _Servo:
             aim = blocked * limit
         else:
             idle = _IDLE if self.goal > self.q else 0.0
-            aim = limit * (_MOVING * self.friction * self.dq / full + idle)
+            aim = limit * (_MOVING * self.dq / full + idle)
         self.current += (aim - self.current) * min(1.0, dt / _STALL)
         self.contact = max(0.0, self.current * blocked / limit) if presses else 0.0
         self.still = want == 0.0 == self.dq and abs(aim - self.current) < 1e-4
@@ -155,13 +148,6 @@ class ServoMechanics:
             goal = q if mode == JointMode.FOC else math.nan
             if servo.goal != goal or servo.speed != speed:
                 servo.goal, servo.speed, servo.still = goal, speed, False
-
-    def wear(self, joint: int, wear: JointWear) -> None:
-        """Wear a joint: current to move, top speed, and whether it has power."""
-        servo = self._servos[joint]
-        servo.friction *= wear.friction
-        servo.spec = replace(servo.spec, dq_max=servo.spec.dq_max * wear.speed)
-        servo.dead = wear.dead
 
     def place(self, q: Sequence[float]) -> None:
         """Put the joints at ``q``, shape (n_joints,), at rest."""

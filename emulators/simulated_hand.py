@@ -16,7 +16,6 @@ from dexkit.clock import Clock, RealClock
 from dexkit.command_age import PAUSE
 from dexkit.documents import read_bytes, write_file
 from dexkit.emulators.joint_mechanics import FixedSteps
-from dexkit.emulators.wear import WEAR_SETTING, JointWear, Wear, Worn, parse_wear
 from dexkit.errors import HandLost, OutputError, UsageError
 from dexkit.escaping import one_line
 from dexkit.hand import HandCommand, HandSpec, HandState
@@ -24,7 +23,6 @@ from dexkit.hand import HandCommand, HandSpec, HandState
 __all__ = ["COMMON_SETTINGS", "Mechanics", "SimulatedHand", "configured", "number"]
 
 COMMON_SETTINGS = {
-    **WEAR_SETTING,
     "pose": "a file that keeps the joints' positions from one start to the next, as a real hand "
     "does (default: none)",
 }
@@ -52,9 +50,6 @@ class Mechanics(Protocol):
     def state(self, stamp: float) -> HandState:
         """The state, measured at ``stamp``."""
 
-    def wear(self, joint: int, wear: JointWear) -> None:
-        """Apply the wear of a joint, except for play."""
-
     def place(self, q: Sequence[float]) -> None:
         """Put the joints at ``q``, shape (n_joints,), at rest."""
 
@@ -77,7 +72,6 @@ class SimulatedHand:
         self._steps = FixedSteps(step, most=0.5)
         self._last = 0.0  # time of the last exchange
         self._open = False
-        self._worn: Worn | None = None
         self._pose: Path | None = None
 
     def keep_pose(self, file: Path) -> None:
@@ -102,12 +96,6 @@ class SimulatedHand:
                 hint="remove the file, or give each hand its own",
             )
         self._mechanics.place(q)
-
-    def wear(self, wear: Wear) -> None:
-        """Apply wear. Call it once: factors of friction and speed multiply."""
-        for index, joint in wear.joints.items():
-            self._mechanics.wear(index, joint)
-        self._worn = Worn(wear, self._spec.n_joints)
 
     @property
     def spec(self) -> HandSpec:
@@ -151,8 +139,7 @@ class SimulatedHand:
         self._last = now
         self._mechanics.step(self._steps.due(now))
         self._mechanics.apply(command)
-        state = self._mechanics.state(now)
-        return state if self._worn is None else self._worn(state)
+        return self._mechanics.state(now)
 
 
 Simulated = TypeVar("Simulated", bound=SimulatedHand)
@@ -163,8 +150,6 @@ def configured(hand: Simulated, options: BackendOptions) -> Simulated:
 
     :raises UsageError: a setting is not understood.
     """
-    if text := options.settings.get("wear"):
-        hand.wear(parse_wear(text, hand.spec))
     if file := options.settings.get("pose"):
         hand.keep_pose(Path(file))
     return hand

@@ -37,7 +37,6 @@ _INPUTS = {
     "--recording",
     "--config",
     "--answers",
-    "--baseline",
     "--from-source",
     "--wire",
     "--beside-episodes",

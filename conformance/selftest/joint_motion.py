@@ -106,12 +106,11 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Samples of one joint: seconds, commanded and measured q, torque; shape (n,)."""
+    """Samples of one joint: seconds, commanded and measured q; shape (n,)."""
 
     t: Floats
     command: Floats
     q: Floats
-    tau: Floats
 
     def gap(self, begin: float = -math.inf, end: float = math.inf) -> float:
         """Seconds between two samples at most, from a time to a time."""
@@ -150,7 +149,7 @@ class Bench:
         self.x: Floats = np.full(self.setup.spec.n_joints, math.nan)
         self.noise: Floats = np.zeros(self.setup.spec.n_joints)
         self.state: HandState | None = None
-        self._rows: list[tuple[Floats, Floats, Floats]] = []
+        self._rows: list[tuple[Floats, Floats]] = []
 
     # -- what is sent ----------------------------------------------------------------------------
 
@@ -209,7 +208,7 @@ class Bench:
         before = self.state.stamp if self.state is not None else state.stamp
         if self.state is None or state.stamp > before:
             self.t.append(state.stamp)
-            self._rows.append((q, state.q, state.tau_est))
+            self._rows.append((q, state.q))
         self.state = state
         return min(max(state.stamp - before, 0.0), _HOLD)
 
@@ -262,17 +261,6 @@ class Bench:
         end = self.state.stamp + seconds
         while self.state.stamp < end:
             yield from self.turn()
-
-    def step(self, joint: int, q: float) -> Turns[float]:
-        """Command a joint to go elsewhere at once; the time of the command."""
-        assert self.state is not None
-        self.x[joint] = q
-        full = np.zeros(len(self.x))
-        if self.setup.servo:
-            full[joint] = self.setup.full[joint].min()
-        yield from self.turn(full)
-        # the state of this exchange was measured when the command took effect
-        return self.state.stamp
 
     def move(
         self, joint: int, goal: float, speed: float, *, fast: bool = False, settle: bool = False
@@ -340,9 +328,8 @@ class Bench:
     def series(self, joint: int, begin: int, end: int | None = None) -> Series:
         """The samples of a joint between two places."""
         rows = self._rows[begin:end]
-        table = np.array([[c[joint], q[joint], tau[joint]] for c, q, tau in rows])
-        table = table.reshape(len(rows), 3)
-        return Series(np.array(self.t[begin:end]), table[:, 0], table[:, 1], table[:, 2])
+        table = np.array([[c[joint], q[joint]] for c, q in rows]).reshape(len(rows), 2)
+        return Series(np.array(self.t[begin:end]), table[:, 0], table[:, 1])
 
     def moved(self, begin: int) -> Floats:
         """Displacement of each joint since a given position, shape (n,)."""

@@ -7,33 +7,25 @@ driven any more: nothing faster happens before that test.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 
-from dexkit.command_age import PAUSE
-from dexkit.conformance.selftest import joint_figures
-from dexkit.conformance.selftest.figure_limits import BY_NAME
-from dexkit.conformance.selftest.joint_figures import Rest
-from dexkit.conformance.selftest.joint_motion import SETTLE, Bench, Series, Setup, T, Turns
+from dexkit.conformance.selftest.joint_motion import SETTLE, Bench, Series, Setup, Turns
 from dexkit.hand import Floats, HandCommand, HandState, JointSpec
 from dexkit.models import model
 
 __all__ = ["ElementFound", "Found", "JointFound", "Procedure"]
 
-_STILL = 1.0  # seconds at rest, for noise and temperatures
+_STILL = 1.0  # seconds at rest, for noise
 _NUDGE = 0.08  # part of the stroke
 _ALIVE = 0.35  # part of that by which a joint has moved
 _STAYS = 0.05  # part of the stroke by which a joint that is told to stay may move
-_CREEP = 30.0  # seconds for a stroke
-_STARTED = 0.005  # part of the stroke that is motion
-_REPEATS = 3
-_STEP = 0.1  # part of the stroke
-_LAGGED = 0.05  # part of a step that is motion
 _RUN = (0.05, 0.95)  # parts of the range between which speeds are tried
 _FIT = (0.35, 0.65)  # and between which they are measured
+_FEWEST = 3  # samples between these
 _LEVELS = (
     0.25,
     0.5,
@@ -41,8 +33,7 @@ _LEVELS = (
 )  # of the speed that is allowed: a faster run only after a good slower one
 _KEPT = 0.8  # part of the speed asked for that a joint reaches
 _OVERSHOT = 0.05  # part of the stroke beyond a goal
-_WATCHED = 0.3  # seconds after a step
-_GAP = 2.5  # periods between two samples at most, where a figure depends on them
+_GAP = 2.5  # periods between two samples at most, while a speed is measured
 _PRESSED = 500.0  # Pa, or ...
 _SIGMAS = 8.0  # ... times the noise, from rest: an element that is pressed
 _TOUCH_PATIENCE = 60.0  # seconds without a new element
@@ -52,7 +43,7 @@ _TOUCH_PATIENCE = 60.0  # seconds without a new element
 class JointFound:
     """Findings about a joint; NaN where it was not measured.
 
-    :ivar figures: by name (:data:`dexkit.conformance.selftest.figure_limits.KINDS`).
+    :ivar figures: by name: ``range``, ``speed+``, ``speed-``.
     :ivar moves: names of the joints that move when it is commanded.
     :ivar notes: what a reader has to know about its figures.
     :ivar curves: by name.
@@ -150,7 +141,6 @@ class Procedure:
         if self.touch:
             yield from self._feel()
         self._report_progress("at rest", 1.0)
-        self._temperatures(still, (yield from self.bench.watch(0.3)))
 
     def _report_progress(self, doing: str, part: float) -> None:
         self.doing, self.part = doing, part
@@ -176,9 +166,7 @@ class Procedure:
 
     def _at_rest(self, states: Sequence[HandState]) -> None:
         q = np.array([s.q for s in states])
-        for j, joint in enumerate(self.found.joints):
-            joint.figures["noise"] = float(q[:, j].std())
-            self.bench.noise[j] = joint.figures["noise"]
+        self.bench.noise[:] = q.std(axis=0)
         pressures = [s.pressure for s in states if s.pressure is not None]
         values = np.array(pressures) if pressures else None
         for packet, sensor in enumerate(self.profile.sensors):
@@ -188,13 +176,6 @@ class Procedure:
                     column = values[:, packet, slot]
                     element.rest, element.noise = float(column.mean()), float(column.std())
                 self.found.elements.append(element)
-
-    def _temperatures(self, first: Sequence[HandState], last: Sequence[HandState]) -> None:
-        before = np.mean([_hottest(s) for s in first], axis=0)
-        after = np.mean([_hottest(s) for s in last], axis=0)
-        for j, joint in enumerate(self.found.joints):
-            joint.figures["temperature"] = float(after[j])
-            joint.figures["rise"] = float(after[j] - before[j])
 
     def _open(self) -> Turns[None]:
         """Open the hand slowly, finger by finger, so that no joint is in another's way."""
@@ -238,13 +219,7 @@ class Procedure:
     def _thoroughly(self, j: int, k: int, of: int) -> Turns[None]:
         joint = self.found.joints[j]
         self.bench.forget()
-        tests = (
-            ("its range", self._range),
-            ("torque to start", self._starts),
-            ("repeatability and play", self._returns),
-            ("lag", self._lags),
-            ("speed", self._speeds),
-        )
+        tests = (("its range", self._range), ("speed", self._speeds))
         for n, (title, test) in enumerate(tests):
             self._report_progress(f"{joint.name}: {title}", (k + n / len(tests)) / of)
             yield from test(j)
@@ -256,109 +231,15 @@ class Procedure:
         yield from bench.move(j, spec.q_min, slow, settle=True)
         begin = bench.mark
         yield from bench.move(j, spec.q_max, slow, settle=True)
-        high = self._rest(j).q
+        high = self._rest(j)
         yield from bench.move(j, spec.q_min, slow, settle=True)
-        low = self._rest(j).q
-        joint.curves["sweep"] = bench.series(j, begin)
-        joint.figures |= {"low": low, "high": high, "range": high - low}
-        joint.figures["zero"] = (low - spec.q_min) + (high - spec.q_max)
+        joint.curves["range"] = bench.series(j, begin)
+        joint.figures["range"] = high - self._rest(j)
 
-    def _rest(self, j: int) -> Rest:
-        """Rest position that a joint has just reached."""
+    def _rest(self, j: int) -> float:
+        """Where a joint that has just come to rest is."""
         s = self.bench.series(j, -max(3, int(SETTLE / self.setup.period)))
-        return joint_figures.rest(s.q, s.tau)
-
-    def _starts(self, j: int) -> Turns[None]:
-        bench, joint = self.bench, self.found.joints[j]
-        yield from bench.move(j, self._at(j, 0.5), float(bench.slow[j]), settle=True)
-        found = []
-        for name, direction in (("start+", 1), ("start-", -1)):
-            one = yield from self._measured(
-                j, BY_NAME[name].title, partial(self._start, j, direction)
-            )
-            joint.figures[name] = math.nan if one is None else one.torque
-            found += [] if one is None else [one]
-        best = max(found, key=lambda s: s.swing, default=joint_figures.Start(math.nan))
-        joint.figures["stiffness"] = best.stiffness
-
-    def _measured(
-        self, j: int, what: str, attempt: Callable[[], Turns[T | None]]
-    ) -> Turns[T | None]:
-        """A measurement of a joint, with a note that names it if this machine's pauses spoil it."""
-        found = yield from self.bench.undisturbed(attempt)
-        if found is None:
-            self.found.joints[j].notes.append(f"{what}: spoiled by pauses of this machine")
-        return found
-
-    def _start(self, j: int, direction: int) -> Turns[joint_figures.Start | None]:
-        bench, stroke = self.bench, float(self.setup.stroke[j])
-        yield from bench.settle(j)
-        assert bench.state is not None
-        q = float(bench.state.q[j])
-        begin = bench.mark
-        yield from bench.move(j, q + direction * 0.03 * stroke, stroke / _CREEP)
-        s = bench.series(j, begin)
-        self.found.joints[j].curves[f"start{'+' if direction > 0 else '-'}"] = s
-        if s.gap() > PAUSE:  # hands brake by themselves then
-            return None
-        return joint_figures.start(s.command, s.q, s.tau, direction, _STARTED * stroke)
-
-    def _returns(self, j: int) -> Turns[None]:
-        figures = self.found.joints[j].figures
-        rests: dict[int, list[Rest]] = {1: [], -1: []}
-        for _ in range(_REPEATS):
-            for direction, found in rests.items():
-                one = yield from self._measured(
-                    j, "repeatability and play", partial(self._return, j, direction)
-                )
-                if one is None:
-                    return
-                found.append(one)
-        figures["repeatability"] = max(joint_figures.spread(r) for r in rests.values())
-        kp = 0.0 if self.setup.servo else float(self.setup.kp[j])
-        stiffness = figures.get("stiffness", math.nan)
-        figures["play"] = joint_figures.lost_motion(rests[1], rests[-1], kp, stiffness)
-
-    def _return(self, j: int, direction: int) -> Turns[Rest | None]:
-        """Rest position of a joint at mid-range, approached in ``direction``."""
-        bench, stroke = self.bench, float(self.setup.stroke[j])
-        goal, slow = self._at(j, 0.5), float(bench.slow[j])
-        yield from bench.move(j, goal - direction * 0.1 * stroke, slow, settle=True)
-        begin = bench.mark
-        yield from bench.move(j, goal, slow, settle=True)
-        s = bench.series(j, begin)
-        there = np.flatnonzero(np.abs(s.command - goal) < 1e-9)
-        arrived = float(s.t[there[0]]) if len(there) else math.inf
-        # a command that jumps after a pause lets the joint swing to another place of rest
-        disturbed = s.gap(end=arrived + SETTLE) > _GAP * self.setup.period
-        return None if disturbed else self._rest(j)
-
-    def _lags(self, j: int) -> Turns[None]:
-        found = []
-        for direction in (1, -1, 1, -1):
-            value = yield from self._measured(j, "a lag", partial(self._lag, j, direction))
-            found.append(math.nan if value is None else value)
-        known = [value for value in found if math.isfinite(value)]
-        self.found.joints[j].figures["lag"] = float(np.median(known)) if known else math.nan
-
-    def _lag(self, j: int, direction: int) -> Turns[float | None]:
-        bench, stroke = self.bench, float(self.setup.stroke[j])
-        step = _STEP * stroke if self.setup.servo else min(_STEP * stroke, self.setup.lead)
-        # from behind: what play there is has been crossed before
-        origin = self._at(j, 0.5) - direction * step / 2
-        yield from bench.move(j, origin - direction * 0.1 * stroke, float(bench.slow[j]))
-        yield from bench.move(j, origin, float(bench.slow[j]), settle=True)
-        assert bench.state is not None
-        begin = bench.mark
-        yield from bench.turn()
-        sent = yield from bench.step(j, float(bench.state.q[j]) + direction * step)
-        yield from bench.wait(_WATCHED)
-        s = bench.series(j, begin)
-        self.found.joints[j].curves["step"] = s
-        lag = joint_figures.delay(s.t, s.q, sent, direction, _LAGGED * step)
-        period = self.setup.period
-        late = s.gap(sent - 2 * period, sent + (lag if math.isfinite(lag) else math.inf))
-        return lag if late <= _GAP * period else None
+        return float(np.median(s.q))
 
     def _speeds(self, j: int) -> Turns[None]:
         """Move back and forth, faster each time, while the joint follows and stops at its goal."""
@@ -372,9 +253,9 @@ class Procedure:
                 asked = level * float(self.found.asked_speed[j, column])
                 if name not in going or (asked <= 2 * slow and level < _LEVELS[-1]):
                     continue
-                found = yield from self._measured(
-                    j, BY_NAME[name].title, partial(self._fast, j, begin, goal, asked)
-                )
+                found = yield from bench.undisturbed(partial(self._fast, j, begin, goal, asked))
+                if found is None:
+                    joint.notes.append(f"{name}: spoiled by pauses of this machine")
                 reached[name], beyond = found or (math.nan, 0.0)
                 if not (reached[name] >= _KEPT * asked and beyond <= _OVERSHOT):
                     going.discard(name)
@@ -404,7 +285,7 @@ class Procedure:
         if s.gap(end=left) > _GAP * self.setup.period:
             return None
         beyond = float((direction * (s.q - self._at(j, goal))).max()) / spec.stroke
-        return joint_figures.speed(s.t, s.q, low, high), beyond
+        return _mean_speed(s, low, high), beyond
 
     # -- touch -----------------------------------------------------------------------------------
 
@@ -444,8 +325,10 @@ class Procedure:
                     element.answered, last = True, state.stamp
 
 
-def _hottest(state: HandState) -> Floats:
-    """The higher temperature of case and winding, per joint."""
-    if state.winding_temperature is None:
-        return state.temperature
-    return np.fmax(state.temperature, state.winding_temperature)
+def _mean_speed(s: Series, low: float, high: float) -> float:
+    """Magnitude of the mean speed between two places; NaN with too few samples there."""
+    inside = (s.q >= low) & (s.q <= high)
+    t, q = s.t[inside], s.q[inside]
+    if len(t) < _FEWEST or float(np.ptp(t)) <= 0:
+        return math.nan
+    return abs(float(np.polyfit(t - t[0], q, 1)[0]))

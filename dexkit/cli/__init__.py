@@ -49,7 +49,7 @@ _SECTIONS: Sections = {
         "doctor": ("dexkit.cli.doctor", "Find out why a client and a hand do not connect."),
         "monitor": ("dexkit.cli.monitor", "Show hands and topics in the terminal, live."),
         "view": ("dexkit.cli.view", "Show hands on a page in the browser, live or recorded."),
-        "selftest": ("dexkit.cli.selftest", "Test a hand's joints and sensors; compare for wear."),
+        "selftest": ("dexkit.cli.selftest", "Test a hand's joints and tactile sensors."),
     },
     "Set up": {
         "setup-dds": ("dexkit.cli.setup_dds", "Find or build CycloneDDS 0.10 for this Python."),

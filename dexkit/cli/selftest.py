@@ -1,4 +1,4 @@
-"""``dexkit selftest``: test the joints and sensors of one hand, and compare with an earlier run."""
+"""``dexkit selftest``: test the joints and sensors of one hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import click
 from dexkit.cli.command_help import Command
 from dexkit.cli.consent import Consent
 from dexkit.cli.options import (
-    FILE,
     Number,
     dds_options,
     device_option,
@@ -96,9 +95,6 @@ whose client asks for all of it, are tried at it."""
     help="Ask for each tactile element to be pressed, where the model has some.  [default: touch]",
 )
 @click.option("--name", default="", metavar="TEXT", help="Name or serial number of the hand.")
-@click.option(
-    "--baseline", type=FILE, metavar="FILE", help="JSON of an earlier run of the same hand."
-)
 @json_file_option("Where to write the result.  [default: selftest-MODEL-SIDE-TIME.json]")
 @html_option()
 @dds_options()
@@ -115,7 +111,7 @@ def command(backend_name: str | None, **given: Any) -> int:
     leaves the hand at rest. If this program was suspended for more than a second, it asks before it
     goes on; without a terminal it ends.
 
-    Writes a page and a JSON file. With --baseline it reports what has become worse since.
+    Writes a page and a JSON file.
     """
     if (backend_name is None) == (not given["external"]):
         raise UsageError(
@@ -130,12 +126,11 @@ def command(backend_name: str | None, **given: Any) -> int:
     from dexkit.conformance.selftest.joint_motion import Setup
     from dexkit.conformance.selftest.live import run
     from dexkit.conformance.selftest.procedure import Procedure
-    from dexkit.conformance.selftest.result import check_baseline, read_result, result_of
+    from dexkit.conformance.selftest.result import result_of
     from dexkit.conformance.selftest.supervision import End, SelfTest
     from dexkit.documents import check_output_paths
     from dexkit.stop_signals import stop_on_signals
 
-    baseline = None if given["baseline"] is None else read_result(given["baseline"])
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
         hand, spoken = _hand(stack, backend_name, given, stop)
@@ -145,11 +140,8 @@ def command(backend_name: str | None, **given: Any) -> int:
             "device": given["device"] or "",
             "name": given["name"],
         }
-        if baseline is not None:
-            whose = {"model": spec.model, "side": str(spec.side), **about}
-            check_baseline(baseline, whose, given["baseline"])
         json_path, page = _outputs(given, spec.model)
-        check_output_paths([json_path, page], [given["baseline"]])
+        check_output_paths([json_path, page], [])
         joints = _joints([joint.name for joint in spec.joints], given["joints"])
         touch = _touch(spec.model, given["touch"])
         _ask(backend_name, given["yes"], spec.side)
@@ -184,8 +176,7 @@ def command(backend_name: str | None, **given: Any) -> int:
     if test.end is End.STOPPED:
         click.echo("stopped; the hand is at rest, and nothing was written", err=True)
         return 130
-    result = result_of(test, about, baseline=baseline, baseline_name=str(given["baseline"] or ""))
-    return _finish(result, baseline, json_path, page)
+    return _finish(result_of(test, about), json_path, page)
 
 
 def _hand(
@@ -307,16 +298,14 @@ def _turn(stop: StopRequest, pressed: Keys, quiet: bool) -> Iterator[Callable[[S
         status.clear()
 
 
-def _finish(
-    result: SelfTestResult, baseline: SelfTestResult | None, json_path: Path, page: Path
-) -> int:
+def _finish(result: SelfTestResult, json_path: Path, page: Path) -> int:
     """Write and print the result; returns the exit code."""
     from dexkit.conformance.report.selftest import print_selftest, render_selftest
     from dexkit.conformance.selftest.result import Verdict
     from dexkit.documents import write_file
 
     result.write_json(json_path)
-    write_file(page, render_selftest(result, baseline))
+    write_file(page, render_selftest(result))
     print_selftest(result)
     click.echo(f"result: {json_path}")
     click.echo(f"page: {page}")

@@ -9,24 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import datetime, timezone
 from pathlib import Path
 
 from PIL import Image
 
 from dexkit.cli.view import recorded
-from dexkit.clock import ManualClock
 from dexkit.conformance.report.curves import page as curves_page
 from dexkit.conformance.report.curves import recorded as curves_of
-from dexkit.conformance.report.selftest import render_selftest
-from dexkit.conformance.selftest.joint_motion import Setup
-from dexkit.conformance.selftest.live import run
-from dexkit.conformance.selftest.procedure import Procedure
-from dexkit.conformance.selftest.result import SelfTestResult, result_of
-from dexkit.conformance.selftest.supervision import SelfTest
-from dexkit.emulators.sim_dex1 import SimHand
-from dexkit.emulators.wear import parse_wear
-from dexkit.hand import Side
 from dexkit.threads import Worker
 from dexkit.traces import open_trace, sample_path
 from dexkit.view.browser_page import Page
@@ -106,13 +95,6 @@ def pictures(only: Sequence[str]) -> None:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelectorAll('svg').length > 3")
                 save(browser.picture(), "info")
-        if asked("selftest"):
-            path = folder / "selftest.html"
-            path.write_text(worn_page())
-            with Browser(folder / "f", 1000, 1000) as browser:
-                browser.open(path.as_uri())
-                browser.wait("document.querySelectorAll('svg').length > 3")
-                save(browser.picture(), "selftest")
         if asked("monitor"):
             path = folder / "monitor.html"
             path.write_text(monitor_picture(sample_path("dex3_pinch"), 12.2, 100, 30))
@@ -120,25 +102,6 @@ def pictures(only: Sequence[str]) -> None:
                 browser.open(path.as_uri())
                 browser.wait("document.querySelector('pre') !== null")
                 save(browser.picture(), "monitor")
-
-
-def worn_page() -> str:
-    """The page of a gripper that was worn on purpose, on a virtual clock."""
-    results: list[SelfTestResult] = []
-    for wear in ("", "play=0.06,friction=2.5"):
-        clock = ManualClock()
-        hand = SimHand(Side.LEFT, clock=clock)
-        hand.wear(parse_wear(wear, hand.spec))
-        hand.open()
-        test = SelfTest(Procedure(Setup.from_spec(hand.spec), speed=0.25))
-        run(hand, test, clock=clock)
-        about = {"backend": "sim-dex1", "name": "A7"}
-        baseline = results[0] if results else None
-        when = datetime(2026, 3 + len(results), 4, 10, 15, tzinfo=timezone.utc)
-        results.append(
-            result_of(test, about, baseline=baseline, baseline_name="new.json", now=when)
-        )
-    return render_selftest(results[1], results[0])
 
 
 def save(png: bytes, name: str) -> None:
