@@ -61,7 +61,6 @@ def test_tolerances_come_from_the_model_and_fill_the_sentence() -> None:
         ('needs = "state"', 'needs = "state"\ndialects = ["latin"]', "no dialect"),
         ('needs = "state"', 'needs = "state"\ncapability = "song"', "capability is one of"),
         ('needs = "state"', 'needs = "state"\nrepeat = 0', "repeat is a number from 1 on"),
-        ('model = "dex1-1"', 'model = "dex1-1"\nretired = ["DEX1-X-01"]', "never used again"),
         ('model = "dex1-1"', 'model = "dex1-1"\nretried = []', "unknown keys ['retried']"),
     ],
 )
@@ -108,11 +107,50 @@ def test_like_entry_inherits_missing_keys() -> None:
 
 
 def test_entry_is_of_the_layer_of_the_requirement_that_it_is_like() -> None:
-    found = {r.layer: r.like for r in requirements._requirements("dex5.toml")}
-    assert found == {"dds": "DEX3-OPER-05", "client": "DEX1-CLIENT-13"}
-    # over two files, of which the first names no layer
-    ftp = {r.id: r.layer for r in requirements._requirements("inspire_ftp.toml")}
-    assert (ftp["FTP-TOPIC-01"], ftp["FTP-CLIENT-01"]) == ("dds", "client")
+    found = parse(LIKE.replace("X-01", "TOPIC-01") + '[[requirement]]\nlike = "FTP-CLIENT-01"\n')
+    assert [r.layer for r in found] == ["dds", "client"]
+
+
+TABLE = """
+ids = ["DEX1-X-02", "DEX3-X-01", "DEX5-X-01 as DEX3", "DFX-X-01 as DEX5"]
+area = "Rate"
+level = "MUST"
+title = "t"
+sentence = "From {low:g} to {high:g} on rt/dex1/SIDE/state."
+rationale = "see DEX1-Y-01"
+source = "s"
+confidence = "measured"
+needs = "state"
+advice = "a"
+tolerances = { low = 1, high = 2 }
+[DEX3]
+advice = "b"
+tolerances = { high = 3 }
+[DEX5]
+title = "u"
+"""
+
+
+def test_one_table_is_about_several_models() -> None:
+    one, three, five, dfx = requirements._of_table(parse_toml(TABLE, "t"), "t")
+    assert one["id"] == "DEX1-X-02"
+    assert (one["advice"], one["tolerances"]) == ("a", {"low": 1, "high": 2})
+    assert three["id"] == "DEX3-X-01"
+    assert (three["rationale"], three["confidence"]) == ("see DEX3-Y-01", "measured")
+    assert three["sentence"].endswith("rt/dex3/SIDE/state.")
+    assert (three["advice"], three["tolerances"]) == ("b", {"low": 1, "high": 3})
+    assert (five["like"], five["source"]) == ("DEX3-X-01", "as DEX3-X-01: s")
+    assert (five["title"], five["advice"], five["confidence"]) == ("u", "b", "inferred")
+    assert (dfx["like"], dfx["title"], dfx["source"]) == ("DEX5-X-01", "u", "as DEX3-X-01: s")
+
+
+def test_error_names_the_mistake_in_a_table_of_several_models() -> None:
+    for old, new, expected in (
+        ("DFX-X", "NO-X", "NO-X-01 is of no known model"),
+        ('title = "u"', "title = 1", "DEX5-X-01: title is a text"),
+    ):
+        with pytest.raises(UsageError, match=expected):
+            requirements._of_table(parse_toml(TABLE.replace(old, new), "t"), "t")
 
 
 def test_expected_is_the_sentence_unless_given() -> None:
@@ -199,11 +237,11 @@ def test_invalid_catalogue_is_refused_by_name() -> None:
         if not isinstance(changed, dict):
             continue
         try:
-            requirements._parse(changed, "it", {})
+            requirements._of_document(changed, "it", {})
         except DexkitError:
             continue
         good += 1
     assert good
-    for text in ("[" * 5000, "a = nan", "model = 1", 'requirement = "x"', "retired = 1"):
+    for text in ("[" * 5000, "a = nan", "model = 1", 'requirement = "x"'):
         with pytest.raises(UsageError):
             parse(text)

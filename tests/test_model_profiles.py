@@ -189,10 +189,7 @@ def forget() -> None:
     registry._declared[:] = [
         d for d in registry._declared if d.made.__module__.startswith("dexkit")
     ]
-    for cached in (
-        *(requirements.catalogue, requirements._files, requirements._requirements),
-        *(requirements._document, mutants, lazy._load, dexkit.models.registered_record),
-    ):
+    for cached in (requirements.catalogue, mutants, lazy._load, dexkit.models.registered_record):
         cached.cache_clear()
 
 

@@ -11,7 +11,7 @@ __all__ = ["BRAINCO_REVO2"]
 
 BRAINCO_REVO2 = ModelUnderTest(
     model=models.BRAINCO_REVO2,
-    requirements=("brainco.toml",),
+    prefixes={"BRAINCO": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.brainco:BrainCoService"),
     quick_phases=("burst", "empty", "joint", "late-joiner", "speeds"),

@@ -11,7 +11,7 @@ __all__ = ["DEX1_1"]
 
 DEX1_1 = ModelUnderTest(
     model=models.DEX1_1,
-    requirements=("dex1.toml", "dex1_client.toml"),
+    prefixes={"DEX1": "dds"},
     script=Lazy("dexkit.conformance.stimuli.gripper:GripperScript"),
     reference=Lazy("dexkit.conformance.virtual.gripper:ReferenceService"),
     quick_phases=("late-joiner", "load", "soft", "squeeze", "step"),

@@ -11,7 +11,7 @@ __all__ = ["DEX3_1"]
 
 DEX3_1 = ModelUnderTest(
     model=models.DEX3_1,
-    requirements=("dex3.toml", "dex3_usb.toml"),
+    prefixes={"DEX3": "dds", "DEX3USB": "usb"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.fingers:Dex3Service"),
     quick_phases=("burst", "drive", "joint", "late-joiner", "single"),

@@ -11,7 +11,7 @@ __all__ = ["DEX5_1"]
 
 DEX5_1 = ModelUnderTest(
     model=models.DEX5_1,
-    requirements=("dex5.toml",),
+    prefixes={"DEX5": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
     quick_phases=("drive", "joint", "late-joiner"),

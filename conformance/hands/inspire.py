@@ -13,7 +13,7 @@ _ROLES = JointRoles(driven=(), slow=(1, 3))
 
 INSPIRE_DFX = ModelUnderTest(
     model=models.INSPIRE_DFX,
-    requirements=("inspire_dfx.toml",),
+    prefixes={"DFX": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.inspire:InspireService"),
     quick_phases=("burst", "empty", "joint", "late-joiner"),
@@ -23,7 +23,7 @@ INSPIRE_DFX = ModelUnderTest(
 
 INSPIRE_FTP = ModelUnderTest(
     model=models.INSPIRE_FTP,
-    requirements=("inspire_ftp.toml",),
+    prefixes={"FTP": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.inspire:FtpService"),
     quick_phases=("burst", "joint", "late-joiner", "squeeze"),

@@ -36,7 +36,9 @@ class JointRoles:
 class ModelUnderTest:
     """How the kit judges a hand or a robot.
 
-    :param requirements: its requirement files; a relative path is one of dexkit's own.
+    :param requirements: its requirement files, of a model of another package.
+    :param prefixes: of a model of dexkit itself, layer of its requirements by the prefix of their
+        ids, which :mod:`dexkit.conformance.behaviours` holds.
     :param script: its stimulus script: a :class:`~dexkit.conformance.stimuli.script.Script`.
     :param reference: service on a virtual clock that does everything right.
     :param quick_phases: phases of a quick run, some eleven seconds: those by which most known wrong
@@ -53,10 +55,11 @@ class ModelUnderTest:
     """
 
     model: HandModel | RobotModel
-    requirements: tuple[str | Path, ...]
     script: Lazy[type[Any]]
     reference: Lazy[type[Any]]
     quick_phases: tuple[str, ...]
+    requirements: tuple[str | Path, ...] = ()
+    prefixes: Mapping[str, str] = field(default_factory=dict)
     roles: JointRoles | None = None
     objects: Mapping[Side, float] = field(default_factory=dict)
     session: str | Path = ""

@@ -16,14 +16,14 @@ _QUICK_PHASES = ("joint", "late-joiner")
 
 H1 = ModelUnderTest(
     model=robots.H1,
-    requirements=("h1.toml",),
+    prefixes={"H1": "robot"},
     script=_SCRIPT,
     reference=_REFERENCE,
     quick_phases=_QUICK_PHASES,
 )
 G1 = ModelUnderTest(
     model=robots.G1,
-    requirements=("g1.toml",),
+    prefixes={"G1": "robot"},
     script=_SCRIPT,
     reference=_REFERENCE,
     quick_phases=_QUICK_PHASES,

@@ -1,13 +1,23 @@
-"""The requirements as data: TOML files in this folder, read into :class:`Requirement`.
+"""The requirements as data: the TOML files of :mod:`dexkit.conformance.behaviours`, one for each
+behaviour, read into :class:`Requirement`.
 
-What one model has in common with another is written once: an entry with ``like = "DEX3-RATE-01"``
-inherits all keys that it does not give from that requirement of another file, which may be like a
-third one. Its id is the same with this model's prefix, unless it gives another; ids and topics of
-the other model in the texts are turned into this model's; tolerances are taken one by one. Where it
-names no source of its own, it is an inference from the other's. It is of the other's layer, unless
-its file names one, so that one file holds what a hand and what its client must do.
+A ``[[requirement]]`` is written once for all hands and robots that have to meet it. ``ids`` names
+it for each of them, by the prefix of its model (:data:`PREFIXES`); the keys below, explained in
+:class:`Requirement`, are those of the first id. A table such as ``[requirement.DEX3]`` has what
+differs for that model; its tolerances are taken one by one. Ids and topics of the first model in
+the texts are turned into the other's.
 
-All other parts take them from here: checks (which read their tolerances), pytest ids,
+``"DEX5-RATE-01 as DEX3"`` says that nobody knows it of that hand itself: it takes all that it does
+not give from DEX3-RATE-01, is judged by its check, and is an inference from it where it names no
+source of its own. A hand of another package has a file of such requirements, in which each entry
+names the one that it is ``like``.
+
+``"model:X"`` takes a tolerance from the hand's model, and ``"DEX1-MOVE-04:x"`` the tolerance x of
+another requirement, so that no fact is written down twice. ``dialects`` restricts the models that
+have them. Lengths that end in ``_stroke`` are parts of the joint's full range. ``area`` at the head
+of a file is that of the requirements that give none. An id is never used again for something else.
+
+All other parts take the requirements from here: checks (which read their tolerances), pytest ids,
 selection, reports and the pages of the site.
 """
 
@@ -22,10 +32,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dexkit.conformance.behaviours import AREAS, BEHAVIOURS
 from dexkit.conformance.hands import BUILT_IN, under_test
-from dexkit.conformance.layers import LAYERS, layer
+from dexkit.conformance.layers import layer
 from dexkit.conformance.plots import Plot
-from dexkit.documents import parse_toml, read_toml
+from dexkit.documents import parse_toml, read_text, read_toml
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.models import DIALECTS, HandModel, model, model_plugins
 from dexkit.robots import RobotModel, robot
@@ -33,6 +44,7 @@ from dexkit.robots import RobotModel, robot
 __all__ = [
     "CAPABILITIES",
     "CONFIDENCE",
+    "PREFIXES",
     "Kind",
     "Level",
     "Requirement",
@@ -60,6 +72,13 @@ CAPABILITIES: Mapping[str, str] = {
 """Optional units of a hand, and what a claim of each means; see
 :mod:`dexkit.conformance.claims`."""
 
+PREFIXES: Mapping[str, tuple[str, str]] = {
+    prefix: (each.model.name, layer_name)
+    for each in BUILT_IN
+    for prefix, layer_name in each.prefixes.items()
+}
+"""Model and layer of dexkit's own ids, by their prefix; those like ``DEX1-CLIENT-01`` are of the
+layer ``client``."""
 _ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
 _NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
 _PHASES = ("phase:", "other-phase:")
@@ -165,8 +184,7 @@ class Requirement:
     :param after: requirements that must not have failed, or this one is blocked.
     :param dialects: the dialects that it applies to.
     :param tolerances: the figures that the check compares with.
-    :param layer: one of :data:`~dexkit.conformance.layers.LAYERS`; a file's ``layer``, ``dds`` by
-        default.
+    :param layer: one of :data:`~dexkit.conformance.layers.LAYERS`.
     :param realtime: a machine that is short of processor time can make a good hand fail it; a
         failure is then not blamed on the hand.
     :param cause: likely cause of a failure: the usual mistake of vendors.
@@ -252,11 +270,6 @@ class Requirement:
             raise ConformanceError(f"{self.id} has no tolerance {name!r}") from None
 
 
-def _model_of(document: Mapping[str, Any]) -> HandModel | RobotModel:
-    name = str(document.get("model", ""))
-    return robot(name) if document.get("layer") == "robot" else model(name)
-
-
 def _resolve(
     value: Any, hand: HandModel | RobotModel, before: Mapping[str, Requirement], where: str
 ) -> float:
@@ -280,40 +293,36 @@ def renamed(text: str, theirs: str, ours: str) -> str:
     )
 
 
-def _entries(document: Mapping[str, Any], others: Mapping[str, Any], origin: str) -> list[Any]:
-    """The entries of a document, each with what it takes from another one's.
+def _with_prefix(value: Any, theirs: str, ours: str) -> Any:
+    """A value with all its texts :func:`renamed`."""
+    if isinstance(value, str):
+        return renamed(value, theirs, ours)
+    if isinstance(value, dict):
+        return {name: _with_prefix(v, theirs, ours) for name, v in value.items()}
+    return [_with_prefix(v, theirs, ours) for v in value] if isinstance(value, list) else value
 
-    :param others: entries of other documents, by id.
+
+def _changed(entry: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry with the keys of ``own`` in place of its; tolerances one by one."""
+    tolerances = {**entry.get("tolerances", {}), **own.get("tolerances", {})}
+    return {**entry, **own, **({"tolerances": tolerances} if tolerances else {})}
+
+
+def _taken(
+    own: Mapping[str, Any], prefix: str, others: Mapping[str, Any], origin: str
+) -> dict[str, Any]:
+    """An entry with what it takes from the one that it is like.
+
+    :param others: complete entries, by id.
     """
-    prefix = str(document.get("prefix", ""))
-    entries = document.get("requirement", [])
-    if not isinstance(entries, list):
-        raise UsageError(f"{origin}: requirements are [[requirement]] tables")
-    found = []
-    for entry in entries:
-        _check_types(entry, origin)
-        if "like" not in entry:
-            found.append(entry)
-            continue
-        if entry["like"] not in others:
-            raise UsageError(f"{origin}: no requirement {entry['like']!r} to be like")
-        origins = others[entry["like"]]
-        theirs = entry["like"].partition("-")[0]
-
-        def ours(value: Any, theirs: str = theirs) -> Any:
-            if isinstance(value, str):
-                return renamed(value, theirs, prefix)
-            if isinstance(value, dict):
-                return {name: ours(v) for name, v in value.items()}
-            return [ours(v) for v in value] if isinstance(value, list) else value
-
-        taken = {key: ours(value) for key, value in origins.items()}
-        source = origins["source"]
-        taken["source"] = source if "like" in origins else f"as {entry['like']}: {source}"
-        taken["confidence"] = "inferred"
-        tolerances = {**taken.get("tolerances", {}), **entry.get("tolerances", {})}
-        found.append({**taken, **entry, **({"tolerances": tolerances} if tolerances else {})})
-    return found
+    if own["like"] not in others:
+        raise UsageError(f"{origin}: no requirement {own['like']!r} to be like")
+    theirs = others[own["like"]]
+    taken = _with_prefix(theirs, own["like"].partition("-")[0], prefix)
+    source = theirs["source"]
+    taken["source"] = source if "like" in theirs else f"as {own['like']}: {source}"
+    taken["confidence"] = "inferred"
+    return _changed(taken, own)
 
 
 def _lineage(entry: Mapping[str, Any], others: Mapping[str, Any]) -> tuple[str, ...]:
@@ -382,35 +391,54 @@ def _kind(entry: Mapping[str, Any], where: str) -> Kind:
 def parse(
     text: str, origin: str = "requirements", others: Mapping[str, Any] | None = None
 ) -> tuple[Requirement, ...]:
-    """Requirements of one TOML text.
+    """Requirements of one hand, of a TOML text with its ``model``, its ``prefix`` and a
+    ``[[requirement]]`` for each.
 
-    :param others: entries of other texts, by id, for what is ``like`` them.
+    :param others: complete entries by id, for what is ``like`` them; None for dexkit's own.
     :raises UsageError: a key is unknown or missing, a value is not one of those allowed, an id
-        occurs twice or is retired, ``after`` names what does not come before, ``like`` what
-        there is not, or ``kind`` and ``original`` contradict each other.
+        occurs twice, ``after`` names what does not come before, ``like`` what there is not, or
+        ``kind`` and ``original`` contradict each other.
     """
-    return _parse(parse_toml(text, origin), origin, others or {})
+    return _of_document(parse_toml(text, origin), origin, _written() if others is None else others)
+
+
+def _of_document(
+    document: Mapping[str, Any], origin: str, others: Mapping[str, Any]
+) -> tuple[Requirement, ...]:
+    unknown = set(document) - {"model", "prefix", "requirement"}
+    if unknown:
+        raise UsageError(f"{origin}: unknown keys {sorted(unknown)}")
+    hand, prefix = model(str(document.get("model", ""))), str(document.get("prefix", ""))
+    entries = document.get("requirement", [])
+    if not isinstance(entries, list):
+        raise UsageError(f"{origin}: requirements are [[requirement]] tables")
+    by_layer: dict[str, list[Mapping[str, Any]]] = {}
+    for entry in entries:
+        _check_types(entry, origin)
+        complete = _taken(entry, prefix, others, origin) if "like" in entry else entry
+        layer_name = _owner(entry["like"])[1] if "like" in entry else "dds"
+        by_layer.setdefault(layer_name, []).append(complete)
+    return tuple(
+        requirement
+        for layer_name, group in by_layer.items()
+        for requirement in _parse(group, hand, layer_name, origin, others)
+    )
 
 
 def _parse(
-    document: Mapping[str, Any], origin: str, others: Mapping[str, Any]
+    entries: Iterable[Mapping[str, Any]],
+    hand: HandModel | RobotModel,
+    layer_name: str,
+    origin: str,
+    others: Mapping[str, Any],
 ) -> tuple[Requirement, ...]:
-    unknown = set(document) - {"model", "prefix", "layer", "retired", "requirement"}
-    if unknown:
-        raise UsageError(f"{origin}: unknown keys {sorted(unknown)}")
-    retired = document.get("retired", [])
-    if not isinstance(retired, list):
-        raise UsageError(f"{origin}: retired is a list of ids")
-    hand = _model_of(document)
-    layer_name = str(document.get("layer", "dds"))
-    if layer_name not in LAYERS:
-        raise UsageError(f"{origin}: layer is one of {', '.join(LAYERS)}")
+    """The requirements of complete entries of one hand and one layer."""
     default_plots = layer(layer_name).plots
     dialect_names = (
         (hand.name,) if isinstance(hand, RobotModel) else tuple(d.name for d in hand.dialects)
     )
     found: dict[str, Requirement] = {}
-    for entry in _entries(document, others, origin):
+    for entry in entries:
         where = f"{origin}: {entry.get('id', 'a requirement without id')}"
         unknown = set(entry) - _KEYS
         missing = _KEYS - _OPTIONAL - set(entry)
@@ -418,8 +446,6 @@ def _parse(
             raise UsageError(f"{where}: unknown keys {sorted(unknown)}, missing {sorted(missing)}")
         if not _ID.match(entry["id"]) or entry["id"] in found:
             raise UsageError(f"{where}: an id is like DEX1-RATE-01 and occurs once")
-        if entry["id"] in retired:
-            raise UsageError(f"{where}: is retired, and an id is never used again")
         if entry["confidence"] not in CONFIDENCE:
             raise UsageError(f"{where}: confidence is one of {', '.join(CONFIDENCE)}")
         if entry["level"] not in Level.__members__:
@@ -458,7 +484,8 @@ def _parse(
             needs=entry["needs"],
             advice=entry["advice"],
             after=tuple(entry.get("after", ())),
-            dialects=tuple(entry.get("dialects", dialect_names)),
+            dialects=tuple(d for d in entry.get("dialects", ()) if d in dialect_names)
+            or dialect_names,
             tolerances=tolerances,
             realtime=bool(entry.get("realtime", False)),
             layer=layer_name,
@@ -477,137 +504,122 @@ def _parse(
     return tuple(found.values())
 
 
+def _owner(name: str) -> tuple[str, str]:
+    """Model and layer of a requirement of dexkit's own."""
+    prefix, _, rest = name.partition("-")
+    model_name, layer_name = PREFIXES[prefix]
+    of_client = layer_name == "dds" and rest.startswith("CLIENT-")
+    return model_name, "client" if of_client else layer_name
+
+
 @cache
-def _files() -> dict[str, tuple[str, str]]:
-    """Model and layer of each requirement file, by its path, which is a name for dexkit's own. The
-    layer is empty where the file names none, and holds what is ``like`` requirements of several.
+def _written() -> Mapping[str, Mapping[str, Any]]:
+    """The complete entries of dexkit's own requirements by id, by area and behaviour."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in BEHAVIOURS:
+        path = Path(__file__).parent / "behaviours" / f"{name}.toml"
+        for table in (document := read_toml(path))["requirement"]:
+            for entry in _of_table({"area": document["area"], **table}, path.name):
+                if entry["id"] in found or entry["area"] not in AREAS:
+                    raise UsageError(f"{path.name}: {entry['id']}: its id or area is no new one")
+                found[entry["id"]] = entry
+    return dict(sorted(found.items(), key=lambda item: AREAS.index(item[1]["area"])))
 
-    Those of dexkit come first, by name. A file of another package that cannot be read is left out:
-    it must not affect the others. :func:`catalogue` of its model raises what is wrong with it.
+
+def _of_table(table: Mapping[str, Any], origin: str) -> list[dict[str, Any]]:
+    """The complete entries of one table, in the order of its ids.
+
+    :raises UsageError: an id is of no known model, or a value has another type.
     """
-    found = {name: _head(name) for name in _own_files()}
-    for plugin in model_plugins():
-        if plugin.model is not None:
-            with contextlib.suppress(UsageError, ModelBroken):
-                found |= _plugin_files(plugin.model)
-    return found
+    ids = {name.partition("-")[0]: name.partition(" as ") for name in table["ids"]}
+    common = {key: value for key, value in table.items() if key not in {"ids", *ids}}
+    first = next(iter(ids))
+    found: dict[str, dict[str, Any]] = {}
+    for prefix, (name, _, like) in ids.items():
+        own = table.get(prefix, {})
+        _check_types({**common, **own, "id": name}, origin)
+        if prefix not in PREFIXES:
+            raise UsageError(f"{origin}: {name} is of no known model")
+        if like:
+            own = {"like": ids[like][0], **own}
+            found[name] = _taken(own, prefix, found, origin)
+        else:
+            found[name] = _changed(_with_prefix(common, first, prefix), own)
+        found[name]["id"] = name
+    return list(found.values())
 
 
-def _own_files() -> list[str]:
-    return sorted(str(file) for each in BUILT_IN for file in each.requirements)
+def _named(entry: Mapping[str, Any]) -> list[str]:
+    """The requirements that an entry comes after, or whose tolerances it takes."""
+    tolerances = entry.get("tolerances", {}).values()
+    return [*entry.get("after", []), *(v.partition(":")[0] for v in tolerances if type(v) is str)]
 
 
-def _plugin_files(hand: HandModel) -> dict[str, tuple[str, str]]:
-    """The same of a model of another package.
+@cache
+def _own(model_name: str, layer_name: str) -> tuple[Requirement, ...]:
+    """Dexkit's own requirements of one model and layer, each after those that it names."""
+    about = (model_name, layer_name)
+    entries = {name: e for name, e in _written().items() if _owner(name) == about}
+    ordered: list[Mapping[str, Any]] = []
+    seen: set[str] = set()
+
+    def place(name: str) -> None:
+        if name in entries and name not in seen:
+            seen.add(name)
+            for before in _named(entries[name]):
+                place(before)
+            ordered.append(entries[name])
+
+    for name in entries:
+        place(name)
+    hand = robot(model_name) if layer_name == "robot" else model(model_name)
+    return _parse(ordered, hand, layer_name, "behaviours", _written())
+
+
+def _of_plugin(hand: HandModel) -> tuple[Requirement, ...]:
+    """The requirements of a model of another package.
 
     :raises UsageError: it has none, or a file cannot be read, or is wrong.
     :raises ModelBroken: what its package registers for the kit cannot be used.
     """
-    files = [str(file) for file in under_test(hand.name).requirements]
-    for name in files:
-        for r in _requirements(name):
+    found: list[Requirement] = []
+    for path in map(Path, under_test(hand.name).requirements):
+        for r in parse(read_text(path), path.name):
             if not r.like or r.model != hand.name:
                 raise UsageError(
-                    f"{name}: {r.id} is of {r.model} and like {r.like or 'nothing'}",
+                    f"{path}: {r.id} is of {r.model} and like {r.like or 'nothing'}",
                     hint=f"each is of {hand.name} and like a requirement of dexkit, whose check "
                     "judges it",
                 )
-    return {name: _head(name) for name in files}
-
-
-def _head(name: str) -> tuple[str, str]:
-    """Model of a file, and the layer that it names."""
-    path = Path(__file__).parent / name
-    head = parse_toml(path.read_text(encoding="utf-8").partition("[[")[0], path.name)
-    return _model_of(head).name, str(head.get("layer", ""))
-
-
-@cache
-def _document(name: str) -> Mapping[str, Any]:
-    return read_toml(Path(__file__).parent / name)
-
-
-@cache
-def _written(file: str) -> Mapping[str, Mapping[str, Any]]:
-    """The entries of a file of dexkit's own, as they are written, by id."""
-    prefix = str(_document(file).get("prefix", ""))
-    found = {}
-    for entry in _document(file)["requirement"]:
-        like = entry.get("like", "")
-        inferred = renamed(like, like.partition("-")[0], prefix)
-        found[str(entry.get("id", inferred))] = entry
-    return found
-
-
-def _ancestors(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries that this one is like, the nearest last, each with all that it takes."""
-    name = str(entry.get("like", ""))
-    if not name:
-        return {}
-    file = _file_of(name)
-    if file is None:
-        return {}
-    theirs = _written(file)[name]
-    found = _ancestors(theirs)
-    document = {**_document(file), "requirement": [theirs]}
-    return {**found, name: _entries(document, found, file)[0]}
-
-
-def _file_of(name: str) -> str | None:
-    """The file of dexkit's own in which a requirement is."""
-    return next((file for file in _own_files() if name in _written(file)), None)
-
-
-def _layer_of(entry: Mapping[str, Any], document: Mapping[str, Any]) -> str:
-    """The layer that an entry's file names, else that of the requirement that it is like."""
-    if "layer" in document or "like" not in entry:
-        return str(document.get("layer", "dds"))
-    file = _file_of(str(entry["like"]))
-    return "dds" if file is None else _layer_of(_written(file)[entry["like"]], _document(file))
-
-
-@cache
-def _requirements(name: str) -> tuple[Requirement, ...]:
-    """Those of one file; the others are read only if it takes something from them."""
-    document = _document(name)
-    others: dict[str, Any] = {}
-    by_layer: dict[str, list[Any]] = {}
-    for entry in document["requirement"]:
-        others |= _ancestors(entry)
-        by_layer.setdefault(_layer_of(entry, document), []).append(entry)
-    return tuple(
-        requirement
-        for layer, entries in by_layer.items()
-        for requirement in _parse(
-            {**document, "layer": layer, "requirement": entries}, name, others
-        )
-    )
+            found.append(r)
+    return tuple(found)
 
 
 @cache
 def catalogue(model: str | None = None, layer: str | None = "dds") -> tuple[Requirement, ...]:
     """The requirements of every model, in their order; those of dexkit's own models first.
 
-    :param model: only those of that hand model; None for all.
+    :param model: only those of that hand model; None for all, without those of another package
+        whose file cannot be read: it must not affect the others.
     :param layer: only those judged there; None for all.
     :raises UsageError: that model, of another package, has no requirements, or a file is wrong.
     :raises ModelBroken: what its package registers for the kit cannot be used.
     """
+    found: list[Requirement] = []
+    for own_model, own_layer in PREFIXES.values():
+        for name in (own_layer, "client") if own_layer == "dds" else (own_layer,):
+            if model in (None, own_model) and layer in (None, name):
+                found += _own(own_model, name)
     for plugin in model_plugins():
-        if plugin.name == model and plugin.model is not None:
-            _plugin_files(plugin.model)
-    return tuple(
-        requirement
-        for name, about in _files().items()
-        if model in (None, about[0]) and (layer is None or about[1] in ("", layer))
-        for requirement in _requirements(name)
-        if layer in (None, requirement.layer)
-    )
+        if plugin.model is not None and model in (None, plugin.name):
+            with contextlib.suppress(*(() if model else (UsageError, ModelBroken))):
+                found += [r for r in _of_plugin(plugin.model) if layer in (None, r.layer)]
+    return tuple(found)
 
 
 def models() -> tuple[str, ...]:
     """The hand models that have requirements."""
-    return tuple(dict.fromkeys(name for name, layer in _files().values() if layer != "robot"))
+    return tuple(dict.fromkeys(r.model for r in catalogue(None, None) if r.layer != "robot"))
 
 
 def select(
