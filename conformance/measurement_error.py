@@ -20,7 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class Measure:
         return self.limit - self.value if self.larger_is_worse else self.value - self.limit
 
     @property
-    def in_errors(self) -> float | None:
+    def margin_in_errors(self) -> float | None:
         """The margin in units of the kit's error; None where that is 0 or not known."""
         return self.margin / self.error if self.error else None
 
@@ -91,25 +91,6 @@ class Measure:
     def uncertain(self) -> bool:
         """Whether the figure is nearer to its limit than the kit can measure."""
         return self.error is not None and abs(self.margin) < self.error
-
-    def as_dict(self) -> dict[str, Any]:
-        """The measure as plain data."""
-        return {
-            "value": self.value,
-            "limit": self.limit,
-            "unit": self.unit,
-            "quantity": str(self.quantity),
-            "larger_is_worse": self.larger_is_worse,
-            "margin": self.margin,
-            "error": self.error,
-            "margin_in_errors": self.in_errors,
-        }
-
-    @classmethod
-    def of_dict(cls, data: dict[str, Any]) -> Measure:
-        """The measure that :meth:`as_dict` gave; ``margin`` is computed again."""
-        names = ("value", "limit", "unit", "larger_is_worse", "error")
-        return cls(quantity=Quantity(data["quantity"]), **{name: data[name] for name in names})
 
     def sentence(self) -> str:
         """The figure, its limit and the kit's error in one sentence."""
@@ -130,7 +111,7 @@ class Measure:
         if abs(self.margin) > _FAR * self.error:
             return f"{text}; the kit's measurement error is {self.error:.3g} {self.unit}"
         return (
-            f"{text}, {self.in_errors:+.3g} times the kit's measurement error of "
+            f"{text}, {self.margin_in_errors:+.3g} times the kit's measurement error of "
             f"{self.error:.3g} {self.unit}"
         )
 
@@ -154,7 +135,7 @@ def weigh(
 
 def _hardest(measure: Measure) -> tuple[float, float]:
     """The order of measures: the smallest margin in errors first, or without errors as it is."""
-    part = measure.in_errors
+    part = measure.margin_in_errors
     if part is None:
         part = math.copysign(math.inf, measure.margin)
     return part, measure.margin

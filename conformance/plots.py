@@ -6,7 +6,6 @@ catalogue, checks and result files do not depend on the drawing code.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 from dexkit.errors import UsageError
@@ -62,20 +61,29 @@ class PlotKind(str, Enum):
         return self.value
 
 
-@dataclass(frozen=True)
-class Plot:
-    """One plot of a result; written ``position`` or ``member:imu_state.quaternion[0]``.
+class Plot(str):
+    """One plot of a result: the text ``position`` or ``member:imu_state.quaternion[0]``.
 
     :param member: of :attr:`PlotKind.MEMBER`: ``dq``, ``ddq``, ``tau_est`` or ``mode`` of the
         result's joint, ``length`` of the motor sequence, or the path of a member of the state
         message, whose last index may be an element of an array.
     """
 
-    kind: PlotKind
-    member: str = ""
+    __slots__ = ()
 
-    def __str__(self) -> str:
-        return f"{self.kind}:{self.member}" if self.member else str(self.kind)
+    def __new__(cls, kind: PlotKind, member: str = "") -> Plot:
+        """The plot of that kind."""
+        return super().__new__(cls, f"{kind}:{member}" if member else str(kind))
+
+    @property
+    def kind(self) -> PlotKind:
+        """What is drawn."""
+        return PlotKind(self.partition(":")[0])
+
+    @property
+    def member(self) -> str:
+        """The member of the state message; empty for another kind."""
+        return self.partition(":")[2]
 
     @classmethod
     def parse(cls, text: str) -> Plot:

@@ -24,12 +24,11 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
-from dexkit.conformance.result_file import parse_result
-from dexkit.conformance.results import SEVERITY, VERSION, Result, RunResult, Verdict, grouped, worst
+from dexkit.conformance.result_file import as_document, parse_result
+from dexkit.conformance.results import SEVERITY, Result, RunResult, Verdict, grouped, worst
 from dexkit.conformance.run_record import recorded_claims
 from dexkit.conformance.selection import RunKind
 from dexkit.digests import sha256_of_file
-from dexkit.errors import UsageError
 from dexkit.escaping import one_line
 from dexkit.traces import open_trace
 
@@ -123,15 +122,10 @@ def compare_with_recording(document: Mapping[str, Any], recording: Path) -> Comp
     """Judge a recording again, and compare everything that follows from it with a result.
 
     :param document: the JSON of a result file.
-    :raises UsageError: it is no result file, or one of an earlier version, which holds less.
+    :raises UsageError: it is no result file of this version.
     :raises DexkitError: the recording cannot be read, or is not of that kind of hand.
     """
     found = parse_result(document, "the result")
-    if document["version"] != VERSION:
-        raise UsageError(
-            f"the result is of version {document['version']}, which cannot be compared",
-            hint="judge the recording again: dexkit check RECORDING.mcap --json RESULT.json",
-        )
     trace = open_trace(recording)
     remarks = [f"the recording is damaged: {text}" for text in trace.damage]
     usual = recording_of(trace, None, ())
@@ -181,7 +175,7 @@ def document_differences(
 
     :param but: paths of members that are not compared.
     """
-    written = json.loads(json.dumps(judged.as_dict()))
+    written = json.loads(json.dumps(as_document(judged)))
     for difference in _differences(document, written, "", ""):
         if difference.path not in but:
             yield difference

@@ -1,43 +1,260 @@
-"""Read a result file, and validate it against its schema."""
+"""The result file: its form, and how it is written and read.
+
+The classes say what is in the file, in the order in which it is written; docs/reports.md describes
+it. Its JSON schema is made of them (``make docs``). What follows from other members (sentences,
+counts, grades) is for programs that only read, and is not read back.
+"""
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable
-from functools import cache
+import math
+import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
 
 from dexkit import documents
-from dexkit.conformance.measurement_error import Measure
+from dexkit.conformance.measurement_error import Quantity
 from dexkit.conformance.plots import Plot
-from dexkit.conformance.requirements import Kind, Level, Requirement
+from dexkit.conformance.requirements import Kind, Level
 from dexkit.conformance.results import (
-    FORMAT,
-    VERSION,
     Disturbance,
     Evidence,
-    Load,
+    Overall,
     Result,
     RunResult,
     Stage,
     Verdict,
+    counts_of,
+    overall_of,
 )
 from dexkit.errors import UsageError
 from dexkit.escaping import one_line
+from dexkit.records import as_plain, from_object, to_record
 
-__all__ = ["SCHEMA", "parse_result", "read_json", "validate"]
+__all__ = [
+    "FORMAT",
+    "VERSION",
+    "ResultFile",
+    "as_document",
+    "parse_result",
+    "read_json",
+    "write_json",
+]
 
-SCHEMA = "result.schema.json"
-"""The schema of a result, beside the reports."""
+FORMAT: Final = "dexkit-conformance-result"
+VERSION: Final = 4
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
+Amount = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Joint = Annotated[int, msgspec.Meta(ge=0, le=1000)]
+SideName = Annotated[str, msgspec.Meta(pattern="^(left|right|robot)$")]
+Confidence = Literal["vendor document", "vendor code", "measured", "inferred"]
+LayerName = Literal["dds", "usb", "robot", "client"]
+HarnessFigure = Annotated[
+    str, msgspec.Meta(pattern="^(jitter_p50_ms|jitter_p99_ms|starved|waited|longest_wait_ms)$")
+]
+_SHA256 = re.compile("[0-9a-f]{64}")
+
+
+class _Record(msgspec.Struct, forbid_unknown_fields=True):
+    """A part of the file; every member must be there, and no other."""
+
+
+class RequirementRecord(_Record):
+    """A requirement, as :class:`~dexkit.conformance.requirements.Requirement`.
+
+    A claimed SHOULD is a MUST here.
+    """
+
+    id: str
+    model: str
+    area: str
+    level: Level
+    title: str
+    sentence: str
+    rationale: str
+    source: str
+    confidence: Confidence
+    needs: str
+    advice: str
+    after: tuple[str, ...]
+    dialects: tuple[str, ...]
+    tolerances: dict[str, float]
+    realtime: bool
+    layer: LayerName
+    cause: str
+    expected: str
+    capability: str
+    repeat: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
+    like: str
+    plots: tuple[Plot, ...]
+    kind: Kind
+    original: str
+
+
+class MeasureRecord(_Record):
+    """The figure with a limit that a verdict rests on, as
+    :class:`~dexkit.conformance.measurement_error.Measure`.
+
+    :param margin: distance to the limit, positive on the side that passes.
+    :param error: the kit's own error of such a figure at that place; null if it is not known.
+    :param margin_in_errors: margin divided by error; null where that is 0 or not known.
+    """
+
+    value: Number
+    limit: Number
+    unit: str
+    quantity: Quantity
+    larger_is_worse: bool
+    margin: Number
+    error: Amount | None
+    margin_in_errors: float | None
+
+
+class ResultRecord(_Record):
+    """The result of a requirement on one side, as :class:`~dexkit.conformance.results.Result`.
+
+    :param expected: what would have been right, in a few words.
+    """
+
+    id: str
+    side: SideName
+    verdict: Verdict
+    figure: str
+    expected: str
+    observed: str
+    reason: str
+    cause: str
+    blocked_by: str
+    evidence: tuple[Evidence, ...]
+    values: dict[str, float]
+    joints: tuple[Joint, ...]
+    disturbance: Disturbance
+    plots: tuple[Plot, ...]
+    retry: bool
+    measure: MeasureRecord | None
+    requirement: RequirementRecord
+
+
+class GradeRecord(_Record):
+    """The verdict on the requirements of one kind."""
+
+    overall: Overall
+    sentence: str
+    counts: dict[Verdict, Count]
+
+
+class ClientRecord(_Record):
+    """The verdict on the client that commanded the hands. It does not count in that on the hands,
+    unless only requirements about the client were selected.
+    """
+
+    overall: Overall
+    sentence: str
+    results: tuple[ResultRecord, ...]
+
+
+class ResultFile(_Record):
+    """A result of a dexkit conformance run, as :class:`~dexkit.conformance.results.RunResult`.
+
+    :param overall: fail: a MUST is not met; inconclusive: a MUST could not be judged, or nothing
+        was.
+    :param sentence: the verdict in one sentence.
+    :param counts: requirements by verdict, sides taken together.
+    :param recorded_at: UTC, ISO 8601.
+    :param catalogue: how many requirements there are for such a run, selected or not.
+    :param client: null where the kit was the client, or nobody commanded the hands.
+    """
+
+    format: Literal["dexkit-conformance-result"]
+    version: Literal[4]
+    overall: Overall
+    sentence: str
+    grades: dict[Kind, GradeRecord]
+    subject: dict[str, str]
+    claims: dict[str, bool] | None
+    stage: dict[SideName, Stage]
+    recorded_at: str
+    duration_s: Amount
+    catalogue: Count
+    counts: dict[Verdict, Count]
+    harness: dict[HarnessFigure, Amount]
+    environment: dict[str, str]
+    run: dict[str, str]
+    notes: tuple[str, ...]
+    results: tuple[ResultRecord, ...]
+    client: ClientRecord | None
+
+    def __post_init__(self) -> None:
+        for name in ("model", "dialect", "sides"):
+            if name not in self.subject:
+                raise ValueError(f"subject: has no {name}")
+        digest = self.subject.get("recording_sha256")
+        if digest is not None and not _SHA256.fullmatch(digest):
+            raise ValueError("subject.recording_sha256: is no SHA-256")
+
+
+def as_document(result: RunResult) -> dict[str, Any]:
+    """The content of the result's file, as plain data."""
+    client = None
+    if result.client:
+        client = ClientRecord(
+            overall=overall_of(result.client),
+            sentence=result.client_sentence(),
+            results=_records(result.client),
+        )
+    grades = {kind: result.grade(kind) for kind in Kind}
+    record = ResultFile(
+        format=FORMAT,
+        version=VERSION,
+        overall=result.overall,
+        sentence=result.sentence(),
+        grades={
+            kind: GradeRecord(overall=g.overall, sentence=g.sentence(), counts=dict(g.counts))
+            for kind, g in grades.items()
+        },
+        subject=result.subject,
+        claims=result.claims,
+        stage=result.stage,
+        recorded_at=result.recorded_at,
+        duration_s=round(result.duration_s, 3),
+        catalogue=result.catalogue,
+        counts=counts_of(result.results),
+        harness={name: round(value, 4) for name, value in result.harness.items()},
+        environment=result.environment,
+        run=result.run,
+        notes=tuple(result.notes),
+        results=_records(result.results),
+        client=client,
+    )
+    found: dict[str, Any] = as_plain(record)
+    return found
+
+
+def _records(results: list[Result]) -> tuple[ResultRecord, ...]:
+    records = (from_object(each, ResultRecord) for each in results)
+    return tuple(
+        msgspec.structs.replace(
+            record, values={k: v for k, v in record.values.items() if math.isfinite(v)}
+        )
+        for record in records
+    )
+
+
+def write_json(result: RunResult, path: Path) -> None:
+    """Write the result file."""
+    documents.write_file(path, json.dumps(as_document(result), indent=2) + "\n")
 
 
 def read_json(path: Path) -> RunResult:
     """Read a result file.
 
-    :raises UsageError: it is not a result file, its version is unknown, or it does not match
-        ``result.schema.json``: the error names the place.
+    :raises UsageError: it is not a result file, of another version, or not of the form of
+        :class:`ResultFile`: the error names the place.
     """
     return parse_result(documents.read_json(path), path)
 
@@ -59,136 +276,19 @@ def parse_result(data: Any, path: object) -> RunResult:
             f"{path}: version {version} of {FORMAT} is not read by this dexkit, but {VERSION}",
             hint="judge the recording again: dexkit check RECORDING.mcap --json RESULT.json",
         )
-    validate(data, path)
+    hint = "the file is damaged, or of another program; docs/reports.md says what is in it"
+    file = to_record(data, ResultFile, path, hint=hint)
     return RunResult(
-        subject=data["subject"],
-        stage={side: Stage(stage) for side, stage in data["stage"].items()},
-        duration_s=data["duration_s"],
-        notes=data["notes"],
-        environment=data["environment"],
-        run=data["run"],
-        harness=data["harness"],
-        claims=data["claims"],
-        catalogue=data["catalogue"],
-        recorded_at=data["recorded_at"],
-        results=[_result_of(entry) for entry in data["results"]],
-        client=[_result_of(entry) for entry in (data["client"] or {"results": []})["results"]],
+        subject=file.subject,
+        results=[from_object(each, Result) for each in file.results],
+        stage=file.stage,
+        duration_s=file.duration_s,
+        notes=list(file.notes),
+        environment=file.environment,
+        recorded_at=file.recorded_at,
+        harness=file.harness,
+        claims=file.claims,
+        catalogue=file.catalogue,
+        client=[from_object(each, Result) for each in file.client.results] if file.client else [],
+        run=file.run,
     )
-
-
-@cache
-def _validator(schema: str) -> Any:
-    import jsonschema
-
-    text = Path(__file__).with_name("report").joinpath(schema).read_text("utf-8")
-    return jsonschema.Draft202012Validator(json.loads(text))
-
-
-_VALID: set[tuple[str, bytes]] = set()
-"""Schema and digest of each document that was found valid: some commands read one twice."""
-
-
-def validate(data: Any, path: object, schema: str = SCHEMA, page: str = "docs/reports.md") -> None:
-    """Validate a document against a schema that is published with dexkit.
-
-    A document that was found valid before is not validated again.
-
-    :param path: what to call the document.
-    :param schema: file beside the reports.
-    :param page: where the document is described.
-    :raises UsageError: naming the first place that does not match.
-    """
-    about = schema, hashlib.sha256(json.dumps(data).encode()).digest()
-    if about in _VALID:
-        return
-    from jsonschema.exceptions import relevance
-
-    error = min(_validator(schema).iter_errors(data), key=relevance, default=None)
-    if error is None:
-        _VALID.add(about)
-        return
-    while error.context:  # of several alternatives: the error of the nearest
-        error = min(error.context, key=relevance)
-    where = one_line(error.json_path.removeprefix("$").removeprefix(".") or "the document")
-    raise UsageError(
-        f"{path}: {where} {_expected(error.validator, error.validator_value, error.instance)}",
-        hint=f"the file is damaged, or was written by another program; {page} says what is in it",
-    )
-
-
-_KINDS = {
-    dict: "an object",
-    list: "a list",
-    str: "a text",
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    type(None): "null",
-}
-_NAMES = {
-    "object": "an object",
-    "array": "a list",
-    "string": "a text",
-    "boolean": "true or false",
-    "integer": "a whole number",
-    "number": "a number",
-    "null": "null",
-}
-
-
-def _expected(rule: str, value: Any, found: Any) -> str:
-    """The expected and the actual value for a rule of the schema."""
-    is_there = _KINDS[type(found)]
-    if isinstance(found, str | int | float | bool):
-        is_there = one_line(json.dumps(found), 60)
-    if rule == "type":
-        kinds = [value] if isinstance(value, str) else value
-        return f"must be {' or '.join(_NAMES[kind] for kind in kinds)}, not {is_there}"
-    if rule == "required":
-        missing = [name for name in value if name not in found]
-        return f"has no {', '.join(missing)}"
-    if rule == "enum":
-        return f"must be one of {', '.join(json.dumps(v) for v in value)}, not {is_there}"
-    if rule == "const":
-        return f"must be {json.dumps(value)}, not {is_there}"
-    if rule in ("minimum", "maximum"):
-        return f"must be {'at least' if rule == 'minimum' else 'at most'} {value:g}, not {is_there}"
-    if rule == "additionalProperties":
-        return "holds something that is not known"
-    if rule in ("maxLength", "maxItems", "maxProperties", "minLength"):
-        return f"is too {'short' if rule == 'minLength' else 'long'} ({rule} {value})"
-    if rule == "pattern":
-        return f"is not of the form {value}: {is_there}"
-    return f"is not as it should be ({rule})"
-
-
-def _result_of(entry: dict[str, Any]) -> Result:
-    data = dict(entry["requirement"])
-    data["level"] = Level(data["level"])
-    data["after"] = tuple(data["after"])
-    data["dialects"] = tuple(data["dialects"])
-    data["plots"] = _plots(data["plots"])
-    data["kind"] = Kind(data["kind"])
-    return Result(
-        requirement=Requirement(**data),
-        side=entry["side"],
-        verdict=Verdict(entry["verdict"]),
-        figure=entry["figure"],
-        observed=entry["observed"],
-        reason=entry["reason"],
-        cause=entry["cause"],
-        blocked_by=entry["blocked_by"],
-        evidence=tuple(Evidence(**e) for e in entry["evidence"]),
-        values=entry["values"],
-        joints=tuple(entry["joints"]),
-        disturbance=Disturbance(
-            **{**entry["disturbance"], "load": Load(entry["disturbance"]["load"])}
-        ),
-        plots=_plots(entry["plots"]),
-        retry=entry["retry"],
-        measure=Measure.of_dict(entry["measure"]) if entry["measure"] else None,
-    )
-
-
-def _plots(names: Iterable[str]) -> tuple[Plot, ...]:
-    return tuple(Plot.parse(name) for name in names)

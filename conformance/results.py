@@ -1,6 +1,6 @@
-"""The result of a run: one object, written as JSON, from which every report is rendered.
+"""The result of a run: one object, from which every report is rendered.
 
-:mod:`dexkit.conformance.result_file` reads the JSON back.
+:mod:`dexkit.conformance.result_file` writes and reads it.
 
 Verdicts (h2spec and Autobahn grade theirs likewise; a plain pass or fail hides too much):
 
@@ -18,26 +18,23 @@ error          the kit's own fault
 
 from __future__ import annotations
 
-import json
-import math
 import platform
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import Enum
-from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from dexkit import __version__, documents
+import msgspec
+
+from dexkit import __version__
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.requirements import Kind, Level, Requirement
 from dexkit.hand import Side
 
 __all__ = [
-    "FORMAT",
     "SEVERITY",
     "UNDISTURBED",
-    "VERSION",
     "Disturbance",
     "Evidence",
     "Grade",
@@ -53,9 +50,6 @@ __all__ = [
     "overall_of",
     "worst",
 ]
-
-FORMAT = "dexkit-conformance-result"
-VERSION = 4
 
 
 class Verdict(str, Enum):
@@ -125,8 +119,11 @@ class Stage(str, Enum):
         return self.value
 
 
-@dataclass(frozen=True)
-class Evidence:
+_Seconds = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+_Delay = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+
+
+class Evidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A place in the recording.
 
     :param topic: topic of the samples.
@@ -136,9 +133,9 @@ class Evidence:
     """
 
     topic: str
-    time_s: float
-    log_time_ns: int
-    end_s: float | None = None
+    time_s: _Seconds
+    log_time_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    end_s: _Seconds | None = None
 
 
 class Load(str, Enum):
@@ -154,8 +151,7 @@ class Load(str, Enum):
         return self.value
 
 
-@dataclass(frozen=True)
-class Disturbance:
+class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The load of the recording machine during a failure, and how much of it the load explains.
 
     :param late_s: by how much the kit's own timer was late at the failure's place, or for how long
@@ -166,9 +162,9 @@ class Disturbance:
     """
 
     load: Load
-    late_s: float | None = None
-    explained_s: float | None = None
-    failure_s: float | None = None
+    late_s: _Delay | None = None
+    explained_s: _Delay | None = None
+    failure_s: _Delay | None = None
 
 
 UNDISTURBED = Disturbance(Load.NONE)
@@ -211,6 +207,11 @@ class Result:
     retry: bool = False
     measure: Measure | None = None
     tolerated: bool = field(default=False, compare=False)
+
+    @property
+    def id(self) -> str:
+        """Of the requirement."""
+        return self.requirement.id
 
     @property
     def expected(self) -> str:
@@ -322,14 +323,6 @@ class Grade:
         head = heads[self.overall] if self.judged else "NOT JUDGED: nothing of this kind was tested"
         parts = [f"{n} {v}" for v, n in self.counts.items() if n]
         return f"{self.kind}: {head} ({self.total} requirements{''.join(f', {p}' for p in parts)})"
-
-    def as_dict(self) -> dict[str, Any]:
-        """The grade as plain data."""
-        return {
-            "overall": str(self.overall),
-            "sentence": self.sentence(),
-            "counts": {str(v): n for v, n in self.counts.items()},
-        }
 
 
 @dataclass
@@ -475,64 +468,3 @@ class RunResult:
             f"the client: {heads[overall_of(self.client)]} ({len(rows)} requirements: "
             f"{', '.join(parts)})"
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        """The result as plain data."""
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "overall": str(self.overall),
-            "sentence": self.sentence(),
-            "grades": {str(kind): self.grade(kind).as_dict() for kind in Kind},
-            "subject": dict(self.subject),
-            "claims": None if self.claims is None else dict(self.claims),
-            "stage": {side: str(stage) for side, stage in self.stage.items()},
-            "recorded_at": self.recorded_at,
-            "duration_s": round(self.duration_s, 3),
-            "catalogue": self.catalogue,
-            "counts": {str(v): n for v, n in self.counts().items()},
-            "harness": {name: round(value, 4) for name, value in self.harness.items()},
-            "environment": dict(self.environment),
-            "run": dict(self.run),
-            "notes": list(self.notes),
-            "results": [_result_dict(r) for r in self.results],
-            "client": {
-                "overall": str(overall_of(self.client)),
-                "sentence": self.client_sentence(),
-                "results": [_result_dict(r) for r in self.client],
-            }
-            if self.client
-            else None,
-        }
-
-    def write_json(self, path: Path) -> None:
-        """Write the result file."""
-        documents.write_file(path, json.dumps(self.as_dict(), indent=2) + "\n")
-
-
-def _result_dict(result: Result) -> dict[str, Any]:
-    requirement = asdict(result.requirement)
-    for name in ("negative", "spoils", "lineage"):  # about the catalogue, no part of the format
-        del requirement[name]
-    requirement["level"] = str(result.requirement.level)
-    requirement["kind"] = str(result.requirement.kind)
-    requirement["plots"] = [str(plot) for plot in result.requirement.plots]
-    return {
-        "id": result.requirement.id,
-        "side": result.side,
-        "verdict": str(result.verdict),
-        "figure": result.figure,
-        "expected": result.expected,
-        "observed": result.observed,
-        "reason": result.reason,
-        "cause": result.cause,
-        "blocked_by": result.blocked_by,
-        "evidence": [asdict(e) for e in result.evidence],
-        "values": {name: v for name, v in result.values.items() if math.isfinite(v)},
-        "joints": list(result.joints),
-        "disturbance": {**asdict(result.disturbance), "load": str(result.disturbance.load)},
-        "plots": [str(plot) for plot in result.plots],
-        "retry": result.retry,
-        "measure": None if result.measure is None else result.measure.as_dict(),
-        "requirement": requirement,
-    }

@@ -24,6 +24,7 @@ from dexkit.conformance.known_backends import (
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
+from dexkit.conformance.result_file import write_json
 from dexkit.conformance.results import RunResult, grouped
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.run_queue import MOST_FILES
@@ -428,7 +429,7 @@ def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
             subject["recording_sha256"] = sha256_of_file(options.recording)
     result = judge(view, requirements=options.requirements, claims=options.claims, subject=subject)
     if options.json:
-        result.write_json(options.json)
+        write_json(result, options.json)
     if options.report:
         from dexkit.conformance.report.html import write_html
 

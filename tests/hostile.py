@@ -185,7 +185,9 @@ def judged_result(folder: Path) -> tuple[dict[str, Any], Path]:
     recording = Recording.decode(open_trace(path))
     few = select(catalogue(recording.model.name), prefixes=("DEX1-RATE", "DEX1-TRACK"))
     found = judge(recording, requirements=few, subject={"recording": path.name})
-    found.write_json(folder / "good.json")
+    from dexkit.conformance.result_file import write_json
+
+    write_json(found, folder / "good.json")
     return json.loads((folder / "good.json").read_text()), path
 
 

@@ -31,7 +31,7 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import render_markdown
 from dexkit.conformance.requirements import Level, catalogue, parse
-from dexkit.conformance.result_file import read_json
+from dexkit.conformance.result_file import as_document, read_json
 from dexkit.conformance.results import Overall, Result, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.conformance.virtual.client import ReferenceClient, run_client
@@ -112,7 +112,7 @@ def test_run_of_the_kit_has_no_results_about_the_client() -> None:
     result = judge(Recording.decode(short_run()))
     assert result.client == []
     assert result.client_sentence() == ""
-    assert result.as_dict()["client"] is None
+    assert as_document(result)["client"] is None
 
 
 def one_of_each_check() -> list[Mutant]:

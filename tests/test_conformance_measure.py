@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -18,13 +17,14 @@ from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.card import Card, near_limits
 from dexkit.conformance.report.html import render
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.result_file import read_json
+from dexkit.conformance.result_file import MeasureRecord, as_document, read_json, write_json
 from dexkit.conformance.results import Evidence, Result, RunResult, Verdict
 from dexkit.conformance.stimulus_record import RECORD, Calibration, Stimulus
 from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
+from dexkit.records import as_plain, from_object, to_record
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 from tests.each import each
 
@@ -128,10 +128,11 @@ def test_margin_is_positive_on_the_side_that_passes(
 ) -> None:
     measure = Measure(value, limit, larger_is_worse=worse, error=error)
     assert (measure.margin >= 0) is (value <= limit if worse else value >= limit)
-    assert measure.in_errors is not None
-    assert measure.in_errors * error == pytest.approx(measure.margin)
+    assert measure.margin_in_errors is not None
+    assert measure.margin_in_errors * error == pytest.approx(measure.margin)
     assert measure.uncertain is (abs(measure.margin) < error)
-    assert Measure.of_dict(json.loads(json.dumps(measure.as_dict()))) == measure
+    record = as_plain(from_object(measure, MeasureRecord))
+    assert from_object(to_record(record, MeasureRecord, "it"), Measure) == measure
 
 
 def test_place_least_explained_by_load_decides() -> None:
@@ -177,7 +178,7 @@ def test_virtual_run_measures_without_error_and_others_do_not_know() -> None:
     trace = copy_of(short_run())
     exact = result_of(judge(Recording.decode(trace)), GAP.id).measure
     assert exact is not None
-    assert (exact.error, exact.in_errors) == (0.0, None)
+    assert (exact.error, exact.margin_in_errors) == (0.0, None)
     trace.metadata.clear()
     unknown = result_of(judge(Recording.decode(trace)), GAP.id).measure
     assert unknown is not None
@@ -215,9 +216,9 @@ def test_damaged_calibration_is_refused(text: str) -> None:
 
 def test_result_file_keeps_measures(tmp_path: Path) -> None:
     result = judge(with_gap(0.2))
-    result.write_json(tmp_path / "r.json")
+    write_json(result, tmp_path / "r.json")
     again = read_json(tmp_path / "r.json")
-    assert [r.measure and r.measure.as_dict() for r in again.results] == [
-        r.measure and r.measure.as_dict() for r in result.results
+    assert [r["measure"] for r in as_document(again)["results"]] == [
+        r["measure"] for r in as_document(result)["results"]
     ]
     assert any(r.measure for r in again.results)

@@ -14,6 +14,7 @@ from dexkit.conformance.report.badge import badge_text, badges, render_badge
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.markdown import render_markdown
 from dexkit.conformance.requirements import Kind, Level, catalogue
+from dexkit.conformance.result_file import as_document
 from dexkit.conformance.results import Overall, RunResult, Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
@@ -74,7 +75,7 @@ def test_a_failure_in_safety_is_in_every_report() -> None:
     assert "safety: FAIL: a MUST is not met" in render_markdown(result)
     assert result.exit_code() == result.exit_code(Kind.SAFETY) == 1
     assert result.exit_code(Kind.DROP_IN) == 0
-    grades = result.as_dict()["grades"]
+    grades = as_document(result)["grades"]
     assert [grades[str(kind)]["overall"] for kind in Kind] == ["pass", "fail"]
 
 

@@ -18,6 +18,7 @@ from dexkit.conformance.claims import Claims
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.robot import NoCrc
 from dexkit.conformance.faults.usb import StaleCrc
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.badge import badge_text, render_badge
@@ -32,7 +33,7 @@ from dexkit.conformance.report.labels import VERDICTS, catch_sentence
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
 from dexkit.conformance.requirements import Kind
-from dexkit.conformance.result_file import read_json
+from dexkit.conformance.result_file import read_json, write_json
 from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.run_record import RECORD, run_record
 from dexkit.conformance.suite_run import SuiteOptions, judge_recording
@@ -41,7 +42,6 @@ from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.models import DEX3_1
 from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import copy_of, short_run
 from tests.each import each
@@ -277,7 +277,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = sample_path("dex1_hand_dropout")
     (folder / "run.mcap").write_bytes(source.read_bytes())
     view = Recording.decode(open_trace(folder / "run.mcap"))
-    judge(view, subject={"recording": "run.mcap"}).write_json(folder / "result.json")
+    write_json(judge(view, subject={"recording": "run.mcap"}), folder / "result.json")
     return folder
 
 
@@ -314,7 +314,7 @@ def write_robot(recorder: Recorder) -> str:
 def write_hand_on_usb(recorder: Recorder) -> str:
     """Record a good Dex3-1 whose USB device sends old checksums."""
     plan = replace(plan_for("dex3", sides=(Side.LEFT,)), phases=frozenset[str]())
-    write_trace(run_virtual(plan, DEX3_1.reference.load()), recorder)
+    write_trace(run_virtual(plan, under_test("dex3-1").reference.load()), recorder)
     usb = UsbRecording.decode(run_virtual_usb(StaleCrc(Side.LEFT)))
     assert usb is not None
     write_usb(usb.sides[Side.LEFT], recorder)
@@ -399,8 +399,8 @@ def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) 
     assert "(recorded)" in done.output
     assert (tmp_path / "b.svg").read_text().startswith("<svg")
     a, b = tmp_path / "a.json", tmp_path / "b.json"
-    run_named("G", "2026-01-01", TOPIC_01=Verdict.PASS).write_json(a)
-    run_named("G", "2026-01-02", TOPIC_01=Verdict.FAIL).write_json(b)
+    write_json(run_named("G", "2026-01-01", TOPIC_01=Verdict.PASS), a)
+    write_json(run_named("G", "2026-01-02", TOPIC_01=Verdict.FAIL), b)
     done = run("compare", a, b, "--html", tmp_path / "c.html")
     assert done.exit_code == 1
     assert "1 regression: DEX1-TOPIC-01" in done.output
@@ -427,6 +427,6 @@ def test_reports_state_that_only_a_part_was_selected(tmp_path: Path) -> None:
     assert "#14734a" not in render_badge(result)
     for text in (render(result), render_markdown(result)):
         assert "Only 1 of 67 requirements were selected" in text
-    result.write_json(tmp_path / "part.json")
+    write_json(result, tmp_path / "part.json")
     assert read_json(tmp_path / "part.json").partial
     assert not replace(result, catalogue=1).partial

@@ -15,6 +15,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.report.curves import page, recorded
 from dexkit.conformance.requirements import catalogue, select
+from dexkit.conformance.result_file import write_json
 from dexkit.digests import sha256_of_file
 from dexkit.messages import message_type
 from dexkit.sparkline import ASCII, resampled, sparkline
@@ -156,7 +157,7 @@ def test_compare_draws_recordings_that_were_judged(
         view = recording_of(open_trace(path), None, ())
         result = judge(view, requirements=few, subject=subject)
         results.append(tmp_path / f"{path.stem}.json")
-        result.write_json(results[-1])
+        write_json(result, results[-1])
     out = tmp_path / "compare.html"
     arguments = ["compare", *map(str, results), "--html", str(out)]
     CliRunner().invoke(cli, arguments)

@@ -18,7 +18,7 @@ from dexkit import digests, documents
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.result_file import read_json
+from dexkit.conformance.result_file import read_json, write_json
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.doctor.environment import uri_problem
@@ -170,7 +170,7 @@ def test_duplicate_key_and_non_finite_number_are_refused() -> None:
 def test_valid_result_renders_and_invalid_one_is_refused_with_its_place(tmp_path: Path) -> None:
     """Every node of a result replaced by every kind of value; a fuzzer's part of it."""
     result = result_of_every_kind()
-    result.write_json(tmp_path / "good.json")
+    write_json(result, tmp_path / "good.json")
     good = json.loads((tmp_path / "good.json").read_text())
     good["results"] = good["results"][2:3]  # one that failed
     path = tmp_path / "given.json"
@@ -192,7 +192,7 @@ def test_valid_result_renders_and_invalid_one_is_refused_with_its_place(tmp_path
 @pytest.mark.soak
 def test_every_kind_of_value_at_every_place_of_a_result(tmp_path: Path) -> None:
     result = result_of_every_kind()
-    result.write_json(tmp_path / "good.json")
+    write_json(result, tmp_path / "good.json")
     good = json.loads((tmp_path / "good.json").read_text())
     good["results"] = good["results"][:3]
     path = tmp_path / "given.json"
@@ -205,15 +205,15 @@ def test_every_kind_of_value_at_every_place_of_a_result(tmp_path: Path) -> None:
 
 def test_error_names_the_place_and_the_expected_value(tmp_path: Path) -> None:
     result = result_of_every_kind()
-    result.write_json(tmp_path / "r.json")
+    write_json(result, tmp_path / "r.json")
     good = json.loads((tmp_path / "r.json").read_text())
     for place, value, printed in (
-        (("results", 2, "evidence", 0, "time_s"), "soon", 'time_s must be a number, not "soon"'),
-        (("results", 2, "verdict"), "good", "results[2].verdict must be one of"),
-        (("results", 2, "side"), hostile.MISSING, "results[2] has no side"),
-        (("duration_s",), -1, "duration_s must be at least 0, not -1"),
-        (("claims",), [], "claims must be"),
-        (("notes",), {}, "notes must be a list, not an object"),
+        (("results", 2, "evidence", 0, "time_s"), "soon", "time_s: Expected float, got str"),
+        (("results", 2, "verdict"), "good", "results[2].verdict: Invalid enum value 'good'"),
+        (("results", 2, "side"), hostile.MISSING, "results[2]: Object missing required field side"),
+        (("duration_s",), -1, "duration_s: Expected float >= 0.0"),
+        (("claims",), [], "claims: Expected object | null, got array"),
+        (("notes",), {}, "notes: Expected array, got object"),
         (("format",), "other", "is not a result file of dexkit"),
         (("version",), 5, "version 5 of dexkit-conformance-result is not read"),
         ((), [], "is not a result file of dexkit"),

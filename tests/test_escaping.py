@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dexkit.cli.status_line import log_to_stderr
+from dexkit.conformance.result_file import write_json
 from dexkit.console import Console, markup
 from dexkit.errors import DdsUnavailable, OutputError, UsageError
 from dexkit.escaping import Guard, guarded, html, one_line, visible
@@ -187,7 +188,7 @@ def test_result_with_escape_sequences_shows_none(tmp_path: Path) -> None:
 
     result = result_of_every_kind(NASTY)
     result.subject["hand"] = result.subject["firmware"] = NASTY
-    result.write_json(tmp_path / "r.json")
+    write_json(result, tmp_path / "r.json")
     hostile.render_all(tmp_path / "r.json", tmp_path)
     file = str(tmp_path / "r.json")
     page = str(tmp_path / "out.html")

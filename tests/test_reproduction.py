@@ -16,7 +16,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.result_file import read_json
+from dexkit.conformance.result_file import as_document, read_json
 from dexkit.conformance.run_record import (
     RECORD,
     catalogue_digest,
@@ -48,7 +48,7 @@ def test_check_of_a_recording_repeats_the_result_of_the_run(
     view = recording_of(open_trace(recording), "unitree_go", (Side.LEFT,))
     live = judge(view, requirements=CLAIMS.apply(catalogue("dex1-1", "dds")), claims=CLAIMS)
     again = checked(recording, tmp_path / "r.json")
-    assert without_surroundings(again) == without_surroundings(as_written(live.as_dict()))
+    assert without_surroundings(again) == without_surroundings(as_written(as_document(live)))
     assert again["claims"] == dict(CLAIMS.units or {})
     measures = [r["measure"] for r in again["results"] if r["measure"]]
     assert {m["quantity"] for m in measures} >= {"time", "position"}
@@ -57,9 +57,9 @@ def test_check_of_a_recording_repeats_the_result_of_the_run(
 
 def test_selected_requirements_get_the_same_verdicts_as_in_a_whole_check(recording: Path) -> None:
     view = recording_of(open_trace(recording), None, ())
-    every = {(r["id"], r["side"]): r for r in judge(view).as_dict()["results"]}
+    every = {(r["id"], r["side"]): r for r in as_document(judge(view))["results"]}
     some = [r for r in catalogue("dex1-1", "dds") if r.id.startswith("DEX1-RATE")]
-    part = judge(view, requirements=some).as_dict()["results"]
+    part = as_document(judge(view, requirements=some))["results"]
     assert part
     assert all(every[r["id"], r["side"]] == r for r in part)
 
@@ -74,7 +74,7 @@ def test_order_of_topics_in_memory_changes_nothing() -> None:
     turned = copy_of(trace)
     turned.rows = dict(reversed(list(trace.rows.items())))
     turned.endpoints.reverse()
-    first, second = (judge(Recording.decode(t)).as_dict() for t in (trace, turned))
+    first, second = (as_document(judge(Recording.decode(t))) for t in (trace, turned))
     assert first == second
 
 

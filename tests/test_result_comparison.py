@@ -16,7 +16,7 @@ from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
 from dexkit.conformance.rejudge import Comparison, compare_with_recording
 from dexkit.conformance.requirements import CAPABILITIES, Kind, catalogue
-from dexkit.conformance.result_file import parse_result
+from dexkit.conformance.result_file import as_document, parse_result
 from dexkit.conformance.results import Evidence, Overall, Verdict
 from dexkit.conformance.robot import robot_dialect
 from dexkit.conformance.run_record import RECORD, run_record
@@ -40,7 +40,7 @@ def document_of(path: Path, sides: tuple[Side, ...] = (), **options: Any) -> Doc
     """The result file that a judging of the recording writes."""
     view = recording_of(open_trace(path), None, sides)
     subject = {"recording": path.name, "recording_sha256": sha256_of_file(path)}
-    found: Document = json.loads(json.dumps(judge(view, subject=subject, **options).as_dict()))
+    found: Document = json.loads(json.dumps(as_document(judge(view, subject=subject, **options))))
     return found
 
 
@@ -79,7 +79,7 @@ def paths(found: Comparison) -> set[str]:
 def recomputed(document: Document, **changes: Any) -> Document:
     """The result with other members, and with all summaries as they follow from these."""
     found = replace(parse_result(document, "it"), **changes)
-    written: Document = json.loads(json.dumps(found.as_dict()))
+    written: Document = json.loads(json.dumps(as_document(found)))
     return written
 
 
@@ -216,7 +216,7 @@ def test_every_member_is_compared(of_run: Document) -> None:
     with_measure = next(r for r in every.results if r.measure is not None)
     failed = replace(every.results[0], evidence=(Evidence("rt/x", 1.0, 1_000_000_000),))
     judged = replace(every, results=[failed, with_measure])  # few, to be fast
-    document = judged.as_dict()
+    document = as_document(judged)
     unnoticed = set()
     for path in leaves(json.loads(json.dumps(document))):
         found = json.loads(json.dumps(document))

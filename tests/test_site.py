@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from dexkit.cli import cli
 from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.result_file import write_json
 from tests.report_helpers import result_of_every_kind
 from tools.site import hooks
 
@@ -86,7 +87,7 @@ def test_ids_of_requirements_become_links() -> None:
 
 def test_reports_link_to_the_pages_of_requirements(tmp_path: Path) -> None:
     result = tmp_path / "result.json"
-    result_of_every_kind("a").write_json(result)
+    write_json(result_of_every_kind("a"), result)
     out = tmp_path / "report.html"
     arguments = ["report", str(result), "--html", str(out), "--catalogue"]
     done = CliRunner().invoke(cli, [*arguments, "https://example.org/requirements/"])

@@ -167,7 +167,9 @@ def command(
     if also:
         console.print(also)
     if json_path:
-        result.write_json(json_path)
+        from dexkit.conformance.result_file import write_json
+
+        write_json(result, json_path)
     if junit_path:
         from dexkit.conformance.report.junit import write_junit
 

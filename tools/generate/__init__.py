@@ -15,6 +15,10 @@ in build/docs and on the site
 :mod:`~.conformity_page`       conformity.md, from conformity.toml
 :mod:`~.doctor_page`           diagnoses.md, of the doctor
 :mod:`~.real_hands_page`       bases.md: what carries the MUSTs of each model
+-------------------------------------------------------------------------------------------------
+in build/docs
+-------------------------------------------------------------------------------------------------
+:mod:`~.record_schemas`        result.schema.json: the form of the result file
 =============================  ==================================================================
 
 What is in the repository is the function ``files()`` of a module: content by path.
@@ -89,9 +93,14 @@ def built_pages() -> dict[str, str]:
 
 
 def write_pages() -> None:
-    """Write :func:`built_pages` to :data:`BUILT`, with their links seen from there."""
+    """Write :func:`built_pages` to :data:`BUILT`, their links seen from there, and schemas."""
+    from tools.generate import record_schemas
+
     made = built_pages()
     shutil.rmtree(BUILT, ignore_errors=True)  # pages of requirements that are gone
+    BUILT.mkdir(parents=True)
+    for name, text in record_schemas.files().items():
+        (BUILT / name).write_text(text, encoding="utf-8")
     for name, text in made.items():
         path = BUILT / name
         folder = posixpath.dirname(name)

@@ -30,7 +30,7 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import render_markdown
 from dexkit.conformance.report.terminal import print_result
-from dexkit.conformance.result_file import read_json
+from dexkit.conformance.result_file import as_document, read_json
 from dexkit.conformance.stimulus_record import Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.console import Console
@@ -194,7 +194,7 @@ def _result() -> dict[str, Any]:
     from dexkit.traces import sample_path
 
     result = judge(Recording.decode(open_trace(sample_path("dex1_hand_dropout"))))
-    return dict(result.as_dict())
+    return as_document(result)
 
 
 def _results(rng: random.Random, scratch: Path) -> Target:
