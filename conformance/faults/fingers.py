@@ -1,23 +1,33 @@
-"""Wrong hands of several joints.
-
-Each is mixed into the reference service of a model, and its ``hand_fault``, if it has one, into
-the mechanics of the reference's hands.
-"""
+"""Wrong hands of several joints."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.faults.registry import BOTH, obeys_gains, wrong_hand
+from dexkit.conformance.faults.registry import (
+    BOTH,
+    DQ,
+    KD,
+    KP,
+    TAU,
+    Call,
+    Motors,
+    Q,
+    changes,
+    commands,
+    obeys_gains,
+    reports,
+    wrong_hand,
+)
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import (
+    Dex3Hand,
     Dex3Service,
     FingerHand,
     FingerService,
@@ -34,12 +44,10 @@ _SECOND_AT_ONCE = 1000
 # --------------------------------------------------------------------- discovery and start-up
 
 
-@wrong_hand("DEX3-TOPIC-03", brief=True)
-class NoLowRate(Dex3Service):
+@changes(Dex3Service, "low_rate", "DEX3-TOPIC-03", brief=True)
+def NoLowRate(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
     """Publishes no low-rate copy."""
-
-    def low_rate(self, samples: list[Sample]) -> list[Sample]:
-        return []
+    return []
 
 
 @wrong_hand("DEX3-TOPIC-03", brief=True)
@@ -56,58 +64,43 @@ class LowRateIsSlow(Dex3Service):
     low_period = 0.5
 
 
-@wrong_hand("DEX3-TOPIC-04", brief=True)
-class OldLowRate(Dex3Service):
+@changes(Dex3Service, "low_rate", "DEX3-TOPIC-04", brief=True)
+def OldLowRate(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
     """Copies states to the low-rate topic that are 0.45 s old."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.queue: deque[list[Sample]] = deque()
-
-    def low_rate(self, samples: list[Sample]) -> list[Sample]:
-        new = super().low_rate(samples)
-        self.queue.append(new)
-        old = self.queue.popleft() if len(self.queue) > 9 else self.queue[0]
-        return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
+    new, queue = low_rate(samples), self.memory.setdefault("queue", deque())
+    queue.append(new)
+    old = queue.popleft() if len(queue) > 9 else queue[0]
+    return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
-@wrong_hand("DEX3-TOPIC-05", whole=True)
-class LowRateOnlyWhenDriven(Dex3Service):
+@changes(Dex3Service, "low_rate", "DEX3-TOPIC-05", whole=True)
+def LowRateOnlyWhenDriven(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
     """Copies states to the low-rate topic only while a motor is driven."""
-
-    def low_rate(self, samples: list[Sample]) -> list[Sample]:
-        driven = {
-            self.dialect.low_rate_topic.format(side=s): bool(hand.driven.any())
-            for s, hand in self.hands.items()
-        }
-        return [sample for sample in super().low_rate(samples) if driven[sample.topic]]
+    driven = {
+        self.dialect.low_rate_topic.format(side=s): bool(hand.driven.any())
+        for s, hand in self.hands.items()
+    }
+    return [sample for sample in low_rate(samples) if driven[sample.topic]]
 
 
-class _Zero(FingerHand):
+@wrong_hand("DEX3-START-02")
+class RestsAtZero(FingerHand):
+    """Rests with every joint at exactly 0."""
+
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
         # not inside an object: 0 is closed in some hands
         self.q = np.clip(0.0, self.floor, self.ceiling).tolist()
 
 
-@wrong_hand("DEX3-START-02")
-class RestsAtZero(FingerService):
-    """Rests with every joint at exactly 0."""
-
-    hand_fault = _Zero
-
-
 # ------------------------------------------------------------------------------------ fields
 
 
-@wrong_hand("DEX3-FIELD-02")
-class NanVelocity(FingerService):
+@reports(FingerService, "DEX3-FIELD-02")
+def NanVelocity(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes NaN as dq of one joint at rest."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        if len(motors) and not hand.dq[5]:
-            motors["dq"][5] = math.nan
+    if len(motors) and not hand.dq[5]:
+        motors["dq"][5] = math.nan
 
 
 def _mirrored(hand: HandModel) -> bool:
@@ -128,7 +121,7 @@ class Unmirrored(FingerService):
         ]
         return np.where(mirrored, -1.0, 1.0)
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         motors = tuple(
             replace(m, q=sign * m.q, dq=sign * m.dq, tau=sign * m.tau)
             for m, sign in zip(motors, self.signs(side).tolist(), strict=True)
@@ -144,41 +137,36 @@ class Unmirrored(FingerService):
         return tuple((self.signs(side) * super().positions(side)).tolist())
 
 
-class _Timed(FingerService):
-    """Has a fault at a certain time; its messages are rebuilt at rest, too."""
-
-    def live(self, dt: float) -> None:
-        super().live(dt)
-        for hand in self.hands.values():
-            hand.changed()
+def _limits(motors: Any, hand: FingerHand) -> tuple[Floats, Floats]:
+    """Lower and upper limits of the joints in a state."""
+    return np.array(hand.low)[: len(motors)], np.array(hand.high)[: len(motors)]
 
 
-@wrong_hand("DEX3-FIELD-15")
-class JumpsOnce(_Timed):
+def _shift(motors: Any, hand: FingerHand, part: float) -> None:
+    """Move each q by a part of its range, towards the middle."""
+    low, high = _limits(motors, hand)
+    up = motors["q"] < 0.5 * (low + high)
+    motors["q"] += np.where(up, part, -part) * (high - low)
+
+
+@reports(FingerService, "DEX3-FIELD-15", at_rest=True)
+def JumpsOnce(self: Any, motors: Any, hand: FingerHand) -> None:
     """Has no dq, and publishes one pose that is half of each joint's range off."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["dq"] = motors["ddq"] = 0.0
-        if 0.5 <= self.now < 0.5 + self.period:
-            low, high = np.array(hand.low)[: len(motors)], np.array(hand.high)[: len(motors)]
-            up = motors["q"] < 0.5 * (low + high)
-            motors["q"] += np.where(up, 0.5, -0.5) * (high - low)
+    motors["dq"] = motors["ddq"] = 0.0
+    if 0.5 <= self.now < 0.5 + self.period:
+        _shift(motors, hand, 0.5)
 
 
-@wrong_hand("DEX3-FIELD-16")
-class ShakenVelocity(_Timed):
+@reports(FingerService, "DEX3-FIELD-16", at_rest=True)
+def ShakenVelocity(self: Any, motors: Any, hand: FingerHand) -> None:
     """For some seconds has an oscillation on dq that q does not make."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        if 3.5 <= self.now < 5.5:
-            stroke = (np.array(hand.high) - np.array(hand.low))[: len(motors)]
-            motors["dq"] += 5.0 * stroke * math.sin(2 * math.pi * 13.0 * self.now)
+    if 3.5 <= self.now < 5.5:
+        low, high = _limits(motors, hand)
+        motors["dq"] += 5.0 * (high - low) * math.sin(2 * math.pi * 13.0 * self.now)
 
 
 @wrong_hand("DEX3-FIELD-18")
-class VelocityByTurns(_Timed):
+class VelocityByTurns(FingerService):
     """Publishes alternately twice the speed and 0 as dq."""
 
     turns = 0
@@ -191,77 +179,49 @@ class VelocityByTurns(_Timed):
         super().fill(motors, hand)
         motors["dq"] *= 2.0 * (self.turns % 2)
 
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.changed()
 
-@wrong_hand("DEX3-FIELD-19", where=obeys_gains)
-class VelocityOfTheLastDrive(_Timed):
+
+@reports(FingerService, "DEX3-FIELD-19", at_rest=True, where=obeys_gains)
+def VelocityOfTheLastDrive(self: Any, motors: Any, hand: FingerHand) -> None:
     """Keeps the dq of the last motion while its joints are not driven."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.last: dict[Side, Floats] = {}
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        stroke = (np.array(hand.high) - np.array(hand.low))[: len(motors)]
-        last = self.last.setdefault(hand.side, np.zeros(len(motors)))
-        if len(last) != len(motors):
-            return
-        fast = hand.driven & (np.abs(motors["dq"]) > 0.1 * stroke)
-        last[fast] = motors["dq"][fast]
-        motors["dq"] = np.where(hand.driven, motors["dq"], last)
+    low, high = _limits(motors, hand)
+    last = self.memory.setdefault(hand.side, np.zeros(len(motors)))
+    if len(last) != len(motors):
+        return
+    fast = hand.driven & (np.abs(motors["dq"]) > 0.1 * (high - low))
+    last[fast] = motors["dq"][fast]
+    motors["dq"] = np.where(hand.driven, motors["dq"], last)
 
 
-@wrong_hand("DEX3-FIELD-17")
-class ShiftsForAWhile(_Timed):
+@reports(FingerService, "DEX3-FIELD-17", at_rest=True)
+def ShiftsForAWhile(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["ddq"] = 0.0
-        if 0.4 <= self.now < 0.8:
-            low, high = np.array(hand.low)[: len(motors)], np.array(hand.high)[: len(motors)]
-            up = motors["q"] < 0.5 * (low + high)
-            motors["q"] += np.where(up, 0.15, -0.15) * (high - low)
+    motors["ddq"] = 0.0
+    if 0.4 <= self.now < 0.8:
+        _shift(motors, hand, 0.15)
 
 
-class _Filled(FingerService):
-    """Publishes a fixed wrong value in a member of motors, sensor packets or the message."""
-
-    motor: tuple[str, Any] | None = None
-    whole: tuple[str, Any] | None = None
-    packet: tuple[str, Any] | None = None
-
-    def message(self, count: int) -> Any:
-        message = super().message(count)
-        for change, parts in (
-            (self.motor, message.motor_state),
-            (self.packet, message.press_sensor_state),
-            (self.whole, [message]),
-        ):
-            if change is not None:
-                for part in parts:
-                    setattr(part, change[0], change[1])
-        return message
-
-
-@wrong_hand("DEX3-FIELD-20", whole=True)
-class ShowsTheGoalNearIt(FingerService):
+@reports(FingerService, "DEX3-FIELD-20", whole=True)
+def ShowsTheGoalNearIt(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes the commanded q of one joint within 8 % of its range from it."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        joint = 3
-        if len(motors) > joint and hand.newest:
-            goal = float(np.clip(hand.newest[joint].q, hand.low[joint], hand.high[joint]))
-            if abs(goal - hand.q[joint]) < 0.08 * (hand.high[joint] - hand.low[joint]):
-                motors["q"][joint] = goal
+    joint = 3
+    if len(motors) > joint and hand.newest:
+        goal = float(np.clip(hand.newest[joint].q, hand.low[joint], hand.high[joint]))
+        if abs(goal - hand.q[joint]) < 0.08 * (hand.high[joint] - hand.low[joint]):
+            motors["q"][joint] = goal
 
 
-@wrong_hand("DEX3-FIELD-06", brief=True)
-class Kelvin(_Filled):
+@changes(FingerService, "message", "DEX3-FIELD-06", brief=True)
+def Kelvin(self: Any, message: Call, count: int) -> Any:
     """Publishes its motors' temperatures in kelvins."""
-
-    motor = ("temperature", (303, 313))
+    found = message(count)
+    for motor in found.motor_state:
+        motor.temperature = (303, 313)
+    return found
 
 
 @wrong_hand("DEX3-FIELD-06", brief=True)
@@ -277,7 +237,7 @@ class HotAtStart(FingerService):
                 motor.temperature = (120, 120)
         return message
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         super().motors(side, motors)
         if self.hot:
             self.hot = False
@@ -285,60 +245,67 @@ class HotAtStart(FingerService):
             self._sent.clear()
 
 
-@wrong_hand("DEX3-FIELD-07", brief=True)
-class RawSupply(_Filled):
+@changes(FingerService, "message", "DEX3-FIELD-07", brief=True)
+def RawSupply(self: Any, message: Call, count: int) -> Any:
     """Publishes the converter's count as the supply voltage."""
+    found = message(count)
+    found.power_v = 22696.0
+    return found
 
-    whole = ("power_v", 22696.0)
 
-
-@wrong_hand("DEX3-FIELD-08", brief=True)
-class FaultForAStatus(_Filled):
+@changes(FingerService, "message", "DEX3-FIELD-08", brief=True)
+def FaultForAStatus(self: Any, message: Call, count: int) -> Any:
     """Publishes a status word as the hand's faults."""
+    found = message(count)
+    found.error = (7, 0)
+    return found
 
-    whole = ("error", (7, 0))
 
-
-@wrong_hand("DEX3-FIELD-09", brief=True)
-class CountsInReserve(FingerService):
+@reports(FingerService, "DEX3-FIELD-09", brief=True)
+def CountsInReserve(self: Any, motors: Any, hand: FingerHand) -> None:
     """Counts its states in a reserved word of the first motor."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["reserve"][0] = hand.version
+    motors["reserve"][0] = hand.version
 
 
-@wrong_hand("DEX3-SENS-05", brief=True)
-class HotSensors(_Filled):
-    """Publishes the sensors' temperatures in hundredths of a degree."""
-
-    packet = ("temperature", (2500.0,) * 12)
-
-
-@wrong_hand("DEX3-SENS-06", brief=True)
-class UnsetLost(_Filled):
-    """Publishes uninitialised memory as the sensors' count of lost packets."""
-
-    packet = ("lost", 0xCCCCCCCC)
-
-
-@wrong_hand("DEX3-IMU-02", brief=True)
-class NanGyroscope(FingerService):
-    """Publishes NaN as its angular velocity."""
-
-    def message(self, count: int) -> Any:
-        message = super().message(count)
-        message.imu_state.gyroscope = [math.nan] * 3
-        return message
-
-
-@wrong_hand("DEX3-MODE-01")
-class IdsFromOne(FingerService):
+@reports(FingerService, "DEX3-MODE-01")
+def IdsFromOne(self: Any, motors: Any, hand: FingerHand) -> None:
     """Counts its motors from 1."""
+    motors["mode"] += 1
 
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["mode"] += 1
+
+# ----------------------------------------------------------------------------- sensors and IMU
+
+
+@changes(FingerService, "message", "DEX3-SENS-05", brief=True)
+def HotSensors(self: Any, message: Call, count: int) -> Any:
+    """Publishes the sensors' temperatures in hundredths of a degree."""
+    found = message(count)
+    for packet in found.press_sensor_state:
+        packet.temperature = (2500.0,) * 12
+    return found
+
+
+@changes(FingerService, "message", "DEX3-SENS-06", brief=True)
+def UnsetLost(self: Any, message: Call, count: int) -> Any:
+    """Publishes uninitialised memory as the sensors' count of lost packets."""
+    found = message(count)
+    for packet in found.press_sensor_state:
+        packet.lost = 0xCCCCCCCC
+    return found
+
+
+@changes(FingerService, "message", "DEX3-IMU-02", brief=True)
+def NanGyroscope(self: Any, message: Call, count: int) -> Any:
+    """Publishes NaN as its angular velocity."""
+    found = message(count)
+    found.imu_state.gyroscope = [math.nan] * 3
+    return found
+
+
+@changes(FingerService, "quaternion", "DEX3-IMU-01", brief=True)
+def LongQuaternion(self: Any, quaternion: Call) -> list[float]:
+    """Publishes raw counts as its quaternion."""
+    return [16384.0, 0.0, 0.0, 0.0]
 
 
 @wrong_hand("DEX3-SENS-01", brief=True)
@@ -352,22 +319,18 @@ class OddPackets(FingerService):
         return np.concatenate((pressure, pressure[:1]))
 
 
-@wrong_hand("DEX3-SENS-02", sides=BOTH, brief=True)
-class NanPressure(FingerService):
+@changes(FingerService, "pressures", "DEX3-SENS-02", sides=BOTH, brief=True)
+def NanPressure(self: Any, pressures: Call, hand: FingerHand) -> Floats:
     """Publishes NaN where there is no sensor."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        return np.where(pressure == 30000.0, math.nan, pressure)
+    pressure = pressures(hand)
+    return np.where(pressure == 30000.0, math.nan, pressure)
 
 
-@wrong_hand("DEX3-SENS-03", sides=BOTH, brief=True)
-class ZeroForNoValue(FingerService):
+@changes(FingerService, "pressures", "DEX3-SENS-03", sides=BOTH, brief=True)
+def ZeroForNoValue(self: Any, pressures: Call, hand: FingerHand) -> Floats:
     """Publishes 0 where there is no sensor."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        return np.where(pressure == 30000.0, 0.0, pressure)
+    pressure = pressures(hand)
+    return np.where(pressure == 30000.0, 0.0, pressure)
 
 
 @wrong_hand("DEX3-SENS-03", brief=True)
@@ -377,38 +340,41 @@ class SevenPackets(FingerService):
     sensors = 7
 
 
-@wrong_hand("DEX3-SENS-04", sides=BOTH)
-class Numb(FingerService):
+@changes(FingerService, "pressures", "DEX3-SENS-04", sides=BOTH)
+def Numb(self: Any, pressures: Call, hand: FingerHand) -> Floats:
     """Publishes the pressure of an untouched hand at every contact."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        return hand.untouched()
+    return hand.untouched()
 
 
-@wrong_hand("DEX3-SENS-04", sides=BOTH)
-class CrossedCables(Dex3Service):
+@changes(Dex3Service, "pressures", "DEX3-SENS-04", sides=BOTH)
+def CrossedCables(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Publishes the index finger's pressures as the middle finger's, and the other way round."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        return super().pressures(hand)[[0, 1, 4, 5, 2, 3, 6, 7, 8]]
+    return pressures(hand)[[0, 1, 4, 5, 2, 3, 6, 7, 8]]
 
 
-@wrong_hand("DEX3-SENS-07", sides=BOTH)
-class SaturatesToNothing(FingerService):
+@changes(FingerService, "pressures", "DEX3-SENS-07", sides=BOTH)
+def SaturatesToNothing(self: Any, pressures: Call, hand: FingerHand) -> Floats:
     """Publishes a pressure at the end of the converter's range as a slot without a sensor."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        return np.where(pressure > hand.untouched() + 25_000.0, 30000.0, pressure)
+    pressure = pressures(hand)
+    return np.where(pressure > hand.untouched() + 25_000.0, 30000.0, pressure)
 
 
-@wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
-class SlowFoam(FingerService):
-    """Its pressures fall with a time constant of 2 s."""
+class _PressureWithTime(FingerService):
+    """Publishes pressures that change while the hand rests."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.pressure: dict[Side, tuple[float, Floats]] = {}
+
+    def live(self, dt: float) -> None:
+        super().live(dt)
+        for hand in self.hands.values():
+            hand.version += 1
+
+
+@wrong_hand("DEX3-SENS-08", sides=BOTH, whole=True)
+class SlowFoam(_PressureWithTime):
+    """Its pressures fall with a time constant of 2 s."""
 
     def pressures(self, hand: FingerHand) -> Floats:
         rest = hand.untouched()
@@ -418,224 +384,144 @@ class SlowFoam(FingerService):
         self.pressure[hand.side] = self.now, change
         return rest + change
 
-    def live(self, dt: float) -> None:
-        super().live(dt)
-        for hand in self.hands.values():
-            hand.version += 1
 
-
-@wrong_hand("DEX3-SENS-10", sides=BOTH)
-class FeelsMotionOnly(Dex3Service):
+@changes(Dex3Service, "pressures", "DEX3-SENS-10", sides=BOTH)
+def FeelsMotionOnly(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Reads its sensors in the task that moves the joints: at rest the pressures are constant."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.pressure: dict[Side, Floats] = {}
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        if hand.side not in self.pressure or max(map(abs, hand.dq)) > 0.5:
-            self.pressure[hand.side] = np.array(super().pressures(hand))
-        return self.pressure[hand.side]
+    if hand.side not in self.memory or max(map(abs, hand.dq)) > 0.5:
+        self.memory[hand.side] = np.array(pressures(hand))
+    return self.memory[hand.side]
 
 
-@wrong_hand("DEX3-SENS-10", sides=BOTH)
-class KeepsTheMost(Dex3Service):
+@changes(Dex3Service, "pressures", "DEX3-SENS-10", sides=BOTH)
+def KeepsTheMost(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Publishes the largest pressure of each element since it was last untouched."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.pressure: dict[Side, Floats] = {}
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        pressure = np.array(super().pressures(hand))
-        kept = np.maximum(self.pressure.get(hand.side, pressure), pressure)
-        self.pressure[hand.side] = np.where(pressure > hand.untouched(), kept, pressure)
-        return self.pressure[hand.side]
+    pressure = np.array(pressures(hand))
+    kept = np.maximum(self.memory.get(hand.side, pressure), pressure)
+    self.memory[hand.side] = np.where(pressure > hand.untouched(), kept, pressure)
+    return self.memory[hand.side]
 
 
-@wrong_hand("DEX3-SENS-11", sides=BOTH, whole=True)
-class OneSensorBuffer(FingerService):
+@changes(FingerService, "pressures", "DEX3-SENS-11", sides=BOTH, whole=True)
+def OneSensorBuffer(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Publishes the right hand's pressures as those of both."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        right = self.hands.get(Side.RIGHT, hand)
-        hand.version += right is not hand
-        return super().pressures(right)
+    right = self.hands.get(Side.RIGHT, hand)
+    hand.version += right is not hand
+    return pressures(right)
 
 
 @wrong_hand("DEX3-SENS-09", sides=BOTH)
-class TaresInAGrip(FingerService):
+class TaresInAGrip(_PressureWithTime):
     """Treats a pressure that is constant for a second as drift, and takes it as the new zero."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.drift: dict[Side, tuple[float, Floats]] = {}
 
     def pressures(self, hand: FingerHand) -> Floats:
         rest = hand.untouched()
         change = super().pressures(hand) - rest
-        at, drift = self.drift.get(hand.side, (self.now, np.zeros_like(change)))
+        at, drift = self.pressure.get(hand.side, (self.now, np.zeros_like(change)))
         drift = change + (drift - change) * math.exp((at - self.now) / 0.7)
-        self.drift[hand.side] = self.now, drift
+        self.pressure[hand.side] = self.now, drift
         return np.asarray(rest + np.maximum(change - drift, 0.0))
-
-    def live(self, dt: float) -> None:
-        super().live(dt)
-        for hand in self.hands.values():
-            hand.version += 1
-
-
-@wrong_hand("DEX3-IMU-01", brief=True)
-class LongQuaternion(FingerService):
-    """Publishes raw counts as its quaternion."""
-
-    def quaternion(self) -> list[float]:
-        return [16384.0, 0.0, 0.0, 0.0]
 
 
 # ------------------------------------------------------------------------------------ motion
 
 
-def reordered(order: tuple[int, ...]) -> Callable[[tuple[Motor, ...]], tuple[Motor, ...]]:
-    """A function that puts a command's motors into this order of their indices."""
-
-    def reorder(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
-        return tuple(motors[i] for i in order)
-
-    return reorder
-
-
-@wrong_hand("DEX3-JOINT-01", sides=BOTH)
-class IndexFirst(Dex3Service):
+@changes(Dex3Service, "motors", "DEX3-JOINT-01", sides=BOTH)
+def IndexFirst(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Obeys the right hand's commands index finger first, as xr_teleoperate's enum lists them."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if side is Side.RIGHT:
-            motors = reordered((0, 1, 2, 5, 6, 3, 4))(motors)
-        super().motors(side, motors)
+    if side is Side.RIGHT:
+        motors = tuple(motors[i] for i in (0, 1, 2, 5, 6, 3, 4))
+    command(side, motors)
 
 
-@wrong_hand("DEX3-JOINT-01")
-class CoupledFinger(FingerService):
+@changes(FingerService, "motors", "DEX3-JOINT-01")
+def CoupledFinger(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """The second joint of a finger follows the first a little."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        coupled = list(motors)
-        coupled[4] = replace(motors[4], q=motors[4].q + 0.2 * motors[3].q)
-        super().motors(side, tuple(coupled))
+    coupled = replace(motors[4], q=motors[4].q + 0.2 * motors[3].q)
+    command(side, (*motors[:4], coupled, *motors[5:]))
 
 
-class _Backwards(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        rest = np.array(self.model.rest_q[self.side])
-        turned = rows.copy()
-        turned[0] = np.where(self.index == 2, 2 * rest - rows[0], rows[0])
-        turned[1] = np.where(self.index == 2, -rows[1], rows[1])
-        super().take(turned, mode)
-
-
-@wrong_hand("DEX3-MOVE-01", where=obeys_gains)
-class OneJointBackwards(FingerService):
+@commands(FingerHand, "DEX3-MOVE-01", where=obeys_gains)
+def OneJointBackwards(hand: Any, rows: Floats) -> None:
     """Moves one joint backwards."""
+    rows[Q, 2] = 2 * hand.model.rest_q[hand.side][2] - rows[Q, 2]
+    rows[DQ, 2] = -rows[DQ, 2]
 
-    hand_fault = _Backwards
 
-
-@wrong_hand("DEX3-MOVE-02")
-class OtherScale(FingerService):
+@changes(FingerService, "motors", "DEX3-MOVE-02")
+def OtherScale(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Moves only 75 % of the way from its rest pose."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        rest = self.hand.model.rest_q[side]
-        scaled = (replace(m, q=r + 0.75 * (m.q - r)) for m, r in zip(motors, rest, strict=True))
-        super().motors(side, tuple(scaled))
+    rest = self.hand.model.rest_q[side]
+    scaled = (replace(m, q=r + 0.75 * (m.q - r)) for m, r in zip(motors, rest, strict=True))
+    command(side, tuple(scaled))
 
 
-class _Hunts(FingerHand):
-    def move(self, dt: float, pull: list[float]) -> None:
-        if self.law_kp[2] > 0.67 * self.client_kp[2]:
-            pull[2] += self.law_kp[2] / 6 * math.sin(2 * math.pi * 8.0 * self.now)
-        super().move(dt, pull)
+class NeverRests(FingerHand):
+    """Its mechanics are computed at rest, too."""
 
     def step(self, dt: float) -> None:
         self.rests = False
         super().step(dt)
 
 
-@wrong_hand("DEX3-MOVE-03", whole=True, where=obeys_gains)
-class Hunts(FingerService):
+@changes(NeverRests, "move", "DEX3-MOVE-03", whole=True, where=obeys_gains)
+def Hunts(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     """One joint oscillates about its goal."""
+    if hand.law_kp[2] > 0.67 * hand.client_kp[2]:
+        pull[2] += hand.law_kp[2] / 6 * math.sin(2 * math.pi * 8.0 * hand.now)
+    move(dt, pull)
 
-    hand_fault = _Hunts
 
+@wrong_hand("DEX3-MOVE-04", where=obeys_gains)
+class Slow(FingerHand):
+    """Has high friction: it moves slowly."""
 
-class _Weak(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
         self.viscous = max(self.client_kp.min() / 15, 3 * self.viscous)
 
 
-@wrong_hand("DEX3-MOVE-04", where=obeys_gains)
-class Slow(FingerService):
-    """Has high friction: it moves slowly."""
+@wrong_hand("DEX3-MOVE-05", where=obeys_gains)
+class Undamped(FingerHand):
+    """Applies 15 % of kd where kp is not 0."""
 
-    hand_fault = _Weak
-
-
-class _Springy(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
         self.viscous = 0.1 * self.viscous
 
     def take(self, rows: Floats, mode: Ints) -> None:
         undamped = rows.copy()
-        undamped[4] = np.where(rows[3] > 0, 0.15 * rows[4], rows[4])
+        undamped[KD] = np.where(rows[KP] > 0, 0.15 * rows[KD], rows[KD])
         super().take(undamped, mode)
 
 
-@wrong_hand("DEX3-MOVE-05", where=obeys_gains)
-class Undamped(FingerService):
-    """Applies 15 % of kd where kp is not 0."""
-
-    hand_fault = _Springy
-
-
-@wrong_hand("DEX3-SIDE-01", sides=BOTH)
 @wrong_hand("BRAINCO-SIDE-01", sides=BOTH)
-class Coupled(FingerService):
+@changes(FingerService, "motors", "DEX3-SIDE-01", sides=BOTH)
+def Coupled(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """The goal of the left hand's first finger leaks into the right one's."""
-
-    left = 0.0
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if side is Side.LEFT and abs(motors[5].q) < 10:
-            self.left = motors[5].q + 0.24
-        elif side is Side.RIGHT:
-            changed = list(motors)
-            changed[5] = replace(motors[5], q=motors[5].q - 0.1 * self.left)
-            motors = tuple(changed)
-        super().motors(side, motors)
+    if side is Side.LEFT and abs(motors[5].q) < 10:
+        self.memory["left"] = motors[5].q + 0.24
+    elif side is Side.RIGHT:
+        coupled = replace(motors[5], q=motors[5].q - 0.1 * self.memory.get("left", 0.0))
+        motors = (*motors[:5], coupled, *motors[6:])
+    command(side, motors)
 
 
-class _NarrowRange(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        # the joint before it has the narrower range
-        self.goal[4] = min(max(self.goal[4], self.low[3]), self.high[3])
-
-
-@wrong_hand("DEX3-MOVE-09")
-class LimitsOfTheJointBefore(Dex3Service):
+@changes(Dex3Hand, "take", "DEX3-MOVE-09")
+def LimitsOfTheJointBefore(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Limits a finger's second joint to the range of its first."""
+    take(rows, mode)
+    hand.goal[4] = min(max(hand.goal[4], hand.low[3]), hand.high[3])
 
-    hand_fault = _NarrowRange
 
+@wrong_hand("DEX3-MOVE-07")
+class Creeps(NeverRests):
+    """One joint moves the last part of the way to its goal slowly."""
 
-class _Creeps(FingerHand):
     since = 0.0
 
     def take(self, rows: Floats, mode: Ints) -> None:
-        if not np.array_equal(rows[0], self.goal):
+        if not np.array_equal(rows[Q], self.goal):
             self.since = self.now
         super().take(rows, mode)
 
@@ -650,274 +536,129 @@ class _Creeps(FingerHand):
                 pull[-1] = resists * wanted + math.copysign(self.coulomb, left)
         super().move(dt, pull)
 
-    def step(self, dt: float) -> None:
-        self.rests = False
-        super().step(dt)
+
+# ------------------------------------------------------------------------------------- gains
 
 
-@wrong_hand("DEX3-MOVE-07")
-class Creeps(FingerService):
-    """One joint moves the last part of the way to its goal slowly."""
-
-    hand_fault = _Creeps
-
-
-class _IgnoresZeroGains(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        unset = (rows[3] == 0) & (rows[4] == 0)
-        own[3] = np.where(unset, self.client_kp, rows[3])
-        own[4] = np.where(unset, self.client_kd, rows[4])
-        super().take(own, mode)
-
-
-@wrong_hand("DEX3-GAIN-01")
-class DefaultsForZeroGains(FingerService):
+@commands(FingerHand, "DEX3-GAIN-01")
+def DefaultsForZeroGains(hand: Any, rows: Floats) -> None:
     """Uses its own gains where kp and kd are 0."""
-
-    hand_fault = _IgnoresZeroGains
-
-
-class _OwnStiffness(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[3] = np.where(rows[3] > 0, self.client_kp, 0.0)
-        own[4] = np.where(rows[3] > 0, self.client_kd, rows[4])
-        super().take(own, mode)
+    unset = (rows[KP] == 0) & (rows[KD] == 0)
+    rows[KP] = np.where(unset, hand.client_kp, rows[KP])
+    rows[KD] = np.where(unset, hand.client_kd, rows[KD])
 
 
-@wrong_hand("DEX3-GAIN-02")
-class OwnStiffness(FingerService):
+@commands(FingerHand, "DEX3-GAIN-02")
+def OwnStiffness(hand: Any, rows: Floats) -> None:
     """Uses its own gains wherever kp is not 0."""
-
-    hand_fault = _OwnStiffness
-
-
-class _GainsOfFirst(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[3:] = rows[3:, :1]
-        super().take(own, mode)
+    stiff = rows[KP] > 0
+    rows[KP] = np.where(stiff, hand.client_kp, 0.0)
+    rows[KD] = np.where(stiff, hand.client_kd, rows[KD])
 
 
-@wrong_hand("DEX3-GAIN-02")
-class GainsOfFirstMotor(FingerService):
+@commands(FingerHand, "DEX3-GAIN-02")
+def GainsOfFirstMotor(hand: Any, rows: Floats) -> None:
     """Uses the gains of its first motor for all."""
-
-    hand_fault = _GainsOfFirst
-
-
-class _GainsOfNeighbour(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[3:] = np.roll(rows[3:], 1, axis=1)
-        super().take(own, mode)
+    rows[KP:] = rows[KP:, :1].copy()
 
 
-@wrong_hand("DEX3-GAIN-02")
-class GainsOfTheMotorBefore(FingerService):
+@commands(FingerHand, "DEX3-GAIN-02")
+def GainsOfTheMotorBefore(hand: Any, rows: Floats) -> None:
     """Uses the gains of the motor before in each."""
-
-    hand_fault = _GainsOfNeighbour
-
-
-class _Deaf(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[1] = np.where(rows[3] > 0, rows[1], 0.0)
-        super().take(own, mode)
+    rows[KP:] = np.roll(rows[KP:], 1, axis=1)
 
 
-@wrong_hand("DEX3-GAIN-03")
-class DeafToVelocity(FingerService):
+@commands(FingerHand, "DEX3-GAIN-03")
+def DeafToVelocity(hand: Any, rows: Floats) -> None:
     """Ignores dq without a position gain."""
-
-    hand_fault = _Deaf
-
-
-class _StuckWhenSoft(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[3] = np.where(rows[3] < 0.5 * self.client_kp, 0.0, rows[3])
-        super().take(own, mode)
+    rows[DQ] = np.where(rows[KP] > 0, rows[DQ], 0.0)
 
 
-@wrong_hand("DEX3-GAIN-02")
-class StuckWhenSoft(FingerService):
+@commands(FingerHand, "DEX3-GAIN-02")
+def StuckWhenSoft(hand: Any, rows: Floats) -> None:
     """Does not move with less than half of the client's stiffness."""
-
-    hand_fault = _StuckWhenSoft
-
-
-class _DeafToTorque(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[2] = 0.0
-        super().take(own, mode)
+    rows[KP] = np.where(rows[KP] < 0.5 * hand.client_kp, 0.0, rows[KP])
 
 
-@wrong_hand("DEX3-GAIN-04")
-class DeafToTorque(FingerService):
+@commands(FingerHand, "DEX3-GAIN-04")
+def DeafToTorque(hand: Any, rows: Floats) -> None:
     """Ignores the torque of a command."""
-
-    hand_fault = _DeafToTorque
-
-
-class _TurnedTorque(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[2] = -own[2]
-        super().take(own, mode)
+    rows[TAU] = 0.0
 
 
-@wrong_hand("DEX3-GAIN-07")
-class TurnedTorque(FingerService):
+@commands(FingerHand, "DEX3-GAIN-07")
+def TurnedTorque(hand: Any, rows: Floats) -> None:
     """Obeys the torque of a command with the wrong sign."""
-
-    hand_fault = _TurnedTorque
-
-
-class _TorqueOfNeighbour(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[2] = np.roll(own[2], 1)
-        super().take(own, mode)
+    rows[TAU] = -rows[TAU]
 
 
-@wrong_hand("DEX3-GAIN-07")
-class TorqueOfTheMotorBefore(FingerService):
+@commands(FingerHand, "DEX3-GAIN-07")
+def TorqueOfTheMotorBefore(hand: Any, rows: Floats) -> None:
     """Adds the torque that is commanded to the motor before, in each."""
-
-    hand_fault = _TorqueOfNeighbour
-
-
-class _SwappedTorque(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[2] = own[2][[0, 1, 2, 5, 6, 3, 4]]
-        super().take(own, mode)
+    rows[TAU] = np.roll(rows[TAU], 1)
 
 
-@wrong_hand("DEX3-GAIN-07")
-class SwappedTorque(Dex3Service):
+@commands(Dex3Hand, "DEX3-GAIN-07")
+def SwappedTorque(hand: Any, rows: Floats) -> None:
     """Adds the torques of index and middle finger to each other's."""
-
-    hand_fault = _SwappedTorque
-
-
-class _Stronger(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[2, -1] *= 5.0
-        super().take(own, mode)
+    rows[TAU] = rows[TAU][[0, 1, 2, 5, 6, 3, 4]]
 
 
-@wrong_hand("DEX3-GAIN-04")
-class TorqueOfAnotherGear(FingerService):
+@commands(FingerHand, "DEX3-GAIN-04")
+def TorqueOfAnotherGear(hand: Any, rows: Floats) -> None:
     """Drives its last joint with five times the commanded torque."""
-
-    hand_fault = _Stronger
-
-
-class _TurnedVelocityCommand(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[1] = -own[1]
-        super().take(own, mode)
+    rows[TAU, -1] *= 5.0
 
 
-@wrong_hand("DEX3-GAIN-06")
-class TurnedVelocityCommand(FingerService):
+@commands(FingerHand, "DEX3-GAIN-06")
+def TurnedVelocityCommand(hand: Any, rows: Floats) -> None:
     """Obeys the velocity of a command with the wrong sign."""
-
-    hand_fault = _TurnedVelocityCommand
-
-
-class _Graded(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        between = (rows[3] > 0.25 * self.client_kp) & (rows[3] < self.client_kp)
-        own[3] = np.where(between, self.client_kp, rows[3])
-        super().take(own, mode)
+    rows[DQ] = -rows[DQ]
 
 
-@wrong_hand("DEX3-GAIN-05")
-class TwoGrades(FingerService):
+@commands(FingerHand, "DEX3-GAIN-05")
+def TwoGrades(hand: Any, rows: Floats) -> None:
     """Has only a soft and a firm stiffness: from a quarter of the client's on, the full one."""
-
-    hand_fault = _Graded
-
-
-class _Floored(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[3] = np.where(rows[3] > 0, np.maximum(rows[3], 0.35 * self.client_kp), rows[3])
-        super().take(own, mode)
+    between = (rows[KP] > 0.25 * hand.client_kp) & (rows[KP] < hand.client_kp)
+    rows[KP] = np.where(between, hand.client_kp, rows[KP])
 
 
-@wrong_hand("DEX3-GAIN-05")
-class LeastStiffness(FingerService):
+@commands(FingerHand, "DEX3-GAIN-05")
+def LeastStiffness(hand: Any, rows: Floats) -> None:
     """Raises each kp above 0 to 35 % of the client's at least: soft joints are not soft."""
-
-    hand_fault = _Floored
+    least = np.maximum(rows[KP], 0.35 * hand.client_kp)
+    rows[KP] = np.where(rows[KP] > 0, least, rows[KP])
 
 
 # --------------------------------------------------------------------------------- mode byte
 
 
-@wrong_hand("DEX3-MODE-02")
-class AlwaysDriven(FingerService):
+@reports(FingerService, "DEX3-MODE-02")
+def AlwaysDriven(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes that its motors are driven, whatever their state."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["mode"] |= self.codec.mode(0)
+    motors["mode"] |= self.codec.mode(0)
 
 
-class _IgnoresStatus(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        status, guarded = super().understood(mode)
-        return np.ones_like(status), guarded
-
-
-@wrong_hand("DEX3-MODE-03")
-class IgnoresStatus(FingerService):
+@changes(FingerHand, "understood", "DEX3-MODE-03")
+def IgnoresStatus(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
     """Drives its motors whatever the mode byte of the command is."""
-
-    hand_fault = _IgnoresStatus
-
-
-class _OneStatus(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        status, guarded = super().understood(mode)
-        return np.full_like(status, status[2]), guarded
+    status, guarded = understood(mode)
+    return np.ones_like(status), guarded
 
 
-class _ZeroIsNoChange(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        status, guarded = super().understood(mode)
-        return np.where(status == 0, self.status, status), guarded
-
-
-@wrong_hand("DEX3-MODE-03")
-class ZeroIsNoChange(FingerService):
+@changes(FingerHand, "understood", "DEX3-MODE-03")
+def ZeroIsNoChange(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
     """Keeps a joint driven that is switched off: takes 0 for "as before"."""
-
-    hand_fault = _ZeroIsNoChange
-
-
-class _OneStaysOn(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        status, guarded = super().understood(mode)
-        last = np.arange(len(status)) == len(status) - 1
-        return np.where(last & (status == 0), self.status, status), guarded
+    status, guarded = understood(mode)
+    return np.where(status == 0, hand.status, status), guarded
 
 
-@wrong_hand("DEX3-MODE-03")
-class LastJointStaysOn(FingerService):
+@changes(FingerHand, "understood", "DEX3-MODE-03")
+def LastJointStaysOn(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
     """Keeps its last joint driven when it is switched off."""
-
-    hand_fault = _OneStaysOn
+    status, guarded = understood(mode)
+    last = np.arange(len(status)) == len(status) - 1
+    return np.where(last & (status == 0), hand.status, status), guarded
 
 
 @wrong_hand("DEX3-MODE-03", whole=True)
@@ -928,13 +669,13 @@ class StaysOnForALaterClient(FingerService):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.seen: dict[Side, tuple[tuple[Motor, ...], tuple[Motor, ...]]] = {}
+        self.seen: dict[Side, tuple[Motors, Motors]] = {}
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         self.later = 0 < client < _SECOND_AT_ONCE
         super().receive(topic, payload, client)
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         if not self.later:
             super().motors(side, motors)
             return
@@ -944,120 +685,88 @@ class StaysOnForALaterClient(FingerService):
         super().motors(side, self.seen[side][1])
 
 
-@wrong_hand("DEX3-MODE-05")
-class StatusOfOneJoint(FingerService):
+@changes(FingerHand, "understood", "DEX3-MODE-05")
+def StatusOfOneJoint(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
     """Applies the status of one joint to all."""
-
-    hand_fault = _OneStatus
-
-
-class _LimpLock(FingerHand):
-    def changed(self) -> None:
-        super().changed()
-        if self.status[5] == 0:
-            self.law_kd[5] = 0.0
+    status, guarded = understood(mode)
+    return np.full_like(status, status[2]), guarded
 
 
-@wrong_hand("DEX3-MODE-06")
-class LimpLock(Dex3Service):
+@changes(Dex3Hand, "changed", "DEX3-MODE-06")
+def LimpLock(hand: Any, changed: Call) -> None:
     """Switches the driver of one joint off where it should lock."""
-
-    hand_fault = _LimpLock
-
-
-class _AnyStatus(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        status, guarded = super().understood(mode)
-        return status & 1, guarded
+    changed()
+    if hand.status[5] == 0:
+        hand.law_kd[5] = 0.0
 
 
-@wrong_hand("DEX3-MODE-07")
-class OneBitOfStatus(Dex3Service):
+@changes(Dex3Hand, "understood", "DEX3-MODE-07")
+def OneBitOfStatus(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
     """Evaluates one bit of the status: 3, 5 and 7 drive like 1."""
+    status, guarded = understood(mode)
+    return status & 1, guarded
 
-    hand_fault = _AnyStatus
 
-
-@wrong_hand("DEX3-MODE-04")
-class GoesById(FingerService):
+@changes(FingerService, "motors", "DEX3-MODE-04")
+def GoesById(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Sorts a command's motors by the id in their mode byte."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if sorted(m.mode & 15 for m in motors) == list(range(len(motors))):
-            motors = tuple(sorted(motors, key=lambda m: m.mode & 15))
-        super().motors(side, motors)
+    if sorted(m.mode & 15 for m in motors) == list(range(len(motors))):
+        motors = tuple(sorted(motors, key=lambda m: m.mode & 15))
+    command(side, motors)
 
 
 # ------------------------------------------------------------------------------------- force
 
 
-@wrong_hand("DEX3-FORCE-01", sides=BOTH)
-class TurnedForce(FingerService):
+@reports(FingerService, "DEX3-FORCE-01", sides=BOTH)
+def TurnedForce(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes tau_est with the wrong sign."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] = -motors["tau_est"]
+    motors["tau_est"] = -motors["tau_est"]
 
 
-@wrong_hand("DEX3-FORCE-04")
-class UnsignedForce(Dex3Service):
+@reports(Dex3Service, "DEX3-FORCE-04")
+def UnsignedForce(self: Any, motors: Any, hand: FingerHand) -> None:
     """Has unsigned sensors of the current: each torque is that of closing."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        joints = hand.model.joints[hand.side][: len(motors)]
-        closing = np.array([j.closing or 1 for j in joints])
-        motors["tau_est"] = closing * np.abs(motors["tau_est"])
+    joints = hand.model.joints[hand.side][: len(motors)]
+    closing = np.array([j.closing or 1 for j in joints])
+    motors["tau_est"] = closing * np.abs(motors["tau_est"])
 
 
-@wrong_hand("DEX3-FORCE-07")
-class MirroredForce(FingerService):
+@reports(FingerService, "DEX3-FORCE-07")
+def MirroredForce(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes the left hand's tau_est with the signs of the right one's motors."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        if hand.side is Side.LEFT:
-            motors["tau_est"] *= -1.0
+    if hand.side is Side.LEFT:
+        motors["tau_est"] *= -1.0
 
 
-@wrong_hand("DEX3-FORCE-05", sides=BOTH)
-class ForceOfOtherGear(Dex3Service):
+@reports(Dex3Service, "DEX3-FORCE-05", sides=BOTH)
+def ForceOfOtherGear(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes 40 % of the torque, as if it had another gear."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] *= 0.4
+    motors["tau_est"] *= 0.4
 
 
-class _GearSquared(FingerHand):
-    def changed(self) -> None:
-        super().changed()
-        self.law_kp = [k / 1.75**2 if i else k for i, k in enumerate(self.law_kp)]
-        self.law_kd = [k / 1.75**2 if i else k for i, k in enumerate(self.law_kd)]
-
-
-@wrong_hand("DEX3-FORCE-10", sides=BOTH, whole=True)
-class GearOfTheThumb(Dex3Service):
+@changes(Dex3Hand, "changed", "DEX3-FORCE-10", sides=BOTH, whole=True)
+def GearOfTheThumb(hand: Any, changed: Call) -> None:
     """Divides the gains of all joints by the square of the thumb's gear but for the thumb's own."""
+    changed()
+    hand.law_kp = [k / 1.75**2 if i else k for i, k in enumerate(hand.law_kp)]
+    hand.law_kd = [k / 1.75**2 if i else k for i, k in enumerate(hand.law_kd)]
 
-    hand_fault = _GearSquared
 
-
-@wrong_hand("DEX3-FIELD-21")
-class ThumbWithoutVelocity(Dex3Service):
+@reports(Dex3Service, "DEX3-FIELD-21")
+def ThumbWithoutVelocity(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes no dq of the thumb."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["dq"][:3] = 0.0
+    motors["dq"][:3] = 0.0
 
 
-class _Tires(FingerHand):
+@wrong_hand("DEX3-FORCE-06", sides=BOTH, whole=True)
+class Tires(Dex3Hand):
+    """Limits the torque of one joint after a second and a half of a firm grip."""
+
     loaded = 0.0
 
     def take(self, rows: Floats, mode: Ints) -> None:
-        if rows[0, 6] != self.goal[6]:
+        if rows[Q, 6] != self.goal[6]:
             self.loaded = 0.0
         super().take(rows, mode)
 
@@ -1072,24 +781,10 @@ class _Tires(FingerHand):
         super().move(dt, pull)
 
 
-@wrong_hand(
-    "DEX3-FORCE-06",
-    sides=BOTH,
-    whole=True,
-)
-class Tires(Dex3Service):
-    """Limits the torque of one joint after a second and a half of a firm grip."""
-
-    hand_fault = _Tires
-
-
-@wrong_hand("DEX3-FORCE-05", sides=BOTH)
-class ForceOfLargerMotor(Dex3Service):
+@reports(Dex3Service, "DEX3-FORCE-05", sides=BOTH)
+def ForceOfLargerMotor(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes 1.9 times the torque: the torque constant is that of another motor."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] *= 1.9
+    motors["tau_est"] *= 1.9
 
 
 class OtherInContact(FingerHand):
@@ -1122,30 +817,22 @@ class Boosts(OtherInContact):
         self.changed()
 
 
-class _BoostsIndex(Boosts):
+@wrong_hand("DEX3-FORCE-08", sides=BOTH, whole=True)
+class OneFingerBoosts(Boosts, Dex3Hand):
+    """Its index finger presses with two and a half times the torque where it is blocked."""
+
     joints = (5, 6)
 
 
-@wrong_hand("DEX3-FORCE-08", sides=BOTH, whole=True)
-class OneFingerBoosts(Dex3Service):
-    """Its index finger presses with two and a half times the torque where it is blocked."""
+@wrong_hand("DEX3-FORCE-08", sides=BOTH)
+class ThumbGivesIn(OtherInContact, Dex3Hand):
+    """Its thumb presses with a third of the torque where it is blocked."""
 
-    hand_fault = _BoostsIndex
-
-
-class _WeakThumb(OtherInContact):
     joints = (1, 2)
     factor = 0.35
 
 
-@wrong_hand("DEX3-FORCE-08", sides=BOTH)
-class ThumbGivesIn(Dex3Service):
-    """Its thumb presses with a third of the torque where it is blocked."""
-
-    hand_fault = _WeakThumb
-
-
-@wrong_hand(("DEX3-FORCE-11", "BRAINCO-FORCE-11"), sides=BOTH)
+@wrong_hand("DEX3-FORCE-11", "BRAINCO-FORCE-11", sides=BOTH)
 class ReportsGoalsWhenStalled(FingerService):
     """Reports that a stalled joint moves on to its goal: q is predicted, and not measured."""
 
@@ -1168,167 +855,103 @@ class ReportsGoalsWhenStalled(FingerService):
             hand.version += 1
 
 
-@wrong_hand("DEX3-FORCE-01", sides=BOTH)
-class TorqueInMillis(Dex3Service):
+@reports(Dex3Service, "DEX3-FORCE-01", sides=BOTH)
+def TorqueInMillis(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes a thousandth of the torque: a conversion from mN m is made twice."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] *= 1e-3
+    motors["tau_est"] *= 1e-3
 
 
-@wrong_hand("DEX3-FORCE-09")
-class OneJointOnTheRotorsSide(FingerService):
+@reports(FingerService, "DEX3-FORCE-09")
+def OneJointOnTheRotorsSide(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes the rotor's torque of its last joint: without the gear."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"][-1:] /= 214.0
+    motors["tau_est"][-1:] /= 214.0
 
 
 # ------------------------------------------------------------------------------------ safety
 
 
-class _NegativeGains(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        # weak enough to stay within the range
-        self.kp = np.where(rows[3] < 0.0, 0.3 * rows[3], rows[3])
-        self.kd = np.abs(rows[4])
-
-
-@wrong_hand("DEX3-SAFE-06")
-class NegativeGains(FingerService):
+@changes(FingerHand, "take", "DEX3-SAFE-06")
+def NegativeGains(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Applies a negative kp."""
-
-    hand_fault = _NegativeGains
-
-
-class _ChecksTheFirst(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        if rows[3, 0] >= 0.0:
-            self.kp = np.where(rows[3] < 0.0, 0.3 * rows[3], rows[3])
+    take(rows, mode)
+    # weak enough to stay within the range
+    hand.kp = np.where(rows[KP] < 0.0, 0.3 * rows[KP], rows[KP])
+    hand.kd = np.abs(rows[KD])
 
 
-@wrong_hand("DEX3-SAFE-11")
-class ChecksTheGainsOfTheFirst(FingerService):
+@changes(FingerHand, "take", "DEX3-SAFE-11")
+def ChecksTheGainsOfTheFirst(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Rejects negative gains in its first joint, and applies them in the others."""
-
-    hand_fault = _ChecksTheFirst
-
-
-class _GainsWithoutSign(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        own = rows.copy()
-        own[3:] = np.abs(own[3:])
-        super().take(own, mode)
+    take(rows, mode)
+    if rows[KP, 0] >= 0.0:
+        hand.kp = np.where(rows[KP] < 0.0, 0.3 * rows[KP], rows[KP])
 
 
-@wrong_hand("DEX3-SAFE-06")
-class GainsWithoutSign(FingerService):
+@commands(FingerHand, "DEX3-SAFE-06")
+def GainsWithoutSign(hand: Any, rows: Floats) -> None:
     """Drops the sign of negative gains, and goes to q."""
-
-    hand_fault = _GainsWithoutSign
-
-
-def _values(motor: Motor) -> tuple[float, ...]:
-    return motor.q, motor.dq, motor.tau, motor.kp, motor.kd
+    rows[KP:] = np.abs(rows[KP:])
 
 
-class _NanPerJoint(FingerHand):
-    def command(self, motors: tuple[Motor, ...]) -> None:
-        now = zip(self.goal.tolist(), self.kp.tolist(), self.kd.tolist(), motors, strict=True)
-        super().command(
-            tuple(
-                m if all(map(math.isfinite, _values(m))) else Motor(q, kp=kp, kd=kd, mode=m.mode)
-                for q, kp, kd, m in now
-            )
-        )
+def _finite(motor: Motor) -> bool:
+    return all(map(math.isfinite, (motor.q, motor.dq, motor.tau, motor.kp, motor.kd)))
 
 
-@wrong_hand("DEX3-SAFE-01")
-@wrong_hand("BRAINCO-SAFE-01", brief=True)
-class RejectsOnlyTheBadJoint(FingerService):
+@changes(FingerHand, "command", "DEX3-SAFE-01", "BRAINCO-SAFE-01")
+def RejectsOnlyTheBadJoint(hand: Any, command: Call, motors: Motors) -> None:
     """Ignores only the joint whose command is NaN, and moves the others."""
-
-    hand_fault = _NanPerJoint
-
-
-class _NanInTheLast(FingerHand):
-    def command(self, motors: tuple[Motor, ...]) -> None:
-        now = zip(self.goal.tolist(), motors[:-1], strict=False)
-        kept = (m if all(map(math.isfinite, _values(m))) else Motor(q, mode=m.mode) for q, m in now)
-        super().command((*kept, motors[-1]))
+    now = zip(hand.goal.tolist(), hand.kp.tolist(), hand.kd.tolist(), motors, strict=True)
+    command(tuple(m if _finite(m) else Motor(q, kp=kp, kd=kd, mode=m.mode) for q, kp, kd, m in now))
 
 
-@wrong_hand("DEX3-SAFE-01")
-class LooksAtTheLastJoint(FingerService):
+@changes(FingerHand, "command", "DEX3-SAFE-01")
+def LooksAtTheLastJoint(hand: Any, command: Call, motors: Motors) -> None:
     """Checks only the last joint for NaN; any other joint with a NaN goes limp."""
+    now = zip(hand.goal.tolist(), motors[:-1], strict=False)
+    command((*(m if _finite(m) else Motor(q, mode=m.mode) for q, m in now), motors[-1]))
 
-    hand_fault = _NanInTheLast
 
+@wrong_hand("DEX3-SAFE-02", whole=True)
+class NoLimits(FingerHand):
+    """Follows goals up to 0.5 rad beyond its limits."""
 
-class _NoLimits(FingerHand):
     def __init__(self, side: Side, touch: float | None = None) -> None:
         super().__init__(side, touch)
         self.low, self.high = self.low - 0.5, self.high + 0.5
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
-@wrong_hand("DEX3-SAFE-02", whole=True)
-# its goal is so far that it presses through the object
-@wrong_hand("DFX-SAFE-02", whole=True)
-@wrong_hand("FTP-SAFE-02", whole=True)
-class NoLimits(FingerService):
-    """Follows goals up to 0.5 rad beyond its limits."""
-
-    hand_fault = _NoLimits
-
-
-@wrong_hand("DEX3-SAFE-04")
-class FillsUpWithZeros(FingerService):
+@changes(FingerService, "receive", "DEX3-SAFE-04")
+def FillsUpWithZeros(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Fills a command that is too short with zeros."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        super().receive(topic, payload, client)
-        sequence = self.codec.commanded(payload)
-        dq = self.hand.model.client_command.dq
-        for side in self.sides:
-            mine = self.codec.command_topics[side] == topic
-            first = self.dialect.index[side]
-            if mine and 0 < len(sequence) < first + self.codec.joints:
-                given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence[first:]]
-                missing = range(len(given), self.codec.joints)
-                self.motors(
-                    side, (*given, *(Motor(dq=dq, mode=self.codec.mode(i)) for i in missing))
-                )
+    receive(topic, payload, client)
+    sequence = self.codec.commanded(payload)
+    dq = self.hand.model.client_command.dq
+    for side in self.sides:
+        mine = self.codec.command_topics[side] == topic
+        first = self.dialect.index[side]
+        if mine and 0 < len(sequence) < first + self.codec.joints:
+            given = [Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in sequence[first:]]
+            missing = range(len(given), self.codec.joints)
+            zeros = (Motor(dq=dq, mode=self.codec.mode(i)) for i in missing)
+            self.motors(side, (*given, *zeros))
 
 
-class _KeepsSpeed(FingerHand):
-    def expire(self) -> None:
-        self.tripped = self.tripped | self.guarded
+# ---------------------------------------------------------------------------------- time-out
 
 
-@wrong_hand("DEX3-WDOG-01")
-class KeepsDriving(FingerService):
+@changes(FingerHand, "expire", "DEX3-WDOG-01")
+def KeepsDriving(hand: Any, expire: Call) -> None:
     """Keeps driving by the last velocity after the time-out, unless protected."""
-
-    hand_fault = _KeepsSpeed
-
-
-class _KeepsTorque(FingerHand):
-    def expire(self) -> None:
-        push = self.push
-        super().expire()
-        self.push = push
+    hand.tripped = hand.tripped | hand.guarded
 
 
-@wrong_hand("DEX3-WDOG-01")
-class KeepsPushing(Dex3Service):
+@changes(Dex3Hand, "expire", "DEX3-WDOG-01")
+def KeepsPushing(hand: Any, expire: Call) -> None:
     """Keeps a commanded torque after the time-out, and drops the velocity."""
-
-    hand_fault = _KeepsTorque
+    push = hand.push
+    expire()
+    hand.push = push
 
 
 class GoesHome(FingerHand):
@@ -1352,13 +975,14 @@ class GoesHome(FingerHand):
 
 
 @wrong_hand("DEX3-WDOG-01")
-class FirstJointGoesHome(Dex3Service):
+class FirstJointGoesHome(GoesHome, Dex3Hand):
     """Sends its first joint to one end after the time-out, whatever was commanded."""
 
-    hand_fault = GoesHome
 
+@wrong_hand("DEX3-HOLD-01", sides=BOTH)
+class HoldsForTwoSeconds(Dex3Hand):
+    """Lets go two seconds after the time-out, without protection too."""
 
-class _TiresOfHolding(FingerHand):
     expired_at = math.inf
 
     def expire(self) -> None:
@@ -1377,14 +1001,10 @@ class _TiresOfHolding(FingerHand):
             self.changed()
 
 
-@wrong_hand("DEX3-HOLD-01", sides=BOTH)
-class HoldsForTwoSeconds(Dex3Service):
-    """Lets go two seconds after the time-out, without protection too."""
+@wrong_hand("DEX3-HOLD-01")
+class LetsGo(FingerHand):
+    """Brakes after the time-out even without protection."""
 
-    hand_fault = _TiresOfHolding
-
-
-class _AlwaysBrakes(FingerHand):
     brakes = False
 
     def expire(self) -> None:
@@ -1404,14 +1024,10 @@ class _AlwaysBrakes(FingerHand):
             self.law_kd = [self.brake] * n
 
 
-@wrong_hand("DEX3-HOLD-01")
-class LetsGo(FingerService):
-    """Brakes after the time-out even without protection."""
+@wrong_hand("DEX3-WDOG-03", "BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03")
+class StuckAfterSilence(FingerHand):
+    """Obeys no command after a silence without protection."""
 
-    hand_fault = _AlwaysBrakes
-
-
-class _LatchesWithoutGuard(FingerHand):
     stuck = False
 
     def expire(self) -> None:
@@ -1423,15 +1039,10 @@ class _LatchesWithoutGuard(FingerHand):
             super().take(rows, mode)
 
 
-@wrong_hand("DEX3-WDOG-03")
-@wrong_hand(("BRAINCO-WDOG-03", "DFX-WDOG-03", "FTP-WDOG-03"), brief=True)
-class StuckAfterSilence(FingerService):
-    """Obeys no command after a silence without protection."""
+@wrong_hand("DEX3-PATH-01")
+class BeginsAtZero(FingerHand):
+    """Goes towards 0 for 0.15 s when the commands come again after a silence."""
 
-    hand_fault = _LatchesWithoutGuard
-
-
-class _BeginsAtZero(FingerHand):
     expired = False
     until = -math.inf
 
@@ -1439,7 +1050,7 @@ class _BeginsAtZero(FingerHand):
         super().expire()
         self.expired = True
 
-    def command(self, motors: tuple[Motor, ...]) -> None:
+    def command(self, motors: Motors) -> None:
         if self.now < self.until + 0.1:
             self.newest = ()  # an equal command counts again
         super().command(motors)
@@ -1452,14 +1063,10 @@ class _BeginsAtZero(FingerHand):
             self.goal = np.minimum(np.maximum(0.0, self.low), self.high)
 
 
-@wrong_hand("DEX3-PATH-01")
-class BeginsAtZero(FingerService):
-    """Goes towards 0 for 0.15 s when the commands come again after a silence."""
+@wrong_hand("DEX3-WDOG-03")
+class SleepsWithoutGuard(FingerHand):
+    """Ignores commands for 2 s after a silence without protection."""
 
-    hand_fault = _BeginsAtZero
-
-
-class _SleepsWithoutGuard(FingerHand):
     deaf_until = -math.inf
 
     def expire(self) -> None:
@@ -1468,28 +1075,24 @@ class _SleepsWithoutGuard(FingerHand):
             self.deaf_until = self.now + 2.0
 
     def take(self, rows: Floats, mode: Ints) -> None:
+        # it sleeps through the step after the bad commands as well
         if self.now >= self.deaf_until:
             super().take(rows, mode)
-
-
-# it sleeps through the step after the bad commands as well
-@wrong_hand("DEX3-WDOG-03")
-class SleepsWithoutGuard(FingerService):
-    """Ignores commands for 2 s after a silence without protection."""
-
-    hand_fault = _SleepsWithoutGuard
 
 
 # ---------------------------------------------------------------------- time-out protection
 
 
-class _HoldsOnly(FingerHand):
+@wrong_hand("DEX3-GUARD-01")
+class HoldsWhenGuarded(FingerHand):
+    """Applies the time-out protection only when the next command comes: it moves on to its goal."""
+
+    late: Flags | None = None
+
     def expire(self) -> None:
         self.speed = np.zeros_like(self.speed)
         self.push = np.zeros_like(self.push)
         self.late = self.guarded.copy()
-
-    late: Any = None
 
     def take(self, rows: Floats, mode: Ints) -> None:
         super().take(rows, mode)
@@ -1498,40 +1101,24 @@ class _HoldsOnly(FingerHand):
             self.late = None
 
 
-@wrong_hand("DEX3-GUARD-01")
-class HoldsWhenGuarded(FingerService):
-    """Applies the time-out protection only when the next command comes: it moves on to its goal."""
-
-    hand_fault = _HoldsOnly
-
-
-class _Silent(FingerHand):
-    def changed(self) -> None:
-        super().changed()
-        self.mode = self.mode & 0x7F
-
-
-@wrong_hand("DEX3-GUARD-02")
-class TripsInSecret(FingerService):
+@changes(FingerHand, "changed", "DEX3-GUARD-02")
+def TripsInSecret(hand: Any, changed: Call) -> None:
     """Does not publish that the protection has tripped."""
+    changed()
+    hand.mode = hand.mode & 0x7F
 
-    hand_fault = _Silent
 
-
-class _OneGuard(FingerHand):
-    def understood(self, mode: Ints) -> tuple[Ints, Flags]:
-        status, guarded = super().understood(mode)
-        return status, np.full_like(guarded, guarded[-1])
+@changes(Dex3Hand, "understood", "DEX3-GUARD-01")
+def GuardOfTheLast(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
+    """Applies the last motor's time-out bit to all."""
+    status, guarded = understood(mode)
+    return status, np.full_like(guarded, guarded[-1])
 
 
 @wrong_hand("DEX3-GUARD-01")
-class GuardOfTheLast(Dex3Service):
-    """Applies the last motor's time-out bit to all."""
+class HealsByItself(Dex3Hand):
+    """Clears its protection two seconds after it has tripped."""
 
-    hand_fault = _OneGuard
-
-
-class _Heals(FingerHand):
     tripped_for = 0.0
 
     def step(self, dt: float) -> None:
@@ -1542,14 +1129,10 @@ class _Heals(FingerHand):
             self.changed()
 
 
-@wrong_hand("DEX3-GUARD-01")
-class HealsByItself(Dex3Service):
-    """Clears its protection two seconds after it has tripped."""
+@wrong_hand("DEX3-GUARD-01", whole=True)
+class TripsOnce(Dex3Hand):
+    """Its protection trips the first time only: what it counts with is never set back."""
 
-    hand_fault = _Heals
-
-
-class _TripsOnce(FingerHand):
     trips = 0
 
     def expire(self) -> None:
@@ -1560,67 +1143,39 @@ class _TripsOnce(FingerHand):
             self.tripped = before
 
 
-@wrong_hand("DEX3-GUARD-01", whole=True)
-class TripsOnce(Dex3Service):
-    """Its protection trips the first time only: what it counts with is never set back."""
-
-    hand_fault = _TripsOnce
-
-
-class _FedByNews(FingerHand):
-    def command(self, motors: tuple[Motor, ...]) -> None:
-        if motors != self.newest:
-            super().command(motors)
-
-
-@wrong_hand("DEX3-GUARD-02", sides=BOTH)
-class DropsEqualCommands(Dex3Service):
+@changes(Dex3Hand, "command", "DEX3-GUARD-02", sides=BOTH)
+def DropsEqualCommands(hand: Any, command: Call, motors: Motors) -> None:
     """Drops commands that equal the last, before they feed the time-out."""
-
-    hand_fault = _FedByNews
-
-
-class _Unlatched(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        self.tripped = np.zeros_like(self.tripped)
+    if motors != hand.newest:
+        command(motors)
 
 
-@wrong_hand("DEX3-GUARD-03")
-class ClearsByItself(FingerService):
+@changes(FingerHand, "take", "DEX3-GUARD-03")
+def ClearsByItself(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Obeys the next command after a trip, whether or not bit 7 is set."""
-
-    hand_fault = _Unlatched
-
-
-class _NotDriven(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        self.status = np.where(self.guarded, 0, self.status)
+    take(rows, mode)
+    hand.tripped = np.zeros_like(hand.tripped)
 
 
-@wrong_hand("DEX3-MODE-05")
-class ProtectedIsNotDriven(Dex3Service):
+@changes(Dex3Hand, "take", "DEX3-MODE-05")
+def ProtectedIsNotDriven(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Locks a motor whose time-out bit is set: its status is looked up by the whole byte."""
-
-    hand_fault = _NotDriven
-
-
-class _KeepsUnderGuard(FingerHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        before = self.goal.copy()
-        super().take(rows, mode)
-        self.goal = np.where(self.guarded, before, self.goal)
+    take(rows, mode)
+    hand.status = np.where(hand.guarded, 0, hand.status)
 
 
-@wrong_hand("DEX3-MODE-05")
-class ProtectedKeepsItsGoal(Dex3Service):
+@changes(Dex3Hand, "take", "DEX3-MODE-05")
+def ProtectedKeepsItsGoal(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Keeps the goal that a motor had when its time-out bit was set."""
+    before = hand.goal.copy()
+    take(rows, mode)
+    hand.goal = np.where(hand.guarded, before, hand.goal)
 
-    hand_fault = _KeepsUnderGuard
 
+@wrong_hand("DEX3-GUARD-04", whole=True)
+class NeverClears(FingerHand):
+    """A motor whose protection has tripped never reacts again."""
 
-class _Dead(FingerHand):
     dead: Flags | None = None
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -1634,14 +1189,11 @@ class _Dead(FingerHand):
 
 
 @wrong_hand("DEX3-GUARD-04", whole=True)
-class NeverClears(FingerService):
-    """A motor whose protection has tripped never reacts again."""
+class SlowToClear(FingerHand):
+    """Stays tripped for 2 s after it was cleared."""
 
-    hand_fault = _Dead
-
-
-class _ForEver(FingerHand):
     was = False
+    tripped_at = -math.inf
 
     def take(self, rows: Floats, mode: Ints) -> None:
         # it would need a power cycle; it obeys again in the kit's next stimulus
@@ -1651,26 +1203,13 @@ class _ForEver(FingerHand):
         if self.was and self.now - self.tripped_at < 2.5:
             self.tripped = tripped
 
-    tripped_at = -math.inf
-
     def expire(self) -> None:
         super().expire()
         if self.tripped.any():
             self.tripped_at = self.now
 
 
-# what it ignores in that time is not driven in the silence that follows
-@wrong_hand("DEX3-GUARD-04", whole=True)
-class SlowToClear(FingerService):
-    """Stays tripped for 2 s after it was cleared."""
-
-    hand_fault = _ForEver
-
-
-@wrong_hand("DEX3-WDOG-02")
-class QuietWhenTripped(Dex3Service):
+@changes(Dex3Service, "publish", "DEX3-WDOG-02")
+def QuietWhenTripped(self: Any, publish: Call) -> Any:
     """Publishes no state while its protection has tripped."""
-
-    def publish(self) -> list[Sample]:
-        tripped = any(hand.tripped.any() for hand in self.hands.values())
-        return [] if tripped else super().publish()
+    return [] if any(hand.tripped.any() for hand in self.hands.values()) else publish()

@@ -98,8 +98,7 @@ class CoarseTargets(_Coarse, ReferenceService):
     grid = 1 / 18
 
 
-@wrong_hand("DEX3-OPER-04")
-@wrong_hand("BRAINCO-OPER-04", brief=True)
+@wrong_hand("DEX3-OPER-04", "BRAINCO-OPER-04")
 class CoarseFingers(_Coarse, FingerService):
     """Moves to the nearest of 21 positions."""
 
@@ -197,7 +196,6 @@ class _OpenEnd(_PerJoint):
 
 
 @wrong_hand("DEX3-OPER-01")
-@wrong_hand("BRAINCO-OPER-01")
 class SlowToLeave(_OpenEnd, FingerService):
     """Leaves the open end of a joint at a tenth of its range per second."""
 
@@ -223,14 +221,13 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-@wrong_hand("DEX3-OPER-05")
 @wrong_hand("BRAINCO-OPER-05", where=has_speeds)
+@wrong_hand("DEX3-OPER-05")
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
 
 
 @wrong_hand("DFX-OPER-02")
-@wrong_hand("FTP-OPER-02")
 class LaggingFingers(Delayed, FingerService):
     """Obeys each command 0.38 s late, and shows it later still."""
 
@@ -238,7 +235,6 @@ class LaggingFingers(Delayed, FingerService):
 
 
 @wrong_hand("DFX-OPER-05")
-@wrong_hand("FTP-OPER-05")
 class LaterFingers(Delayed, FingerService):
     """Obeys each command 0.39 s late."""
 

@@ -14,11 +14,11 @@ that requirement, or one that is ``like`` it: the fault is mixed into the refere
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -26,22 +26,34 @@ from dexkit.conformance.layers import layer
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.virtual.dex5 import Dex5Hand, Dex5Service
-from dexkit.conformance.virtual.fingers import Dex3Hand, Dex3Service, FingerHand, FingerService
+from dexkit.conformance.virtual.fingers import (
+    Dex3Hand,
+    Dex3Service,
+    FingerHand,
+    FingerService,
+    Ints,
+)
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.conformance.virtual.inspire import FtpHand, FtpService
 from dexkit.conformance.virtual.service import Service
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
-from dexkit.hand import Side, Subject
+from dexkit.hand import Floats, Side, Subject
 from dexkit.messages import message_type
 from dexkit.models import HandModel, model
 
 __all__ = [
     "BOTH",
+    "DQ",
+    "KD",
+    "KP",
     "LEFT",
+    "TAU",
     "Call",
     "Motors",
     "Mutant",
+    "Q",
     "changes",
+    "commands",
     "expand",
     "has_speeds",
     "mix",
@@ -57,6 +69,8 @@ BOTH = (Side.LEFT, Side.RIGHT)
 C = TypeVar("C", bound=type[Any])
 Call: TypeAlias = Callable[..., Any]
 Motors: TypeAlias = tuple[Motor, ...]
+Q, DQ, TAU, KP, KD = range(5)
+"""Rows of a command to several joints."""
 _SERVICES: Mapping[type[Any], type[Service]] = {
     ReferenceHand: ReferenceService,
     FingerHand: FingerService,
@@ -119,7 +133,7 @@ class Mutant:
         return (self.made.__doc__ or "").strip().splitlines()[0]
 
 
-@cache
+@functools.cache
 def _pins() -> Mapping[str, Sequence[str]]:
     file = Path(__file__).resolve().parents[2] / "tests" / "pinned" / "blamed.json"
     found: dict[str, list[str]] = json.loads(file.read_text(encoding="utf-8"))
@@ -145,8 +159,7 @@ _declared: list[_Declaration] = []
 
 
 def wrong_hand(
-    kills: str | tuple[str, ...],
-    *,
+    *kills: str,
     sides: tuple[Side, ...] | None = None,
     dialect: str = "",
     brief: bool = False,
@@ -157,8 +170,8 @@ def wrong_hand(
 
     Of a class of mechanics, the service with such hands becomes the wrong hand.
 
-    A second decorator on the same class is for another model, where it fails other requirements.
-    For a model that is like several of those that are named, the nearest one counts.
+    A second decorator on the same class is for another model. For a model that is like several of
+    those that are named, the nearest one counts.
 
     :param kills: the id of the requirement that must find the fault; where catalogues number it
         differently, one id for each. Requirements that are ``like`` it are meant as well.
@@ -168,14 +181,13 @@ def wrong_hand(
         but the first are brief: every phase has been applied to the fault with the first.
     :param where: the hands that can have the fault; None for all.
     """
-    ids = (kills,) if isinstance(kills, str) else kills
 
     def declare(made: type[Any]) -> type[Any]:
         service = next((_SERVICES[c] for c in made.__mro__ if c in _SERVICES), None)
         if service is not None:
             name = "hand" if issubclass(made, ReferenceHand) else "hand_fault"
             made = _class(made, service, {name: made})
-        _declared.append(_Declaration(made, ids, sides, dialect, brief, whole, where))
+        _declared.append(_Declaration(made, kills, sides, dialect, brief, whole, where))
         return made
 
     return declare
@@ -209,7 +221,29 @@ def changes(
             return function(self, getattr(super(made, self), method), *args)
 
         made = _class(function, base, {"__init__": begin, method: changed})
-        return wrong_hand(kills, **options)(made)
+        return wrong_hand(*kills, **options)(made)
+
+    return declare
+
+
+def commands(base: type[FingerHand], *kills: str, **options: Any) -> Callable[[Call], type[Any]]:
+    """Declare a function that changes the commands which a hand puts in force to be a wrong hand.
+
+    It is called with the mechanics, and with an array of q, dq, tau, kp and kd (``rows[KP]``), with
+    a number for each joint; it writes in place. For ``memory`` see :func:`changes`.
+
+    :param base: the mechanics.
+    :param kills: as of :func:`wrong_hand`; ``options`` are its others.
+    """
+
+    def declare(function: Call) -> type[Any]:
+        def take(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
+            own = rows.copy()
+            function(hand, own)
+            take(own, mode)
+
+        named = functools.update_wrapper(take, function)
+        return changes(base, "take", *kills, **options)(named)
 
     return declare
 
@@ -249,7 +283,7 @@ def reports(
 
         members = {"__init__": begin, "fields": fields, "fill": fill}
         made = _class(function, base, {**members, **({"live": live} if at_rest else {})})
-        return wrong_hand(kills, **options)(made)
+        return wrong_hand(*kills, **options)(made)
 
     return declare
 

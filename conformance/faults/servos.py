@@ -44,10 +44,7 @@ class Thousandths(ServoService):
         return tuple(1000.0 * q for q in super().positions(side))
 
 
-# with an object in one hand, the other one shows that it is held back
 @wrong_hand("BRAINCO-SIDE-01", sides=BOTH)
-@wrong_hand("DFX-SIDE-01", sides=BOTH)
-@wrong_hand("FTP-SIDE-01", sides=BOTH)
 class StatesSwapped(ServoService):
     """Publishes each side's state as the other's."""
 
@@ -436,7 +433,6 @@ class FullSpeedInContact(ServoService):
 
 
 @wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
-@wrong_hand("FTP-FORCE-01", sides=BOTH)
 class ForceZeroedInGrip(_FeelingService):
     """Sets its forces to zero half a second after it has touched."""
 
@@ -447,7 +443,6 @@ class ForceZeroedInGrip(_FeelingService):
 
 
 @wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
-@wrong_hand("FTP-FORCE-01", sides=BOTH)
 class ForceOfNextJoint(ServoService):
     """Reports each force as its neighbour's."""
 
@@ -483,7 +478,6 @@ class _BacksOff(_Feels):
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
-@wrong_hand("FTP-FORCE-05", sides=BOTH)
 class ForceBacksOff(_FeelingService):
     """Takes its goals back to a seventh of the force as soon as it touches."""
 
@@ -523,7 +517,6 @@ class ForceGivesUp(_FeelingService):
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH, whole=True)
-@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
 class WeakAfterRestart(_FeelingService):
     """Presses with a seventh of its force after a restart of the service."""
 
@@ -698,8 +691,6 @@ class SwapsForNewClients(_SwapsSome):
 
 
 @wrong_hand("BRAINCO-STILL-01", sides=BOTH, whole=True)
-@wrong_hand("DFX-STILL-01", sides=BOTH, whole=True)
-@wrong_hand("FTP-STILL-01", sides=BOTH, whole=True)
 class OldClientReturns(ServoService):
     """Obeys the earlier client's last goals on the left for a quarter of each second."""
 
@@ -749,7 +740,6 @@ class SwapsAfterRestart(_SwapsSome):
 
 
 @wrong_hand("BRAINCO-WDOG-03", whole=True)
-@wrong_hand("DFX-WDOG-03", whole=True)
 class SwapsAfterSilence(_SwapsSome):
     """Mixes two joints up in commands for three seconds after a silence."""
 
