@@ -3,9 +3,9 @@ behaviour, read into :class:`Requirement`.
 
 A ``[[requirement]]`` is written once for all hands and robots that have to meet it. ``ids`` names
 it for each of them, by the prefix of its model (:data:`PREFIXES`); the keys below, explained in
-:class:`Requirement`, are those of the first id. A table such as ``[requirement.DEX3]`` has what
-differs for that model; its tolerances are taken one by one. Ids and topics of the first model in
-the texts are turned into the other's.
+:class:`Requirement`, are those of the first id. ``DEX3.sentence`` is what differs for that model;
+tolerances are taken one by one. Ids and topics of the first model in the texts are turned into the
+other's. Keys at the head of a file are those of the requirements that do not give them.
 
 ``"DEX5-RATE-01 as DEX3"`` says that nobody knows it of that hand itself: it takes all that it does
 not give from DEX3-RATE-01, is judged by its check, and is an inference from it where it names no
@@ -14,8 +14,8 @@ names the one that it is ``like``.
 
 ``"model:X"`` takes a tolerance from the hand's model, and ``"DEX1-MOVE-04:x"`` the tolerance x of
 another requirement, so that no fact is written down twice. ``dialects`` restricts the models that
-have them. Lengths that end in ``_stroke`` are parts of the joint's full range. ``area`` at the head
-of a file is that of the requirements that give none. An id is never used again for something else.
+have them. Lengths that end in ``_stroke`` are parts of the joint's full range. An id is never used
+again for something else.
 
 All other parts take the requirements from here: checks (which read their tolerances), pytest ids,
 selection, reports and the pages of the site.
@@ -518,8 +518,9 @@ def _written() -> Mapping[str, Mapping[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for name in BEHAVIOURS:
         path = Path(__file__).parent / "behaviours" / f"{name}.toml"
-        for table in (document := read_toml(path))["requirement"]:
-            for entry in _of_table({"area": document["area"], **table}, path.name):
+        head = dict(read_toml(path))
+        for table in head.pop("requirement"):
+            for entry in _of_table({**head, **table}, path.name):
                 if entry["id"] in found or entry["area"] not in AREAS:
                     raise UsageError(f"{path.name}: {entry['id']}: its id or area is no new one")
                 found[entry["id"]] = entry
