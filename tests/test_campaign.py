@@ -190,6 +190,6 @@ def test_every_message_type_program_and_option_has_its_case() -> None:
     for kind in message_types():
         package, _, rest = kind.name.partition("::")
         assert f"fuzz:cdr.{package}.{rest.rpartition('::')[2]}" in names
-    for program in ("serve-ezgripper", "bridge", "record", "replay", "emulate-all", "conformance"):
+    for program in ("serve-ezgripper", "bridge", "record", "publish", "emulate-all", "conformance"):
         assert {f"kill:{program}", f"stop:{program}"} <= set(names)
     assert set(command_lines()) == set(_BASE)

@@ -35,8 +35,8 @@ DIFFERENT = {
         "a folder with a default, a folder that must be named, a file or an address",
     ),
     "--speed": (
-        {"bringup", "calibrate", "replay", "selftest"},
-        "rad/s, whether to measure it, a factor of time, a part of the full speed",
+        {"bringup", "calibrate", "selftest"},
+        "rad/s, whether to measure it, a part of the full speed",
     ),
     "--to": (
         {"bridge", "cut", "export", "view"},
@@ -102,7 +102,7 @@ def test_help_of_every_command_ends_with_its_exit_codes() -> None:
 
 
 COMPLETED = {
-    "dexkit re": {"record", "replay", "report"},
+    "dexkit re": {"record", "rehearse", "replay", "report"},
     "dexkit emulate dex": {"dex1-motor", "dex3-usb"},
     "dexkit check --ju": {"--junit"},
     "dexkit teleop --side l": {"left"},

@@ -43,6 +43,8 @@ _FIXED: dict[tuple[str, ...], list[str]] = {
     ("info",): [_SAMPLE],
     ("install-service",): ["sim-dex1", "--side", "left", "--user", "root", "--dry-run"],
     ("record",): ["<new>"],
+    ("publish",): [_SAMPLE],
+    ("rehearse",): [_SAMPLE],
     ("replay",): [_SAMPLE],
     ("report",): ["<result>"],
     ("selftest",): ["--external", "--dialect", "unitree_go", "--side", "left"],

@@ -26,7 +26,7 @@ _WRITERS: dict[tuple[str, ...], list[str]] = {
     ("compare",): ["<result>", "<result>"],
     ("diff",): [_SAMPLE, _SAMPLE, "--offset", "0"],
     ("info",): [_SAMPLE],
-    ("replay",): [_SAMPLE, "--rehearse"],
+    ("rehearse",): [_SAMPLE],
     ("report",): ["<result>"],
 }
 """Commands that write files by options, with what they need for it."""
@@ -93,7 +93,7 @@ def test_unwritable_output_file_of_any_option_is_an_error(
             (str(there), "No space left on device"),
             (str(tmp_path / "out"), "Is a directory"),
             (str(tmp_path / "none" / "x"), "No such file or directory"),
-        )[: 2 if name in (("check",), ("replay",)) else 4]:  # which work each time
+        )[: 2 if name in (("check",), ("rehearse",)) else 4]:  # which work each time
             with monkeypatch.context() as patch:
                 if place == str(there):
                     patch.setattr(os, "replace", full)

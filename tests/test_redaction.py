@@ -293,11 +293,11 @@ def test_command_lines_of_other_programs_are_redacted(monkeypatch: pytest.Monkey
 
 
 def test_options_on_a_page_and_the_device_of_a_result_are_redacted() -> None:
-    from dexkit.cli.replay import _options, command
+    from dexkit.cli.rehearse import _options, command
     from dexkit.conformance.backend_processes import RigOptions
 
-    context = command.make_context("replay", ["x.mcap", "--topic", URL])
-    assert _options(context) == "--topic https://***@host/a.mcap?***"
+    context = command.make_context("rehearse", ["x.mcap", "--episode", URL])
+    assert _options(context) == "--episode https://***@host/a.mcap?***"
     about: Callable[..., dict[str, str]] = RigOptions.subject.fget  # type: ignore[attr-defined]
     stand_in = type("Options", (), {"backend": "x", "devices": {"left": URL}, "objects": {}})
     assert about(stand_in) == {"backend": "x", "device": "left https://***@host/a.mcap?***"}

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.cli.replay import command
+from dexkit.cli.rehearse import command
 from dexkit.command_age import PAUSE, SETTLE
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.virtual.rehearsal import rehearse
@@ -158,7 +158,7 @@ def test_a_hand_that_moved_without_force_commanded_is_played_by_its_states(tmp_p
     taught = session(tmp_path, sorted(gripper(q, kp=0.0) + states, key=lambda row: row[1]))
     found = prepare(taught)
     assert levels(found) == {"zero-gains": "refused"}
-    assert found.cures == ["--play states"]
+    assert found.cures == ["--set play=states"]
     played = prepare(taught, ReplayOptions(states=True))
     assert not played.refused
     assert played.plan is not None
@@ -194,7 +194,7 @@ def test_session_with_high_gains_and_thin_rate_is_refused_and_corrected(tmp_path
     loud = session(tmp_path, fingers(waves, hz=30.0, kp=20.0))
     found = prepare(loud)
     assert levels(found) == {"high-gains": "refused", "thin-rate": "refused"}
-    assert found.cures == ["--gains model", "--resample 100"]
+    assert found.cures == ["--set gains=model", "--set rate=100"]
     assert all("loud motors" in f.text for f in found.findings)
     half = prepare(loud, ReplayOptions(gains="model"))
     assert levels(half) == {"high-gains": "cured", "thin-rate": "refused"}
@@ -367,7 +367,7 @@ def test_a_session_of_the_other_hand_is_recognised(tmp_path: Path) -> None:
     found = prepare(wrong)
     assert named(found)["side"].level is Level.REFUSED
     assert levels(found) == {"side": "refused"}
-    assert found.cures == ["--swap-sides"]
+    assert found.cures == ["--set swap-sides=yes"]
     again = prepare(wrong, ReplayOptions(accept=["side"], swap_sides=False))
     assert levels(again) == {"side": "accepted"}
     swapped = prepare(wrong, ReplayOptions(swap_sides=True))
@@ -397,7 +397,7 @@ def test_unsendable_commands_are_refused_or_left_out(tmp_path: Path) -> None:
         folder.mkdir()
         broken = session(folder, rows)
         found = prepare(broken)
-        assert found.cures == ["--invalid drop"], (name, found.findings)
+        assert found.cures == ["--set invalid=drop"], (name, found.findings)
         assert name in levels(found)
         cured = prepare(broken, ReplayOptions(invalid="drop"))
         assert not cured.refused, name
@@ -467,7 +467,7 @@ def test_a_session_of_states_is_refused_or_played(tmp_path: Path) -> None:
     states = session(tmp_path, rows)
     found = prepare(states)
     assert levels(found) == {"only-states": "refused"}
-    assert found.cures == ["--play states"]
+    assert found.cures == ["--set play=states"]
     played = prepare(states, ReplayOptions(states=True))
     assert not played.refused
     assert played.plan is not None
@@ -530,13 +530,13 @@ def _recorded(t: np.ndarray, q: np.ndarray) -> RecordedCommands:
 
 SHORT = {"dex1-1": GO, "dex3-1": DEX3}
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--gains model": {"gains": "model"},
-    "--jumps stretch": {"jumps": "stretch"},
-    "--limit clamp": {"limit": "clamp"},
-    "--invalid drop": {"invalid": "drop"},
-    "--play states": {"states": True},
-    "--swap-sides": {"swap_sides": True},
-    **{f"--resample {hz}": {"resample": float(hz)} for hz in (100, 200)},
+    "--set gains=model": {"gains": "model"},
+    "--set jumps=stretch": {"jumps": "stretch"},
+    "--set limit=clamp": {"limit": "clamp"},
+    "--set invalid=drop": {"invalid": "drop"},
+    "--set play=states": {"states": True},
+    "--set swap-sides=yes": {"swap_sides": True},
+    **{f"--set rate={hz}": {"resample": float(hz)} for hz in (100, 200)},
 }
 """What an option that a finding prints stands for."""
 KINDS = ("drive", "limp", "locked", "loud", "weak", "damped")
@@ -925,16 +925,16 @@ def test_every_source_that_import_knows_is_replayed(tmp_path: Path) -> None:
         (tmp_path / "parquet", ()),
         (recording, ()),
     ):
-        code, output = dexkit("replay", source, *more, "--check")
+        code, output = dexkit("rehearse", source, *more, "--check")
         assert code == 1, output
         assert "thin-rate" in output
-        assert "--resample 100" in output
-        code, output = dexkit("replay", source, *more, "--check", "--resample", 100)
+        assert "--set rate=100" in output
+        code, output = dexkit("rehearse", source, *more, "--check", "--set", "rate=100")
         assert code == 0, output
         assert "Dex3-1 hand, left, right (dex3)" in output
     page = tmp_path / "page.html"
-    cured = ("--resample", 100, "--ramp-speed", 2, "--report", page)
-    code, output = dexkit("replay", made, "--rehearse", *cured)
+    cured = ("--set", "rate=100", "--set", "ramp-speed=2", "--report", page)
+    code, output = dexkit("rehearse", made, *cured)
     assert code == 0, output
     assert "played to the end" in output
     text = page.read_text()
@@ -945,7 +945,7 @@ def test_every_source_that_import_knows_is_replayed(tmp_path: Path) -> None:
 
 def test_session_with_nominal_times_is_reported(tmp_path: Path) -> None:
     made = episode(tmp_path / "e", whole(document(30, "dex3-1")))
-    code, output = dexkit("replay", made, "--check", "--resample", 100)
+    code, output = dexkit("rehearse", made, "--check", "--set", "rate=100")
     assert (code, "nominal-time" in output) == (0, True)
     assert "30 a second" in output
 
@@ -953,7 +953,7 @@ def test_session_with_nominal_times_is_reported(tmp_path: Path) -> None:
 def test_a_refused_session_is_rehearsed_nevertheless(tmp_path: Path) -> None:
     session(tmp_path, gripper(slow_wave(), kp=0.0))
     page = tmp_path / "page.html"
-    code, output = dexkit("replay", tmp_path / "session.mcap", "--rehearse", "--report", page)
+    code, output = dexkit("rehearse", tmp_path / "session.mcap", "--report", page)
     assert code == 1
     assert "refused: zero-gains" in output
     assert "--accept zero-gains" in output
@@ -965,24 +965,24 @@ def test_options_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     session(tmp_path, gripper(slow_wave()))
     source = tmp_path / "session.mcap"
     for arguments, text in (
-        ((source, "--report", tmp_path / "x.html"), "add --rehearse"),
-        ((source, "--as-recorded", "--gains", "model"), "--gains does not apply"),
-        ((source, "--no-wait", "--resample", 100), "--resample does not apply"),
+        ((source, "--check", "--report", tmp_path / "x.html"), "leave out --check"),
+        ((source, "--set", "gains=own"), "gains=own"),
+        ((source, "--set", "gain=model"), "no setting 'gain'"),
+        ((source, "--set", "rate=100", "--set", "rate=200"), "rate is given twice"),
         ((source, "--check", "--side", "right"), "nothing to play on the right hand"),
-        ((source, "--hand", "dex9"), "no hand model"),
         ((tmp_path, "--check"), "holds no session"),
-        ((source, "--rehearse", "--report", source), "is also an"),
+        ((source, "--report", source), "is also an"),
     ):
-        code, output = dexkit("replay", *arguments)
+        code, output = dexkit("rehearse", *arguments)
         assert (code, text in output) == (2, True), output
 
 
 def test_several_sessions_need_a_choice(tmp_path: Path) -> None:
     for i in range(2):
         episode(tmp_path / "task" / f"episode_000{i}", whole(document(20, "dex3-1")))
-    code, output = dexkit("replay", tmp_path / "task", "--check")
+    code, output = dexkit("rehearse", tmp_path / "task", "--check")
     assert (code, "--episode episode_0000" in output) == (2, True)
-    code, output = dexkit("replay", tmp_path / "task", "--check", "--episode", "episode_0001")
+    code, output = dexkit("rehearse", tmp_path / "task", "--check", "--episode", "episode_0001")
     assert (code, "thin-rate" in output) == (1, True)
 
 

@@ -31,7 +31,7 @@ from tests.trace_helpers import CMD, CMD_TYPE, mcap_bytes, write
 
 GO = dialect("unitree_go")
 WAVE = np.linspace(2.0, 4.0, 100)
-PATIENT = ("--max-silence", PATIENCE)
+PATIENT = ("--set", f"max-silence={PATIENCE}")
 """States may come late on a busy machine."""
 
 
@@ -103,7 +103,7 @@ def test_a_session_is_played_on_a_served_hand(
     hand = Watched()
     with served(hand) as domain:
         code, output = dexkit(
-            "replay", clip(tmp_path), "--domain", domain, "--ramp-speed", 2, *PATIENT
+            "replay", clip(tmp_path), "--domain", domain, "--set", "ramp-speed=2", *PATIENT
         )
     assert code == 0, output
     assert "played 0.5 s" in output
@@ -138,7 +138,7 @@ def test_a_subscriber_without_states_is_no_hand(tmp_path: Path) -> None:
         code, output = dexkit("replay", clip(tmp_path), "--domain", domain, "--wait", 0.4)
     assert code == 1
     assert "no usable state of the left hand" in output
-    assert "--as-recorded" in output
+    assert "dexkit publish" in output
 
 
 def test_replay_gives_way_to_another_client_without_a_last_command() -> None:

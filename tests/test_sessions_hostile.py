@@ -162,7 +162,7 @@ def test_hostile_record_of_an_import_is_refused(
         assert (code, "a.mcap: refused" in output) == (1, True), output
         assert (tmp_path / form).is_dir()
     if key in ("rate_hz", "first_ns", "clock"):
-        assert dexkit("replay", path, "--check")[0] == 2
+        assert dexkit("rehearse", path, "--check")[0] == 2
 
 
 @each("value", ['{"goal": 1e400}', '{"goal": "\\ud800"}'])

@@ -318,11 +318,11 @@ def test_service_that_discovers_an_earlier_one_late_brakes_and_ends() -> None:
             assert served.failure is None  # the vendor's came later: only logged
 
 
-def test_replay_gives_way_to_a_new_publisher() -> None:
+def test_publish_gives_way_to_a_new_publisher() -> None:
     domain = free_domain()
     topic = GO.topics(Side.LEFT)[0]
-    arguments = ("--no-wait", "--loop", "--domain", domain)
-    with running("replay", sample_path("dex1_pick_place"), *arguments) as replay:
+    arguments = ("--wait", 0, "--loop", "--domain", domain)
+    with running("publish", sample_path("dex1_pick_place"), *arguments) as replay:
         stdout = replay._popen.stdout
         assert stdout is not None
         assert any(line.startswith("ready:") for line in stdout)

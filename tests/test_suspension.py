@@ -183,7 +183,7 @@ def test_recording_played_as_it_is_ends_after_a_suspension_without_a_terminal(
     monkeypatch.setattr("dexkit.traces.player.RealClock", Sleeping)
     domain = free_domain()
     with DdsNode(domain) as node, node.reader(CMD, CMD_TYPE):
-        code, output = dexkit("replay", clip(tmp_path), "--as-recorded", "--domain", domain)
+        code, output = dexkit("publish", clip(tmp_path), "--domain", domain)
     assert code == 1, output
     assert "has no terminal to ask" in output
 

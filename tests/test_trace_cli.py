@@ -131,7 +131,7 @@ def test_a_replayed_session_is_recorded_as_it_was(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     options = ("--domain", domain)
     with running("record", out, "--topic", "/dex1/left/cmd", "--topic", RIGHT, *options) as rec:
-        done = run("replay", clip, "--as-recorded", *options)
+        done = run("publish", clip, *options)
         assert done.returncode == 0, done.stderr
         stdout, stderr = interrupt(rec)
         assert rec.returncode == 0, stderr
@@ -227,32 +227,32 @@ def test_record_on_no_such_interface(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_replay_names_the_topics_that_nobody_subscribes() -> None:
-    done = run("replay", sample_path("dex1_pick_place"), "--wait", "0.3", "--domain", free_domain())
+def test_publish_names_the_topics_that_nobody_subscribes() -> None:
+    done = run("publish", sample_path("dex1_pick_place"), "--wait", 0.3, "--domain", free_domain())
     assert done.returncode == 1
     assert f"no process subscribes to {CMD}, {RIGHT}" in done.stderr
     assert "dexkit serve" in done.stderr
 
 
-def test_replay_refuses_other_publishers_on_its_topics() -> None:
+def test_publish_refuses_other_publishers_on_its_topics() -> None:
     from dexkit.dds import DdsNode
 
     domain = free_domain()
     sample = sample_path("dex1_pick_place")
     with DdsNode(domain) as node:
         node.writer(RIGHT, CMD_TYPE)
-        refused = run("replay", sample, "--no-wait", "--domain", domain)
+        refused = run("publish", sample, "--wait", 0, "--domain", domain)
         assert refused.returncode == 1
         assert f"already publishes {RIGHT} on domain {domain}" in refused.stderr
-        forced = run("replay", sample, "--no-wait", "--force", "--speed", "40", "--domain", domain)
+        forced = run("publish", sample, "--wait", 0, "--force", "--pace", 40, "--domain", domain)
     assert forced.returncode == 0, forced.stderr
     assert "sent 8052 messages" in forced.stdout
 
 
 @pytest.mark.parametrize(("options", "code"), [((), 130), (("--loop",), 0)])
-def test_an_interrupted_replay_ends_cleanly(options: tuple[str, ...], code: int) -> None:
+def test_an_interrupted_publisher_ends_cleanly(options: tuple[str, ...], code: int) -> None:
     with running(
-        "replay", sample_path("dex1_pick_place"), "--no-wait", *options, "--domain", free_domain()
+        "publish", sample_path("dex1_pick_place"), "--wait", 0, *options, "--domain", free_domain()
     ) as process:
         stdout, stderr = interrupt(process)
     assert process.returncode == code
@@ -260,8 +260,8 @@ def test_an_interrupted_replay_ends_cleanly(options: tuple[str, ...], code: int)
     assert stderr == ""
 
 
-def test_replay_refuses_a_type_it_does_not_know(tmp_path: Path) -> None:
+def test_publish_refuses_a_type_it_does_not_know(tmp_path: Path) -> None:
     data = mcap_bytes(rows(4), schema_text="uint8 other\n", schema_name="other_msgs/msg/Thing")
-    done = run("replay", write(tmp_path / "a.mcap", data), "--no-wait", "--domain", free_domain())
+    done = run("publish", write(tmp_path / "a.mcap", data), "--wait", 0, "--domain", free_domain())
     assert done.returncode == 2
     assert "does not know the type" in done.stderr

@@ -266,7 +266,7 @@ def test_a_damaged_session_is_not_repeated(tmp_path: Path) -> None:
         CommandSession.load(hurt_sample(tmp_path))
 
 
-def test_replay_of_a_damaged_recording_sends_the_rest_and_warns(
+def test_publishing_a_damaged_recording_sends_the_rest_and_warns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = [(CMD, T0 + i * 1_000_000, T0, cmd(0.1 * i)) for i in range(40)]
@@ -274,7 +274,7 @@ def test_replay_of_a_damaged_recording_sends_the_rest_and_warns(
     data[places(bytes(data), 6)[1] + 60] ^= 0x10
     path = write(tmp_path / "a.mcap", bytes(data))
     domain = free_domain()
-    assert exit_code("replay", path, "--domain", domain, "--no-wait", "--force") == 1
+    assert exit_code("publish", path, "--domain", domain, "--wait", 0, "--force") == 1
     out, err = capsys.readouterr()
     assert "sent 3" in out or "sent 2" in out
     assert "its checksum does not match" in err

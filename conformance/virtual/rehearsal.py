@@ -160,7 +160,7 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
     if plan.duration > _LONGEST:
         raise UsageError(
             f"the session takes {plan.duration:,.0f} s, too long to be rehearsed",
-            hint="shorten pauses with --max-gap S, or cut the session: dexkit cut",
+            hint="shorten pauses with --set max-gap=S, or cut the session: dexkit cut",
         )
     machine = ReplayMachine(plan, Guards(**{**vars(guards), "loop": False}))
     spoken: Dialect = plan.dialect
@@ -176,7 +176,7 @@ def rehearse(plan: Plan, guards: Guards = _DEFAULT) -> Rehearsal:
         if now > plan.duration + _LONGEST:
             raise UsageError(
                 f"the hand is not where the session begins after {_LONGEST:,.0f} s",
-                hint="--ramp-speed RAD/S says how fast it goes there",
+                hint="--set ramp-speed=RAD/S says how fast it goes there",
             )
         for sample in service.advance(service.tick):
             if sample.topic not in topics:

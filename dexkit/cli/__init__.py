@@ -37,7 +37,9 @@ _SECTIONS: Sections = {
     },
     "Sessions": {
         "record": ("dexkit.cli.record", "Record DDS topics to an mcap file."),
-        "replay": ("dexkit.cli.replay", "Publish the commands of a recording."),
+        "rehearse": ("dexkit.cli.rehearse", "Check a session, and play it on emulated hands."),
+        "replay": ("dexkit.cli.replay", "Play a session on hands, checked and supervised."),
+        "publish": ("dexkit.cli.publish", "Publish the messages of a recording as they are."),
         "info": ("dexkit.cli.info", "Show the topics, rates and damage of a recording."),
         "cut": ("dexkit.cli.cut", "Write a part of a recording."),
         "merge": ("dexkit.cli.merge", "Write several recordings as one."),

@@ -33,6 +33,7 @@ __all__ = [
     "domain_option",
     "dry_run_option",
     "duration_option",
+    "episode_option",
     "force_option",
     "found_interface",
     "grade_option",
@@ -47,12 +48,14 @@ __all__ = [
     "junit_option",
     "level_option",
     "list_option",
+    "loop_option",
     "markdown_option",
     "network_options",
     "one_side_option",
     "out_option",
     "output_option",
     "overwrite_option",
+    "pace_option",
     "peer_addresses",
     "port_option",
     "prefix_option",
@@ -379,13 +382,7 @@ def session_options() -> Callable[[F], F]:
             type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
             help="The format of SOURCE.  [default: detected by its files]",
         ),
-        click.option(
-            "--episode",
-            "chosen",
-            multiple=True,
-            metavar="NAME",
-            help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
-        ),
+        episode_option(),
         click.option(
             "--rate",
             type=Number(min=0.1, max=2000),
@@ -407,6 +404,33 @@ def session_options() -> Callable[[F], F]:
         return function
 
     return decorate
+
+
+def episode_option() -> Callable[[F], F]:
+    """``--episode``, repeated, as ``chosen``."""
+    return click.option(
+        "--episode",
+        "chosen",
+        multiple=True,
+        metavar="NAME",
+        help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
+    )
+
+
+def pace_option(more: str = "") -> Callable[[F], F]:
+    """``--pace``: a factor of time."""
+    return click.option(
+        "--pace",
+        type=Number(1e-3, 1e3),
+        default=1.0,
+        show_default=True,
+        help=f"0.5 plays in twice the time. {more}".rstrip(),
+    )
+
+
+def loop_option() -> Callable[[F], F]:
+    """``--loop``."""
+    return click.option("--loop", is_flag=True, help="Start over at the end, until Ctrl-C.")
 
 
 # ------------------------------------------------------------------------------ conformance

@@ -55,10 +55,15 @@ class Setting:
 class Settings(dict[str, Any]):
     """The value of every setting by its key.
 
-    :ivar given: the keys that were named on the command line.
+    :ivar texts: what was given on the command line.
     """
 
-    given: frozenset[str] = frozenset()
+    texts: tuple[str, ...] = ()
+
+    @property
+    def given(self) -> set[str]:
+        """The keys that were named."""
+        return {key_and_value(text)[0] for text in self.texts}
 
 
 class SettingsOption(click.Option):
@@ -83,7 +88,7 @@ class SettingsOption(click.Option):
                 )
             if key in values.given:
                 raise UsageError(f"{key} is given twice")
-            values.given |= {key}
+            values.texts += (text,)
             try:
                 values[key] = known[key].type.convert(value, parameter, ctx)
             except click.BadParameter as error:

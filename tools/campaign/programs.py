@@ -373,9 +373,9 @@ def specs() -> list[Spec]:
             after=_readable,
         ),
         Spec(
-            "replay",
+            "publish",
             lambda s: [
-                "dexkit", "replay", _sample(), "--loop", "--no-wait", "--domain", s.domain,
+                "dexkit", "publish", _sample(), "--loop", "--wait", "0", "--domain", s.domain,
                 "--topic", source.topics(SIDE)[0],
             ],
             _nothing,

@@ -18,7 +18,7 @@ from dexkit.temporary_folder import TemporaryFolder
 from dexkit.topics import Role, roles
 from dexkit.traces.names import SESSION
 from dexkit.traces.reader import SampleArray, Trace, open_trace
-from dexkit.traces.sessions.episodes import DATA, DEFAULT, Options
+from dexkit.traces.sessions.episodes import DATA, DEFAULT
 from dexkit.traces.sessions.imported import NOMINAL, import_record
 from dexkit.traces.sessions.sources import choose, find
 from dexkit.traces.sessions.streams import COMMAND, HAND, Stream, streams_of
@@ -97,30 +97,24 @@ class RecordedCommands:
             has = f"; it has: {', '.join(self.others)}" if self.others else ""
             raise SessionError(
                 f"{self.name} has no commands to a hand that dexkit knows{has}",
-                hint="--as-recorded publishes the command topics of a recording as they are"
+                hint="'dexkit publish' publishes the command topics of a recording as they are"
                 if self.form == "recording"
-                else "--hand states the hands' model",
+                else "'dexkit import --hand MODEL' states the hands' model",
             )
         return model(self.dialect.model)
 
 
-def read_session(
-    source: Path,
-    form: str | None = None,
-    chosen: Sequence[str] = (),
-    options: Options = DEFAULT,
-) -> RecordedCommands:
+def read_session(source: Path, chosen: Sequence[str] = ()) -> RecordedCommands:
     """The commands in a recording, or in a session of any format that ``dexkit import`` reads.
 
-    :param form: of the source, as for :func:`~dexkit.traces.sessions.sources.find`.
     :param chosen: the session's name, where the source has several.
     :raises SessionError: there is no session, or it cannot be read.
     :raises UsageError: the source has several sessions, or none of that name.
     :raises TraceError: the recording cannot be read.
     """
-    if form is None and not chosen and _is_recording(source):
+    if not chosen and _is_recording(source):
         return read_trace(open_trace(source), source.name)
-    (entry,) = choose(source, find(source, form, options), chosen, one=True)
+    (entry,) = choose(source, find(source, None, DEFAULT), chosen, one=True)
     with TemporaryFolder("replay") as folder:
         path = folder / "session.mcap"
         report = entry.convert(path, False, False)

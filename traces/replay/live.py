@@ -97,7 +97,8 @@ class LiveReplay:
                 s for s, topic in HandStateCodec(d).topics.items() if (topic, d.state_type) in seen
             ]
             if sides and d == spoken:
-                return f"there is the {' and '.join(map(str, sides))} hand: --side, --swap-sides"
+                there = " and ".join(map(str, sides))
+                return f"there is the {there} hand: --side, --set swap-sides=yes"
             if sides:
                 same = d.model == spoken.model
                 return f"there is a hand of the dialect {d.name}" + (
@@ -105,7 +106,7 @@ class LiveReplay:
                 )
         return (
             "start the hand first ('dexkit serve'), check --domain and --interface; "
-            "--as-recorded publishes without a hand"
+            "'dexkit publish' publishes without a hand"
         )
 
     def wait_ready(

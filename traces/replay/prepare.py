@@ -353,7 +353,7 @@ class _Preparation:
                 "nominal-time",
                 f"the source has no usable times: frames are played at {session.nominal_rate:g} a "
                 "second, which is what was asked for when it was recorded, not what was measured",
-                advice="--rate HZ states another rate, --pace 0.5 plays it slower",
+                advice="'dexkit import --rate HZ' states another rate, --pace 0.5 plays it slower",
             )
         if session.others and session.dialect is not None:
             self.note("not-played", ", ".join(session.others))
@@ -379,7 +379,7 @@ class _Preparation:
                 "the session has positions of hands and no commands"
                 if not commands
                 else "its positions are played instead of its commands",
-                "--play states",
+                "--set play=states",
                 cured=options.states,
             )
             commands = {s: _from_states(t, q, self.model) for s, (t, q) in session.states.items()}
@@ -392,7 +392,7 @@ class _Preparation:
             raise UsageError(
                 f"{session.name} has nothing to play on the {' and '.join(missing)} hand",
                 hint=f"it has the {' and '.join(map(str, commands)) or 'no'} hand: --side, or "
-                "--swap-sides to play it on the other one",
+                "--set swap-sides=yes to play it on the other one",
             )
         return {s: commands[s] for s in Side if s in sides}
 
@@ -406,7 +406,7 @@ class _Preparation:
         stale = ~odd & ~broken & (given.late > PAUSE)
         drop = self.options.invalid == "drop"
         out = odd | broken | given.backwards
-        option = "--invalid drop"
+        option = "--set invalid=drop"
         if odd.all() and len(given):
             self.refuse(
                 "joints",
@@ -482,10 +482,10 @@ class _Preparation:
             "side",
             f"{mine:.0%} of the commands are outside the limits of the {side} hand, and "
             f"within those of the {other} one",
-            "" if self.options.swap_sides else "--swap-sides",
+            "" if self.options.swap_sides else "--set swap-sides=yes",
             cured=False,
             where=str(side),
-            advice="leave out --swap-sides" if self.options.swap_sides else "",
+            advice="leave out swap-sides=yes" if self.options.swap_sides else "",
         )
         return True
 
@@ -495,7 +495,7 @@ class _Preparation:
         return float(outside.any(axis=1).mean())
 
     def _gains(self, side: Side, track: Track) -> Track:
-        """Check kp, kd and mode; with ``--gains model`` lower the gains to those of its client.
+        """Check kp, kd and mode; with ``gains=model`` lower the gains to those of its client.
 
         A command without force gets none, whatever the options: the recorded hand did not obey it.
         """
@@ -526,7 +526,7 @@ class _Preparation:
                 "high-gains",
                 f"loud motors: {' and '.join(ranges)} for {limits.names[j]}, where the model's "
                 f"client sends {kp[j]:g} and {kd[j]:g}",
-                "--gains model",
+                "--set gains=model",
                 cured=lowered,
                 where=str(side),
             )
@@ -551,7 +551,7 @@ class _Preparation:
             rows = idle & dead
             if not rows.any():
                 continue
-            option = "--gains model" if bare else self._states_move(side)
+            option = "--set gains=model" if bare else self._states_move(side)
             self.judge(
                 name,
                 f"no motion: {what} {_joints(limits, rows)} in "
@@ -589,7 +589,7 @@ class _Preparation:
         if not len(q):
             return ""
         way = np.ptp(q, axis=0) > _MOVES * joint_limits(self.recorded, side).stroke
-        return "--play states" if way.any() else ""
+        return "--set play=states" if way.any() else ""
 
     def _limits(self, side: Side, track: Track) -> Track:
         """Check position, feed-forward velocity and torque."""
@@ -625,7 +625,7 @@ class _Preparation:
                     if name == "q"
                     else f"{high[j]:.3g}"
                 ),
-                "--limit clamp",
+                "--set limit=clamp",
                 cured=clamp,
                 where=str(side),
             )
@@ -672,7 +672,7 @@ class _Preparation:
             "gaps",
             f"{len(gaps)} pauses of up to {dt[gaps].max():.2f} s; the pose is held in them",
             str(side),
-            advice="--max-gap S shortens them",
+            advice="--set max-gap=S shortens them",
         )
         return _inserted(track, gaps + 1, track.t[gaps + 1] - track.period, gaps)
 
@@ -698,7 +698,7 @@ class _Preparation:
             f"{_places(over)}: {limits.names[j]} by {way:.2f} {limits.unit} in "
             f"{window * 1e3:.0f} ms at "
             f"{track.t[i]:.2f} s, at most {limits.dq[j]:.3g} {limits.unit}/s",
-            "--jumps stretch",
+            "--set jumps=stretch",
             cured=self.options.jumps == "stretch",
             where=str(side),
         )
@@ -752,7 +752,7 @@ class _Preparation:
             f"{self.model.command_rate:g}; steps of up to {steps[i, j]:.3f} {self.model.unit} at "
             f"kp {track.kp[i + 1, j]:g} are torque steps of {torque[i, j]:.2f} "
             f"{self.model.torque_unit}",
-            f"--resample {self.model.command_rate:g}",
+            f"--set rate={self.model.command_rate:g}",
             cured=wished >= least,
             where=str(side),
         )
@@ -851,7 +851,7 @@ def _resampled(track: Track, rate: float) -> Track:
     if count > _MOST:
         raise UsageError(
             f"{rate:g} commands a second are {count:,} in all, more than {_MOST:,}",
-            hint="shorten pauses with --max-gap S, or cut the session: dexkit cut",
+            hint="shorten pauses with --set max-gap=S, or cut the session: dexkit cut",
         )
     times = np.append(track.t[0] + np.arange(count + 1) / rate, track.t[-1])
     return _at_times(track, np.unique(times))

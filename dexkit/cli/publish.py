@@ -1,4 +1,4 @@
-"""``dexkit replay --as-recorded``: publish the payloads of a recording with their timing."""
+"""``dexkit publish``: publish the payloads of a recording as they are, with their timing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dexkit.cli.command_help import Command
 from dexkit.cli.consent import Consent
+from dexkit.cli.options import (
+    FILE,
+    Number,
+    dds_options,
+    force_option,
+    loop_option,
+    pace_option,
+    topic_option,
+    wait_option,
+)
 from dexkit.cli.stop_keys import keys
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
@@ -27,7 +38,7 @@ if TYPE_CHECKING:
     from dexkit.dds import DdsNode, Writer
     from dexkit.traces import Player, Trace, TraceMessage
 
-__all__ = ["play_as_recorded"]
+__all__ = ["command"]
 
 # Seconds from a match seen here to the first message, for the other side to see it too: what comes
 # before is lost to it. Unitree's SDK sleeps as long after making a writer
@@ -37,29 +48,54 @@ _SETTLE = 0.2
 _LINGER = 0.1
 
 
-def play_as_recorded(
+@click.command(
+    "publish",
+    cls=Command,
+    exit_codes={
+        0: "published, or a loop was stopped",
+        1: "the recording is damaged, suspended without a terminal, or the topics are not free",
+        2: "it cannot be read or published",
+        130: "stopped",
+    },
+)
+@click.argument("file", type=FILE, metavar="IN.mcap")
+@topic_option("Publish", "those that end in /cmd")
+@pace_option()
+@loop_option()
+@click.option(
+    "--max-gap",
+    type=Number(min=0, min_open=True),
+    metavar="S",
+    help="Shorten longer pauses to S seconds.  [default: keep them]",
+)
+@dds_options()
+@wait_option("Wait up to S seconds for a subscriber of each topic; 0 starts at once.")
+@force_option()
+def command(
     file: Path,
-    *,
-    speed: float,
-    loop: bool,
     topics: tuple[str, ...],
+    pace: float,
+    loop: bool,
     max_gap: float | None,
     domain: int,
     interface: str,
     wait: float,
-    no_wait: bool,
     force: bool,
 ) -> int:
-    """Publish the payloads of a recording as they are, with their timing; the exit code.
+    """Publish the messages of a recording as they are, with their timing.
 
-    :raises DexkitError: it cannot be read or published.
+    Nothing is checked, there is no ramp and no supervision: 'dexkit replay' plays a session on a
+    hand with care. The default domain is 1, the simulation's.
+
+    If this program was suspended for more than a second, it asks before it goes on; without a
+    terminal it ends.
     """
     from dexkit.dds import DdsNode
     from dexkit.traces import Player, open_trace
 
     trace = open_trace(file)
     try:
-        player = Player(trace, topics or None, speed=speed, loop=loop, max_gap=max_gap)
+        player = Player(trace, topics or None, speed=pace, loop=loop, max_gap=max_gap)
     finally:  # more may be found while the messages are read
         for warning in trace.warnings:
             click.echo(one_line(f"warning: {warning}", REMARK), err=True)
@@ -88,7 +124,7 @@ def play_as_recorded(
             for topic, name in player.topics.items()
         }
         sole.settle()
-        if not no_wait:
+        if wait:
             _wait_for_readers(node, writers, wait, stop, consent)
             stop.wait(_SETTLE)
         if stop:
@@ -171,8 +207,8 @@ def _wait_for_readers(
             f"no process subscribes to {', '.join(missing)} on domain {node.domain}, "
             f"{node.interface} (waited {patience:g} s)",
             hint=elsewhere_hint(node)
-            or "start the hand first ('dexkit serve'), check --domain and --interface, or play "
-            "anyway with --no-wait",
+            or "start the hand first ('dexkit serve'), check --domain and --interface, or publish "
+            "anyway with --wait 0",
         )
 
 
