@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from dexkit import __version__, documents
 from dexkit.conformance.selftest.joint_motion import Series
 from dexkit.conformance.selftest.procedure import ElementFound, JointFound, Procedure
 from dexkit.conformance.selftest.supervision import End, SelfTest
 
 __all__ = [
     "FIGURES",
-    "FORMAT",
-    "SCHEMA",
-    "VERSION",
     "Condition",
     "ElementResponse",
     "ElementResult",
@@ -33,9 +26,6 @@ __all__ = [
     "result_of",
 ]
 
-FORMAT = "dexkit-selftest"
-VERSION = 1
-SCHEMA = "selftest.schema.json"
 FIGURES = {"range": "range", "speed+": "speed, q rising", "speed-": "speed, q falling"}
 """Figures of a joint by name, with their titles. More is better."""
 _RANGE = 0.95  # part of the stroke
@@ -170,61 +160,6 @@ class SelfTestResult:
         if self.ended is not End.DONE or self.spoiled or not measured or untouched:
             return Verdict.INCOMPLETE
         return Verdict.GOOD
-
-    def as_dict(self) -> dict[str, Any]:
-        """The document of the file."""
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "verdict": str(self.verdict),
-            "hand": dict(self.hand),
-            "options": dict(self.options),
-            "recorded_at": self.recorded_at,
-            "duration_s": round(self.duration_s, 3),
-            "ended": str(self.ended),
-            "reason": self.reason,
-            "touched": self.touched,
-            "spoiled": self.spoiled,
-            "paused": self.paused,
-            "dexkit": __version__,
-            "joints": [_joint_dict(j) for j in self.joints],
-            "elements": [_element_dict(e) for e in self.elements],
-        }
-
-    def write_json(self, path: Path) -> None:
-        """Write the file."""
-        text = json.dumps(self.as_dict(), ensure_ascii=False, allow_nan=False)
-        documents.write_file(path, text + "\n")
-
-
-def _number(value: float) -> float | None:
-    return float(f"{value:.7g}") if math.isfinite(value) else None
-
-
-def _joint_dict(joint: JointResult) -> dict[str, Any]:
-    return {
-        "name": joint.name,
-        "condition": str(joint.condition),
-        "moves": list(joint.moves),
-        "faulty": joint.faulty,
-        "figures": {
-            f.name: {"value": _number(f.value), "least": _number(f.least), "good": f.good}
-            for f in joint.figures
-        },
-        "notes": list(joint.notes),
-    }
-
-
-def _element_dict(element: ElementResult) -> dict[str, Any]:
-    return {
-        "packet": element.packet,
-        "slot": element.slot,
-        "place": element.place,
-        "touch": str(element.touch),
-        "rest": _number(element.rest),
-        "noise": _number(element.noise),
-        "peak": _number(element.peak),
-    }
 
 
 def result_of(

@@ -302,9 +302,10 @@ def _finish(result: SelfTestResult, json_path: Path, page: Path) -> int:
     """Write and print the result; returns the exit code."""
     from dexkit.conformance.report.selftest import print_selftest, render_selftest
     from dexkit.conformance.selftest.result import Verdict
+    from dexkit.conformance.selftest.result_file import write_json
     from dexkit.documents import write_file
 
-    result.write_json(json_path)
+    write_json(result, json_path)
     write_file(page, render_selftest(result))
     print_selftest(result)
     click.echo(f"result: {json_path}")

@@ -18,7 +18,7 @@ in build/docs and on the site
 -------------------------------------------------------------------------------------------------
 in build/docs
 -------------------------------------------------------------------------------------------------
-:mod:`~.record_schemas`        result.schema.json: the form of the result file
+:mod:`~.record_schemas`        *.schema.json: the forms of result and self-test
 =============================  ==================================================================
 
 What is in the repository is the function ``files()`` of a module: content by path.

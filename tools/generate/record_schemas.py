@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 
 from dexkit.conformance.result_file import ResultFile
+from dexkit.conformance.selftest.result_file import SelfTestFile
 from dexkit.records import json_schema
 
 __all__ = ["files"]
 
-_FORMS = {"result.schema.json": ResultFile}
+_FORMS = {"result.schema.json": ResultFile, "selftest.schema.json": SelfTestFile}
 
 
 def files() -> dict[str, str]:
