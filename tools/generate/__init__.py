@@ -5,7 +5,6 @@ in the repository
 -------------------------------------------------------------------------------------------------
 :mod:`~.message_modules`       dexkit/messages/unitree_*.py, from dexkit/messages/idl/*.idl
 :mod:`~.models_page`           docs/images/model-*.svg, from the model profiles
-:mod:`~.dex3_protocol_page`    the tables of docs/dex3-protocol.md, from the USB codec
 :mod:`~.real_hands_page`       docs/sources/real-hands.md, from real_hands.toml
 :mod:`~.layouts`               docs/layouts, for Foxglove and PlotJuggler, from the model profiles
 in build/docs and on the site
@@ -46,7 +45,6 @@ def generated_files() -> dict[Path, str]:
     """Content of every generated file of the repository, by path."""
     # the generators import ROOT and DOCS from here
     from tools.generate import (
-        dex3_protocol_page,
         layouts,
         message_modules,
         models_page,
@@ -56,7 +54,6 @@ def generated_files() -> dict[Path, str]:
     return {
         **message_modules.files(),
         **models_page.files(),
-        **dex3_protocol_page.files(),
         **real_hands_page.files(),
         **layouts.files(),
     }

@@ -1,5 +1,4 @@
-"""The Dex3-1's USB structures as data, from which struct formats, offsets and docs/dex3-protocol.md
-are derived.
+"""The Dex3-1's USB structures as data, from which struct formats and offsets are derived.
 
 All structures are little-endian and packed to one byte (the Dex3-1 manual "Introduction to Send and
 Receive Structures"; docs/sources/unitree-dex.md#c).
