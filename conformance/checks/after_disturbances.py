@@ -213,7 +213,7 @@ def in_force(ctx: Context) -> Figures:
 def _arrives(ctx: Context, at: float, way: float) -> bool:
     """Whether the last command before a time has a position that is nearer than so far, rad."""
     row = int(np.searchsorted(ctx.commands.t, at, "right")) - 1
-    here = ctx.states.q[ctx.states.between(at - 0.05, at), 0]
+    here = ctx.q(at - 0.05, at)[:, 0]
     if not ctx.commands.kp[row, 0] > 0 or not len(here):
         return False
     return abs(float(ctx.commands.q[row, 0]) - median(here)) < way

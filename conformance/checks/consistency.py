@@ -15,8 +15,10 @@ from functools import cached_property
 
 import numpy as np
 
-from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks import Context, check
+from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.excess import Course
+from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.median import median
 from dexkit.conformance.provenance import TIMES
 from dexkit.conformance.row_selection import Rows, SomeTimes, Times, finite_rows
@@ -144,13 +146,12 @@ def _reported_speed(ctx: Context, joint: int) -> float | None:
 
 
 @check("DEX1-FIELD-15", "DEX3-FIELD-15", rests_on=(TIMES,))
-def jumps(ctx: Context) -> Outcome:
+@worst("change_rad", "max_change_rad", nothing="too few states with a position")
+def jumps(ctx: Context) -> Figures:
     """The largest change of q between two states, relative to the speed limit."""
-    states = ctx.states
-    worst: tuple[float, float, float, int, float, float] | None = None
     for joint in range(len(ctx.joints)):
         good = ctx.known_states(joint, "q")
-        t, q = states.clock[good], states.q[good, joint]
+        t, q = ctx.states.clock[good], ctx.states.q[good, joint]
         if len(t) < _FEW:
             continue
         speed = _fastest(ctx, joint)
@@ -158,32 +159,14 @@ def jumps(ctx: Context) -> Outcome:
         # RATE-03 judges gaps; the motion within a long one is unknown
         near = gaps <= ctx.tolerance("max_gap_s")
         allowed = speed * (gaps + ctx.tolerance("max_hold_s")) + ctx.tolerance("counts_rad")
-        part = np.where(near, change / allowed, 0.0)
-        i = int(np.argmax(part))
-        found = (float(part[i]), float(change[i]), float(allowed[i]), joint, float(t[i]), speed)
-        if worst is None or found > worst:
-            worst = found
-    if worst is None:
-        return ctx.skipped("too few states with a position")
-    _, change_rad, limit, joint, at, speed = worst
-    text = ctx.named(
-        f"q changes by at most {change_rad:.3f} {ctx.unit} from one state to the next; at the "
-        "hand's "
-        f"fastest, {speed:.1f} {ctx.unit}/s, it may change by {limit:.2f} {ctx.unit}",
-        joint,
-    )
-    if change_rad <= limit:
-        return ctx.passed(f"{change_rad:.3f} {ctx.unit}", text, change_rad=change_rad).placed(
-            change_rad, limit
+        i = int(np.argmax(np.where(near, change / allowed, 0.0)))
+        far, limit, at = float(change[i]), float(allowed[i]), float(t[i])
+        text = (
+            f"q changes by at most {far:.3f} {ctx.unit} from one state to the next; at the hand's "
+            f"fastest, {speed:.1f} {ctx.unit}/s, it may change by {limit:.2f} {ctx.unit}"
         )
-    outcome = ctx.failed(
-        f"{change_rad:.2f} {ctx.unit}",
-        text,
-        ctx.at(states.topic, at - 0.05, at + 0.05),
-        change_rad=change_rad,
-    )
-    late = (change_rad - limit) / speed
-    return outcome.about(joint).placed(change_rad, limit).if_late(late)
+        late = (far - limit) / speed
+        yield Figure(far, at - 0.05, at + 0.05, joint, text, limit=limit, late=late)
 
 
 FOUGHT_OVER = (
@@ -215,14 +198,13 @@ _SPREADS = 4.0
 
 
 @check("DEX1-FRESH-03", "DEX3-FRESH-03", rests_on=(TIMES,))
-def alternates(ctx: Context) -> Outcome:
+@worst("turns", "max_turns", nothing="too few states with a position")
+def alternates(ctx: Context) -> Figures:
     """Number of cells with a reversal of q, in the worst window."""
-    cell, count = (
-        ctx.tolerance("cell_s"),
-        round(ctx.tolerance("window_s") / ctx.tolerance("cell_s")),
-    )
+    cell = ctx.tolerance("cell_s")
+    count = round(ctx.tolerance("window_s") / cell)
+    window = count * cell
     fought = [ctx.span(p) for n in FOUGHT_OVER for p in ctx.phases(n)]
-    worst: tuple[int, float, int, float] | None = None
     for joint in range(len(ctx.joints)):
         good = ctx.known_states(joint, "q")
         t, q = ctx.states.t[good], ctx.states.q[:, joint][good]
@@ -253,24 +235,14 @@ def alternates(ctx: Context) -> Outcome:
         noise = min(_noise(*ways, 2 * even), most_noise)
         often = np.convolve(back >= limit + noise, np.ones(count), "valid")
         i = int(np.argmax(often))
-        found = (int(often[i]), float(back[i : i + count].max()), joint, float(t[0]) + i * cell)
-        worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.skipped("too few states with a position")
-    turns, back_rad, joint, at = worst
-    window = count * cell
-    text = ctx.named(
-        f"in the worst {window:.2g} s q goes forth and back within {cell:g} s {turns} times, by up "
-        f"to {back_rad:.3f} {ctx.unit}",
-        joint,
-    )
-    if turns <= ctx.tolerance("max_turns"):
-        return ctx.passed(f"{turns} times", text, turns=turns)
-    outcome = ctx.failed(
-        f"{turns} times", text, ctx.at(ctx.states.topic, at, at + window), turns=turns
-    )
-    # a delay does not reorder states
-    return outcome.about(joint).if_late(math.inf)
+        turns, at = int(often[i]), float(t[0]) + i * cell
+        text = (
+            f"in the worst {window:.2g} s q goes forth and back within {cell:g} s {turns} times, "
+            f"by up to {back[i : i + count].max():.3f} {ctx.unit}"
+        )
+        # a delay does not reorder states
+        shown = f"{turns} times"
+        yield Figure(turns, at, at + window, joint, text, shown=shown, late=math.inf)
 
 
 def filled(ctx: Context) -> bool:
@@ -287,35 +259,31 @@ def filled(ctx: Context) -> bool:
         "dq",
     ),
 )
-def slope(ctx: Context) -> Outcome:
+@worst("relative_rms", "max_relative_rms", nothing="the hand hardly moves in this recording")
+def slope(ctx: Context) -> Figures:
     """Relative RMS error between dq and the slope of q, in the worst window."""
     if not filled(ctx):
-        return ctx.absent("dq is not filled (0 throughout)")
-    worst: tuple[float, float, int, float] | None = None
+        yield ctx.absent("dq is not filled (0 throughout)")
+    window = ctx.tolerance("window_s")
     for joint, spec in enumerate(ctx.joints):
         x = _Joint.from_context(ctx, joint)
         found = _window_error(ctx, x, spec.stroke, held_s(ctx, joint))
-        if found is not None and (worst is None or found[0] > worst[0]):
-            worst = (*found[:2], joint, found[2])
-    if worst is None:
-        return ctx.skipped("the hand hardly moves in this recording")
-    error, ratio, joint, at = worst
-    window = ctx.tolerance("window_s")
-    text = ctx.named(
-        f"in the worst window of {window:g} s dq is {error:.0%} off the slope of q, which is "
-        f"{ratio:.2f} times dq",
-        joint,
-    )
-    limit = ctx.tolerance("max_relative_rms")
-    if error <= limit:
-        return ctx.passed(f"{error:.0%} off", text, relative_rms=error)
-    outcome = ctx.failed(
-        f"{error:.0%} off",
-        text + ("; its sign is turned" if ratio < 0 else ""),
-        ctx.at(ctx.states.topic, at, at + window),
-        relative_rms=error,
-    )
-    return outcome.about(joint).if_late((error - limit) * ctx.tolerance("slope_s"))
+        if found is None:
+            continue
+        error, ratio, at = found
+        text = (
+            f"in the worst window of {window:g} s dq is {error:.0%} off the slope of q, which is "
+            f"{ratio:.2f} times dq"
+        )
+        yield Figure(
+            error,
+            at,
+            at + window,
+            joint,
+            text + ("; its sign is turned" if ratio < 0 else ""),
+            shown=f"{error:.0%} off",
+            late=(error - ctx.tolerance("max_relative_rms")) * ctx.tolerance("slope_s"),
+        )
 
 
 def held_s(ctx: Context, joint: int) -> float:
@@ -394,10 +362,15 @@ def _window_error(
         "dq",
     ),
 )
-def keeps_up(ctx: Context) -> Outcome:
+@worst(
+    "excess_rad",
+    "max_excess_stroke",
+    nothing="the states are too far apart to integrate dq",
+)
+def keeps_up(ctx: Context) -> Figures:
     """Motion of q that dq, up to 40 ms earlier or later, does not explain, in the worst window."""
     if not filled(ctx):
-        return ctx.absent("dq is not filled (0 throughout)")
+        yield ctx.absent("dq is not filled (0 throughout)")
     joints = [_Joint.from_context(ctx, joint) for joint in range(len(ctx.joints))]
     courses = {i: _course(ctx, x) for i, x in enumerate(joints) if len(x.t) >= _FEW}
     lengths = (_LAGS * ctx.tolerance("max_lag_s")).tolist()
@@ -405,38 +378,20 @@ def keeps_up(ctx: Context) -> Outcome:
     def bound(joint: int) -> float:
         return courses[joint][0].bound(lengths) / ctx.joints[joint].stroke
 
-    worst: tuple[float, float, int, float, float, float] | None = None
+    part = -math.inf
     # the presumably worst joint first, so that the others need few windows
     for joint in sorted(courses, key=bound, reverse=True):
         x, (course, factor), stroke = joints[joint], courses[joint], ctx.joints[joint].stroke
         for seconds in lengths:
-            above = -math.inf if worst is None else worst[0] * stroke
-            most = course.worst(seconds, above)
-            if most is None:
+            most = course.worst(seconds, part * stroke)
+            if most is None or most.rad / stroke < part:
                 continue
+            part, excess = most.rad / stroke, max(most.rad, 0.0)
             speed = float(np.abs(factor * x.dq[most.start : most.end + 1]).max())
             begin, end = float(x.t[most.start]), float(x.t[most.end])
-            found = (most.rad / stroke, most.rad, joint, begin, end, speed)
-            if worst is None or found > worst:
-                worst = found
-    if worst is None:
-        return ctx.skipped("the states are too far apart to integrate dq")
-    _, excess, joint, begin, end, speed = worst
-    limit = ctx.tolerance("max_excess_stroke", joint)
-    text = ctx.named(
-        f"from {begin:.2f} to {end:.2f} s q moved {excess:.3f} {ctx.unit} beyond what dq allows",
-        joint,
-    )
-    if excess <= limit:
-        text = text if excess > 0 else ctx.named("q moves as dq says", joint)
-        return ctx.passed(f"{max(excess, 0.0):.3f} {ctx.unit}", text, excess_rad=excess).placed(
-            max(excess, 0.0), limit
-        )
-    outcome = ctx.failed(
-        f"{excess:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin, end), excess_rad=excess
-    )
-    late = (excess - limit) / max(speed, 1e-3)
-    return outcome.about(joint).placed(excess, limit).if_late(late)
+            text = f"from {begin:.2f} to {end:.2f} s q moved {excess:.3f} {ctx.unit} beyond what "
+            late = (excess - ctx.tolerance("max_excess_stroke", joint)) / max(speed, 1e-3)
+            yield Figure(excess, begin, end, joint, f"{text}dq allows", late=late)
 
 
 def _course(ctx: Context, x: _Joint) -> tuple[Course, float]:
@@ -579,64 +534,49 @@ def contacts(ctx: Context, touch: float) -> list[_Pressing]:
 
 
 @check("DEX1-FORCE-06")
-def force_in_every_contact(ctx: Context) -> Outcome:
+@with_object
+@worst("tau_nm", "min_tau_nm", nothing="it never pressed on the object for long enough")
+def force_in_every_contact(ctx: Context) -> Figures:
     """The smallest abs(tau_est) of all pieces of all contacts with the object."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    found = contacts(ctx, ctx.object_at)
-    if not found:
-        return ctx.skipped("it never pressed on the object for long enough")
-    least = min(found, key=lambda p: p.tau)
-    limit = ctx.tolerance("min_tau_nm")
-    text = f"tau_est of {least.tau:.3f} N m or more in {len(found)} pieces of contacts"
-    if least.tau >= limit:
-        met = ctx.passed(f"{least.tau:.2f} N m", text, tau_nm=least.tau)
-        return met.pressed(least.tau, limit, at_least=True)
-    text = (
-        f"tau_est of {least.tau:.3f} N m while q was at {least.q:.2f} {ctx.unit} on the object and "
-        f"{least.goal:.2f} {ctx.unit} was commanded"
-    )
-    place = ctx.at(ctx.states.topic, least.begin, least.end)
-    outcome = ctx.failed(f"{least.tau:.3f} N m", text, place, tau_nm=least.tau)
-    return outcome.pressed(least.tau, limit, at_least=True)
+    for piece in contacts(ctx, ctx.touch):
+        text = (
+            f"tau_est of {piece.tau:.3f} N m while q was at {piece.q:.2f} {ctx.unit} on the object "
+            f"and {piece.goal:.2f} {ctx.unit} was commanded"
+        )
+        yield Figure(piece.tau, piece.begin, piece.end, text=text)
 
 
 @check("DEX1-FIELD-18")
-def stops_at_object(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "max_depth_part", nothing="tau_est shows no contact with the object")
+def stops_at_object(ctx: Context) -> Figures:
     """Motion of q into the object while tau_est shows contact, as a part of the command."""
-    touch = ctx.object_at
-    if touch is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    felt = [p for p in contacts(ctx, touch) if p.tau >= ctx.tolerance("min_tau_nm")]
-    if not felt:
-        return ctx.skipped("tau_est shows no contact with the object")
-
-    def into(p: _Pressing) -> float:
-        return (touch - p.q) / (touch - p.goal)
-
-    deepest = max(felt, key=into)
-    part, limit = into(deepest), ctx.tolerance("max_depth_part")
-    text = (
-        f"pressing on an object at {touch:.2f} {ctx.unit} with {deepest.tau:.2f} N m, q was at "
-        f"{deepest.q:.2f} {ctx.unit}, and {deepest.goal:.2f} {ctx.unit} was commanded"
-    )
-    if part <= limit:
-        return ctx.passed(f"{max(part, 0.0):.0%} of the way in", text, part=part)
-    place = ctx.at(ctx.states.topic, deepest.begin, deepest.end)
-    outcome = ctx.failed(f"{part:.0%} of the way in", text, place, part=part)
-    return outcome.placed(touch - deepest.q, limit * (touch - deepest.goal))
+    touch = ctx.touch
+    for piece in contacts(ctx, touch):
+        if piece.tau < ctx.tolerance("min_tau_nm"):
+            continue
+        part = max((touch - piece.q) / (touch - piece.goal), 0.0)
+        text = (
+            f"pressing on an object at {touch:.2f} {ctx.unit} with {piece.tau:.2f} N m, q was at "
+            f"{piece.q:.2f} {ctx.unit}, and {piece.goal:.2f} {ctx.unit} was commanded"
+        )
+        limit = ctx.tolerance("max_depth_part") * (touch - piece.goal)
+        measure = Measure(touch - piece.q, limit, "rad", Quantity.POSITION)
+        shown = f"{part:.0%} of the way in"
+        yield Figure(part, piece.begin, piece.end, text=text, shown=shown, measure=measure)
 
 
 @check("DEX1-FORCE-07")
-def no_force_at_any_rest(ctx: Context) -> Outcome:
+@worst("tau_nm", "max_tau_nm", nothing="the gripper never rests without contact in this recording")
+def no_force_at_any_rest(ctx: Context) -> Figures:
     """The largest tau_est at rest without contact, beyond what the distance to the goal
     explains.
     """
     states, spec = ctx.states, ctx.joints[0]
     if (unknown := ctx.contact_unknown) is not None:
-        return unknown
+        yield unknown
     if not len(states) or not len(ctx.commands):
-        return ctx.skipped("no states, or no commands to this hand")
+        yield ctx.skipped("no states, or no commands to this hand")
     ends = ctx.tolerance("clear_stroke")
     low = (spec.q_min if ctx.object_at is None else ctx.object_at) + ends
     rows, ages = _newest(ctx)
@@ -649,9 +589,7 @@ def no_force_at_any_rest(ctx: Context) -> Outcome:
         held &= offs <= ctx.tolerance("max_error_stroke")
     idle = ages > ctx.recording.model.command_timeout + 0.5  # before the first one, too
     window = ctx.tolerance("min_rest_s")
-    worst: tuple[float, float, float, float] | None = None
-    count = 0
-    for begin in np.arange(float(states.t[0]), float(states.t[-1]) - window, 0.5 * window):
+    for begin in np.arange(float(states.t[0]), float(states.t[-1]) - window, 0.5 * window).tolist():
         piece = slice(*np.searchsorted(states.t, (begin, begin + window)))
         q, tau = states.q[piece, 0], states.tau[piece, 0]
         if len(q) < 5 or not (np.isfinite(q).all() and np.isfinite(tau).all()):
@@ -666,16 +604,6 @@ def no_force_at_any_rest(ctx: Context) -> Outcome:
             pull = 0.0
         else:
             continue
-        count += 1
-        size = median(np.abs(tau))
-        limit = ctx.tolerance("max_tau_nm") + pull
-        if worst is None or size - limit > worst[0]:
-            worst = (size - limit, size, limit, float(begin))
-    if worst is None:
-        return ctx.skipped("the gripper never rests without contact in this recording")
-    beyond, size, limit, at = worst
-    text = f"tau_est of {size:.3f} N m at the worst of {count} rests without contact"
-    if beyond <= 0:
-        return ctx.passed(f"{size:.3f} N m", text, tau_nm=size).pressed(size, limit)
-    place = ctx.at(states.topic, at, at + window)
-    return ctx.failed(f"{size:.2f} N m", text, place, tau_nm=size).pressed(size, limit)
+        size, limit = median(np.abs(tau)), ctx.tolerance("max_tau_nm") + pull
+        text = f"tau_est of {size:.3f} N m at the worst rest without contact"
+        yield Figure(size, begin, begin + window, text=text, limit=limit)

@@ -22,6 +22,7 @@ from dexkit.conformance.checks.motion import (
     limited_by_speed,
     limited_by_start,
     noise_at_rest,
+    slower,
     steps,
     steps_of,
 )
@@ -447,16 +448,6 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
             took, quick = least_half_way(softer), max(took, 1e-3)
             figures.append(slower(ctx, step.joint, took, quick, how))
     return judged(ctx, figures, "ratio", "min_ratio", nothing=nothing)
-
-
-def slower(ctx: Context, joint: int, took: float, quick: float, how: str) -> Figure:
-    """How many times as long a softer step takes to half-way, with the seconds of both."""
-    return Figure(
-        took / quick,
-        joint=joint,
-        text=f"a step {how} takes {took / quick:.1f} times as long to half-way",
-        measure=Measure(took, ctx.tolerance("min_ratio") * quick, larger_is_worse=False),
-    )
 
 
 def _seen_to_half(ctx: Context, step: Step) -> bool:

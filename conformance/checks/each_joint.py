@@ -166,7 +166,7 @@ def _delay(ctx: Context, begin: float, end: float) -> float:
         return 0.0
     same = rows[(commands.q[rows] == commands.q[rows[-1]]).all(axis=1)]
     given = float(commands.t[same[0]])
-    before = ctx.states.q[ctx.states.between(given - 0.05, given)]
+    before = ctx.q(given - 0.05, given)
     after = ctx.states.between(given, end)
     if not len(before):
         return 0.0

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.conformance.provenance import TIMES
 from dexkit.conformance.recording import joints_of
@@ -150,7 +151,8 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
 
 
 @check("DEX1-FIELD-14", rests_on=(TIMES,))
-def plausible_speed(ctx: Context) -> Outcome:
+@worst("speed_rad_s", "max_speed_rad_s", nothing="no state with a position that lasts long enough")
+def plausible_speed(ctx: Context) -> Figures:
     """The fastest motion of q, relative to the joint's top speed."""
     window = ctx.tolerance("window_s")
     t = ctx.states.clock
@@ -159,28 +161,25 @@ def plausible_speed(ctx: Context) -> Outcome:
     ends = ends[starts]
     near = t[ends] - t[starts] < 2 * window  # a gap in the state is judged by RATE-03
     starts, ends = starts[near], ends[near]
-    worst: tuple[float, float, int, float] = (-1.0, 0.0, 0, 0.0)
+    moves = False
+    figures = []
     for joint, spec in enumerate(ctx.joints):
         q = ctx.states.q[:, joint]
         speed = np.abs(q[ends] - q[starts]) / (t[ends] - t[starts])
         if not np.isfinite(speed).any():
             continue
         i = int(np.nanargmax(speed))
-        worst = max(worst, (speed[i] / spec.dq_max, float(speed[i]), joint, float(t[starts[i]])))
-    part, speed_rad_s, joint, at = worst
-    if part < 0:
-        return ctx.skipped("no state with a position that lasts long enough")
-    if not speed_rad_s:
-        return ctx.skipped("the hand does not move in this recording")
-    text = ctx.named(f"q moves by up to {speed_rad_s:.1f} {ctx.unit}/s over {window:g} s", joint)
-    if part <= ctx.tolerance("max_part"):
-        return ctx.passed(f"{speed_rad_s:.1f} {ctx.unit}/s", text, speed_rad_s=speed_rad_s)
-    return ctx.failed(
-        f"{speed_rad_s:.0f} {ctx.unit}/s",
-        f"{text}: {part:.1f} times what the joint is good for",
-        ctx.at(ctx.states.topic, at, at + window),
-        speed_rad_s=speed_rad_s,
-    ).about(joint)
+        fast, at = float(speed[i]), float(t[starts[i]])
+        moves |= fast > 0
+        text = (
+            f"q moves by up to {fast:.1f} {ctx.unit}/s over {window:g} s: {fast / spec.dq_max:.1f} "
+            "times what the joint is good for"
+        )
+        limit = ctx.tolerance("max_part") * spec.dq_max
+        figures.append(Figure(fast, at, at + window, joint, text, limit=limit))
+    if figures and not moves:
+        yield ctx.skipped("the hand does not move in this recording")
+    yield from figures
 
 
 @check(

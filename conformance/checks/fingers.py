@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, judged, with_object
 from dexkit.conformance.checks.force import squeezes
 from dexkit.conformance.checks.grip import torque_scales
 from dexkit.conformance.checks.motion import (
@@ -18,6 +19,7 @@ from dexkit.conformance.checks.motion import (
     least_half_way,
     limited_by_speed,
     not_driven,
+    slower,
     steps_of,
 )
 from dexkit.conformance.checks.safety import arrival, stays, stopped
@@ -266,7 +268,7 @@ def plain_mode(ctx: Context) -> Outcome:
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         far = [abs(s.size) / s.stroke for s in steps_of(ctx, phase)]
-        q = ctx.states.q[ctx.states.between(begin - 0.1, end)]
+        q = ctx.q(begin - 0.1, end)
         q = q[np.isfinite(q).all(axis=1)]
         if len(q) and far and max(far) >= 0.05:
             asked += 1
@@ -310,7 +312,7 @@ def order(ctx: Context) -> Outcome:
         commanded = phase.targets.get(ctx.side, {})
         for step in steps_of(ctx, phase):
             rows = ctx.states.between(begin, end)
-            before = ctx.states.q[ctx.states.between(begin - 0.1, begin)]
+            before = ctx.q(begin - 0.1, begin)
             if not len(before) or abs(step.size) < 0.05 * step.stroke:
                 continue
             moved = np.abs(ctx.states.q[rows] - np.median(before, axis=0)).max(axis=0)
@@ -370,19 +372,17 @@ def stiffness(ctx: Context) -> Outcome:
     """
     stiff = {s.joint: s for p in ctx.recording.phases("stiff", ctx.side) for s in steps_of(ctx, p)}
     stuck: Outcome | None = None
-    worst: tuple[float, int, float, float] | None = None
-    limited = 0
+    nothing, figures = "no state during the steps", []
     soft = [(s, len(p.targets.get(ctx.side, {}))) for p in ctx.phases() for s in steps_of(ctx, p)]
     for step, joints in soft:
         reference = stiff.get(step.joint)
         if reference is None or abs(step.size) < _SMALL * step.stroke:
             continue
-        progress = (step.final - step.start) / step.size if step.size else 0.0
         # after another soft step gravity may still move the joint: only the first starts from rest
-        if joints == len(ctx.joints) and progress < ctx.tolerance("min_progress"):
-            text = f"with soft gains it goes {progress:.0%} of its way"
+        if joints == len(ctx.joints) and step.progress < ctx.tolerance("min_progress"):
+            text = f"with soft gains it goes {step.progress:.0%} of its way"
             place = ctx.at(ctx.states.topic, step.begin, step.end)
-            outcome = ctx.failed(f"{progress:.0%}", ctx.named(text, step.joint), place)
+            outcome = ctx.failed(f"{step.progress:.0%}", ctx.named(text, step.joint), place)
             stuck = stuck or outcome.about(step.joint).tolerated().because(_TOO_SOFT)
             continue
         quick = half_way(reference)
@@ -390,37 +390,22 @@ def stiffness(ctx: Context) -> Outcome:
             return ctx.skipped(ctx.named("the stiff step did not get half-way", step.joint))
         took, quick = least_half_way(step), max(quick, 1e-3)
         if took < ctx.tolerance("min_ratio") * quick and limited_by_speed(ctx, reference):
-            limited += 1
+            nothing = "its own speed limits every joint's steps, whatever their gains are"
             continue
-        if worst is None or took / quick < worst[0]:
-            worst = took / quick, step.joint, took, quick
-    if worst is None and stuck is not None:
-        return stuck
-    if worst is None and limited:
-        return ctx.skipped("its own speed limits every joint's steps, whatever their gains are")
-    if worst is None:
-        return ctx.skipped("no state during the steps")
-    ratio, joint, took, quick = worst
-    least = ctx.tolerance("min_ratio") * quick
-    text = ctx.named(f"a soft step takes {ratio:.1f} times as long to half-way", joint)
-    if ratio >= ctx.tolerance("min_ratio"):
-        if stuck is not None:
-            return stuck
-        return ctx.passed(f"x {ratio:.1f}", text, ratio=ratio).timed(took, least, at_least=True)
-    outcome = ctx.failed(f"x {ratio:.1f}", text, ratio=ratio).about(joint)
-    return outcome.timed(took, least, at_least=True)
+        figures.append(slower(ctx, step.joint, took, quick, "with soft gains"))
+    outcome = judged(ctx, figures, "ratio", "min_ratio", nothing=nothing)
+    return outcome if outcome.met is False or stuck is None else stuck
 
 
 @check("DEX3-FORCE-01")
+@with_object
 def contact(ctx: Context) -> Outcome:
     """Closing torque of the joints that press on an object."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     rows = squeezes(ctx)
     if rows is None:
         return ctx.skipped("no state while it squeezed")
     begin, end = rows
-    tau = np.median(ctx.states.tau[ctx.states.between(begin, end)], axis=0)
+    tau = np.median(ctx.tau(begin, end), axis=0)
     closing = np.array([j.closing for j in ctx.joints])
     felt = tau * closing
     pressing = felt[closing != 0]
@@ -439,10 +424,9 @@ def contact(ctx: Context) -> Outcome:
 
 
 @check("DEX5-FORCE-03")
+@with_object
 def units(ctx: Context) -> Outcome:
     """tau_est compared with the commanded stiffness times the position error."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     span = squeezes(ctx)
     if span is None:
         return ctx.skipped("no state while it squeezed")
@@ -477,7 +461,7 @@ def units(ctx: Context) -> Outcome:
 
 def _moved(ctx: Context, joints: Sequence[int], begin: float, end: float) -> Floats:
     """Motion of each joint from begin to end, as a part of its stroke."""
-    q = ctx.states.q[ctx.states.between(begin, end)][:, list(joints)]
+    q = ctx.q(begin, end)[:, list(joints)]
     if len(q) < 5:
         return np.full(len(joints), np.nan)
     return np.asarray(np.ptp(q, axis=0) / [ctx.joints[j].stroke for j in joints])
@@ -564,7 +548,7 @@ def _strays(ctx: Context, silence: _Silence, *, guarded: bool) -> Outcome | None
         for j in range(len(ctx.joints))
         if j not in roles.driven and j not in roles.slow and silence.guarded[j] == guarded
     ]
-    before = ctx.states.q[ctx.states.between(last - _MEDIAN_S, last)][:, mine]
+    before = ctx.q(last - _MEDIAN_S, last)[:, mine]
     rows = ctx.states.between(last, end)
     t, q = ctx.states.t[rows], ctx.states.q[rows][:, mine]
     sent = np.flatnonzero(np.isfinite(ctx.commands.q).all(axis=1) & (ctx.commands.t <= last))
@@ -578,21 +562,17 @@ def _strays(ctx: Context, silence: _Silence, *, guarded: bool) -> Outcome | None
     beyond = np.maximum(low - q, q - high) / [j.stroke for j in spec]
     ends = np.searchsorted(t, t + _MEDIAN_S)
     windows = np.column_stack((np.arange(len(t)), ends))[ends < len(t)]
+    figures = []
     for i in np.flatnonzero((beyond > limit).any(axis=0)).tolist():
         away = np.nan_to_num(medians(beyond[:, i], windows))  # noise is no motion
-        at = int(np.argmax(away)) if len(away) else 0
-        if not len(away) or away[at] <= limit:
-            continue
-        rad = float(away[at]) * spec[i].stroke
-        text = f"left its place by {rad:.2f} {ctx.unit} after the last command"
-        outcome = ctx.failed(
-            f"{rad:.2f} {ctx.unit}",
-            ctx.named(text, mine[i]),
-            ctx.at(ctx.states.topic, float(t[at]), end),
-            motion_rad=rad,
-        )
-        return outcome.about(mine[i]).placed(rad, limit * spec[i].stroke)
-    return None
+        if len(away):
+            at = int(np.argmax(away))
+            rad = float(away[at]) * spec[i].stroke
+            text = f"left its place by {rad:.2f} {ctx.unit} after the last command"
+            figures.append(Figure(rad, float(t[at]), end, mine[i], text))
+    nothing = ctx.passed("in its place")
+    outcome = judged(ctx, figures, "motion_rad", "max_motion_stroke", nothing=nothing)
+    return None if outcome.met else outcome
 
 
 def _stops_in(ctx: Context, joints: Sequence[int], silence: _Silence) -> Outcome:
@@ -757,9 +737,9 @@ def _stood(ctx: Context, joint: int, silence: _Silence) -> bool:
 
 def _grips_on(ctx: Context, silence: _Silence) -> Outcome:
     last, late, end = silence.last, silence.late, silence.end
-    before = np.abs(ctx.states.tau[ctx.states.between(last - 0.2, last)])
+    before = np.abs(ctx.tau(last - 0.2, last))
     spans = [(late, min(end, late + _AT_LAST)), (max(late, end - _AT_LAST), end)]
-    later = [np.abs(ctx.states.tau[ctx.states.between(a, b)]) for a, b in spans]
+    later = [np.abs(ctx.tau(a, b)) for a, b in spans]
     if not len(before) or not all(map(len, later)):
         return ctx.skipped("no state in the silence")
     pressed = np.where(silence.guarded, 0.0, np.median(before, axis=0))
@@ -780,10 +760,9 @@ def _grips_on(ctx: Context, silence: _Silence) -> Outcome:
 
 
 @check("DEX5-WDOG-04")
+@with_object
 def all_alike(ctx: Context) -> Outcome:
     """Which joints that pressed when the commands ended still press after the time-out."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     least = ctx.tolerance("min_tau_nm")
     scales = torque_scales(ctx, least)
     squeezed = [p.end_ns for p in ctx.phases("squeeze")]
@@ -796,8 +775,7 @@ def all_alike(ctx: Context) -> Outcome:
         last = float(sent[-1]) if len(sent) else begin
         late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
         before, after = (
-            np.abs(ctx.states.tau[ctx.states.between(a, b)]) / scales
-            for a, b in ((last - 0.2, last), (late, end))
+            np.abs(ctx.tau(a, b)) / scales for a, b in ((last - 0.2, last), (late, end))
         )
         if len(before) < 3 or len(after) < 3:
             continue

@@ -28,7 +28,7 @@ def squeezes(ctx: Context) -> tuple[float, float] | None:
     for phase in reversed(ctx.phases()):
         begin, end = ctx.span(phase)
         begin = max(begin, end - 0.5)
-        tau = ctx.states.tau[ctx.states.between(begin, end)]
+        tau = ctx.tau(begin, end)
         if np.isfinite(tau).all(axis=1).any():
             return begin, end
     return None
@@ -43,7 +43,7 @@ def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
     span = squeezes(ctx)
     if span is None:
         return None
-    tau = ctx.states.tau[ctx.states.between(*span), 0]
+    tau = ctx.tau(*span)[:, 0]
     begin = next(b for b, e in map(ctx.span, reversed(ctx.phases())) if e == span[1])
     return float(np.median(tau[np.isfinite(tau)])), begin, span[1]
 

@@ -216,7 +216,7 @@ def limited_by_start(ctx: Context, step: Step) -> bool:
     if half is None:
         return False
     for one in _larger(ctx, step):
-        before = ctx.states.q[ctx.states.between(one.begin - _REST_S, one.begin), step.joint]
+        before = ctx.q(one.begin - _REST_S, one.begin)[:, step.joint]
         if not float(np.ptp(before)) <= _RESTS * step.stroke:
             continue
         then = min(int(np.searchsorted(one.t, one.begin + half)), len(one.t) - 1)
@@ -308,6 +308,16 @@ def least_half_way(step: Step) -> float:
         return half
     progress = (step.final - step.start) / step.size if step.size else 0.0
     return (step.end - step.begin) * max(1.0, 0.5 / max(progress, 1e-3))
+
+
+def slower(ctx: Context, joint: int, took: float, quick: float, how: str) -> Figure:
+    """How many times as long a softer step takes to half-way, with the seconds of both."""
+    return Figure(
+        took / quick,
+        joint=joint,
+        text=f"a step {how} takes {took / quick:.1f} times as long to half-way",
+        measure=Measure(took, ctx.tolerance("min_ratio") * quick, larger_is_worse=False),
+    )
 
 
 def steps(ctx: Context) -> list[Step]:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.checks.motion import steps_of
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, Subject
@@ -117,10 +118,9 @@ def _presses(ctx: Context, phase: Phase) -> bool:
 
 
 @check("DEX3-SENS-04")
+@with_object
 def touch(ctx: Context) -> Outcome:
     """The change of the pressure in a finger's own packets while it alone presses."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     found = list(_touches(ctx))
     if not found:
         return ctx.absent("the states hold no sensor packets")
@@ -185,10 +185,9 @@ def saturates(ctx: Context) -> Outcome:
 
 
 @check("DEX3-SENS-08")
+@with_object
 def releases(ctx: Context) -> Outcome:
     """Remaining pressure of each element some time after the object was released."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     rest = [ctx.span(p)[0] for p in (ctx.phases("touch") or ctx.phases("squeeze"))[:1]]
     held = [ctx.span(p) for p in ctx.phases("squeeze")]
     let_go = [ctx.span(p)[0] for p in ctx.phases()]
@@ -225,11 +224,10 @@ def _untouched(ctx: Context, begin: float) -> float:
 
 
 @check("DEX3-SENS-09")
-def pressure_lasts(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "min_part", nothing="no pressure changed at the object")
+def pressure_lasts(ctx: Context) -> Figures:
     """The smallest remaining part of an element's pressure at the end of a grip."""
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
-    worst: tuple[float, int, int, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         if end - begin < ctx.tolerance("min_hold_s"):
@@ -247,58 +245,45 @@ def pressure_lasts(ctx: Context) -> Outcome:
             continue
         part = np.where(change >= 0.3 * most, later / np.where(change > 0, change, 1.0), np.inf)
         packet, slot = (int(k) for k in np.unravel_index(int(np.argmin(part)), part.shape))
-        found = (float(part[packet, slot]), packet, slot, begin, end)
-        worst = found if worst is None or found < worst else worst
-    if worst is None:
-        return ctx.skipped("no pressure changed at the object")
-    part_left, packet, slot, begin, end = worst
-    part_left = max(part_left, 0.0)
-    text = (
-        f"at the end of a grip of {end - begin:.1f} s, {part_left:.0%} of the change of pressure "
-        f"is left in slot {slot} of packet {packet}"
-    )
-    if part_left >= ctx.tolerance("min_part"):
-        return ctx.passed(f"{part_left:.0%}", text, part=part_left)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{part_left:.0%}", text, place, part=part_left)
+        left = max(float(part[packet, slot]), 0.0)
+        text = (
+            f"at the end of a grip of {end - begin:.1f} s, {left:.0%} of the change of pressure is "
+            f"left in slot {slot} of packet {packet}"
+        )
+        yield Figure(left, begin, end, text=text)
 
 
 @check("DEX3-SENS-10")
-def follows_the_force(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "min_part", nothing="no finger's torque changed while it held the object")
+def follows_the_force(ctx: Context) -> Figures:
     """Change of a finger's pressure relative to that of its torque, while it holds the object.
 
     Gear friction keeps the pressure, so a rise counts only above the largest torque of the grip so
     far, and a fall only where the finger gives way by a part of its former advance.
     """
-    if ctx.object_at is None:
-        return ctx.skipped("this hand was not given an object to squeeze (--object)")
     phases = sorted(ctx.phases(), key=lambda p: p.begin_ns)
     if not phases:
-        return ctx.skipped("the fingers did not press in turn")
+        yield ctx.skipped("the fingers did not press in turn")
     rest = _untouched(ctx, ctx.span(phases[0])[0])
     free, noise = _pressures(ctx, rest - 2 * _BEFORE_S, rest), _noise(ctx, rest)
-    worst: tuple[float, str, str, float, float] | None = None
     for phase, after in zip(phases, [*phases[1:], None], strict=True):
         finger = phase.params.get("finger", "")
         begin, end = ctx.span(phase)
         later = end if after is None else ctx.span(after)[1]
         if not finger:  # they are all soft again
             continue
-        for word, a, b in (("rises", begin, end), ("falls", end, later)):
+        for word, limit, a, b in (
+            ("rises", "min_part", begin, end),
+            ("falls", "min_fall_part", end, later),
+        ):
             if word == "falls" and not _gives_way(ctx, finger, begin, end, later):
                 continue
-            found = _share(ctx, finger, free, noise, a, b)
-            if found is not None and (worst is None or found < worst[0]):
-                worst = found, finger, word, a, b
-    if worst is None:
-        return ctx.skipped("no finger's torque changed while it held the object")
-    share, finger, word, begin, end = worst
-    text = f"where the torque of the {finger} {word} on the object, its pressure shows {share:.0%}"
-    limit = ctx.tolerance("min_part" if word == "rises" else "min_fall_part")
-    if share >= limit:
-        return ctx.passed(f"{share:.0%}", f"{text} of that", part=share)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{share:.0%}", f"{text} of that", place, part=share)
+            share = _share(ctx, finger, free, noise, a, b)
+            if share is not None:
+                text = f"where the torque of the {finger} {word} on the object, its pressure shows "
+                text += f"{share:.0%} of that"
+                yield Figure(share, a, b, text=text, limit=ctx.tolerance(limit))
 
 
 def _share(
@@ -340,7 +325,7 @@ def _most_torque(ctx: Context, joints: list[int], begin: float) -> Floats:
     """The largest torque of each joint in the grip in progress at ``begin``, N m, shape
     (joints,).
     """
-    tau = np.abs(ctx.states.tau[ctx.states.between(0.0, begin)][:, joints])
+    tau = np.abs(ctx.tau(0.0, begin)[:, joints])
     free = np.flatnonzero((tau < ctx.tolerance("min_tau_nm")).all(axis=1))
     return np.asarray(tau[free[-1] + 1 if len(free) else 0 :].max(axis=0))
 

@@ -416,7 +416,7 @@ def _silent(ctx: RobotContext, phase: Phase) -> Outcome:
 
 def _q(ctx: RobotContext, begin: float, end: float) -> Floats:
     """Positions in [begin, end], shape (n, joints)."""
-    return ctx.states.q[ctx.states.between(begin, end)]
+    return ctx.q(begin, end)
 
 
 @check("H1-MOVE-01", "H1-SAFE-04", "H1-LIFE-02")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.checks.force import raw_counts
 from dexkit.conformance.motor_messages import state_member
 from dexkit.hand import Floats
@@ -245,12 +246,12 @@ def _has_offset(ctx: Context, joint: int) -> bool:
 
 
 @check("BRAINCO-FORCE-05")
-def grips_alike(ctx: Context) -> Outcome:
+@with_object
+@worst("part", "min_part", nothing="no joint pressed with enough force to compare")
+def grips_alike(ctx: Context) -> Figures:
     """The weakest stretch of a joint's grips, relative to the strongest."""
     if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
-        return skipped
-    unit = _unit(ctx)
-    worst: tuple[float, int, float, float, Stand] | None = None
+        yield skipped
     for joint, spec in enumerate(ctx.joints):
         mine = [s for s in stands(ctx) if s.presses[joint]]
         strongest = max((float(np.abs(s.force[:, joint]).max()) for s in mine), default=0.0)
@@ -259,50 +260,36 @@ def grips_alike(ctx: Context) -> Outcome:
             continue
         ends = [abs(float(s.force[-1, joint])) for s in mine]
         second = int(np.argsort(ends, kind="stable")[FEW_STANDS - 1])
-        weakest, one = ends[second], mine[second]
-        found = weakest / strongest, joint, strongest, weakest, one
-        worst = min(worst or found, found, key=lambda w: w[:2])
-    if worst is None:
-        return ctx.skipped("no joint pressed with enough force to compare")
-    part, joint, strongest, weakest, one = worst
-    text = ctx.named(
-        f"{_member(ctx)} of {weakest:.2f} {unit} in a grip, where it was {strongest:.2f} {unit} "
-        "at most",
-        joint,
+        yield _compared(ctx, joint, ends[second], strongest, mine[second].begin, mine[second].end)
+
+
+def _compared(
+    ctx: Context, joint: int, weakest: float, strongest: float, begin: float, end: float
+) -> Figure:
+    """A joint's weakest grip, relative to its strongest."""
+    unit = _unit(ctx)
+    text = (
+        f"{_member(ctx)} of {weakest:.2f} {unit} in a grip, where it was {strongest:.2f} {unit} at "
+        "most"
     )
-    if part >= ctx.tolerance("min_part"):
-        return ctx.passed(f"{part:.0%}", text, part=part)
-    place = ctx.at(ctx.states.topic, one.begin, one.end)
-    return ctx.failed(f"{part:.0%}", text, place, part=part).about(joint)
+    return Figure(weakest / strongest, begin, end, joint, text)
 
 
 @check("FTP-FORCE-07")
-def squeezes_alike(ctx: Context) -> Outcome:
+@with_object
+@worst(
+    "part", "min_part", nothing="no joint squeezed the object twice with enough force to compare"
+)
+def squeezes_alike(ctx: Context) -> Figures:
     """The weakest squeeze of a joint, relative to its strongest one that began as far away."""
     if (skipped := _without_object(ctx) or _reported(ctx)) is not None:
-        return skipped
-    unit = _unit(ctx)
-    worst: tuple[float, int, float, float, tuple[float, float]] | None = None
+        yield skipped
     for joint, spec in enumerate(ctx.joints):
         found = _squeezes(ctx, joint)
         strongest = max((force for force, _ in found), default=0.0)
-        weak = strongest < ctx.tolerance("min_strongest_part") * spec.tau_max
-        if weak or len(found) < 2:
-            continue
-        weakest, when = min(found)
-        mine = weakest / strongest, joint, strongest, weakest, when
-        worst = min(worst or mine, mine, key=lambda w: w[:2])
-    if worst is None:
-        return ctx.skipped("no joint squeezed the object twice with enough force to compare")
-    part, joint, strongest, weakest, when = worst
-    text = ctx.named(
-        f"{_member(ctx)} of {weakest:.2f} {unit} in a squeeze, where it was {strongest:.2f} "
-        f"{unit} in another one",
-        joint,
-    )
-    if part >= ctx.tolerance("min_part"):
-        return ctx.passed(f"{part:.0%}", text, part=part)
-    return ctx.failed(f"{part:.0%}", text, ctx.at(ctx.states.topic, *when), part=part).about(joint)
+        if strongest >= ctx.tolerance("min_strongest_part") * spec.tau_max and len(found) >= 2:
+            weakest, span = min(found)
+            yield _compared(ctx, joint, weakest, strongest, *span)
 
 
 def _squeezes(ctx: Context, joint: int) -> list[tuple[float, tuple[float, float]]]:
@@ -317,7 +304,7 @@ def _squeezes(ctx: Context, joint: int) -> list[tuple[float, tuple[float, float]
     found = []
     for phase in ctx.phases("squeeze"):
         begin, end = ctx.span(phase)
-        q = ctx.states.q[ctx.states.between(begin - _GRID_S, begin), joint]
+        q = ctx.q(begin - _GRID_S, begin)[:, joint]
         if not len(q) or (contact - q[-1]) * spec.closing < _AWAY * spec.stroke:
             continue
         inside = [s for s in stands(ctx) if begin <= s.begin and s.end <= end and s.presses[joint]]

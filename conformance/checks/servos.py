@@ -47,7 +47,7 @@ def _commanded_speeds(ctx: Context) -> list[tuple[Step, float]]:
     found = []
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        given = ctx.commands.dq[(ctx.commands.t >= begin) & (ctx.commands.t <= end)]
+        given = ctx.commands.dq[ctx.given(begin, end)]
         given = given[np.isfinite(given).all(axis=1)]
         if len(given):
             found += [(s, float(np.median(given[:, s.joint]))) for s in steps_of(ctx, phase)]

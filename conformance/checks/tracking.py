@@ -9,7 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks import STROKE_S, Context, Late, Outcome, check
+from dexkit.conformance.checks.figures import Figure, judged
 from dexkit.conformance.checks.motion import own_speed, speed_of, steps_of
 from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.sums import mean
@@ -265,35 +266,35 @@ def follows(ctx: Context) -> Outcome:
     figures = measure(ctx, ctx.tolerance("max_delay_s"))
     if isinstance(figures, str):
         return ctx.skipped(figures)
-    found = max(figures, key=lambda f: f.rms / ctx.joints[f.joint].stroke)
-    text = (
-        f"RMS {found.rms:.3f} {ctx.unit}, peak {found.peak:.2f} {ctx.unit} at "
-        f"{found.peak_at:.2f} s, delay "
-        f"{found.delay * 1e3:.0f} ms, RMS without removing it {found.raw:.3f} {ctx.unit}"
-    )
-    if found.blocked:
-        text += f"; {found.blocked:.0%} of the time blocked by an object and left out"
-    if len(ctx.joints) > 1:
-        each = ", ".join(f"{ctx.joints[f.joint].name} {f.rms:.3f}" for f in figures)
-        text = f"{ctx.joints[found.joint].name} is worst: {text}; RMS by joint: {each}"
-    values = {"rms_rad": found.rms, "peak_rad": found.peak, "delay_s": found.delay}
-    if len(ctx.joints) > 1:
-        values |= {f"rms_rad_{ctx.joints[f.joint].name}": f.rms for f in figures}
-    limit = ctx.tolerance("max_rms_stroke", found.joint)
-    if found.rms <= limit:
-        return ctx.passed(f"rms {found.rms:.3f} {ctx.unit}", text, **values).placed(
-            found.rms, limit
+    several = len(ctx.joints) > 1
+    each = ", ".join(f"{ctx.joints[f.joint].name} {f.rms:.3f}" for f in figures)
+    values = {f"rms_rad_{ctx.joints[f.joint].name}": f.rms for f in figures if several}
+
+    def figure(found: Tracking) -> Figure:
+        text = (
+            f"RMS {found.rms:.3f} {ctx.unit}, peak {found.peak:.2f} {ctx.unit} at "
+            f"{found.peak_at:.2f} s, delay {found.delay * 1e3:.0f} ms, RMS without removing it "
+            f"{found.raw:.3f} {ctx.unit}"
         )
-    worst_first = sorted(figures, key=lambda f: -f.rms)
-    size = STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin)
-    outcome = ctx.failed(
-        f"rms {found.rms:.2f} {ctx.unit}",
-        text,
-        ctx.at(ctx.states.topic, found.peak_at),
-        ctx.at(ctx.states.topic, found.begin, found.end),
-        **values,
-    ).placed(found.rms, limit)
-    return outcome.about(*(f.joint for f in worst_first)).if_late(size)
+        if found.blocked:
+            text += f"; {found.blocked:.0%} of the time blocked by an object and left out"
+        if several:
+            text = f"is worst: {text}; RMS by joint: {each}"
+        return Figure(
+            found.rms,
+            found.begin,
+            found.end,
+            found.joint,
+            text,
+            shown=f"rms {found.rms:.3f} {ctx.unit}",
+            late=STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin),
+            values={"peak_rad": found.peak, "delay_s": found.delay, **values},
+        )
+
+    outcome = judged(ctx, map(figure, figures), "rms_rad", "max_rms_stroke", nothing="")
+    if outcome.met:
+        return outcome
+    return outcome.about(*(f.joint for f in sorted(figures, key=lambda f: -f.rms)))
 
 
 @check("DEX1-TRACK-02", "DEX3-TRACK-02")
@@ -303,15 +304,13 @@ def delay(ctx: Context) -> Outcome:
     if isinstance(figures, str):
         return ctx.skipped(figures)
     found = sorted(figures, key=lambda f: f.delay)[len(figures) // 2]
-    text = f"the position follows the command by {found.delay * 1e3:.0f} ms"
-    limit = ctx.tolerance("max_delay_s")
-    if found.delay <= limit:
-        met = ctx.passed(f"{found.delay * 1e3:.0f} ms", text, delay_s=found.delay)
-        return met.timed(found.delay, limit, span=(found.begin, found.end))
-    outcome = ctx.failed(
-        f"{found.delay * 1e3:.0f} ms",
-        text,
-        ctx.at(ctx.states.topic, found.begin, found.end),
-        delay_s=found.delay,
+    size = found.delay - ctx.tolerance("max_delay_s")
+    figure = Figure(
+        found.delay,
+        found.begin,
+        found.end,
+        text=f"the position follows the command by {found.delay * 1e3:.0f} ms",
+        shown=f"{found.delay * 1e3:.0f} ms",
+        late=Late((max(size, 0.0),), "mean"),
     )
-    return outcome.timed(found.delay, limit).if_late(found.delay - limit, how="mean")
+    return judged(ctx, [figure], "delay_s", "max_delay_s", nothing="")

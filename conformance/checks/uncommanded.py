@@ -12,7 +12,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks import Context, check
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.median import median
 from dexkit.hand import Floats
 
@@ -90,41 +91,27 @@ def _excluded(ctx: Context) -> list[tuple[float, float]]:
 
 
 @check("DEX1-STILL-01", "DEX3-STILL-01")
-def still(ctx: Context) -> Outcome:
+@worst(
+    "motion_rad",
+    "max_motion_stroke",
+    nothing="no joint came to rest while its command stayed the same",
+)
+def still(ctx: Context) -> Figures:
     """The largest motion of a joint at rest with a constant goal."""
     if not len(ctx.commands):
-        return ctx.skipped("no commands to this hand in the recording")
+        yield ctx.skipped("no commands to this hand in the recording")
     excluded = _excluded(ctx)
-    worst: tuple[float, float, int, float, str] = (-1.0, 0.0, 0, 0.0, "")
-    for joint, spec in enumerate(ctx.joints):
-        goals = _goals(ctx, joint)
-        for begin, end, goal in _stretches(ctx, goals, excluded):
+    for joint in range(len(ctx.joints)):
+        for begin, end, goal in _stretches(ctx, _goals(ctx, joint), excluded):
             moved = _leaves(ctx, joint, begin, end, goal)
-            if moved is not None and moved[0] / spec.stroke > worst[0]:
-                when = (
-                    "before the first command"
-                    if goal is None
-                    else f"at its goal {goal:.2f} {ctx.unit}"
-                )
-                worst = moved[0] / spec.stroke, moved[0], joint, moved[1], when
-    part, rad, joint, at, when = worst
-    if part < 0:
-        return ctx.skipped("no joint came to rest while its command stayed the same")
-    text = ctx.named(f"moved by at most {rad:.3f} {ctx.unit} at rest", joint)
-    if rad <= ctx.tolerance("max_motion_stroke", joint):
-        met = ctx.passed(f"{rad:.3f} {ctx.unit}", text, motion_rad=rad)
-        return met.placed(rad, ctx.tolerance("max_motion_stroke", joint))
-    return (
-        ctx.failed(
-            f"{rad:.2f} {ctx.unit}",
-            ctx.named(f"at rest {when}, it moved by {rad:.2f} {ctx.unit} at {at:.2f} s", joint),
-            ctx.at(ctx.states.topic, at),
-            motion_rad=rad,
-        )
-        .about(joint)
-        .placed(rad, ctx.tolerance("max_motion_stroke", joint))
-        .if_late(STROKE_S * rad / ctx.joints[joint].stroke)
-    )
+            if moved is None:
+                continue
+            rad, at = moved
+            when = "before the first command"
+            if goal is not None:
+                when = f"at its goal {goal:.2f} {ctx.unit}"
+            text = f"at rest {when}, it moved by {rad:.3f} {ctx.unit} at {at:.2f} s"
+            yield Figure(rad, at, None, joint, text)
 
 
 def _stretches(
@@ -187,41 +174,22 @@ def _leaves(
 
 
 @check("DEX1-PATH-01", "DEX3-PATH-01")
-def path(ctx: Context) -> Outcome:
+@worst("beyond_rad", "max_beyond_stroke", nothing="too few states while positions were commanded")
+def path(ctx: Context) -> Figures:
     """Excess of q over the range between earlier position and commanded goals.
 
     At each time q must lie between the position ``before_s`` earlier and the goals in force since
     then or up to ``max_delay_s`` before.
     """
-    worst: tuple[float, float, int, float] = (-1.0, 0.0, 0, 0.0)
-    for joint, spec in enumerate(ctx.joints):
+    for joint in range(len(ctx.joints)):
         found = _beyond(ctx, joint)
-        if found is not None and found[0] / spec.stroke > worst[0]:
-            worst = found[0] / spec.stroke, found[0], joint, found[1]
-    part, rad, joint, at = worst
-    if part < 0:
-        return ctx.skipped("too few states while positions were commanded")
-    if rad <= ctx.tolerance("max_beyond_stroke", joint):
-        return ctx.passed(
-            f"{rad:.3f} {ctx.unit}",
-            ctx.named(f"at most {rad:.3f} {ctx.unit} beyond its start and its goal", joint),
-            beyond_rad=rad,
-        ).placed(rad, ctx.tolerance("max_beyond_stroke", joint))
-    return (
-        ctx.failed(
-            f"{rad:.2f} {ctx.unit}",
-            ctx.named(
-                f"at {at:.2f} s it was {rad:.2f} {ctx.unit} outside of where it had been "
-                f"{ctx.tolerance('before_s'):g} s before and where it was commanded to go",
-                joint,
-            ),
-            ctx.at(ctx.states.topic, at),
-            beyond_rad=rad,
-        )
-        .about(joint)
-        .placed(rad, ctx.tolerance("max_beyond_stroke", joint))
-        .if_late(STROKE_S * rad / ctx.joints[joint].stroke)
-    )
+        if found is not None:
+            rad, at = found
+            text = (
+                f"at {at:.2f} s it was {rad:.3f} {ctx.unit} outside of where it had been "
+                f"{ctx.tolerance('before_s'):g} s before and where it was commanded to go"
+            )
+            yield Figure(rad, at, None, joint, text)
 
 
 def _beyond(ctx: Context, joint: int) -> tuple[float, float] | None:
@@ -277,53 +245,46 @@ def _in_force(goals: _Goals, origin: float, cells: int) -> tuple[Floats, Floats]
 
 
 @check("DEX1-START-03", "DEX3-START-03")
-def starts_idle(ctx: Context) -> Outcome:
+@worst("motion_rad", "max_motion_stroke", nothing="too few states after a start")
+def starts_idle(ctx: Context) -> Figures:
     """Motion and force between the first state of a started service and the first command.
 
     A requirement without ``max_tau_nm`` has no limit of the force.
     """
-    worst: tuple[float, float, int] = (0.0, 0.0, 0)
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         first = ctx.commands.t[(ctx.commands.t >= begin) & (ctx.commands.t < end)]
         rows = ctx.states.between(begin, float(first[0]) if len(first) else end)
-        for joint, spec in enumerate(ctx.joints):
+        for joint in range(len(ctx.joints)):
             t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
             t, q = t[np.isfinite(q)], q[np.isfinite(q)]
             if len(t) < 5:
                 continue
             away = np.abs(q - q[0])
             i = int(np.argmax(away))
-            worst = max(worst, (float(away[i]) / spec.stroke, float(t[i]), joint))
+            text = f"moved by {away[i]:.3f} {ctx.unit} before the first command after a start"
+            yield Figure(float(away[i]), float(t[i]), None, joint, text)
         if "max_tau_nm" in ctx.requirement.tolerances:
-            tau = ctx.states.tau[rows, 0]
-            pressing = _still_presses(ctx, ctx.states.t[rows], tau)
-            if pressing is not None:
-                return pressing
-    part, when, joint = worst
-    rad = part * ctx.joints[joint].stroke
-    limit = ctx.tolerance("max_motion_stroke", joint)
-    text = ctx.named(f"moved by {rad:.3f} {ctx.unit} before the first command after a start", joint)
-    if rad > limit:
-        place = ctx.at(ctx.states.topic, when)
-        outcome = ctx.failed(f"{rad:.2f} {ctx.unit}", text, place, motion_rad=rad)
-        return outcome.about(joint).placed(rad, limit).if_late(STROKE_S * part)
-    return ctx.passed(f"{rad:.3f} {ctx.unit}", text, motion_rad=rad).placed(rad, limit)
+            presses = judged(
+                ctx,
+                _presses(ctx, ctx.states.t[rows], ctx.states.tau[rows, 0]),
+                "tau_nm",
+                "max_tau_nm",
+                nothing=ctx.passed("no force"),
+            )
+            if not presses.met:
+                yield presses
 
 
-def _still_presses(ctx: Context, t: Floats, tau: Floats) -> Outcome | None:
-    """The failure of a started gripper with a torque, N m, that its last command had asked for."""
+def _presses(ctx: Context, t: Floats, tau: Floats) -> Figures:
+    """The torques, N m, of a started gripper whose last command may have asked for one."""
     t, tau = t[np.isfinite(tau)], tau[np.isfinite(tau)]
     if len(t) < 5:
-        return None
-    limit = ctx.tolerance("max_tau_nm")
+        return
     # a motor that releases a grip may still show its force at first
-    for x in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1):
-        at = float(x)
+    for at in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1).tolist():
         piece = np.abs(tau[(t >= at) & (t < at + 0.1)])
-        felt = median(piece) if len(piece) >= 3 else 0.0
-        if felt > limit:
+        if len(piece) >= 3:
+            felt = median(piece)
             text = f"tau_est of {felt:.2f} N m before the first command after a start"
-            outcome = ctx.failed(f"{felt:.2f} N m", text, ctx.at(ctx.states.topic, at), tau_nm=felt)
-            return outcome.pressed(felt, limit)
-    return None
+            yield Figure(felt, at, text=text)

@@ -16,6 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import FOUGHT_OVER, filled
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.row_selection import Rows, Selected, Times
 from dexkit.hand import Floats
 from dexkit.unseen import UNSEEN_S
@@ -103,13 +104,14 @@ def _zeros(t: Floats, dq: Floats) -> Iterator[tuple[int, int]]:
 
 
 @check("DEX1-FIELD-19", "DEX3-FIELD-18", rests_on=("dq",))
-def one_course(ctx: Context) -> Outcome:
+@worst("turns", "max_turns", nothing="too few states with a velocity")
+def one_course(ctx: Context) -> Figures:
     """Number of cells in which dq alternates by the speed itself, in the worst window."""
     if not filled(ctx):
-        return ctx.absent("dq is not filled (0 throughout)")
+        yield ctx.absent("dq is not filled (0 throughout)")
     cell = ctx.tolerance("cell_s")
     count = round(ctx.tolerance("window_s") / cell)
-    worst: tuple[int, float, int, float] | None = None
+    window = count * cell
     for joint in range(len(ctx.joints)):
         t, q, dq = _series(ctx, joint)
         kept = _outside(ctx, t)
@@ -129,37 +131,28 @@ def one_course(ctx: Context) -> Outcome:
         odd = moves & (back > ctx.tolerance("max_part") * speed)
         often = np.convolve(odd, np.ones(count), "valid")
         i = int(np.argmax(often))
-        found = (int(often[i]), float(back[i : i + count].max()), joint, float(t[0]) + i * cell)
-        worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.skipped("too few states with a velocity")
-    turns, back_rad_s, joint, at = worst
-    window = count * cell
-    text = ctx.named(
-        f"in the worst {window:.2g} s of motion dq goes forth and back within {cell:g} s {turns} "
-        f"times by more than the speed, by up to {back_rad_s:.2f} {ctx.unit}/s",
-        joint,
-    )
-    if turns <= ctx.tolerance("max_turns"):
-        return ctx.passed(f"{turns} times", text, turns=turns)
-    place = ctx.at(ctx.states.topic, at, at + window)
-    return ctx.failed(f"{turns} times", text, place, turns=turns).about(joint)
+        turns, at = int(often[i]), float(t[0]) + i * cell
+        text = (
+            f"in the worst {window:.2g} s of motion dq goes forth and back within {cell:g} s "
+            f"{turns} times by more than the speed, by up to {back[i : i + count].max():.2f} "
+            f"{ctx.unit}/s"
+        )
+        yield Figure(turns, at, at + window, joint, text, shown=f"{turns} times")
 
 
 @check("DEX1-FIELD-20", "DEX3-FIELD-19", rests_on=("dq",))
-def at_rest(ctx: Context) -> Outcome:
+@worst("dq_rad_s", "max_speed_stroke", nothing="no joint rests in this recording")
+def at_rest(ctx: Context) -> Figures:
     """The largest mean of dq of a joint at rest.
 
     If q is measured every 50 ms, it stands that long when the next motion begins, and dq may
     already show the motion: the end of a rest is left out.
     """
     if not filled(ctx):
-        return ctx.absent("dq is not filled (0 throughout)")
+        yield ctx.absent("dq is not filled (0 throughout)")
     cell = ctx.tolerance("cell_s")
     count = round(ctx.tolerance("min_rest_s") / cell)
-    worst: tuple[float, float, int, float] | None = None
-    rests = 0
-    for joint, spec in enumerate(ctx.joints):
+    for joint in range(len(ctx.joints)):
         t, q, dq = _series(ctx, joint)
         # where two clients alternate as fast as the states come, all of them show one of the two
         kept = _outside(ctx, t)
@@ -183,27 +176,19 @@ def at_rest(ctx: Context) -> Outcome:
         )
         rest = fulls.all(axis=1)
         rest &= highs.max(axis=1) - lows.min(axis=1) <= ctx.tolerance("max_ripple_stroke", joint)
-        rests += int(rest.sum())
         if not rest.any():
             continue
         # without the first cell, in which it may come to rest, and the last, in which it may begin
         # to move; a tremor in the play of a gear has zero mean. Each state counts once: a cell with
         # a pause of the states has few
         mean = totals[:, 1:-1].sum(axis=1) / np.maximum(counts[:, 1:-1].sum(axis=1), 1)
-        last = np.where(rest, np.abs(mean), 0.0)
-        i = int(np.argmax(last))
-        found = (float(last[i]) / spec.stroke, float(last[i]), joint, float(edges[i + count - 1]))
-        worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.skipped("no joint rests in this recording")
-    _, speed, joint, at = worst
-    limit = ctx.tolerance("max_speed_stroke", joint)
-    text = ctx.named(f"dq of {speed:.3f} {ctx.unit}/s at most while q stands", joint)
-    if speed <= limit:
-        return ctx.passed(f"{speed:.3f} {ctx.unit}/s", text, rests=rests)
-    place = ctx.at(ctx.states.topic, at - (count - 2) * cell, at + cell)
-    text = ctx.named(f"at {at:.2f} s dq is {speed:.2f} {ctx.unit}/s while q stands", joint)
-    return ctx.failed(f"{speed:.2f} {ctx.unit}/s", text, place).about(joint)
+        speeds = np.where(rest, np.abs(mean), 0.0)
+        i = int(np.argmax(speeds))
+        at = float(edges[i + count - 1])
+        text = f"at {at:.2f} s dq is {speeds[i]:.3f} {ctx.unit}/s while q stands"
+        shown = f"{speeds[i]:.3f} {ctx.unit}/s"
+        begin = at - (count - 2) * cell
+        yield Figure(float(speeds[i]), begin, at + cell, joint, text, shown=shown)
 
 
 _NEWEST = 3
@@ -248,10 +233,15 @@ def not_the_command(ctx: Context) -> Outcome:
     """
     if not filled(ctx):
         return ctx.absent("dq is not filled (0 throughout)")
-    commands = ctx.commands
-    if len(commands) < 2:
+    if len(ctx.commands) < 2:
         return ctx.skipped("no commands to this hand")
-    worst: tuple[float, float, int, float, float] | None = None
+    never = ctx.passed("never", "q is nowhere exactly the commanded q for long")
+    return judged(ctx, _commanded(ctx), "motion_rad", "max_way_stroke", nothing=never)
+
+
+def _commanded(ctx: Context) -> Figures:
+    """The ways that dq shows while q is that of a command."""
+    commands = ctx.commands
     for joint, spec in enumerate(ctx.joints):
         t, q, dq = _series(ctx, joint)
         if len(t) < _FEW:
@@ -268,31 +258,24 @@ def not_the_command(ctx: Context) -> Outcome:
         for start, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
             # dq may still be that of the motion which has led there
             begin = int(np.searchsorted(t, t[start] + ctx.tolerance("settle_s")))
-            if last - begin < 2:
-                continue
-            steps = np.diff(t[begin:last])
-            dq_integral = np.concatenate(
-                ([0.0], np.cumsum(0.5 * steps * (dq[begin : last - 1] + dq[begin + 1 : last])))
-            )
-            beyond = dq_integral - (q[begin:last] - q[begin])
-            for at in np.arange(
-                float(t[begin]), float(t[last - 1]), ctx.tolerance("window_s")
-            ).tolist():
-                piece = beyond[
-                    slice(*np.searchsorted(t[begin:last], (at, at + ctx.tolerance("window_s"))))
-                ]
-                way = float(np.ptp(piece)) if len(piece) else 0.0
-                found = (way / spec.stroke, way, joint, at, at + ctx.tolerance("window_s"))
-                worst = found if worst is None or found > worst else worst
-    if worst is None:
-        return ctx.passed("never", "q is nowhere exactly the commanded q for long")
-    _, way, joint, begin_s, end_s = worst
-    limit = ctx.tolerance("max_way_stroke", joint)
-    text = ctx.named(
-        f"q is exactly the commanded q while dq shows {way:.3f} {ctx.unit} of another way", joint
-    )
-    if way <= limit:
-        return ctx.passed(f"{way:.3f} {ctx.unit}", text, motion_rad=way).placed(way, limit)
-    place = ctx.at(ctx.states.topic, begin_s, end_s)
-    outcome = ctx.failed(f"{way:.3f} {ctx.unit}", text, place, motion_rad=way)
-    return outcome.about(joint).placed(way, limit)
+            if last - begin >= 2:
+                run = slice(begin, last)
+                for way, a, b in _other_ways(ctx, t[run], q[run], dq[run]):
+                    text = f"q is exactly the commanded q while dq shows {way:.3f} {ctx.unit} of "
+                    yield Figure(way, a, b, joint, f"{text}another way")
+
+
+def _other_ways(
+    ctx: Context, t: Floats, q: Floats, dq: Floats
+) -> Iterator[tuple[float, float, float]]:
+    """By how much dq shows another way than q in each window of a stretch, and the window."""
+    beyond = _integral(t, dq) - (q - q[0])
+    window = ctx.tolerance("window_s")
+    for at in np.arange(float(t[0]), float(t[-1]), window).tolist():
+        piece = beyond[slice(*np.searchsorted(t, (at, at + window)))]
+        yield float(np.ptp(piece)) if len(piece) else 0.0, at, at + window
+
+
+def _integral(t: Floats, x: Floats) -> Floats:
+    """The integral of x up to each time."""
+    return np.concatenate(([0.0], np.cumsum(0.5 * np.diff(t) * (x[:-1] + x[1:]))))
