@@ -23,16 +23,36 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from dexkit import documents
 from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement
 from dexkit.errors import UsageError
 from dexkit.models import model
+from dexkit.records import as_plain, to_record
 
 __all__ = ["Claims"]
 
-_HAND = ("name", "vendor", "firmware", "model")
+_About = Annotated[str, msgspec.Meta(pattern="^(name|vendor|firmware|model)$")]
+_Units = msgspec.defstruct(
+    "_Units",
+    [(unit, bool, False) for unit in CAPABILITIES],
+    forbid_unknown_fields=True,
+    frozen=True,
+)
+_HINT = (
+    "[hand] has texts: name, vendor, firmware, model; [claims] has true or false for units: "
+    f"{', '.join(CAPABILITIES)}"
+)
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The form of the file; each member may be left out."""
+
+    hand: dict[_About, str] = {}
+    claims: _Units = _Units()  # type: ignore[valid-type]  # made above
 
 
 @dataclass(frozen=True)
@@ -58,30 +78,10 @@ class Claims:
     @classmethod
     def of_document(cls, document: Mapping[str, Any], origin: str) -> Claims:
         """The claims of a document that was parsed; raises as :meth:`parse`."""
-        hand, units = document.get("hand", {}), document.get("claims", {})
-        unknown = sorted(set(document) - {"hand", "claims"})
-        if unknown or not isinstance(hand, dict) or not isinstance(units, dict):
-            raise UsageError(
-                f"{origin}: {', '.join(unknown) or 'hand or claims'} is not understood",
-                hint="its tables are [hand] and [claims]",
-            )
-        for key, value in hand.items():
-            if key not in _HAND or not isinstance(value, str):
-                raise UsageError(
-                    f"{origin}: [hand] {key} is not understood",
-                    hint=f"texts, each may be left out: {', '.join(_HAND)}",
-                )
-        for unit, claimed in units.items():
-            if unit not in CAPABILITIES:
-                raise UsageError(
-                    f"{origin}: no unit {unit!r}", hint=f"units: {', '.join(CAPABILITIES)}"
-                )
-            if not isinstance(claimed, bool):
-                raise UsageError(f"{origin}: {unit} is true or false, not {claimed!r}")
-        if "model" in hand:
-            model(hand["model"])
-        claimed = {unit: units.get(unit, False) for unit in CAPABILITIES}
-        return cls(claimed, hand)
+        file = to_record(document, _File, origin, hint=_HINT)
+        if "model" in file.hand:
+            model(file.hand["model"])
+        return cls(as_plain(file.claims), file.hand)
 
     @classmethod
     def load(cls, path: Path | None, model_name: str | None) -> Claims:

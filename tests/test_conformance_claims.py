@@ -29,12 +29,12 @@ VELOCITY = next(r for r in catalogue("dex1-1") if r.id == "DEX1-FIELD-04")
 @each(
     ("text", "expected"),
     [
-        ("[claims]\nforse = true", "no unit 'forse'"),
-        ("[claims]\nforce = 1", "force is true or false"),
-        ("[claim]\nforce = true", "claim is not understood"),
-        ("claims = true", "hand or claims is not understood"),
-        ("[hand]\ncolour = 'red'", "colour is not understood"),
-        ("[hand]\nname = 1", "name is not understood"),
+        ("[claims]\nforse = true", "claims: Object contains unknown field forse"),
+        ("[claims]\nforce = 1", "claims.force: Expected bool, got int"),
+        ("[claim]\nforce = true", "Object contains unknown field claim"),
+        ("claims = true", "claims: Expected object, got bool"),
+        ("[hand]\ncolour = 'red'", "hand: Expected str matching regex '^(name|"),
+        ("[hand]\nname = 1", "hand[...]: Expected str, got int"),
         ("[hand]\nmodel = 'dex9'", "no hand model 'dex9'"),
         ("[claims", "capabilities.toml is not valid TOML: "),
     ],
