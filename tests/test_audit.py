@@ -15,7 +15,7 @@ from dexkit.cli import main
 from dexkit.conformance.audit import objects, sessions
 from dexkit.conformance.audit.audit import Audit, AuditProgress, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
-from dexkit.conformance.audit.file_records import FINDING, FileRecord, State
+from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.journal import Journal
 from dexkit.conformance.audit.result_tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.sessions import SessionFile, find
@@ -23,7 +23,9 @@ from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
+from dexkit.conformance.results import Verdict
 from dexkit.errors import DexkitError, OutputError, UsageError
+from dexkit.records import to_record
 from dexkit.traces import open_trace, sample_path
 from tests.audit_work import work
 from tests.trace_helpers import CMD_TYPE, Shape, mcap_bytes, rows
@@ -59,18 +61,15 @@ def test_a_file_gets_the_verdicts_of_dexkit_check(tmp_path: Path) -> None:
     assert found.state is State.JUDGED
     assert (found.overall, found.exit_code) == (str(result.overall), result.exit_code())
     expected = [
-        (r.requirement.id, r.side, str(r.verdict), r.observed)
-        for r in (*result.results, *result.client)
+        (r.requirement.id, r.side, r.verdict, r.observed) for r in (*result.results, *result.client)
     ]
-    names = ("requirement", "side", "verdict", "observed")
-    assert list(zip(*map(found.of_findings, names), strict=True)) == expected
+    assert [(f.requirement, f.side, f.verdict, f.observed) for f in found.findings] == expected
     gap = found.facts["sides"]["left"]["states"]["max_s"]
     assert gap == pytest.approx(1.502, abs=0.001)
-    failure = next(f for f in found.findings if f[5] == "fail")
-    about = dict(zip(FINDING, failure, strict=True))
-    assert about["requirement"] == "DEX1-RATE-03"
-    assert about["evidence_s"] == pytest.approx(9.496, abs=0.01)
-    assert about["value"] > about["limit"]
+    failure = next(f for f in found.findings if f.verdict is Verdict.FAIL)
+    assert failure.requirement == "DEX1-RATE-03"
+    assert failure.evidence_s == pytest.approx(9.496, abs=0.01)
+    assert failure.value > failure.limit
     assert FileRecord.of_line(found.as_line()) == found
 
 
@@ -326,8 +325,8 @@ def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
     summary = Summary()
     for day in range(1, 5):
         for name, verdict in (("good", "pass"), ("<b>bad", "fail")):
-            finding = [None] * len(FINDING)
-            finding[:8] = ["hand", "DEX1-RATE-03", "MUST", "drop-in", "left", verdict, "", "a gap"]
+            row = ["hand", "DEX1-RATE-03", "MUST", "drop-in", "left", verdict, "", "a gap"]
+            finding = to_record([*row, "", "", None, None, "", "", None, None], Finding, "it")
             summary.add(
                 FileRecord(
                     f"{day}/{name}.mcap",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import msgspec
 
 from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
 from dexkit.conformance.audit.file_records import FileRecord, State
@@ -14,6 +16,7 @@ from dexkit.conformance.audit.result_tables import write_tables
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.workers import Pool, WorkerLost
+from dexkit.conformance.results import Verdict
 from dexkit.documents import write_file
 from dexkit.redaction import redact
 
@@ -91,7 +94,7 @@ class AuditProgress:
         self.reused += reused
         self.failing += record.failed
         self.unusable += record.exit_code == 2
-        self.warned += any(v == "warn" for v in record.of_findings("verdict"))
+        self.warned += any(f.verdict is Verdict.WARN for f in record.findings)
         seconds = record.facts.get("duration_s") or 0.0
         self.recorded_s += seconds
         if not reused:
@@ -217,7 +220,7 @@ class Audit:
             error = redact(result, session.place)
             record = FileRecord(session.name, session.size, session.tag, state, error=error)
         elif task.known and result.sha256 == task.known:
-            record = replace(
+            record = msgspec.structs.replace(
                 journal.read(self._before[session.name]), size=session.size, tag=session.tag
             )
         else:

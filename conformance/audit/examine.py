@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dexkit import __version__
-from dexkit.conformance.audit.file_records import FileRecord, State, finding_of
+from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.sessions import SessionFile, opened, problem_of
 from dexkit.conformance.judge import judge
 from dexkit.conformance.layers import recording_of
@@ -128,8 +128,8 @@ def _judged(path: Path, open_file: OpenFile | None, name: str, labels: Sequence[
         exit_code=2 if error_text else result.exit_code(),
         facts=facts,
         findings=[
-            *(finding_of(r, about) for r in result.results),
-            *(finding_of(r, "client") for r in result.client),
+            *(Finding.of(r, about) for r in result.results),
+            *(Finding.of(r, "client") for r in result.client),
         ],
     )
 

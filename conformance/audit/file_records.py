@@ -3,40 +3,77 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
-from dexkit.conformance.results import Overall, Result, Verdict, worst
+import msgspec
 
-__all__ = ["FINDING", "FORMAT", "VERSION", "FileRecord", "Finding", "State", "finding_of"]
+from dexkit.conformance.requirements import Kind, Level
+from dexkit.conformance.results import Overall, Result, Verdict, worst
+from dexkit.errors import UsageError
+from dexkit.records import as_plain, to_record
+
+__all__ = ["FORMAT", "VERSION", "FileRecord", "Finding", "State"]
 
 FORMAT = "dexkit-audit"
 VERSION = 2
 """Journals of version 1 may hold the credentials of URLs."""
 
-Finding = list[Any]
-"""One requirement on one side; its values are those of :data:`FINDING`, in that order."""
-FINDING: dict[str, type] = {
-    "about": str,
-    "requirement": str,
-    "level": str,
-    "kind": str,
-    "side": str,
-    "verdict": str,
-    "figure": str,
-    "observed": str,
-    "reason": str,
-    "blocked_by": str,
-    "value": float,
-    "limit": float,
-    "unit": str,
-    "evidence_topic": str,
-    "evidence_s": float,
-    "evidence_end_s": float,
-}
-"""Columns of a finding. ``about`` is ``hand``, ``robot`` or ``client``; ``value``, ``limit`` and
-``unit`` are of the figure that the verdict rests on, where it rests on one."""
+
+class Finding(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """One requirement on one side.
+
+    :param about: ``hand``, ``robot`` or ``client``.
+    :param value: of the figure that the verdict rests on, where it rests on one; also ``limit`` and
+        ``unit``.
+    :param evidence_topic: of the first place in the recording that shows it, where there is one;
+        also the times.
+    """
+
+    about: str
+    requirement: str
+    level: Level
+    kind: Kind
+    side: str
+    verdict: Verdict
+    figure: str
+    observed: str
+    reason: str
+    blocked_by: str
+    value: float | None
+    limit: float | None
+    unit: str
+    evidence_topic: str
+    evidence_s: float | None
+    evidence_end_s: float | None
+
+    @classmethod
+    def of(cls, result: Result, about: str) -> Finding:
+        """The row of a result."""
+        place = result.evidence[0] if result.evidence else None
+        measure = result.measure
+        return cls(
+            about,
+            result.id,
+            result.requirement.level,
+            result.requirement.kind,
+            result.side,
+            result.verdict,
+            result.figure,
+            result.observed,
+            result.reason,
+            result.blocked_by,
+            None if measure is None else measure.value,
+            None if measure is None else measure.limit,
+            "" if measure is None else measure.unit,
+            "" if place is None else place.topic,
+            None if place is None else round(place.time_s, 6),
+            None if place is None or place.end_s is None else round(place.end_s, 6),
+        )
+
+    def as_row(self) -> dict[str, Any]:
+        """Its values by their names."""
+        return dict(zip(self.__struct_fields__, as_plain(self), strict=True))
 
 
 class State(str, Enum):
@@ -66,8 +103,7 @@ class State(str, Enum):
         return self in (State.JUDGED, State.NOT_JUDGED, State.UNREADABLE)
 
 
-@dataclass
-class FileRecord:
+class FileRecord(msgspec.Struct, forbid_unknown_fields=True):
     """One file of an archive.
 
     :param name: path, or URL without credentials; ``tag`` changes whenever the file does: an etag,
@@ -94,13 +130,12 @@ class FileRecord:
     overall: str = ""
     client: str = ""
     exit_code: int = 2
-    facts: dict[str, Any] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
+    facts: dict[str, Any] = {}
+    findings: list[Finding] = []
 
     def as_line(self) -> bytes:
         """The record as a line of JSON."""
-        text = json.dumps({**vars(self), "state": str(self.state)}, separators=(",", ":"))
-        return text.encode() + b"\n"
+        return json.dumps(as_plain(self), separators=(",", ":")).encode() + b"\n"
 
     @classmethod
     def of_line(cls, line: bytes) -> FileRecord:
@@ -109,25 +144,16 @@ class FileRecord:
         :raises ValueError: it is none, or cut.
         """
         try:
-            data = json.loads(line)
-            found = cls(**{**data, "state": State(data["state"])})
-            if any(len(finding) != len(FINDING) for finding in found.findings):
-                raise ValueError("a finding of another version")
-        except (KeyError, TypeError, RecursionError) as error:
-            raise ValueError(f"not a record: {error}") from None
-        return found
-
-    def of_findings(self, name: str) -> list[Any]:
-        """One column of the findings."""
-        at = list(FINDING).index(name)
-        return [finding[at] for finding in self.findings]
+            return to_record(json.loads(line), cls, "a line of a journal")
+        except (UsageError, RecursionError) as error:
+            raise ValueError(str(error)) from None
 
     def verdicts(self, about_client: bool = False) -> dict[str, Verdict]:
         """The verdict on each requirement, sides taken together."""
         found: dict[str, list[Verdict]] = {}
         for finding in self.findings:
-            if (finding[0] == "client") is about_client:
-                found.setdefault(finding[1], []).append(Verdict(finding[5]))
+            if (finding.about == "client") is about_client:
+                found.setdefault(finding.requirement, []).append(finding.verdict)
         return {name: worst(verdicts) for name, verdicts in found.items()}
 
     @property
@@ -144,27 +170,3 @@ class FileRecord:
             -int(self.exit_code == 2),
             -found.count(Verdict.WARN),
         )
-
-
-def finding_of(result: Result, about: str) -> Finding:
-    """The row of a result."""
-    place = result.evidence[0] if result.evidence else None
-    measure = result.measure
-    return [
-        about,
-        result.requirement.id,
-        str(result.requirement.level),
-        str(result.requirement.kind),
-        result.side,
-        str(result.verdict),
-        result.figure,
-        result.observed,
-        result.reason,
-        result.blocked_by,
-        None if measure is None else measure.value,
-        None if measure is None else measure.limit,
-        "" if measure is None else measure.unit,
-        "" if place is None else place.topic,
-        None if place is None else round(place.time_s, 6),
-        None if place is None or place.end_s is None else round(place.end_s, 6),
-    ]

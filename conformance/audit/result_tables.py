@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.audit.file_records import FINDING, FileRecord
+import msgspec
+
+from dexkit.conformance.audit.file_records import FileRecord, Finding
 from dexkit.documents import write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error
@@ -54,7 +56,10 @@ FILE: dict[str, type] = {
 }
 """Columns of ``files``; the last four are JSON."""
 _OF_FILE = ("file", "sha256", "dexkit", "catalogue", "model", "dialect", "recorded_at")
-FINDINGS: dict[str, type] = {**{name: FILE[name] for name in _OF_FILE}, **FINDING}
+FINDINGS: dict[str, type] = {
+    **{name: FILE[name] for name in _OF_FILE},
+    **{f.name: float if f.type == float | None else str for f in msgspec.structs.fields(Finding)},
+}
 """Columns of ``findings``."""
 _BATCH = 200  # files whose rows are held at once
 
@@ -101,7 +106,7 @@ def finding_rows(record: FileRecord) -> list[dict[str, Any]]:
     """The rows of a file in ``findings``."""
     row = file_row(record)
     about = {name: row[name] for name in _OF_FILE}
-    return [{**about, **dict(zip(FINDING, f, strict=True))} for f in record.findings]
+    return [{**about, **finding.as_row()} for finding in record.findings]
 
 
 def write_tables(

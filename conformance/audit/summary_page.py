@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dexkit import __version__
-from dexkit.conformance.audit.file_records import FINDING, FileRecord, State
+from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import ANSWERS, VERDICTS
@@ -34,10 +34,6 @@ _MOST = 3
 _SHORT = 40
 """Characters of a file's name that are not broken into lines."""
 _DAY = 86_400.0
-
-_ABOUT, _REQUIREMENT, _SIDE, _VERDICT, _OBSERVED = (
-    list(FINDING).index(name) for name in ("about", "requirement", "side", "verdict", "observed")
-)
 
 
 @dataclass
@@ -130,10 +126,9 @@ class Summary:
             return
         shown = []
         for finding in record.findings:
-            named = finding[_REQUIREMENT] in failed and finding[_ABOUT] != "client"
-            if named and finding[_VERDICT] == "fail":
-                text = f"{finding[_SIDE]}: {finding[_OBSERVED]}"
-                shown.append((finding[_REQUIREMENT], text))
+            named = finding.requirement in failed and finding.about != "client"
+            if named and finding.verdict is Verdict.FAIL:
+                shown.append((finding.requirement, f"{finding.side}: {finding.observed}"))
         line = _Line(
             record.name,
             record.overall,

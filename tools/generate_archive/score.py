@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -82,8 +82,8 @@ def _count(score: Score, answer: Answer, record: FileRecord | None) -> None:
     allowed = {*answer.find, *answer.also}
     if not answer.state or answer.state == "truncated":
         for finding in _failed(record.findings):
-            if not (finding["requirement"] in allowed and finding["side"] == answer.side):
-                text = f"{finding['requirement']} {finding['side']}: {finding['observed']}"
+            if not (finding.requirement in allowed and finding.side == answer.side):
+                text = f"{finding.requirement} {finding.side}: {finding.observed}"
                 score.blamed.append(f"{what}: {text}")
 
 
@@ -95,17 +95,14 @@ def _finds(answer: Answer, record: FileRecord) -> bool:
     if answer.state:
         return str(record.state) == answer.state
     return any(
-        f["requirement"] in answer.find and f["side"] == answer.side
+        f.requirement in answer.find and f.side == answer.side
         for f in _failed(record.findings, ("fail", "warn"))
     )
 
 
 def _failed(
     findings: Iterable[Finding], verdicts: tuple[str, ...] = ("fail",)
-) -> Iterable[Mapping[str, str]]:
-    from dexkit.conformance.audit.file_records import FINDING
-
+) -> Iterable[Finding]:
     for finding in findings:
-        row = dict(zip(FINDING, finding, strict=True))
-        if row["verdict"] in verdicts and row["about"] != "client":
-            yield row
+        if finding.verdict in verdicts and finding.about != "client":
+            yield finding
