@@ -28,7 +28,7 @@ A node sees only what comes in by its interface or from this machine
 machine. Where the system has no filter for that, a node is refused, unless
 ``DEXKIT_ALL_INTERFACES=1`` allows it.
 
-``DEXKIT_PEERS=HOST,...`` (``--peer``) names other machines that are called by unicast, for networks
+``DEXKIT_PEERS=HOST,...`` names other machines that are called by unicast, for networks
 without multicast. Samples then go by unicast only.
 
 ``DEXKIT_DDS_LOG=PATH`` appends CycloneDDS's own log to a file; otherwise its warnings only become
@@ -61,13 +61,12 @@ from dexkit.dds_library import loaded_here
 from dexkit.dds_socket_filter import DomainSockets, open_sockets
 from dexkit.errors import DdsError, DdsSetupError, DdsUnavailable, EncodeError, UsageError
 from dexkit.escaping import html
-from dexkit.interface_names import find_interface, resolve_peers
+from dexkit.interface_names import find_interface, named_peers
 from dexkit.messages import MessageType, layout, message_type
 from dexkit.open_file_limit import require_open_files
 from dexkit.threads import Worker
 
 __all__ = [
-    "PEERS",
     "DdsNode",
     "Discovery",
     "DiscoveryEvent",
@@ -79,14 +78,10 @@ __all__ = [
     "Writer",
     "cyclone_type",
     "interfaces",
-    "named_peers",
     "type_hash",
 ]
 
 _log = logging.getLogger(__name__)
-
-PEERS = "DEXKIT_PEERS"
-"""Environment variable: other machines to call by unicast, separated by commas."""
 
 _INFINITY = 0x7FFFFFFFFFFFFFFF
 _OK = 0
@@ -473,14 +468,6 @@ def _trace(verbosity: str, path: str) -> str:
 
 # until the filter is there; dds_domain_set_deafmute() ends it
 _DEAF = "<Internal><ControlTopic><Deaf>true</Deaf></ControlTopic></Internal>"
-
-
-def named_peers() -> tuple[str, ...]:
-    """Addresses of the other machines that are called by unicast.
-
-    :raises DdsSetupError: a name is not known.
-    """
-    return resolve_peers([p.strip() for p in os.environ.get(PEERS, "").split(",") if p.strip()])
 
 
 def _config(interface: str, more: str = "", peers: Sequence[str] = ()) -> str:

@@ -10,6 +10,7 @@ same, 192.168.123.0/24. So that is accepted wherever an interface is named:
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 import socket
 import time
@@ -23,9 +24,20 @@ from dexkit.interface_filter import (
     is_loopback,
 )
 
-__all__ = ["find_interface", "interface_towards", "resolve_peers", "wait_for_interface"]
+__all__ = [
+    "PEERS",
+    "find_interface",
+    "interface_towards",
+    "named_peers",
+    "resolve_peers",
+    "wait_for_interface",
+]
+
+PEERS = "DEXKIT_PEERS"
+"""Environment variable: other machines to call by unicast, separated by commas."""
 
 _IFF_UP = 0x1
+_WAITS = "'dexkit serve --wait-for-interface S' waits for one that comes later"
 _POLL = 0.2  # seconds between two looks for an interface that is not there yet
 _PARTIAL = re.compile(r"(\d{1,3}\.){1,3}|\d{1,3}(\.\d{1,3}){1,2}")  # 192.168.123. or 192.168.123
 
@@ -83,7 +95,7 @@ def find_interface(text: str) -> str:
     what = f"address {text}" if network.prefixlen == 32 else f"an address in {network}"
     raise DdsSetupError(
         f"no network interface has {what}",
-        hint=f"is the cable plugged in? {_list()}; --wait-for-interface waits for it",
+        hint=f"is the cable plugged in? {_list()}; {_WAITS}",
     )
 
 
@@ -91,13 +103,13 @@ def _named(name: str) -> str:
     if name not in _names():
         raise DdsSetupError(
             f"there is no network interface {name!r}",
-            hint=f"{_list()}; --wait-for-interface waits for one that comes later",
+            hint=f"{_list()}; {_WAITS}",
         )
     if not interface_address(name) and not is_loopback(name):
         down = "" if interface_flags(name) & _IFF_UP else " and is down"
         raise DdsSetupError(
             f"network interface {name!r} has no IPv4 address{down}",
-            hint=f"is the cable plugged in? {_list()}; --wait-for-interface waits for it",
+            hint=f"is the cable plugged in? {_list()}; {_WAITS}",
         )
     return name
 
@@ -148,6 +160,14 @@ def interface_towards(address: str) -> str:
                 hint=f"{_list()}; give --interface",
             ) from error
     return find_interface(own)
+
+
+def named_peers() -> tuple[str, ...]:
+    """Addresses of the other machines that are called by unicast.
+
+    :raises DdsSetupError: a name is not known.
+    """
+    return resolve_peers([p.strip() for p in os.environ.get(PEERS, "").split(",") if p.strip()])
 
 
 def resolve_peers(texts: list[str]) -> tuple[str, ...]:

@@ -28,7 +28,6 @@ DIFFERENT = {
         {SHARED, "bridge", "cut"},
         "a format, a dialect, a time",
     ),
-    "--link": ({"emulate/serving", "doctor"}, "a path, and the host at the other end of a network"),
     "--log": ({"monitor", "setup_dds"}, "a recording, and the output of programs"),
     "--out": (
         {SHARED, "export", "view"},

@@ -39,7 +39,7 @@ ELSEWHERE = (
     (r"s3://|head:6379", "a store and a cluster: tests/test_audit.py, tests/test_audit_ray.py"),
     (r"^setup-dds", "downloads, or needs sources: tests/test_setup_dds.py"),
     (r"^install-service ezgripper", "as root: tests/test_install_service.py"),
-    (r"--peer|--interface (wlan0|192)", "other machines: tests/test_networks.py"),
+    (r"DEXKIT_PEERS|--interface (wlan0|192)", "other machines: tests/test_networks.py"),
     (
         r"ttyUSB1|(dex1|inspire|revo2)-serial .*--device /dev|--device 192|"
         r"(calibrate|selftest) dex1",

@@ -441,7 +441,7 @@ def test_doctor_prints_its_verdict_and_sets_the_exit_code(service: int) -> None:
     assert good.return_value == 0, good.output
     assert good.output.startswith("Healthy")
     assert "a client gets past its wait" in good.output
-    bad = CliRunner().invoke(cli, [*base, "--model", "dex3", "--json"], standalone_mode=False)
+    bad = CliRunner().invoke(cli, [*base, "--dialect", "dex3", "--json"], standalone_mode=False)
     assert bad.return_value == 1
     data = json.loads(bad.stdout)
     assert not data["healthy"]

@@ -612,7 +612,7 @@ def test_good_link_has_no_finding_and_remedies_name_the_interface() -> None:
     (found,) = [f for f in diagnose(_linked(rtt_95=0.04), devices) if f.id == "LINK-JITTER"]
     assert "iw dev eth0 set power_save off" in found.fix
     (found,) = [f for f in diagnose(_linked(multicast=False), devices) if f.id == "LINK-MULTICAST"]
-    assert "--peer robot" in found.fix
+    assert "DEXKIT_PEERS=robot" in found.fix
     (found,) = [f for f in diagnose(_linked(received=80), devices) if f.id == "LINK-LOSS"]
     assert found.severity is Severity.ERROR
     # without commands from there their age follows from the round trips

@@ -18,11 +18,13 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
-from dexkit.dds import PEERS, _config
+from dexkit.dds import _config
 from dexkit.errors import DdsSetupError, UsageError
 from dexkit.interface_names import (
+    PEERS,
     find_interface,
     interface_towards,
+    named_peers,
     resolve_peers,
     wait_for_interface,
 )
@@ -121,20 +123,23 @@ def test_waiting_for_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert wait(0.0) == "lo2"
 
 
-def test_peers_last_as_long_as_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv(PEERS, "10.0.0.1")
+def test_interface_is_that_by_which_the_first_peer_is_reached(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(PEERS, "127.0.0.1, localhost")
+    assert named_peers() == ("127.0.0.1",)
+    words = ("record", str(tmp_path / "x.mcap"))
     seen: list[str] = []
+    monkeypatch.setattr("dexkit.dds.DdsNode", lambda **options: 1 / 0)
     monkeypatch.setattr(
-        "dexkit.dds.DdsNode", lambda **options: seen.append(os.environ[PEERS]) or 1 / 0
+        "dexkit.interface_names.interface_towards", lambda peer: seen.append(peer) or "lo"
     )
-    words = ("record", str(tmp_path / "x.mcap"), "--peer", "127.0.0.1", "--peer", "localhost")
     done = CliRunner().invoke(cli, words, standalone_mode=False)
     assert isinstance(done.exception, ZeroDivisionError)
     assert seen == ["127.0.0.1"]
-    assert os.environ[PEERS] == "10.0.0.1"
-    done = CliRunner().invoke(cli, [*words[:2], "--peer", "no such host"], standalone_mode=False)
+    monkeypatch.setenv(PEERS, "no such host")
+    done = CliRunner().invoke(cli, words, standalone_mode=False)
     assert isinstance(done.exception, DdsSetupError)
-    assert os.environ[PEERS] == "10.0.0.1"
 
 
 @each(
@@ -147,11 +152,13 @@ def test_peers_last_as_long_as_the_command(monkeypatch: pytest.MonkeyPatch, tmp_
     ],
 )
 def test_commands_refuse_an_interface_that_is_not_there(words: tuple[str, ...]) -> None:
-    more = ("--interface", "203.0.113.0/24", "--wait-for-interface", "0.1")
+    more = ["--interface", "203.0.113.0/24"]
+    if words[0] == "serve":
+        more += ["--wait-for-interface", "0.1"]
     done = CliRunner().invoke(cli, [*words, *more], standalone_mode=False)
     assert isinstance(done.exception, DdsSetupError)
     assert "203.0.113.0/24" in str(done.exception)
-    assert "waiting for up to 0.1 s" in done.stderr
+    assert ("waiting for up to 0.1 s" in done.stderr) == (words[0] == "serve")
 
 
 # -- networks
@@ -184,10 +191,10 @@ def test_peers_without_multicast_and_an_interface_that_comes_later() -> None:
             service.wait_line("waiting for up to 100 s: no network interface has an address")
             hosts["hand"].sh("ip address add 10.9.5.1/24 dev net0")
             assert "domain 7, net0" in service.wait_line("^ready")
-            # --peer on one side is enough, and chooses the interface
+            # DEXKIT_PEERS on one side is enough, and chooses the interface
             said = hosts["client"].run(
-                *(sys.executable, "-m", "dexkit", "doctor", "--domain", 7, "--scan", "none"),
-                *("--peer", HAND, "--seconds", 1, "--model", "dex1"),
+                *("env", f"DEXKIT_PEERS={HAND}", sys.executable, "-m", "dexkit"),
+                *("doctor", "--domain", 7, "--scan", "none", "--seconds", 1),
                 check=False,
             )
             assert "rt/dex1/left/state" in said
@@ -222,7 +229,7 @@ def test_a_link_is_measured(impairments: tuple[object, ...], expected: set[str])
             for _ in range(_MEASUREMENTS):
                 said = hosts["client"].run(
                     *(sys.executable, "-m", "dexkit", "doctor", "--domain", 7, "--scan", "none"),
-                    *("--link", HAND, "--seconds", 5, "--json"),
+                    *("--ping", HAND, "--seconds", 5, "--json"),
                     check=False,
                 )
                 report = json.loads(said)

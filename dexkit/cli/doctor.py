@@ -22,11 +22,9 @@ from dexkit.cli.options import (
     found_interface,
     interfaces_option,
     json_option,
-    network_options,
-    peer_addresses,
 )
 from dexkit.errors import UsageError
-from dexkit.models import DIALECTS, MODELS, Dialect, short_names
+from dexkit.models import DIALECTS
 from dexkit.open_file_limit import require_open_files
 from dexkit.stop_signals import StopRequest, stop_on_signals
 
@@ -38,7 +36,6 @@ __all__ = ["command"]
 
 _REFRESH = 1.0  # seconds between looks
 _FILES = 16  # descriptors beside one a domain and interface
-_MODEL_NAMES = {short: hand.name for short, hand in short_names().items()}
 
 
 def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int]:
@@ -81,14 +78,10 @@ def _scan(ctx: click.Context, parameter: click.Parameter, text: str) -> list[int
 @interfaces_option(
     "Examine this network interface (name, address or prefix) as well as lo; may be repeated."
 )
-@network_options()
 @click.option(
-    "--link",
+    "--ping",
     metavar="HOST",
     help="Also measure the link to this machine: latency, loss, jitter, multicast, clock.",
-)
-@click.option(
-    "--model", type=click.Choice(list(_MODEL_NAMES)), help="Only this hand model.  [default: any]"
 )
 @dialect_option("Only this dialect.  [default: any]")
 @devices_option("Also examine a serial port and ask for servos on it, 'usb', or usbip://HOST:PORT.")
@@ -105,8 +98,7 @@ def command(
     domain: int | None,
     scan: list[int],
     interfaces: tuple[str, ...],
-    link: str | None,
-    model: str | None,
+    ping: str | None,
     dialect: str | None,
     devices: tuple[str, ...],
     as_json: bool,
@@ -122,23 +114,21 @@ def command(
     """
     from dexkit.doctor import Scope, diagnose, readiness, verdict
     from dexkit.doctor.environment import environment
+    from dexkit.interface_names import interface_towards, named_peers, resolve_peers
 
     if domain is None and not scan:
         raise UsageError("no domain to examine", hint="give --domain or --scan")
-    scope = Scope(domain, _dialects(model, dialect), bool(devices) and domain is None)
+    dialects = () if dialect is None else (DIALECTS[dialect],)
+    scope = Scope(domain, dialects, bool(devices) and domain is None)
     ctx = click.get_current_context()
-    peers = peer_addresses(ctx)
+    peers = named_peers()
     target = None
-    if link is not None:
-        from dexkit.interface_names import interface_towards, resolve_peers
-
-        (address,) = resolve_peers([link])
-        target = (link, address, interface_towards(address))
+    if ping is not None:
+        (address,) = resolve_peers([ping])
+        target = (ping, address, interface_towards(address))
         interfaces = tuple(dict.fromkeys((*interfaces, target[2])))
     interfaces = tuple(dict.fromkeys(found_interface(ctx, text) for text in interfaces))
     if peers and not interfaces:
-        from dexkit.interface_names import interface_towards
-
         interfaces = tuple(dict.fromkeys(interface_towards(peer) for peer in peers))
     windows = len({*scan, *([] if domain is None else [domain])}) * len({"lo", *interfaces})
     require_open_files(windows + _FILES, f"examining {windows} domain(s)")
@@ -179,16 +169,6 @@ def command(
             if not watch:
                 return last
             stop.wait(_REFRESH)
-
-
-def _dialects(model: str | None, dialect: str | None) -> tuple[Dialect, ...]:
-    if dialect is not None:
-        chosen = DIALECTS[dialect]
-        if model is not None and chosen.model != _MODEL_NAMES[model]:
-            raise UsageError(f"--dialect {dialect} is not one of {_MODEL_NAMES[model]}")
-        return (chosen,)
-    # every dialect of a model would be one too many: which it is shows when it is seen
-    return MODELS[_MODEL_NAMES[model]].dialects if model is not None else ()
 
 
 def _observe(

@@ -50,13 +50,11 @@ __all__ = [
     "list_option",
     "loop_option",
     "markdown_option",
-    "network_options",
     "one_side_option",
     "out_option",
     "output_option",
     "overwrite_option",
     "pace_option",
-    "peer_addresses",
     "port_option",
     "prefix_option",
     "prefixed_topics",
@@ -170,9 +168,10 @@ OUTPUT_FILE = LocalPath(folder=False)
 def dds_options(
     *, default_domain: int | None = 1, domain_default_text: str = ""
 ) -> Callable[[F], F]:
-    """``--domain``, ``--interface``, ``--peer`` and ``--wait-for-interface``.
+    """``--domain`` and ``--interface``.
 
-    The interface defaults to loopback, or to that by which the first peer is reached.
+    The interface defaults to loopback, or to that by which the first of ``DEXKIT_PEERS`` is
+    reached.
 
     :param domain_default_text: what ``--help`` prints where there is no fixed default.
     """
@@ -185,8 +184,7 @@ def dds_options(
         "this machine unless one is named.",
         callback=_interface,
     )
-    network = network_options()
-    return lambda function: domain(interface(network(function)))
+    return lambda function: domain(interface(function))
 
 
 def domain_option(help: str, default: int | None = None) -> Callable[[F], F]:
@@ -219,79 +217,21 @@ def interfaces_option(help: str) -> Callable[[F], F]:
     return click.option("--interface", "interfaces", multiple=True, metavar="IF", help=help)
 
 
-def network_options() -> Callable[[F], F]:
-    """``--peer`` and ``--wait-for-interface``; :func:`found_interface` uses them."""
-    peer = click.option(
-        "--peer",
-        "peers",
-        multiple=True,
-        metavar="HOST",
-        is_eager=True,  # before --interface
-        expose_value=False,
-        callback=_set_peers,
-        help="Call this machine by unicast, for networks without multicast; may be repeated.",
-    )
-    wait = wait_for_interface_option(
-        "Wait up to S seconds for a network interface that is not up yet.",
-        is_eager=True,
-        expose_value=False,
-        callback=lambda ctx, param, value: ctx.meta.__setitem__(_WAIT, value),
-    )
-    return lambda function: peer(wait(function))
+_WAIT = "dexkit.wait_for_interface"
 
 
-def wait_for_interface_option(
-    help: str, default: float = 0.0, **attributes: Any
-) -> Callable[[F], F]:
-    """``--wait-for-interface S``.
-
-    :param attributes: further ones of :func:`click.option`.
-    """
+def wait_for_interface_option(help: str, default: float = 0.0) -> Callable[[F], F]:
+    """``--wait-for-interface S``; the interface of :func:`dds_options` is waited for."""
     return click.option(
         "--wait-for-interface",
         type=Number(min=0),
         default=default,
         show_default=default > 0,
         metavar="S",
+        is_eager=True,  # before --interface
+        callback=lambda ctx, param, value: ctx.meta.setdefault(_WAIT, value),
         help=help,
-        **attributes,
     )
-
-
-_PEERS, _WAIT = "dexkit.peers", "dexkit.wait_for_interface"
-
-
-def _set_peers(
-    ctx: click.Context, parameter: click.Parameter, peers: tuple[str, ...]
-) -> tuple[str, ...]:
-    """Set the peers of this process, and of those that it starts, while the command runs."""
-    if ctx.resilient_parsing or not peers:
-        return peers
-    from dexkit.dds import PEERS
-
-    ctx.meta[_PEERS] = peers
-    found = ",".join(peer_addresses(ctx))  # refused before anything is changed
-    before = os.environ.get(PEERS)
-
-    def restore() -> None:
-        if before is None:
-            os.environ.pop(PEERS, None)
-        else:
-            os.environ[PEERS] = before
-
-    ctx.call_on_close(restore)
-    os.environ[PEERS] = found
-    return peers
-
-
-def peer_addresses(ctx: click.Context) -> tuple[str, ...]:
-    """Addresses of the machines of ``--peer``.
-
-    :raises DdsSetupError: a name is not known.
-    """
-    from dexkit.interface_names import resolve_peers
-
-    return resolve_peers(list(ctx.meta.get(_PEERS, ())))
 
 
 def found_interface(ctx: click.Context, text: str) -> str:
@@ -313,11 +253,11 @@ def found_interface(ctx: click.Context, text: str) -> str:
 
 def _interface(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
     """Resolve ``--interface``; without it, that by which the peers are reached."""
-    from dexkit.interface_names import interface_towards
+    from dexkit.interface_names import interface_towards, named_peers
 
     if ctx.resilient_parsing:
         return text
-    peers = peer_addresses(ctx)
+    peers = named_peers()
     given = ctx.get_parameter_source(str(parameter.name))
     if peers and given is click.core.ParameterSource.DEFAULT:
         return interface_towards(peers[0])

@@ -28,6 +28,7 @@ from dexkit.cli.options import (
     side_option,
     usb_option,
     view_option,
+    wait_for_interface_option,
     with_guesses,
 )
 from dexkit.cli.settings import key_and_value, set_option
@@ -75,6 +76,7 @@ _LONELY = 10.0  # seconds without a client before a hint
 )
 @prefix_option("Serve on rt/NAME/..., for one of several robots: rt/r2/dex3/left/cmd for r2.")
 @dds_options(default_domain=None, domain_default_text="0 for a device, else 1")
+@wait_for_interface_option("Wait up to S seconds for a network interface that is not up yet.")
 @click.option(
     "--state-rate",
     type=Number(1, 1000),
@@ -123,6 +125,7 @@ def command(
     prefix: str,
     domain: int | None,
     interface: str,
+    wait_for_interface: float,
     state_rate: float | None,
     estimator: str,
     stall_tau: float,

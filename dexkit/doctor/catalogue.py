@@ -154,7 +154,7 @@ _ALL = (
         "multicast does not reach the other machine",
         _WAITS + "; ping works",
         "DDS finds peers by multicast, which many access points, VPNs and containers do not carry",
-        "give --peer HOST to dexkit's programs; for others <Peers> in CYCLONEDDS_URI",
+        "set DEXKIT_PEERS=HOST for dexkit's programs; for others <Peers> in CYCLONEDDS_URI",
     ),
     Diagnosis(
         "LINK-CLOCK",

@@ -46,7 +46,7 @@ def states_on(domains: Sequence[int], interface: str) -> dict[int, tuple[str, ..
 
     :raises DdsSetupError: the interface is not there or has no address.
     """
-    from dexkit.dds import named_peers
+    from dexkit.interface_names import named_peers
 
     views = observe_domains(domains, (interface,), seconds=0.0, peers=named_peers())
     found = {}
