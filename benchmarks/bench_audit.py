@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Reader
 
 from benchmarks import Result
 from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, Runner, in_this_process
-from dexkit.conformance.audit.cluster import THIS_MACHINE
+from dexkit.conformance.audit.cluster import THIS_MACHINE, Cluster
 from dexkit.conformance.audit.journal import Journal
 from dexkit.models import BUILT_IN, HandModel
 from tools.generate_archive import ANSWERS, generate
@@ -51,7 +51,7 @@ def run() -> list[Result]:
         found = [result for hand in BUILT_IN for result in _speed(hand, files)]
         found += [_scaling(one, many, cores), _score(archive, folder / "many")]
         if importlib.util.find_spec("ray") is not None:
-            ray, _ = _audit(archive, folder / "ray", Limits().cluster(THIS_MACHINE))
+            ray, _ = _audit(archive, folder / "ray", Cluster(THIS_MACHINE, Limits()).run)
             found += [_ray(many, ray, cores), _score(archive, folder / "ray", " on Ray")]
         return found
 

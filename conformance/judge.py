@@ -148,13 +148,13 @@ def judge_layer(
 
 
 def _judge_one(
-    layer: Layer[Any, Any, ContextT],
+    layer: Layer[Any, Any, Any],
     judgement: Judgement,
-    context: ContextT,
+    context: Any,
     whole: tuple[float, float] | None,
 ) -> Result:
     for precondition in layer.preconditions:
-        decided = precondition(judgement, context)
+        decided: Result | None = precondition(judgement, context)
         if decided:
             return decided
     requirement = judgement.requirement

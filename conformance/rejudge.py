@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.result_file import as_document, parse_result
 from dexkit.conformance.results import SEVERITY, Result, RunResult, Verdict, grouped, worst

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import judge
 from dexkit.conformance.known_backends import (
@@ -21,7 +22,6 @@ from dexkit.conformance.known_backends import (
     emulator_of,
     has_usb_requirements,
 )
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording, sides_of
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.result_file import write_json

@@ -21,8 +21,8 @@ from dexkit.conformance.audit.result_tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.workers import Pool, WorkerLost
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.results import Verdict
 from dexkit.errors import DexkitError, OutputError, UsageError
 from dexkit.records import to_record

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, in_this_process
+from dexkit.conformance.audit.cluster import Cluster as RayCluster
 from dexkit.conformance.audit.file_records import FileRecord
 from dexkit.conformance.audit.journal import Journal
 from dexkit.errors import ConformanceError, UsageError
@@ -32,7 +33,7 @@ LOOPBACK = "127.0.0.2"
 def test_missing_ray_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match="needs Ray"):
-        Limits().cluster("auto")
+        RayCluster("auto", Limits())
 
 
 def test_cluster_of_this_machine_has_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,14 +51,14 @@ def test_cluster_of_this_machine_has_a_token(monkeypatch: pytest.MonkeyPatch) ->
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
         monkeypatch.setenv(name, "")  # as before, afterwards
     for _ in range(2):
-        Limits().cluster("local")
+        RayCluster("local", Limits())
     (first, second) = asked
     assert first[:3] == second[:3] == ("local", False, "token")
     assert len({first[3], second[3]}) == 2
     assert len(first[3]) == 64
     ray.__version__ = "2.51.1"
     with pytest.raises(UsageError, match="would run code for every network"):
-        Limits().cluster("local")
+        RayCluster("local", Limits())
     assert len(asked) == 2
 
 
@@ -67,7 +68,8 @@ def test_nobody_else_runs_code_on_the_cluster_of_this_machine() -> None:
     script = """
 import os, subprocess, sys
 from dexkit.conformance.audit.audit import Limits
-Limits().cluster("local")
+from dexkit.conformance.audit.cluster import Cluster
+Cluster("local", Limits())
 import ray
 address = ray.get_runtime_context().gcs_address
 client = f"import ray; ray.init('{address}', log_to_driver=False); print(ray.get(ray.put(7)))"
@@ -135,7 +137,7 @@ def test_a_node_is_killed_and_nothing_is_lost_or_done_twice(
             killed.append(outcome.done)
 
     audit = Audit([str(files)], tmp_path / "ray", parquet=False)
-    outcome = audit.run(Limits().cluster(cluster.address), progress=kill_a_node)
+    outcome = audit.run(RayCluster(cluster.address, Limits()).run, progress=kill_a_node)
     assert killed == [3]
     assert (outcome.done, outcome.total, outcome.stopped) == (FILES + 1, FILES + 1, False)
     Audit([str(files)], tmp_path / "one", parquet=False).run(in_this_process)
@@ -154,10 +156,10 @@ def test_stopped_audit_keeps_results_and_the_next_one_continues(
             stop.append(True)
 
     audit = Audit([str(files)], tmp_path / "ray", parquet=False)
-    outcome = audit.run(Limits().cluster(two_nodes[0].address), stop, after_four)
+    outcome = audit.run(RayCluster(two_nodes[0].address, Limits()).run, stop, after_four)
     assert (outcome.done, outcome.stopped) == (4, True)
     assert len((tmp_path / "ray/files.jsonl").read_text().splitlines()) == 4
-    outcome = audit.run(Limits().cluster(two_nodes[0].address))
+    outcome = audit.run(RayCluster(two_nodes[0].address, Limits()).run)
     assert (outcome.done, outcome.reused, outcome.stopped) == (FILES + 1, 4, False)
     assert len(records(tmp_path / "ray")) == FILES + 1
 
@@ -170,7 +172,7 @@ def test_file_that_exceeds_the_time_limit_becomes_a_row(
     for path in sorted(files.iterdir())[2:]:
         path.unlink()
     audit = Audit([str(files)], tmp_path / "ray", parquet=False)
-    outcome = audit.run(Limits(seconds=1e-3).cluster(two_nodes[0].address))
+    outcome = audit.run(RayCluster(two_nodes[0].address, Limits(seconds=1e-3)).run)
     found = records(tmp_path / "ray").values()
     assert outcome.done == 2
     assert {(str(r.state), r.error) for r in found} == {
@@ -183,7 +185,7 @@ def test_missing_ray_cluster_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Non
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(ConformanceError, match="no Ray cluster"):
-        Limits().cluster(f"127.0.0.1:{port}")
+        RayCluster(f"127.0.0.1:{port}", Limits())
 
 
 def test_a_head_node_that_only_listens_at_127_0_0_1_is_named(
@@ -197,4 +199,4 @@ def test_a_head_node_that_only_listens_at_127_0_0_1_is_named(
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with pytest.raises(ConformanceError, match=r"looks for it at 127\.0\.0\.3.*127\.0\.0\.2"):
-            Limits().cluster(f"127.0.0.1:{port}")
+            RayCluster(f"127.0.0.1:{port}", Limits())

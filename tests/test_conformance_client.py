@@ -20,11 +20,12 @@ from hypothesis import strategies as st
 from dexkit.cli.check import command
 from dexkit.conformance.checks import Context, Outcome, check_of
 from dexkit.conformance.checks.client import returns, sessions, slow_stretches
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import Mutant, mutants
 from dexkit.conformance.faults.matrix import WrongHandResult as Trial
 from dexkit.conformance.faults.matrix import try_one
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import layer, recording_of
+from dexkit.conformance.layers import layer
 from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.recording import Commands, Recording, SideView, States, joints_of
 from dexkit.conformance.report.html import render

@@ -10,9 +10,9 @@ import pytest
 
 from dexkit.conformance.checks import Context
 from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.generated import parse
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.selection import length

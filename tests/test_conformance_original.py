@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.report.badge import badge_text, badges, render_badge
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.markdown import render_markdown

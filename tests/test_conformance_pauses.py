@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.checks import Context
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.generated import parse
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual

@@ -8,8 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.trials import plan_for
-from dexkit.conformance.layers import layer_of_model, recording_of
+from dexkit.conformance.layers import layer_of_model
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.hand import ROBOT, Side, Subject

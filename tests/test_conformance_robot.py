@@ -16,11 +16,11 @@ from click.testing import CliRunner
 from dexkit.cli.check import command
 from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.checks import check_of
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import Mutant, mutants, plan_for, run_mutant
 from dexkit.conformance.faults.matrix import WrongHandResult, try_one
 from dexkit.conformance.faults.robot import CdrCrc, NoCrc, WaitsForCommands
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.live import LiveOptions, record_run
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.requirements import Level, catalogue, select

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks.timing import Positions
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 
 from dexkit.cli import cli
 from dexkit.cli.info_plot import plot_lines
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.report.curves import page, recorded
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.result_file import write_json

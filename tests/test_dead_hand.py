@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from dexkit.cli import main
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.results import Overall, RunResult, Verdict
 from dexkit.hand import Side
 from dexkit.messages import message_type

@@ -38,10 +38,10 @@ from dexkit.service.dialects import StateView, dialect_map
 from dexkit.topics import roles
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.streams import _streams
+from dexkit.traces.watched import feed
 from dexkit.view.html_tables import hand_table
 from dexkit.watch import Collector, Picture, SubjectView
 from dexkit.watch.fields import parts_of
-from dexkit.watch.recorded import feed
 from tests.each import each
 from tests.service_helpers import FakeNode, wait_until
 

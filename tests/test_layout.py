@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 from collections.abc import Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from tests.each import each
@@ -21,11 +21,6 @@ MAY_IMPORT = {
     "conformance": {"traces"},
 }
 
-_OF_INTEREST = re.compile(
-    rf"^\s*(from|import) +(\.|dexkit import|(dexkit\.)?({'|'.join(PACKAGES)}|cyclonedds)\b)",
-    re.MULTILINE,
-)
-
 
 def modules(folder: Path) -> Iterator[Path]:
     """Python files below ``folder``, not through the packages' links."""
@@ -35,39 +30,39 @@ def modules(folder: Path) -> Iterator[Path]:
 
 
 @cache
-def imported(path: Path) -> frozenset[str]:
-    """Modules that a file imports, at the top or inside a function, as absolute names.
+def imports(path: Path) -> tuple[frozenset[str], frozenset[str]]:
+    """What a file imports, as absolute names: outside functions, and anywhere in it.
 
-    None if it imports neither a package nor CycloneDDS. What is imported for type checking only
-    is left out: a program never loads it.
+    What is imported for type checking only counts as the rest does.
     """
-    text = path.read_text(encoding="utf-8")
-    if not _OF_INTEREST.search(text):  # parsing every file takes seconds
-        return frozenset()
-    names = set()
-    tree = ast.parse(text, str(path))
-    for node in statements(tree):
+    outside, anywhere = set(), set()
+    for node, in_function in statements(ast.parse(path.read_text(encoding="utf-8"), str(path))):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute here"
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return frozenset(names)
-
-
-def statements(block: ast.AST) -> Iterator[ast.stmt]:
-    """Every statement, but for those of type checking; expressions import nothing."""
-    for node in ast.iter_child_nodes(block):
-        if not isinstance(node, ast.stmt | ast.excepthandler | ast.match_case):
-            continue
-        if isinstance(node, ast.stmt):
-            yield node
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            for other in node.orelse:
-                yield other
-                yield from statements(other)
+            names = {alias.name for alias in node.names}
         else:
-            yield from statements(node)
+            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute here"
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+        anywhere |= names
+        if not in_function:
+            outside |= names
+    return frozenset(outside), frozenset(anywhere)
+
+
+def statements(
+    block: ast.AST, in_function: bool = False
+) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Every import, and whether it is in a function; expressions import nothing."""
+    for node in ast.iter_child_nodes(block):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node, in_function
+        elif isinstance(node, ast.stmt | ast.excepthandler | ast.match_case):
+            function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            yield from statements(node, in_function or function)
+
+
+def imported(path: Path) -> frozenset[str]:
+    """Everything that a file imports."""
+    return imports(path)[1]
 
 
 def packages_imported(path: Path) -> set[str]:
@@ -119,6 +114,27 @@ def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))
         assert not touches or path == ROOT / "dexkit" / "dds.py", path.relative_to(ROOT)
+
+
+def module_name(path: Path) -> str:
+    """``dexkit.traces.reader`` of ``traces/reader.py``."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    parts = parts if parts[0] == "dexkit" else ("dexkit", *parts)
+    return ".".join(parts).removesuffix(".__init__")
+
+
+def test_no_circle_of_files() -> None:
+    """What is imported for type checking included: a part can be read without those above it."""
+    paths = {module_name(p): p for folder in ("dexkit", *PACKAGES) for p in files(folder)}
+    graph = {}
+    for name, path in paths.items():
+        found = imports(path)[0]
+        graph[name] = {n if n in paths else n.rpartition(".")[0] for n in found} & set(paths)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        circle = list(reversed(error.args[1]))
+        raise AssertionError(" imports ".join(circle)) from None
 
 
 def test_help_imports_neither_packages_nor_dds() -> None:

@@ -16,10 +16,10 @@ import pytest
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.generated import Fault, Generated
 from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.motor_messages import Motor, state_member
 from dexkit.conformance.requirements import CAPABILITIES, catalogue
 from dexkit.conformance.results import Result, RunResult, Verdict

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.provenance import TIMES, Provenance
 from dexkit.conformance.results import Verdict
 from dexkit.models import MODELS

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import mutants
 from dexkit.conformance.faults.matrix import try_one
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.virtual.fingers import Dex3Service

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.result_file import as_document, read_json

@@ -12,8 +12,8 @@ import pytest
 
 from dexkit.conformance import rejudge
 from dexkit.conformance.claims import Claims
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.rejudge import Comparison, compare_with_recording
 from dexkit.conformance.requirements import CAPABILITIES, Kind, catalogue
 from dexkit.conformance.result_file import as_document, parse_result

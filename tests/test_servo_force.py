@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual

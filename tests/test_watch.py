@@ -16,12 +16,12 @@ from dexkit.messages import message_type, unitree_go, unitree_hg
 from dexkit.messages.columns import RowReader
 from dexkit.models import DEX1_1, DEX3_1
 from dexkit.traces import open_trace, sample_path
+from dexkit.traces.watched import feed
 from dexkit.watch import Collector
 from dexkit.watch.collector import fault_names
 from dexkit.watch.cycles import Cycles
 from dexkit.watch.fields import parts_of
 from dexkit.watch.history import History
-from dexkit.watch.recorded import feed
 from tests.watch_helpers import COMMAND, STATE, closing_hands, dex3_command, dex3_state, ns
 
 LEFT = "rt/dex3/left/state"

@@ -45,16 +45,6 @@ class Limits:
         """A runner in processes with these limits."""
         return Pool(examine, jobs=jobs, seconds=self.seconds, memory=self.memory).run
 
-    def cluster(self, address: str) -> Runner:
-        """A runner on a Ray cluster with these limits.
-
-        :raises UsageError: Ray is not installed.
-        :raises ConformanceError: there is no such cluster.
-        """
-        from dexkit.conformance.audit.cluster import Cluster
-
-        return Cluster(address, self).run
-
 
 def in_this_process(tasks: Iterable[Task], stop: object) -> Iterator[tuple[Task, FileRecord]]:
     """A runner without other processes, and without limits."""

@@ -15,8 +15,8 @@ import numpy as np
 from dexkit import __version__
 from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.sessions import SessionFile, opened, problem_of
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Overall, RunResult, overall_of
 from dexkit.conformance.run_record import catalogue_digest, recorded_claims

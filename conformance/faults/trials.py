@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.registry import Mutant
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.judge import deciding, judge, judge_layer, results_of
-from dexkit.conformance.layers import layer, recording_of
+from dexkit.conformance.layers import layer
 from dexkit.conformance.recording import TraceLike
 from dexkit.conformance.requirements import Requirement, catalogue, select
 from dexkit.conformance.results import Result, RunResult, Verdict

@@ -1,8 +1,8 @@
 """The layers of judging: a hand's DDS topics, a robot's DDS topics, a hand's USB, and the client.
 
 A :class:`Layer` is the data by which the kit goes from a device to verdicts: how a recording is
-decoded (:func:`recording_of`), what is judged by which checks (:mod:`dexkit.conformance.judge`),
-and which script is played to which reference. Each layer is in a module of its own:
+decoded, what is judged by which checks (:mod:`dexkit.conformance.judge`), and which script is
+played to which reference. Each layer is in a module of its own:
 
 * :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
 * :mod:`~dexkit.conformance.layers.usb`: ``usb``, the USB transfers of Dex3-1 hands;
@@ -17,42 +17,31 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from dexkit.conformance.plots import Plot
+from dexkit.hand import Subject
 from dexkit.lazy import Lazy
 from dexkit.robots import ROBOTS
-from dexkit.topics import HAND_TOPICS, prefixes_of
-
-if TYPE_CHECKING:
-    from dexkit.conformance.checks import BaseContext, Outcome
-    from dexkit.conformance.recording import Recording, TraceLike
-    from dexkit.conformance.requirements import Requirement
-    from dexkit.conformance.results import Result
-    from dexkit.conformance.verdicts import Judgement
-    from dexkit.hand import Subject
 
 __all__ = [
     "LAYERS",
     "Layer",
     "Precondition",
-    "claimed",
     "layer",
     "layer_of_model",
-    "not_blocked",
-    "not_spoiled",
-    "recording_of",
 ]
 
 
 RecordingT = TypeVar("RecordingT")
 ViewT = TypeVar("ViewT")
-ContextT = TypeVar("ContextT", bound="BaseContext[Any, Any]")
+ContextT = TypeVar("ContextT")
 
-Precondition = Callable[["Judgement", ContextT], "Result | None"]
-"""The result, where a requirement is not to be checked at all."""
-Decode = Callable[["TraceLike", "str | None", "Sequence[Subject]"], "RecordingT | None"]
+# the layers are below all that judges: they name requirements, outcomes and results by Any
+Precondition = Callable[[Any, ContextT], Any]
+"""Takes the judgement; returns the result, where a requirement is not to be checked at all."""
+Decode = Callable[[Any, "str | None", Sequence[Subject]], "RecordingT | None"]
 
 
 @dataclass(frozen=True)
@@ -83,9 +72,9 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     plots: tuple[Plot, ...]
     decode: Decode[RecordingT]
     subjects: Callable[[RecordingT], Iterable[tuple[Subject, ViewT]]]
-    context: Lazy[Callable[[RecordingT, ViewT, Requirement], ContextT]]
+    context: Lazy[Callable[[RecordingT, ViewT, Any], ContextT]]
     preconditions: Sequence[Precondition[ContextT]]
-    refine: Callable[[ContextT, Outcome], Outcome]
+    refine: Callable[[ContextT, Any], Any]
     whole: Callable[[RecordingT], tuple[float, float] | None]
     script: Callable[[str], type[Any]]
     reference: Callable[[str], type[Any]]
@@ -106,61 +95,3 @@ def layer(name: str) -> Layer[Any, Any, Any]:
 def layer_of_model(model_name: str) -> Layer[Any, Any, Any]:
     """The layer of a hand's or robot's DDS topics."""
     return layer("robot" if model_name in ROBOTS else "dds")
-
-
-def recording_of(
-    trace: TraceLike,
-    dialect_name: str | None,
-    sides: Sequence[Subject],
-    prefix: str = "",
-) -> Recording:
-    """Decode the DDS part of a recording: hands or a robot.
-
-    :param dialect_name: None to take what the run record says, else what the topics show: hands,
-        if there are any.
-    :param sides: none to take those of the run record, else those that have a topic.
-    :param prefix: of the hands' topics; empty for hands without one, or the only one there is.
-    :raises ConformanceError: it has none of their topics.
-    :raises UsageError: sides of a robot; no hand has the prefix, or there are several to choose
-        from.
-    :raises TraceUnsupported: its stimulus record cannot be read.
-    """
-    from dexkit.conformance import run_record
-    from dexkit.conformance.recording import Recording
-    from dexkit.conformance.robot import robot_in
-    from dexkit.conformance.unprefixed import Unprefixed, choose_prefix
-
-    everything = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
-    chosen = choose_prefix(everything, prefix)
-    trace = Unprefixed(trace, chosen) if chosen else trace
-    run = trace.metadata.get(run_record.RECORD, {})
-    recorded = run_record.recorded_dialect(run)
-    name = dialect_name or recorded
-    if name is None:
-        topics = {c.topic for c in trace.channels} | {e.topic for e in trace.endpoints}
-        found = None if topics & HAND_TOPICS else robot_in(trace)
-        name = found.name if found else None
-    if not sides and name == recorded:
-        sides = run_record.recorded_subjects(run)
-    recording = layer_of_model(name or "").decode(trace, name, sides)
-    assert isinstance(recording, Recording), "only USB may be missing from a recording"
-    others = [each or "none" for each in prefixes_of(everything) if each != chosen]
-    notes = [f"the topics are under the prefix {chosen}: rt/{chosen}/..."] if chosen else []
-    if others:
-        notes.append(f"hands under other prefixes are not judged: {', '.join(others)} (--prefix)")
-    return replace(recording, notes=[*recording.notes, *notes]) if notes else recording
-
-
-def claimed(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
-    """A precondition: the vendor does not disclaim the unit that the requirement is about."""
-    return judgement.not_claimed()
-
-
-def not_blocked(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
-    """A precondition: nothing has failed that the requirement depends on."""
-    return judgement.blocked()
-
-
-def not_spoiled(judgement: Judgement, context: BaseContext[Any, Any]) -> Result | None:
-    """A precondition: the client's commands allow to judge it."""
-    return judgement.spoiled()

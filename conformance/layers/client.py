@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from dexkit.conformance.layers import Layer, hand, not_blocked
+from dexkit.conformance.layers import Layer, hand
+from dexkit.conformance.layers.preconditions import not_blocked
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import Subject

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.layers import Layer, claimed, not_blocked, not_spoiled
+from dexkit.conformance.layers import Layer
+from dexkit.conformance.layers.preconditions import claimed, not_blocked, not_spoiled
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.layers import Layer, claimed, hand, not_blocked
+from dexkit.conformance.layers import Layer, hand
+from dexkit.conformance.layers.preconditions import claimed, not_blocked
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import ROBOT, Subject

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from dexkit.conformance.layers import Layer, claimed, not_blocked
+from dexkit.conformance.layers import Layer
+from dexkit.conformance.layers.preconditions import claimed, not_blocked
 from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.hand import Subject
 from dexkit.lazy import Lazy

@@ -102,7 +102,7 @@ class HandScript(Script[Side]):
             self._patient = self.plan.rounds > 1 and done == 0
             yield from self._provoke()
         if OPERATOR in self.plan.phases:
-            yield from operate(self)
+            yield from operate(self, self._codec)
             yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
         if self.plan.phases & {"two-writers", "restart"}:
             yield from self._two_writers()

@@ -14,15 +14,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.stimuli.script import Plan, Send, Steps
+from dexkit.conformance.motor_messages import Motor, MotorCodec
+from dexkit.conformance.stimuli.script import Plan, Script, Send, Steps
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, client_for, profile
 
 if TYPE_CHECKING:
-    from dexkit.conformance.stimuli.hand import HandScript
+    pass
 
 __all__ = ["OPERATOR", "operate", "operator_of"]
 
@@ -51,7 +51,7 @@ def operator_of(phase: Phase, dialect: Dialect) -> Operator:
     return Operator(profile(phase.params["profile"], dialect.model), dialect, most=most)
 
 
-def operate(script: HandScript) -> Steps:
+def operate(script: Script[Side], codec: MotorCodec) -> Steps:
     """Play the phase ``operator``: Unitree's client in a closed loop with the hand."""
     plan = script.plan
     if not plan.dialect.has_client:
@@ -72,7 +72,7 @@ def operate(script: HandScript) -> Steps:
     while script._elapsed(phase) < operator.profile.duration:
         now = receive()
         commands = client.step(now, {}, operator.inputs(now, plan.sides))
-        payloads = script._codec.encode(
+        payloads = codec.encode(
             {s: [Motor(**m._asdict()) for m in motors] for s, motors in commands.items()}
         )
         # the next turn, without making up for turns that were missed

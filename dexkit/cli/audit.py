@@ -117,6 +117,7 @@ def command(
     again to continue a stopped audit (docs/audit.md).
     """
     from dexkit.conformance.audit.audit import FAIL_ON, Audit, Limits
+    from dexkit.conformance.audit.cluster import Cluster
     from dexkit.conformance.audit.examine import LABELS
     from dexkit.conformance.audit.sessions import is_url
 
@@ -137,7 +138,7 @@ def command(
     )
     # Python's worker processes begin with the working folder in front of their import path
     os.chdir("/")
-    runner = limits.pool(jobs) if ray is None else limits.cluster(ray)
+    runner = limits.pool(jobs) if ray is None else Cluster(ray, limits).run
     status = StatusLine(quiet)
     last = 0.0
 

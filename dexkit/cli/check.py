@@ -112,8 +112,8 @@ def command(
         _compare(recording, against)
         return
     from dexkit.conformance.claims import Claims
+    from dexkit.conformance.decoding import recording_of
     from dexkit.conformance.judge import judge
-    from dexkit.conformance.layers import recording_of
     from dexkit.conformance.report.terminal import print_result
     from dexkit.conformance.requirements import Kind, catalogue, select
     from dexkit.conformance.robot import robot_in

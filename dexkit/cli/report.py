@@ -123,7 +123,7 @@ def _matching_recording(path: Path, result: RunResult, *, given: bool) -> Record
 
     :raises UsageError: the recording that the user gave is not the one that was judged.
     """
-    from dexkit.conformance.layers import recording_of
+    from dexkit.conformance.decoding import recording_of
     from dexkit.conformance.report.labels import utc_date
     from dexkit.traces import open_trace
 

@@ -220,8 +220,8 @@ def _live(
 def recorded(path: Path, judge: bool) -> Source:
     """A recording as a source of the page, with its phases and failures if it can be judged."""
     from dexkit.traces import open_trace
+    from dexkit.traces.watched import feed
     from dexkit.view.sources import Recorded
-    from dexkit.watch.recorded import feed
 
     trace = open_trace(path)
     for text in trace.warnings:
@@ -233,8 +233,8 @@ def recorded(path: Path, judge: bool) -> Source:
 
 def _marks(trace: Trace, judge: bool) -> list[Mark]:
     """Phases and verdicts; a recording that cannot be judged is shown all the same."""
+    from dexkit.conformance.decoding import recording_of
     from dexkit.conformance.judge import judge as verdict_on
-    from dexkit.conformance.layers import recording_of
     from dexkit.conformance.recording_marks import phase_marks, verdict_marks
     from dexkit.conformance.run_record import recorded_claims
 

@@ -11,14 +11,11 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import Any
 
 from dexkit.errors import UsageError
 from dexkit.hand import HandSpec, JointMode, JointSpec, Side, Subject
 from dexkit.lazy import Lazy
-
-if TYPE_CHECKING:
-    from dexkit.service.dialects import DialectMap
 
 __all__ = [
     "ClientCommand",
@@ -74,7 +71,8 @@ class Dialect:
         have no such scale.
     :param ends: a gripper's targets from which on it closes or opens all the way: at or below the
         first, at or above the second, rad; infinite where a target is where it goes.
-    :param codec: translates its messages in ``dexkit serve``; None for a robot, which has none.
+    :param codec: the :class:`~dexkit.service.dialects.DialectMap` that translates its messages in
+        ``dexkit serve``; None for a robot, which has none.
     :param mode_byte: what the mode byte of a motor holds.
     :param interface_specification: it is defined by the gripper's DDS interface specification:
         gains, dq and tau of a command are not used, targets near an end go to the end, and a
@@ -108,7 +106,7 @@ class Dialect:
     q_open: float
     summary: str
     ends: tuple[float, float] = (-math.inf, math.inf)
-    codec: Lazy[type[DialectMap]] | None = None
+    codec: Lazy[type[Any]] | None = None
     mode_byte: ModeByte = ModeByte.UNUSED
     interface_specification: bool = False
     has_client: bool = True

@@ -463,7 +463,8 @@ def dialect_map(
     """
     if dialect.codec is None:
         raise UsageError(f"the dialect {dialect.name} has no codec in its profile")
-    return dialect.codec.load()(dialect, specs, fill)
+    made: type[DialectMap] = dialect.codec.load()
+    return made(dialect, specs, fill)
 
 
 def _known(value: float) -> float:

@@ -2,7 +2,7 @@
 
 :class:`~dexkit.watch.collector.Collector` takes samples and answers for any moment, without input
 or output of its own. :class:`~dexkit.watch.listener.Listener` feeds it from a DDS domain,
-:func:`~dexkit.watch.recorded.feed` from a recording.
+:func:`~dexkit.traces.watched.feed` from a recording.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from dexkit.monitor.screen import Shown, screen
 from dexkit.traces import open_trace
+from dexkit.traces.watched import feed
 from dexkit.watch.events import Events
-from dexkit.watch.recorded import feed
 
 __all__ = ["monitor_picture"]
 

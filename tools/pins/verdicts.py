@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.judge import results_of
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.results import Result
 from dexkit.traces import open_trace
 

@@ -17,6 +17,7 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.generated import Generated
 from dexkit.conformance.faults.generated.rig import Faulty, compose
 from dexkit.conformance.faults.generated.stimulus import (
@@ -29,7 +30,6 @@ from dexkit.conformance.faults.generated.stimulus import (
 )
 from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.layers import recording_of
 from dexkit.conformance.recording import States
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.virtual import MemoryTrace

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from dexkit.traces.reader import Trace
 from dexkit.watch.collector import Collector
 from dexkit.watch.fields import parts_of
-
-if TYPE_CHECKING:
-    from dexkit.traces import Trace
 
 __all__ = ["feed"]
 
