@@ -9,6 +9,9 @@ from typing import Any
 
 from dexkit.conformance.faults.registry import (
     BOTH,
+    Call,
+    Motors,
+    changes,
     obeys_gains,
     reports,
     takes_floats,
@@ -21,33 +24,47 @@ from dexkit.hand import JointSpec, Side
 from dexkit.messages import message_type
 from dexkit.models import HandModel, model
 
+Sides = tuple[Side, ...]
+
+
+def finite(motors: Motors) -> bool:
+    """Whether all values of a command are finite."""
+    return all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd))
+
+
+def finite_q(motors: Motors) -> bool:
+    """Whether the goals of a command are finite."""
+    return all(math.isfinite(m.q) for m in motors)
+
+
+def other(side: Side) -> Side:
+    """The other side."""
+    return Side.LEFT if side is Side.RIGHT else Side.RIGHT
+
+
 # -------------------------------------------------------------------------------- discovery
 
 
-@wrong_hand("DEX1-TOPIC-01", "DEX3-TOPIC-01")
-class OldTopic(Service):
+@changes(Service, "sample", "DEX1-TOPIC-01", "DEX3-TOPIC-01")
+def OldTopic(self: Any, sample: Call, topic: str, sides: Sides) -> Any:
     """Publishes on the topic of an older stack."""
-
-    def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
-        return replace(super().sample(topic, sides), topic="rt/unitree_actuator/state")
+    return replace(sample(topic, sides), topic="rt/unitree_actuator/state")
 
 
-@wrong_hand("DEX1-TOPIC-01", "DEX3-TOPIC-01")
-class OtherStateType(Service):
+@changes(Service, "sample", "DEX1-TOPIC-01", "DEX3-TOPIC-01")
+def OtherStateType(self: Any, sample: Call, topic: str, sides: Sides) -> Sample:
     """Publishes another type of the Dex family on its state topic."""
-
-    def sample(self, topic: str, sides: tuple[Side, ...]) -> Sample:
-        go, hg = "unitree_go::msg::dds_::MotorStates_", "unitree_hg::msg::dds_::HandState_"
-        kind = message_type(hg if self.dialect.state_type == go else go)
-        return Sample(topic, kind.name, kind.encode(kind.cls()), self.now)
+    go, hg = "unitree_go::msg::dds_::MotorStates_", "unitree_hg::msg::dds_::HandState_"
+    kind = message_type(hg if self.dialect.state_type == go else go)
+    return Sample(topic, kind.name, kind.encode(kind.cls()), self.now)
 
 
 @wrong_hand("DEX1-TOPIC-02", "DEX3-TOPIC-02")
 class OtherCommandType(Service):
     """Subscribes to its command topic with another type."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         go, hg = "unitree_go::msg::dds_::MotorCmds_", "unitree_hg::msg::dds_::HandCmd_"
         self.command_type = hg if self.dialect.cmd_type == go else go
 
@@ -75,7 +92,7 @@ class SilentUntilCommanded(Service):
 
     commanded = False
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.commanded = True
         super().motors(side, motors)
 
@@ -86,18 +103,18 @@ class SilentUntilCommanded(Service):
 # --------------------------------------------------------------------------- rate and order
 
 
-@wrong_hand("DEX1-RATE-01", "DEX3-RATE-01")
 @wrong_hand("BRAINCO-RATE-02")
+@wrong_hand("DEX1-RATE-01", "DEX3-RATE-01")
 class SlowPublisher(Service):
     """Publishes at 125 Hz, or at 1.15 times the least rate where that is less."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.period = max(0.008, 1 / 1.15 / model(self.dialect.model).min_state_rate)
 
 
-@wrong_hand("DEX1-RATE-01", "DEX3-RATE-01")
 @wrong_hand("BRAINCO-RATE-01")
+@wrong_hand("DEX1-RATE-01", "DEX3-RATE-01")
 class SlowsDown(Service):
     """Publishes at 60 Hz or less from 6 s on, as if it is throttled when warm."""
 
@@ -130,28 +147,20 @@ class HalfRate(Service):
     period = 0.0045
 
 
-@wrong_hand("DEX1-RATE-03", "DEX3-RATE-03")
-class Hiccup(Service):
+@changes(Service, "publish", "DEX1-RATE-03", "DEX3-RATE-03")
+def Hiccup(self: Any, publish: Call) -> Any:
     """Publishes nothing for 0.3 s once, as if its publishing thread waits for the device."""
-
-    def publish(self) -> list[Sample]:
-        return [] if 2.0 < self.now < 2.3 else super().publish()
+    return [] if 2.0 < self.now < 2.3 else publish()
 
 
-@wrong_hand("DEX1-RATE-03", "DEX3-RATE-03")
-class DeliversLate(Service):
+@changes(Service, "publish", "DEX1-RATE-03", "DEX3-RATE-03")
+def DeliversLate(self: Any, publish: Call) -> Any:
     """Holds its states back for 0.25 s once, with the source timestamps of when they were made."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.waiting: list[Sample] = []
-
-    def publish(self) -> list[Sample]:
-        self.waiting += super().publish()
-        if 2.0 < self.now < 2.25:
-            return []
-        samples, self.waiting = self.waiting, []
-        return samples
+    waiting = [*self.memory.pop("waiting", []), *publish()]
+    if not 2.0 < self.now < 2.25:
+        return waiting
+    self.memory["waiting"] = waiting
+    return []
 
 
 @wrong_hand("DEX1-RATE-04", "DEX3-RATE-04")
@@ -160,8 +169,8 @@ class BurstsWithGoodStamps(Service):
 
     together = 10
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.waiting: list[list[Sample]] = []
 
     def publish(self) -> list[Sample]:
@@ -176,76 +185,57 @@ class BurstsWithGoodStamps(Service):
         return super().end()
 
 
-@wrong_hand("DEX1-RATE-04", "DEX3-RATE-04")
-class Bursts(BurstsWithGoodStamps):
+@changes(BurstsWithGoodStamps, "publish", "DEX1-RATE-04", "DEX3-RATE-04")
+def Bursts(self: Any, publish: Call) -> list[Sample]:
     """Publishes states in bursts of ten."""
-
-    def publish(self) -> list[Sample]:
-        burst = super().publish()
-        return [replace(sample, sent=self.now + i * 1e-6) for i, sample in enumerate(burst)]
+    return [replace(sample, sent=self.now + i * 1e-6) for i, sample in enumerate(publish())]
 
 
-@wrong_hand("DEX1-RATE-05", "DEX3-RATE-05")
-class BurstsForTwoSeconds(BurstsWithGoodStamps):
+@changes(BurstsWithGoodStamps, "publish", "DEX1-RATE-05", "DEX3-RATE-05")
+def BurstsForTwoSeconds(self: Any, publish: Call) -> Any:
     """Delivers its states in bursts of twenty for two seconds, with the right timestamps."""
-
-    def publish(self) -> list[Sample]:
-        self.together = 20 if 2.0 < self.now < 4.0 else 1
-        return super().publish()
+    self.together = 20 if 2.0 < self.now < 4.0 else 1
+    return publish()
 
 
-@wrong_hand("DEX1-RATE-04", "DEX3-RATE-04")
-class PausesOften(Service):
+@changes(Service, "publish", "DEX1-RATE-04", "DEX3-RATE-04")
+def PausesOften(self: Any, publish: Call) -> Any:
     """Publishes nothing for 60 ms three times in one second of four: each is allowed."""
-
-    length, times, every = 0.06, (0.1, 0.4, 0.7), 4.0
-
-    def publish(self) -> list[Sample]:
-        at = self.now % self.every
-        pauses = any(begin <= at < begin + self.length for begin in self.times)
-        return [] if pauses else super().publish()
+    at = self.now % 4.0
+    return [] if any(begin <= at < begin + 0.06 for begin in (0.1, 0.4, 0.7)) else publish()
 
 
-@wrong_hand("DEX1-ORDER-01", "DEX3-ORDER-01")
-class RepeatsOldStates(Service):
+@changes(Service, "publish", "DEX1-ORDER-01", "DEX3-ORDER-01")
+def RepeatsOldStates(self: Any, publish: Call) -> list[Sample]:
     """Publishes every hundredth state again after the next one."""
-
-    count = 0
-    old: tuple[Sample, ...] = ()
-
-    def publish(self) -> list[Sample]:
-        samples = super().publish()
-        self.count += 1
-        if self.count % 100 == 0:
-            self.old = tuple(samples)
-        elif self.count % 100 == 1:
-            samples += self.old
-        return samples
+    samples = list(publish())
+    self.memory["count"] = count = self.memory.get("count", 0) + 1
+    if count % 100 == 0:
+        self.memory["old"] = tuple(samples)
+    elif count % 100 == 1:
+        samples += self.memory.get("old", ())
+    return samples
 
 
-@wrong_hand("DEX1-FRESH-01", "DEX3-FRESH-01", whole=True)
-class StaleState(Service):
+# ---------------------------------------------------------------------------- measured values
+
+
+@changes(Service, "payload", "DEX1-FRESH-01", "DEX3-FRESH-01", whole=True)
+def StaleState(self: Any, payload: Call, sides: Sides, length: int | None = None) -> Any:
     """Measures five times a second and publishes the same values in between."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.measured: dict[tuple[Side, ...], tuple[float, bytes]] = {}
-
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        at, _ = self.measured.get(sides, (-1.0, b""))
-        if self.now - at >= 0.2:
-            self.measured[sides] = (self.now, super().payload(sides, length))
-        return self.measured[sides][1]
+    at, _ = self.memory.get(sides, (-1.0, b""))
+    if self.now - at >= 0.2:
+        self.memory[sides] = (self.now, payload(sides, length))
+    return self.memory[sides][1]
 
 
-@wrong_hand("DEX1-FRESH-01", "DEX3-FRESH-01", "BRAINCO-FRESH-01", whole=True)
-class StaleLater(StaleState):
+@changes(Service, "payload", "DEX1-FRESH-01", "DEX3-FRESH-01", "BRAINCO-FRESH-01", whole=True)
+def StaleLater(self: Any, payload: Call, sides: Sides, length: int | None = None) -> Any:
     """Measures five times a second from 12 s on."""
-
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        if self.now < 12.0:
-            self.measured.clear()
-        return super().payload(sides, length)
+    at, _ = self.memory.get(sides, (-1.0, b""))
+    if self.now < 12.0 or self.now - at >= 0.2:
+        self.memory[sides] = (self.now, payload(sides, length))
+    return self.memory[sides][1]
 
 
 @wrong_hand("DEX1-FRESH-02", "DEX3-FRESH-02", whole=True)
@@ -254,15 +244,15 @@ class FrozenAtFirst(Service):
 
     until = math.inf
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.first: dict[tuple[Side, ...], bytes] = {}
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.first: dict[Sides, bytes] = {}
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.until = min(self.until, self.now + 0.7)
         super().motors(side, motors)
 
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+    def payload(self, sides: Sides, length: int | None = None) -> bytes:
         newest = super().payload(sides, length)
         frozen = self.now < self.until and not self.restarted
         return self.first.setdefault(sides, newest) if frozen else newest
@@ -272,12 +262,12 @@ class FrozenAtFirst(Service):
 class FreezesOnce(Service):
     """Publishes the same values for 0.3 s when it first begins to move."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.start: dict[Side, float] = {}
-        self.kept: dict[tuple[Side, ...], tuple[float, bytes]] = {}
+        self.kept: dict[Sides, tuple[float, bytes]] = {}
 
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+    def payload(self, sides: Sides, length: int | None = None) -> bytes:
         here = sum(self.positions(s)[-1] for s in sides)
         start = self.start.setdefault(sides[0], here)
         if sides not in self.kept and abs(here - start) > 0.02 and not self.restarted:
@@ -291,11 +281,11 @@ class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 
     ended = False
+    turn = 0
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.past: dict[tuple[Side, ...], deque[tuple[float, bytes]]] = {}
-        self.turn = 0
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.past: dict[Sides, deque[tuple[float, bytes]]] = {}
 
     def publish(self) -> list[Sample]:
         self.turn += 1
@@ -305,7 +295,7 @@ class SwapsBuffers(Service):
         self.ended = True
         super().brake()
 
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+    def payload(self, sides: Sides, length: int | None = None) -> bytes:
         newest = super().payload(sides, length)
         past = self.past.setdefault(sides, deque())
         past.append((self.now, newest))
@@ -314,40 +304,28 @@ class SwapsBuffers(Service):
         return newest if self.turn % 2 or self.ended else past[0][1]
 
 
-@wrong_hand("DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01")
-class Frozen(Service):
+@changes(Service, "payload", "DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01")
+def Frozen(self: Any, payload: Call, sides: Sides, length: int | None = None) -> Any:
     """Publishes its first measurement forever, at full rate."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.first: dict[tuple[Side, ...], bytes] = {}
-
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        if sides not in self.first:
-            self.first[sides] = super().payload(sides, length)
-        return self.first[sides]
+    if sides not in self.memory:
+        self.memory[sides] = payload(sides, length)
+    return self.memory[sides]
 
 
 # ----------------------------------------------------------------------------------- fields
 
 
-@wrong_hand("DEX1-FIELD-01", "DEX3-FIELD-01", where=takes_floats)
-class OneTooMany(Service):
+@changes(Service, "payload", "DEX1-FIELD-01", "DEX3-FIELD-01", where=takes_floats)
+def OneTooMany(self: Any, payload: Call, sides: Sides, length: int | None = None) -> Any:
     """Publishes a sequence with one motor too many."""
-
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        return super().payload(sides, self.dialect.length + 1)
+    return payload(sides, self.dialect.length + 1)
 
 
-@wrong_hand("DEX1-FIELD-01", "DEX3-FIELD-01")
-class EmptyNowAndThen(Service):
+@changes(Service, "payload", "DEX1-FIELD-01", "DEX3-FIELD-01")
+def EmptyNowAndThen(self: Any, payload: Call, sides: Sides, length: int | None = None) -> Any:
     """Publishes an empty sequence in every 500th state."""
-
-    count = 0
-
-    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
-        self.count += 1
-        return super().payload(sides, 0 if self.count % 500 == 0 else length)
+    self.memory["count"] = count = self.memory.get("count", 0) + 1
+    return payload(sides, 0 if count % 500 == 0 else length)
 
 
 @wrong_hand("DEX3-FIELD-04")
@@ -366,7 +344,7 @@ def TurnedAcceleration(self: Any, state: Any, hand: Any) -> None:
 @wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
 @reports(Service, "DEX1-FORCE-01")
 def NoForce(self: Any, state: Any, hand: Any) -> None:
-    """Does not fill tau_est."""
+    """Publishes no force."""
     state["tau_est"] = 0.0
 
 
@@ -381,24 +359,18 @@ def MilliNewtonMetres(self: Any, state: Any, hand: Any) -> None:
 
 # both sides of a Revo2 do the same while one joint moves, so that only later steps show it
 @wrong_hand("BRAINCO-SIDE-01", sides=BOTH)
-@wrong_hand("DEX1-SIDE-01", "DEX3-SIDE-01", sides=BOTH)
-class Swapped(Service):
+@changes(Service, "motors", "DEX1-SIDE-01", "DEX3-SIDE-01", sides=BOTH)
+def Swapped(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Each side obeys the other side's commands."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        super().motors(Side.LEFT if side is Side.RIGHT else Side.RIGHT, motors)
+    command(other(side), motors)
 
 
-@wrong_hand("DEX1-SIDE-01", "DEX3-SIDE-01", sides=BOTH, whole=True)
-class SwappedWhenRestarted(Service):
+@changes(Service, "motors", "DEX1-SIDE-01", "DEX3-SIDE-01", sides=BOTH, whole=True)
+def SwappedWhenRestarted(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Each side obeys the other side's commands since the service was restarted: it found the two
     devices in another order.
     """
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if self.restarted:
-            side = Side.LEFT if side is Side.RIGHT else Side.RIGHT
-        super().motors(side, motors)
+    command(other(side) if self.restarted else side, motors)
 
 
 @wrong_hand("DEX5-MOVE-06")
@@ -407,13 +379,13 @@ class SwappedWhenRestarted(Service):
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.kicks: dict[Side, tuple[float, tuple[Motor, ...]]] = {}
-        self.newest: dict[Side, tuple[Motor, ...]] = {}
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.kicks: dict[Side, tuple[float, Motors]] = {}
+        self.newest: dict[Side, Motors] = {}
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
+    def motors(self, side: Side, motors: Motors) -> None:
+        if not finite(motors):
             super().motors(side, motors)
             return
         here = self.positions(side)
@@ -436,9 +408,8 @@ class _Moves(Service):
 
     def go(self, side: Side, part: float) -> None:
         """Command a part of each joint's range from here, towards the middle."""
-        every = zip(self.positions(side), joints_of(self.dialect, side), strict=True)
         hand = model(self.dialect.model)
-        gains = hand.gains
+        every = zip(self.positions(side), joints_of(self.dialect, side), hand.gains, strict=True)
         super().motors(
             side,
             tuple(
@@ -449,23 +420,17 @@ class _Moves(Service):
                     kd=kd,
                     mode=self.codec.mode(i),
                 )
-                for i, ((q, j), (kp, kd)) in enumerate(zip(every, gains, strict=True))
+                for i, (q, j, (kp, kd)) in enumerate(every)
             ),
         )
 
 
-@wrong_hand("DEX1-SAFE-01", "DEX5-SAFE-01", sides=BOTH, whole=True)
-class CrossesSidesAfterBadCommands(Service):
+@changes(Service, "motors", "DEX1-SAFE-01", "DEX5-SAFE-01", sides=BOTH, whole=True)
+def CrossesSidesAfterBadCommands(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Gives each side the other's commands for 2 s after one that is not finite."""
-
-    until = -math.inf
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(m.q) for m in motors):
-            self.until = self.now + 2.0
-        if self.now < self.until:
-            side = Side.LEFT if side is Side.RIGHT else Side.RIGHT
-        super().motors(side, motors)
+    if not finite_q(motors):
+        self.memory["until"] = self.now + 2.0
+    command(other(side) if self.now < self.memory.get("until", -math.inf) else side, motors)
 
 
 @wrong_hand("DEX1-STILL-01", "DEX3-STILL-01")
@@ -474,7 +439,7 @@ class HomesAtTheStart(_Moves):
 
     homed = commanded = False
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.commanded = True
         super().motors(side, motors)
 
@@ -516,26 +481,24 @@ class HomesAtOnceWhenRestarted(HomesWhenRestarted):
 class KicksTheOtherSide(_Moves):
     """Moves the other hand when one gets a command with a negative gain."""
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         super().motors(side, motors)
         if any(m.kp < 0 for m in motors):
-            for other in self.sides:
-                if other is not side:
-                    self.go(other, 0.07)
+            for each in self.sides:
+                if each is not side:
+                    self.go(each, 0.07)
 
 
 class _Snaps(Service):
     """Goes to the other end for a quarter of a second when it gets its first command."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    when_restarted = False
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.other: dict[Side, tuple[float, list[float]]] = {}
 
-    def snaps(self) -> bool:
-        """Whether this service does so at all."""
-        raise NotImplementedError
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         if side not in self.other:
             ends = [
                 j.q_min if q > 0.5 * (j.q_min + j.q_max) else j.q_max
@@ -543,7 +506,7 @@ class _Snaps(Service):
             ]
             self.other[side] = self.now + 0.25, ends
         until, ends = self.other[side]
-        if self.snaps() and self.now < until:
+        if self.restarted is self.when_restarted and self.now < until:
             motors = tuple(replace(m, q=q) for m, q in zip(motors, ends, strict=True))
         super().motors(side, motors)
 
@@ -552,105 +515,72 @@ class _Snaps(Service):
 class SnapsAtFirst(_Snaps):
     """Goes to the other end for a quarter of a second when it gets its first command."""
 
-    def snaps(self) -> bool:
-        return not self.restarted
-
 
 @wrong_hand("DEX1-PATH-01", "DEX3-PATH-01", whole=True)
 class SnapsWhenRestarted(_Snaps):
     """After a restart of its service, first goes to the other end for a quarter of a second."""
 
-    def snaps(self) -> bool:
-        return self.restarted
+    when_restarted = True
 
 
-@wrong_hand("DEX1-CMD-01", "DEX3-CMD-01")
-class DropsEverySecond(Service):
+@changes(Service, "motors", "DEX1-CMD-01", "DEX3-CMD-01")
+def DropsEverySecond(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Obeys every second command to a side."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.count = dict.fromkeys(self.sides, 0)
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        self.count[side] += 1
-        if self.count[side] % 2:
-            super().motors(side, motors)
+    self.memory[side] = self.memory.get(side, 0) + 1
+    if self.memory[side] % 2:
+        command(side, motors)
 
 
-@wrong_hand("DEX1-CMD-01", "DEX3-CMD-01")
-class OneBehind(Service):
+@changes(Service, "motors", "DEX1-CMD-01", "DEX3-CMD-01")
+def OneBehind(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Obeys each command when the next one arrives."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.newest: dict[Side, tuple[Motor, ...]] = {}
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        before = self.newest.get(side, motors)
-        self.newest[side] = motors
-        super().motors(side, before)
+    before = self.memory.get(side, motors)
+    self.memory[side] = motors
+    command(side, before)
 
 
-@wrong_hand("DEX1-SIDE-02", "DEX3-SIDE-02", sides=BOTH, where=takes_floats)
-class BadCommandsStopBoth(Service):
+@changes(Service, "motors", "DEX1-SIDE-02", "DEX3-SIDE-02", sides=BOTH, where=takes_floats)
+def BadCommandsStopBoth(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Drops the commands to both hands for half a second after a bad one."""
-
-    deaf_until = -math.inf
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
-            self.deaf_until = self.now + 0.5
-        if self.now >= self.deaf_until:
-            super().motors(side, motors)
+    if not finite(motors):
+        self.memory["deaf_until"] = self.now + 0.5
+    if self.now >= self.memory.get("deaf_until", -math.inf):
+        command(side, motors)
 
 
-@wrong_hand("DEX1-SIDE-02", "DEX3-SIDE-02", sides=BOTH, whole=True)
-class OneWatchdogForBoth(Service):
+@changes(Service, "motors", "DEX1-SIDE-02", "DEX3-SIDE-02", sides=BOTH, whole=True)
+def OneWatchdogForBoth(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Drops the commands to one hand while the other has got none for a second."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.heard: dict[Side, float] = {}
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if all(math.isfinite(m.q) for m in motors):
-            self.heard[side] = self.now
-        if all(self.now - self.heard.get(s, self.now) < 1.0 for s in self.sides):
-            super().motors(side, motors)
+    if finite_q(motors):
+        self.memory[side] = self.now
+    if all(self.now - self.memory.get(s, self.now) < 1.0 for s in self.sides):
+        command(side, motors)
 
 
-@wrong_hand("DEX3-SIDE-03", sides=BOTH, whole=True)
-class WaitsForTheOtherGrip(Service):
+@changes(Service, "motors", "DEX3-SIDE-03", sides=BOTH, whole=True)
+def WaitsForTheOtherGrip(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Drops the commands to one hand while the other one presses on an object."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        hands = self.hands  # type: ignore[attr-defined]
-        others = [hands[s] for s in self.sides if s is not side and hands[s].touches]
-        if not any(abs(x) > 0.005 for hand in others for x in hand.contact):
-            super().motors(side, motors)
+    others = [hand for s, hand in self.hands.items() if s is not side and hand.touches]
+    if not any(abs(x) > 0.005 for hand in others for x in hand.contact):
+        command(side, motors)
 
 
-@wrong_hand("DEX1-ABUSE-01", "DEX3-ABUSE-01", where=obeys_gains)
-class WeakAfterNan(Service):
+@changes(Service, "motors", "DEX1-ABUSE-01", "DEX3-ABUSE-01", where=obeys_gains)
+def WeakAfterNan(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Uses a quarter of the stiffness since it has got a command that is not finite."""
-
-    weak = False
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(m.q) for m in motors):
-            self.weak = True
-        if self.weak:
-            motors = tuple(replace(m, kp=0.25 * m.kp) for m in motors)
-        super().motors(side, motors)
+    if not finite_q(motors):
+        self.memory["weak"] = True
+    if self.memory:
+        motors = tuple(replace(m, kp=0.25 * m.kp) for m in motors)
+    command(side, motors)
 
 
 @wrong_hand("DEX1-ABUSE-01", "DEX3-ABUSE-01", sides=BOTH, whole=True)
 class SlowForASecondClient(Service):
     """Moves by 20 % of the range in a second for 4 s when a second client has come."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.known: set[int] = set()
         self.slow_until = -math.inf
         self.goals: dict[Side, tuple[float, tuple[float, ...]]] = {}
@@ -662,8 +592,8 @@ class SlowForASecondClient(Service):
                 self.slow_until = self.now + 4.0
         super().receive(topic, payload, client)
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if self.now < self.slow_until and all(math.isfinite(m.q) for m in motors):
+    def motors(self, side: Side, motors: Motors) -> None:
+        if self.now < self.slow_until and finite_q(motors):
             at, goals = self.goals.get(side, (self.now, self.positions(side)))
             steps = [0.2 * j.stroke * (self.now - at) for j in joints_of(self.dialect, side)]
             goals = tuple(
@@ -677,52 +607,44 @@ class SlowForASecondClient(Service):
         super().motors(side, motors)
 
 
-@wrong_hand("DEX3-ABUSE-01", where=obeys_gains, whole=True)
-class WeakWhenRestarted(Service):
+@changes(Service, "motors", "DEX3-ABUSE-01", where=obeys_gains, whole=True)
+def WeakWhenRestarted(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Uses two fifths of the stiffness after a restart of its service, as settings are lost."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if self.restarted:
-            motors = tuple(replace(m, kp=0.4 * m.kp) for m in motors)
-        super().motors(side, motors)
+    if self.restarted:
+        motors = tuple(replace(m, kp=0.4 * m.kp) for m in motors)
+    command(side, motors)
 
 
 # ----------------------------------------------------------------------------------- safety
 
 
-@wrong_hand("DEX1-SAFE-01", "DEX3-SAFE-01")
-class NanIsZero(Service):
+@changes(Service, "motors", "DEX1-SAFE-01", "DEX3-SAFE-01")
+def NanIsZero(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Replaces NaN and infinity by 0."""
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        def zeroed(value: float) -> float:
-            return value if math.isfinite(value) else 0.0
+    def zero(x: float) -> float:
+        return x if math.isfinite(x) else 0.0
 
-        super().motors(
-            side,
-            tuple(
-                Motor(zeroed(m.q), zeroed(m.dq), zeroed(m.tau), zeroed(m.kp), zeroed(m.kd), m.mode)
-                for m in motors
-            ),
-        )
+    command(
+        side,
+        tuple(
+            Motor(zero(m.q), zero(m.dq), zero(m.tau), zero(m.kp), zero(m.kd), m.mode)
+            for m in motors
+        ),
+    )
 
 
-def _zeroed(motors: tuple[Motor, ...]) -> tuple[Motor, ...]:
+def _zeroed(motors: Motors) -> Motors:
     """The motors with 0 for each q that is not finite."""
     return tuple(replace(m, q=m.q if math.isfinite(m.q) else 0.0) for m in motors)
 
 
 # a hand without gains gets fewer of them
-@wrong_hand("DEX1-SAFE-01", "DEX3-SAFE-01", whole=True, where=obeys_gains)
-class TiresOfNan(Service):
+@changes(Service, "motors", "DEX1-SAFE-01", "DEX3-SAFE-01", whole=True, where=obeys_gains)
+def TiresOfNan(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Rejects a hundred commands that are not finite, and obeys later ones as 0."""
-
-    count = 0
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
-            self.count += 1
-        super().motors(side, motors if self.count <= 100 else _zeroed(motors))
+    self.memory["count"] = count = self.memory.get("count", 0) + (not finite(motors))
+    command(side, motors if count <= 100 else _zeroed(motors))
 
 
 @wrong_hand("DEX1-SAFE-01", "DEX3-SAFE-01", whole=True)
@@ -735,91 +657,79 @@ class TrustsTheNextClient(Service):
         self.client = client
         super().receive(topic, payload, client)
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         super().motors(side, _zeroed(motors) if self.client else motors)
 
 
-@wrong_hand("DEX1-SAFE-03", "DEX3-SAFE-03")
-class EmptyIsZero(Service):
+@changes(Service, "receive", "DEX1-SAFE-03", "DEX3-SAFE-03")
+def EmptyIsZero(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys an empty command as goals of 0 with its default gains."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        super().receive(topic, payload, client)
-        if self.codec.commanded(payload):
-            return
-        for side in self.sides:
-            if self.codec.command_topics[side] == topic:
-                dq = model(self.dialect.model).client_command.dq
-                motors = (Motor(dq=dq, mode=self.codec.mode(i)) for i in range(self.codec.joints))
-                self.motors(side, tuple(motors))
+    receive(topic, payload, client)
+    if self.codec.commanded(payload):
+        return
+    for side in self.sides:
+        if self.codec.command_topics[side] == topic:
+            dq = model(self.dialect.model).client_command.dq
+            motors = (Motor(dq=dq, mode=self.codec.mode(i)) for i in range(self.codec.joints))
+            self.motors(side, tuple(motors))
 
 
-@wrong_hand("DEX1-SAFE-03", "DEX3-SAFE-03")
-class DiesOfEmpty(Service):
+class _Dies(Service):
+    """Publishes nothing for 0.4 s when it has crashed."""
+
+    dead_until = 0.0
+
+    def publish(self) -> list[Sample]:
+        return [] if self.now < self.dead_until else super().publish()
+
+
+@changes(_Dies, "receive", "DEX1-SAFE-03", "DEX3-SAFE-03")
+def DiesOfEmpty(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Crashes on a command without motors, and is restarted 0.4 s later."""
-
-    dead_until = 0.0
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        sequence = self.codec.commanded(payload)
-        if not sequence and any(self.codec.command_topics[s] == topic for s in self.sides):
-            self.dead_until = self.now + 0.4
-        super().receive(topic, payload, client)
-
-    def publish(self) -> list[Sample]:
-        return [] if self.now < self.dead_until else super().publish()
-
-
-@wrong_hand("DEX1-SAFE-04", "DEX3-SAFE-05")
-class TakesTheLast(Service):
-    """Obeys the last motors of an over-long command."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        message = self.codec.command.decode(payload)
-        motors = getattr(message, self.codec.command_sequence)
-        if len(motors) > self.dialect.length:
-            setattr(message, self.codec.command_sequence, motors[-self.dialect.length :])
-            payload = self.codec.command.encode(message)
-        super().receive(topic, payload, client)
-
-
-@wrong_hand("DEX1-SAFE-06", "DEX3-SAFE-07")
-class TakesAnyType(Service):
-    """Decodes and obeys any type that is published on its command topic."""
-
-    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
-        message = message_type(type_name).decode(payload)
-        motors = getattr(message, sequence_of(type_name))
-        for side in self.sides:
-            if self.codec.command_topics[side] == topic:
-                first = self.dialect.index[side]
-                mine = motors[first : first + self.codec.joints]
-                self.motors(side, tuple(Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in mine))
-
-
-@wrong_hand("DEX1-SAFE-06", "DEX3-SAFE-07")
-class DiesOfAnyType(Service):
-    """Crashes on a message of another type, and is restarted 0.4 s later."""
-
-    dead_until = 0.0
-
-    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
+    sequence = self.codec.commanded(payload)
+    if not sequence and any(self.codec.command_topics[s] == topic for s in self.sides):
         self.dead_until = self.now + 0.4
-
-    def publish(self) -> list[Sample]:
-        return [] if self.now < self.dead_until else super().publish()
+    receive(topic, payload, client)
 
 
-@wrong_hand("DEX1-SAFE-07", whole=True)
+@changes(Service, "receive", "DEX1-SAFE-04", "DEX3-SAFE-05")
+def TakesTheLast(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
+    """Obeys the last motors of an over-long command."""
+    message = self.codec.command.decode(payload)
+    motors = getattr(message, self.codec.command_sequence)
+    if len(motors) > self.dialect.length:
+        setattr(message, self.codec.command_sequence, motors[-self.dialect.length :])
+        payload = self.codec.command.encode(message)
+    receive(topic, payload, client)
+
+
+@changes(Service, "foreign", "DEX1-SAFE-06", "DEX3-SAFE-07")
+def TakesAnyType(self: Any, foreign: Call, topic: str, type_name: str, payload: bytes) -> None:
+    """Decodes and obeys any type that is published on its command topic."""
+    motors = getattr(message_type(type_name).decode(payload), sequence_of(type_name))
+    for side in self.sides:
+        if self.codec.command_topics[side] == topic:
+            first = self.dialect.index[side]
+            mine = motors[first : first + self.codec.joints]
+            self.motors(side, tuple(Motor(m.q, m.dq, m.tau, m.kp, m.kd, m.mode) for m in mine))
+
+
+@changes(_Dies, "foreign", "DEX1-SAFE-06", "DEX3-SAFE-07")
+def DiesOfAnyType(self: Any, foreign: Call, topic: str, type_name: str, payload: bytes) -> None:
+    """Crashes on a message of another type, and is restarted 0.4 s later."""
+    self.dead_until = self.now + 0.4
+
+
 @wrong_hand("DEX3-SAFE-08", brief=True)
+@wrong_hand("DEX1-SAFE-07", whole=True)
 class QueuesCommands(Service):
     """Queues up to 600 commands and carries out at most two of them in each cycle."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.queues: dict[Side, list[tuple[Motor, ...]]] = {s: [] for s in self.sides}
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.queues: dict[Side, list[Motors]] = {s: [] for s in self.sides}
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.queues[side] = [*self.queues[side][-599:], motors]
 
     def live(self, dt: float) -> None:
@@ -833,11 +743,9 @@ class QueuesCommands(Service):
 class StopsInABurst(Service):
     """Receives in its publishing thread: each waiting command delays the next state."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.busy_until = 0.0
+    busy_until = 0.0
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         busy = max(self.busy_until, self.now) + 0.001 / len(self.sides)
         self.busy_until = min(busy, self.now + 0.6)  # the socket's buffer drops the others
         super().motors(side, motors)
@@ -846,92 +754,64 @@ class StopsInABurst(Service):
         return [] if self.busy_until > self.now + 0.02 else super().publish()
 
 
-@wrong_hand("DEX1-SAFE-08", "DEX3-SAFE-09")
-class GivesUpOnTwo(Service):
+# ---------------------------------------------------------------------------------- clients
+
+
+@changes(_Dies, "receive", "DEX1-SAFE-08", "DEX3-SAFE-09")
+def GivesUpOnTwo(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Ends when a second client commands it, and is restarted 0.4 s later."""
-
-    dead_until = 0.0
-    quarrel = (0, -math.inf)
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        other, at = self.quarrel
-        if client != other and self.now - at < 0.05:
-            self.dead_until = self.now + 0.4
-        self.quarrel = (client, self.now)
-        super().receive(topic, payload, client)
-
-    def publish(self) -> list[Sample]:
-        return [] if self.now < self.dead_until else super().publish()
+    before, at = self.memory.get("newest", (0, -math.inf))
+    if client != before and self.now - at < 0.05:
+        self.dead_until = self.now + 0.4
+    self.memory["newest"] = client, self.now
+    receive(topic, payload, client)
 
 
-@wrong_hand("DEX1-SAFE-08", "DEX3-SAFE-09")
-class StaysWithTheNewest(Service):
+@changes(Service, "receive", "DEX1-SAFE-08", "DEX3-SAFE-09")
+def StaysWithTheNewest(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys only the newest client, even when that one has gone."""
-
-    master: int | None = None
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.known: set[int] = set()
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        if client not in self.known:
-            self.known.add(client)
-            self.master = client
-        if client == self.master:
-            super().receive(topic, payload, client)
+    self.memory.setdefault(client, len(self.memory))
+    if client == max(self.memory, key=self.memory.__getitem__):
+        receive(topic, payload, client)
 
 
-@wrong_hand("DEX1-SAFE-09", "DEX3-SAFE-10")
-class IgnoresTwo(Service):
+@changes(Service, "receive", "DEX1-SAFE-09", "DEX3-SAFE-10")
+def IgnoresTwo(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys nobody while two clients command it."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.heard: dict[int, float] = {}
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        self.heard[client] = self.now
-        if all(other == client or self.now - at > 0.05 for other, at in self.heard.items()):
-            super().receive(topic, payload, client)
+    self.memory[client] = self.now
+    if all(each == client or self.now - at > 0.05 for each, at in self.memory.items()):
+        receive(topic, payload, client)
 
 
-@wrong_hand("DEX1-MOVE-09", "DEX3-MOVE-08", whole=True, where=takes_floats)
-class DeafAfterFar(Service):
+@changes(Service, "motors", "DEX1-MOVE-09", "DEX3-MOVE-08", whole=True, where=takes_floats)
+def DeafAfterFar(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Ignores commands for 0.8 s after one that is far out of range."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.deaf_until: dict[Side, float] = {}
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if any(100.0 < abs(m.q) < math.inf for m in motors):
-            self.deaf_until[side] = self.now + 0.8
-        if self.now >= self.deaf_until.get(side, 0.0):
-            super().motors(side, motors)
+    if any(100.0 < abs(m.q) < math.inf for m in motors):
+        self.memory[side] = self.now + 0.8
+    if self.now >= self.memory.get(side, 0.0):
+        command(side, motors)
 
 
-@wrong_hand("DEX1-SAFE-02")
-class WrapsFarGoals(Service):
+@changes(Service, "motors", "DEX1-SAFE-02")
+def WrapsFarGoals(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Takes a q that is far out of range modulo its range."""
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        wrapped = []
-        for motor, joint in zip(motors, joints_of(self.dialect, side), strict=True):
-            q = motor.q
-            if 100.0 < abs(q) < math.inf:
-                q = joint.q_min + (q - joint.q_min) % joint.stroke
-            wrapped.append(replace(motor, q=q))
-        super().motors(side, tuple(wrapped))
+    def wrapped(q: float, joint: JointSpec) -> float:
+        far = 100.0 < abs(q) < math.inf
+        return joint.q_min + (q - joint.q_min) % joint.stroke if far else q
+
+    joints = joints_of(self.dialect, side)
+    command(side, tuple(replace(m, q=wrapped(m.q, j)) for m, j in zip(motors, joints, strict=True)))
 
 
-@wrong_hand("DEX1-ORDER-02", "DEX3-ORDER-02")
-class DropsOldStamps(Service):
+@changes(Service, "receive", "DEX1-ORDER-02", "DEX3-ORDER-02")
+def DropsOldStamps(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Ignores commands whose source timestamps are more than a second old."""
+    if self.now - self.stamp < 1.0:
+        receive(topic, payload, client)
 
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        if self.now - self.stamp < 1.0:
-            super().receive(topic, payload, client)
+
+# ------------------------------------------------------------------------------------- load
 
 
 def _too_slow(service: Service) -> int:
@@ -944,11 +824,11 @@ class StuttersUnderLoad(Service):
     """Publishes too few states while four commands of one client come within 11 ms."""
 
     tick = period = 0.002
+    cycle = 0
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.came: dict[tuple[str, int], list[float]] = {}
-        self.cycle = 0
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         key = topic, client
@@ -964,20 +844,14 @@ class StuttersUnderLoad(Service):
         return [] if busy and self.cycle % _too_slow(self) else super().publish()
 
 
-@wrong_hand("DEX1-LOAD-02", "DEX3-LOAD-02")
-class DeafToThousands(Service):
+@changes(Service, "motors", "DEX1-LOAD-02", "DEX3-LOAD-02")
+def DeafToThousands(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Takes no command while more than 700 a second arrive, as its inbox overflows."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.came: dict[Side, deque[float]] = {s: deque(maxlen=70) for s in self.sides}
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        came = self.came[side]
-        full = len(came) == 70 and self.now - came[0] < 0.1
-        came.append(self.now)
-        if not full:
-            super().motors(side, motors)
+    came = self.memory.setdefault(side, deque(maxlen=70))
+    full = len(came) == 70 and self.now - came[0] < 0.1
+    came.append(self.now)
+    if not full:
+        command(side, motors)
 
 
 @wrong_hand("DEX1-LOAD-01", "DEX3-LOAD-01", where=_needs_many_states)
@@ -987,14 +861,14 @@ class ChokesOnThousands(Service):
     tick = period = 0.002
     share = 3
     """One state of how many it publishes then."""
+    busy_until = second = 0.0
+    cycle = 0
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.came: dict[Side, int] = dict.fromkeys(self.sides, 0)
-        self.busy_until = self.second = 0.0
-        self.cycle = 0
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         if self.now >= self.second + 0.1:
             self.second, self.came = self.now, dict.fromkeys(self.sides, 0)
         self.came[side] += 1
@@ -1008,32 +882,28 @@ class ChokesOnThousands(Service):
         return [] if held else super().publish()
 
 
-@wrong_hand("DEX1-LOAD-01", "DEX3-LOAD-01")
-class WaitsForItsReaders(Service):
+@changes(Service, "publish", "DEX1-LOAD-01", "DEX3-LOAD-01")
+def WaitsForItsReaders(self: Any, publish: Call) -> Any:
     """Keeps all samples for a slow reliable reader: its writer blocks when the history is full."""
-
-    def publish(self) -> list[Sample]:
-        return [] if self.loaded and self.now % 0.5 < 0.2 else super().publish()
+    return [] if self.loaded and self.now % 0.5 < 0.2 else publish()
 
 
 @wrong_hand("DEX1-LOAD-03", "DEX3-LOAD-03")
 class OldUnderLoad(Service):
     """Queues its states for a slow reliable reader: they are 0.3 s old when they leave."""
 
-    late_s = 0.3
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.queue: deque[tuple[float, list[Sample]]] = deque()
 
-    @property
-    def lateness(self) -> float:
-        """How old a state is when it leaves, seconds."""
-        return self.late_s if self.loaded else 0.0
+    def is_late(self) -> bool:
+        """Whether they wait now."""
+        return self.loaded
 
     def publish(self) -> list[Sample]:
         self.queue.append((self.now, super().publish()))
-        while len(self.queue) > 1 and self.queue[1][0] <= self.now - self.lateness:
+        late = 0.3 if self.is_late() else 0.0
+        while len(self.queue) > 1 and self.queue[1][0] <= self.now - late:
             self.queue.popleft()
         return [replace(s, sent=self.now) for s in self.queue[0][1]]
 
@@ -1042,17 +912,14 @@ class OldUnderLoad(Service):
 class OldUnderThousands(OldUnderLoad):
     """Its states wait behind its commands: 0.3 s from 1000 commands a second on."""
 
-    def __init__(self, *args: object) -> None:
+    def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.came: deque[float] = deque(maxlen=200)
 
-    @property
-    def lateness(self) -> float:
-        """How old a state is when it leaves, seconds."""
-        full = len(self.came) == self.came.maxlen and self.now - self.came[0] < 0.1
-        return self.late_s if full else 0.0
+    def is_late(self) -> bool:
+        return len(self.came) == self.came.maxlen and self.now - self.came[0] < 0.1
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         if side is self.sides[0]:
             self.came.append(self.now)
         super().motors(side, motors)
@@ -1062,11 +929,11 @@ class OldUnderThousands(OldUnderLoad):
 class LateUnderLoad(Service):
     """Puts commands in force 0.3 s late while a slow reader is there."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.mail: deque[tuple[float, Side, tuple[Motor, ...]]] = deque()
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.mail: deque[tuple[float, Side, Motors]] = deque()
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.mail.append((self.now + (0.3 if self.loaded else 0.0), side, motors))
         self.deliver()
 
@@ -1086,7 +953,7 @@ class QuietInSilence(Service):
 
     heard = math.inf
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.heard = self.now
         super().motors(side, motors)
 
@@ -1104,26 +971,18 @@ class ServesOnlyTheFirst(Service):
     serves_late_readers = False
 
 
-@wrong_hand("DEX1-LIFE-02", "DEX3-LIFE-02")
-class BoundToOneClient(Service):
+@changes(Service, "receive", "DEX1-LIFE-02", "DEX3-LIFE-02")
+def BoundToOneClient(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys only the first client that ever commanded it."""
-
-    master: int | None = None
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        if self.master is None:
-            self.master = client
-        if client == self.master:
-            super().receive(topic, payload, client)
+    if client == self.memory.setdefault("first", client):
+        receive(topic, payload, client)
 
 
-@wrong_hand("DEX1-LIFE-03", "DEX3-LIFE-03")
-class DeafAfterRestart(Service):
+@changes(Service, "receive", "DEX1-LIFE-03", "DEX3-LIFE-03")
+def DeafAfterRestart(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """After a restart, it gets no commands from clients that were there before."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        if not self.restarted:
-            super().receive(topic, payload, client)
+    if not self.restarted:
+        receive(topic, payload, client)
 
 
 @wrong_hand("DEX1-LIFE-03", "DEX3-LIFE-03")
@@ -1168,13 +1027,11 @@ class LeavesItsName(Service):
     gone_s = 10.0
 
 
-@wrong_hand("DEX1-LIFE-05", "DEX3-LIFE-05")
-class LeavesItDriven(Service):
+@changes(Service, "brake", "DEX1-LIFE-05", "DEX3-LIFE-05")
+def LeavesItDriven(self: Any, brake: Call) -> None:
     """Ends without braking, and took the time-out with it."""
-
-    def brake(self) -> None:
-        for hand in self.hands.values():  # type: ignore[attr-defined]
-            hand.timeout = math.inf
+    for hand in self.hands.values():
+        hand.timeout = math.inf
 
 
 @wrong_hand("DEX1-LIFE-06", "DEX3-LIFE-06")
@@ -1200,43 +1057,31 @@ class ParksWhenItEnds(Service):
         return joint.q_min if q > 0.5 * (joint.q_min + joint.q_max) else joint.q_max
 
 
-@wrong_hand("BRAINCO-LIFE-06", sides=BOTH, whole=True)
-class ParksAtAThird(ParksWhenItEnds):
+@changes(ParksWhenItEnds, "place", "BRAINCO-LIFE-06", sides=BOTH, whole=True)
+def ParksAtAThird(self: Any, place: Call, q: float, joint: JointSpec) -> float:
     """Commands both hands to a pose of a third of the way when its service ends."""
-
-    def place(self, q: float, joint: JointSpec) -> float:
-        return joint.closed_by(0.33)
+    return joint.closed_by(0.33)
 
 
 # --------------------------------------------------------------------------------- tracking
 
 
-# it drops single commands
-@wrong_hand("DEX1-TRACK-01", "DEX3-TRACK-01")
-class WaitsForRest(Service):
+@changes(Service, "motors", "DEX1-TRACK-01", "DEX3-TRACK-01")
+def WaitsForRest(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Obeys a new goal only when the goal has not changed for 0.1 s."""
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.seen: dict[tuple[Side, int], tuple[float, float]] = {}
-        self.taken: dict[tuple[Side, int], float] = {}
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if not all(math.isfinite(m.q) for m in motors):
-            super().motors(side, motors)
-            return
-        for joint, motor in enumerate(motors):
-            key = side, joint
-            q, since = self.seen.get(key, (math.inf, self.now))
-            if not abs(motor.q - q) < 0.002:
-                self.seen[key] = (motor.q, self.now)
-            elif self.now - since >= 0.1:
-                self.taken[key] = motor.q
-        here = self.positions(side)
-        super().motors(
-            side,
-            tuple(replace(m, q=self.taken.get((side, i), here[i])) for i, m in enumerate(motors)),
-        )
+    if not finite_q(motors):
+        command(side, motors)
+        return
+    goals = []
+    for joint, (motor, here) in enumerate(zip(motors, self.positions(side), strict=True)):
+        q, since, taken = self.memory.get((side, joint), (math.inf, self.now, None))
+        if not abs(motor.q - q) < 0.002:
+            q, since = motor.q, self.now
+        elif self.now - since >= 0.1:
+            taken = motor.q
+        self.memory[side, joint] = q, since, taken
+        goals.append(here if taken is None else taken)
+    command(side, tuple(replace(m, q=q) for m, q in zip(motors, goals, strict=True)))
 
 
 @wrong_hand("DEX1-TRACK-02", "DEX3-TRACK-02")
@@ -1245,11 +1090,11 @@ class Delayed(Service):
 
     delay = 0.15
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.queue: list[tuple[float, Side, tuple[Motor, ...]]] = []
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.queue: list[tuple[float, Side, Motors]] = []
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.queue.append((self.now + self.delay, side, motors))
 
     def live(self, dt: float) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
-from dexkit.conformance.faults.registry import takes_floats, wrong_hand
+from dexkit.conformance.faults.registry import Call, changes, takes_floats, wrong_hand
 from dexkit.conformance.motor_messages import LIMP, Motor
 from dexkit.conformance.recording import joints_of
 from dexkit.conformance.virtual.client import ReferenceClient
@@ -20,52 +21,42 @@ from dexkit.teleop import Dex1Client, Pose, TeleopClient
 # ------------------------------------------------------------------------------ form and values
 
 
-@wrong_hand("DEX1-CLIENT-01", where=takes_floats)
-class OneMotorTooMany(ReferenceClient):
+@changes(ReferenceClient, "encoded", "DEX1-CLIENT-01", where=takes_floats)
+def OneMotorTooMany(self: Any, encoded: Call, hands: Mapping[Side, list[Motor]]) -> Any:
     """Sends one motor more than the hand has."""
-
-    def encoded(self, hands: Mapping[Side, list[Motor]]) -> list[tuple[str, bytes]]:
-        return self.codec.encode_longer(hands, [LIMP])
+    return self.codec.encode_longer(hands, [LIMP])
 
 
-@wrong_hand("DEX1-CLIENT-01")
-class EmptyNowAndThen(ReferenceClient):
+@changes(ReferenceClient, "encoded", "DEX1-CLIENT-01")
+def EmptyNowAndThen(self: Any, encoded: Call, hands: Mapping[Side, list[Motor]]) -> Any:
     """Sends every fiftieth command without a motor in it."""
-
-    def encoded(self, hands: Mapping[Side, list[Motor]]) -> list[tuple[str, bytes]]:
-        if self.turn % 50 == 0:
-            return self.codec.encode_empty(list(hands))
-        return super().encoded(hands)
+    if self.turn % 50 == 0:
+        return self.codec.encode_empty(list(hands))
+    return encoded(hands)
 
 
-@wrong_hand("DEX1-CLIENT-02")
-class DividesByZero(ReferenceClient):
+@changes(ReferenceClient, "change", "DEX1-CLIENT-02")
+def DividesByZero(self: Any, change: Call, side: Side, motors: list[Motor]) -> list[Motor]:
     """Sends NaN as the velocity of the last joint when the target rests."""
-
-    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
-        if self.turn % 40:
-            return motors
-        return [*motors[:-1], replace(motors[-1], dq=math.nan)]
+    if self.turn % 40:
+        return motors
+    return [*motors[:-1], replace(motors[-1], dq=math.nan)]
 
 
-@wrong_hand("DEX1-CLIENT-03")
-class SendsPercent(ReferenceClient):
+@changes(ReferenceClient, "change", "DEX1-CLIENT-03")
+def SendsPercent(self: Any, change: Call, side: Side, motors: list[Motor]) -> list[Motor]:
     """Sends q as percent of each joint's range."""
-
-    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
-        joints = joints_of(self.dialect, side)
-        return [
-            replace(m, q=100.0 * (m.q - j.q_min) / j.stroke)
-            for m, j in zip(motors, joints, strict=True)
-        ]
+    joints = joints_of(self.dialect, side)
+    return [
+        replace(m, q=100.0 * (m.q - j.q_min) / j.stroke)
+        for m, j in zip(motors, joints, strict=True)
+    ]
 
 
-@wrong_hand("DEX1-CLIENT-03")
-class SendsDegrees(ReferenceClient):
+@changes(ReferenceClient, "change", "DEX1-CLIENT-03")
+def SendsDegrees(self: Any, change: Call, side: Side, motors: list[Motor]) -> list[Motor]:
     """Sends q in degrees."""
-
-    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
-        return [replace(m, q=math.degrees(m.q)) for m in motors]
+    return [replace(m, q=math.degrees(m.q)) for m in motors]
 
 
 @wrong_hand("DEX1-CLIENT-04")
@@ -106,91 +97,75 @@ class GainsOfTheMotor(SoftGains):
     factor = 10.0
 
 
-@wrong_hand("DEX1-CLIENT-14", dialect="unitree_hg")
-class GainsWithoutUse(ReferenceClient):
+@changes(ReferenceClient, "change", "DEX1-CLIENT-14", dialect="unitree_hg")
+def GainsWithoutUse(self: Any, change: Call, side: Side, motors: list[Motor]) -> list[Motor]:
     """Sends gains in a dialect whose clients send 0."""
-
-    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
-        return [replace(m, kp=5.0, kd=0.05) for m in motors]
+    return [replace(m, kp=5.0, kd=0.05) for m in motors]
 
 
-@wrong_hand("DEX1-CLIENT-10")
-class ModeOfAnotherProduct(ReferenceClient):
+@changes(ReferenceClient, "change", "DEX1-CLIENT-10")
+def ModeOfAnotherProduct(self: Any, change: Call, side: Side, motors: list[Motor]) -> list[Motor]:
     """Sends the mode byte of another product."""
-
-    def change(self, side: Side, motors: list[Motor]) -> list[Motor]:
-        kind = self.dialect.mode_byte
-        return [
-            replace(m, mode={ModeByte.UNUSED: 10, ModeByte.STATUS: 0x10 | i}.get(kind, 1))
-            for i, m in enumerate(motors)
-        ]
+    kind = self.dialect.mode_byte
+    return [
+        replace(m, mode={ModeByte.UNUSED: 10, ModeByte.STATUS: 0x10 | i}.get(kind, 1))
+        for i, m in enumerate(motors)
+    ]
 
 
 # ----------------------------------------------------------------------------------------- time
 
 
-@wrong_hand("DEX1-CLIENT-05")
-class FiveHertz(ReferenceClient):
+@changes(ReferenceClient, "sends", "DEX1-CLIENT-05")
+def FiveHertz(self: Any, sends: Call, now: float) -> Any:
     """Sends 5 commands a second."""
-
-    def sends(self, now: float) -> bool:
-        return self.turn % round(self.rate / 5) == 0
+    return self.turn % round(self.rate / 5) == 0
 
 
-@wrong_hand("DEX1-CLIENT-05")
-class SlowsDown(ReferenceClient):
+@changes(ReferenceClient, "sends", "DEX1-CLIENT-05")
+def SlowsDown(self: Any, sends: Call, now: float) -> bool:
     """Sends 10 commands a second for 1.5 s; the mean of the session is good."""
-
-    def sends(self, now: float) -> bool:
-        return not 2.3 <= now < 3.8 or self.turn % round(self.rate / 10) == 0
+    return not 2.3 <= now < 3.8 or self.turn % round(self.rate / 10) == 0
 
 
-@wrong_hand("DEX1-CLIENT-06")
-class HalfRateClient(ReferenceClient):
+@changes(ReferenceClient, "sends", "DEX1-CLIENT-06")
+def HalfRateClient(self: Any, sends: Call, now: float) -> Any:
     """Sends every second command."""
-
-    def sends(self, now: float) -> bool:
-        return self.turn % 2 == 0
+    return self.turn % 2 == 0
 
 
-@wrong_hand("DEX1-CLIENT-07")
-class Stutters(ReferenceClient):
+@changes(ReferenceClient, "sends", "DEX1-CLIENT-07")
+def Stutters(self: Any, sends: Call, now: float) -> bool:
     """Sends nothing for 0.25 s, twice."""
-
-    def sends(self, now: float) -> bool:
-        return not (2.0 <= now < 2.25 or 4.5 <= now < 4.75)
+    return not (2.0 <= now < 2.25 or 4.5 <= now < 4.75)
 
 
 # --------------------------------------------------------------------------------------- motion
 
 
-@wrong_hand("DEX1-CLIENT-08")
-class JumpsToTheTarget(ReferenceClient):
+@changes(ReferenceClient, "make_client", "DEX1-CLIENT-08")
+def JumpsToTheTarget(self: Any, make_client: Call) -> TeleopClient:
     """Sends the operator's target without a limit to the step."""
-
-    def make_client(self) -> TeleopClient:
-        return Dex1Client(self.dialect, self.sides, simulated=True)
+    return Dex1Client(self.dialect, self.sides, simulated=True)
 
 
-@wrong_hand("DEX1-CLIENT-11")
-class TwoClients(ReferenceClient):
+@changes(ReferenceClient, "messages", "DEX1-CLIENT-11")
+def TwoClients(self: Any, messages: Call, now: float) -> Any:
     """A second client commands the same hands to another pose, alternating with the first."""
-
-    def messages(self, now: float) -> list[tuple[str, bytes]]:
-        first = super().messages(now)
-        if not first:
-            return []
-        rival = {
-            side: [
-                # on the other side of the last state
-                replace(m, q=m.q - math.copysign(0.03 * joint.stroke, m.q - state))
-                for m, joint, state in zip(
-                    motors, joints_of(self.dialect, side), self.q[side], strict=True
-                )
-            ]
-            for side, motors in self.motors(now).items()
-        }
-        return [*first, *self.encoded(rival)]
+    first = messages(now)
+    if not first:
+        return []
+    rival = {
+        side: [
+            # on the other side of the last state
+            replace(m, q=m.q - math.copysign(0.03 * joint.stroke, m.q - state))
+            for m, joint, state in zip(
+                motors, joints_of(self.dialect, side), self.q[side], strict=True
+            )
+        ]
+        for side, motors in self.motors(now).items()
+    }
+    return [*first, *self.encoded(rival)]
 
 
 # -------------------------------------------------------------------------------- begin and end

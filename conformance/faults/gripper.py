@@ -95,16 +95,14 @@ class _OtherScale(ReferenceHand):
         return {**super().fields(), "tau_est": 0.1 * self.tau}
 
 
-class _PercentBothWays(ReferenceService):
+@wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
+class PercentBothWays(ReferenceService):
+    """Obeys and publishes percent; starts nearly closed, in the range of radians."""
+
     hand = _OtherScale
 
 
-@wrong_hand("DEX1-FIELD-03", sides=LEFT, whole=True)
-class PercentBothWays(_PercentBothWays):
-    """Obeys and publishes percent; starts nearly closed, in the range of radians."""
-
-
-@changes(_PercentBothWays, "command", "DEX1-FIELD-14", sides=LEFT)
+@changes(PercentBothWays, "command", "DEX1-FIELD-14", sides=LEFT)
 def PercentWithin(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Obeys and publishes percent, after it has clamped q to 0 to 5.4."""
     q = min(max(motor.q, 0.0), self.dialect.q_open) if math.isfinite(motor.q) else motor.q

@@ -9,36 +9,45 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from dexkit.conformance.faults.any_model import Delayed
-from dexkit.conformance.faults.registry import has_speeds, obeys_gains, wrong_hand
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.faults.any_model import Delayed, finite
+from dexkit.conformance.faults.registry import (
+    Call,
+    Motors,
+    changes,
+    has_speeds,
+    obeys_gains,
+    reports,
+    wrong_hand,
+)
 from dexkit.conformance.virtual import Service
 from dexkit.conformance.virtual.fingers import FingerService
-from dexkit.conformance.virtual.gripper import ReferenceService
+from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
 from dexkit.models import model
+
+Joint = tuple[Side, int]
 
 
 class _PerJoint(Service):
     """Changes the goal of each joint, where it is finite."""
 
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.obeyed: dict[tuple[Side, int], tuple[float, float]] = {}
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.obeyed: dict[Joint, tuple[float, float]] = {}
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if all(math.isfinite(x) for m in motors for x in (m.q, m.dq, m.tau, m.kp, m.kd)):
+    def motors(self, side: Side, motors: Motors) -> None:
+        if finite(motors):
             here = self.positions(side)
             motors = tuple(
                 replace(m, q=self.change((side, i), m.q, here[i])) for i, m in enumerate(motors)
             )
         super().motors(side, motors)
 
-    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+    def change(self, joint: Joint, q: float, here: float) -> float:
         """The goal that is obeyed in place of ``q``, rad."""
         raise AssertionError  # overridden
 
-    def stroke(self, joint: tuple[Side, int]) -> float:
+    def stroke(self, joint: Joint) -> float:
         """The joint's range, rad."""
         side, index = joint
         if self.dialect.is_gripper:
@@ -50,7 +59,7 @@ class _DeadBand(_PerJoint):
     band = 0.0
     """Of the stroke."""
 
-    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+    def change(self, joint: Joint, q: float, here: float) -> float:
         if abs(q - here) >= self.band * self.stroke(joint):
             self.obeyed[joint] = (q, self.now)
         return self.obeyed.setdefault(joint, (here, self.now))[0]
@@ -64,14 +73,10 @@ class DeadBand(_DeadBand, ReferenceService):
     band = 0.16 / 5.4
 
 
-@wrong_hand("DEX1-OPER-01")
-class SaturatingGain(ReferenceService):
+@changes(ReferenceService, "motors", "DEX1-OPER-01")
+def SaturatingGain(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Takes no kp above 2: with the client's small lead it has 40 % of the force."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        super().motors(
-            side, tuple(replace(m, kp=2.0) if 2.0 < m.kp < math.inf else m for m in motors)
-        )
+    command(side, tuple(replace(m, kp=2.0) if 2.0 < m.kp < math.inf else m for m in motors))
 
 
 # what it leaves of each step shows in steps of every kind
@@ -86,7 +91,7 @@ class _Coarse(_PerJoint):
     grid = 0.0
     """Of the stroke."""
 
-    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+    def change(self, joint: Joint, q: float, here: float) -> float:
         grid = self.grid * self.stroke(joint)
         return round(q / grid) * grid
 
@@ -105,23 +110,14 @@ class CoarseFingers(_Coarse, FingerService):
     grid = 1 / 20
 
 
-@wrong_hand("DEX1-OPER-02")
-class LateState(ReferenceService):
+@reports(ReferenceService, "DEX1-OPER-02")
+def LateState(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the position of 60 ms ago in fresh messages."""
-
-    late = 0.06
-
-    def __init__(self, *args: object) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self.past: dict[Side, list[tuple[float, dict[str, float]]]] = {}
-
-    def fields(self, side: Side) -> dict[str, Any]:
-        found = super().fields(side)
-        past = self.past.setdefault(side, [])
-        past.append((self.now, {name: found[name] for name in ("q", "dq", "ddq")}))
-        while len(past) > 1 and past[1][0] <= self.now - self.late:
-            del past[0]
-        return {**found, **past[0][1]}
+    past = self.memory.setdefault(hand, [])
+    past.append((self.now, {name: state[name] for name in ("q", "dq", "ddq")}))
+    while len(past) > 1 and past[1][0] <= self.now - 0.06:
+        del past[0]
+    state.update(past[0][1])
 
 
 @wrong_hand("DEX1-OPER-03")
@@ -131,11 +127,11 @@ class RunsAhead(_PerJoint, ReferenceService):
     lead, memory = 0.07, 0.1
     """Seconds ahead, and over which the targets' speed is smoothed."""
 
-    def __init__(self, *args: object) -> None:
+    def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.speed: dict[tuple[Side, int], float] = {}
+        self.speed: dict[Joint, float] = {}
 
-    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+    def change(self, joint: Joint, q: float, here: float) -> float:
         before, since = self.obeyed.get(joint, (q, self.now))
         step, seconds = q - before, self.now - since
         if abs(step) > 0.04 * self.stroke(joint):  # a jump is not a velocity
@@ -148,19 +144,20 @@ class RunsAhead(_PerJoint, ReferenceService):
         return q + self.lead * self.speed.get(joint, 0.0)
 
 
-class _SlowToWake(_PerJoint):
-    sleeps_after, wakes_in = 0.3, 0.2
-    """Seconds without a new target until it sleeps, and until it is awake again."""
+# nothing wakes it but a second command
+@wrong_hand("DEX1-OPER-05")
+class SlowToWake(_PerJoint, ReferenceService):
+    """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
 
-    def __init__(self, *args: object) -> None:
+    def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.awake: dict[tuple[Side, int], float] = {}
+        self.awake: dict[Joint, float] = {}
 
-    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+    def change(self, joint: Joint, q: float, here: float) -> float:
         before, since = self.obeyed.get(joint, (q, self.now))
         if abs(q - before) > 1e-4 * self.stroke(joint):
-            if self.now - since > self.sleeps_after:
-                self.awake[joint] = self.now + self.wakes_in
+            if self.now - since > 0.3:
+                self.awake[joint] = self.now + 0.2
             if self.now >= self.awake.get(joint, 0.0):
                 self.obeyed[joint] = (q, self.now)
                 return q
@@ -170,19 +167,13 @@ class _SlowToWake(_PerJoint):
         return before
 
 
-# nothing wakes it but a second command
-@wrong_hand("DEX1-OPER-05")
-class SlowToWake(_SlowToWake, ReferenceService):
-    """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
-
-
 class _OpenEnd(_PerJoint):
     """Obeys another goal near the open end of a joint."""
 
     near = 0.08
     """Part of the joint's closing that counts as that."""
 
-    def change(self, joint: tuple[Side, int], q: float, here: float) -> float:
+    def change(self, joint: Joint, q: float, here: float) -> float:
         side, index = joint
         spec = model(self.dialect.model).joints[side][index]
         if not spec.closing:
@@ -190,7 +181,7 @@ class _OpenEnd(_PerJoint):
         opened, span = spec.straight, spec.closed_by(1.0) - spec.straight
         return opened + span * self.close(joint, (q - opened) / span, (here - opened) / span)
 
-    def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
+    def close(self, joint: Joint, goal: float, here: float) -> float:
         """The obeyed closing in place of ``goal``, 0 to 1."""
         raise AssertionError  # overridden
 
@@ -201,7 +192,7 @@ class SlowToLeave(_OpenEnd, FingerService):
 
     near = speed = 0.1
 
-    def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
+    def close(self, joint: Joint, goal: float, here: float) -> float:
         taken = goal
         if here < self.near and goal > here:
             before, since = self.obeyed.get(joint, (here, self.now))
@@ -214,7 +205,7 @@ class SlowToLeave(_OpenEnd, FingerService):
 class Springs(_OpenEnd, FingerService):
     """Moves 25 % too far for 0.5 s when it leaves the open end of a joint."""
 
-    def close(self, joint: tuple[Side, int], goal: float, here: float) -> float:
+    def close(self, joint: Joint, goal: float, here: float) -> float:
         if here < self.near:
             self.obeyed[joint] = (here, self.now)
         _, left = self.obeyed.get(joint, (here, -1.0))

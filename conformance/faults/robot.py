@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.faults.registry import wrong_hand
-from dexkit.conformance.virtual import MemoryTrace, Sample
+from dexkit.conformance.faults.registry import Call, changes, wrong_hand
+from dexkit.conformance.virtual import MemoryTrace
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
-from dexkit.hand import Floats, RobotSubject, Subject
+from dexkit.hand import RobotSubject, Subject
 from dexkit.messages import decode, message_type
 from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
-from dexkit.traces import TraceEndpoint
 from dexkit.wire.crc32 import crc32_words
 
 _EARLY = 0.8  # s: while the kit only listens
@@ -58,13 +57,11 @@ class OtherCommands(_OtherFamily):
         self.command_type = self.others[0]
 
 
-@wrong_hand("H1-TOPIC-03")
-class TwoStatePublishers(ReferenceRobot):
+@changes(ReferenceRobot, "endpoints", "H1-TOPIC-03")
+def TwoStatePublishers(self: Any, endpoints: Call) -> Any:
     """Two publishers send its state."""
-
-    def endpoints(self) -> list[TraceEndpoint]:
-        every = super().endpoints()
-        return every + [e for e in every if e.kind == "writer"]
+    every = endpoints()
+    return every + [e for e in every if e.kind == "writer"]
 
 
 @wrong_hand("H1-QOS-01")
@@ -81,51 +78,41 @@ class BestEffort(ReferenceRobot):
     writer_reliability = "best_effort"
 
 
-@wrong_hand("H1-START-01")
-class WaitsForCommands(ReferenceRobot):
+@changes(ReferenceRobot, "publish", "H1-START-01")
+def WaitsForCommands(self: Any, publish: Call) -> Any:
     """Publishes nothing before the first command."""
-
-    def publish(self) -> list[Sample]:
-        return super().publish() if self.orders is not None else []
+    return publish() if self.orders is not None else []
 
 
 # ------------------------------------------------------------------------------------ integrity
 
 
-@wrong_hand("H1-FIELD-01")
-class CutShort(ReferenceRobot):
+@changes(ReferenceRobot, "state_with_crc", "H1-FIELD-01")
+def CutShort(self: Any, state_with_crc: Call) -> Any:
     """Its first states lack their last four bytes."""
-
-    def state_with_crc(self) -> bytes:
-        payload = super().state_with_crc()
-        return payload[:-4] if self.now < _EARLY else payload
+    payload = state_with_crc()
+    return payload[:-4] if self.now < _EARLY else payload
 
 
-@wrong_hand("H1-FIELD-02")
-class NotANumber(ReferenceRobot):
+@changes(ReferenceRobot, "message", "H1-FIELD-02")
+def NotANumber(self: Any, message: Call) -> Any:
     """Publishes NaN as ddq of one motor at first."""
-
-    def message(self) -> Any:
-        state = super().message()
-        state.motor_state[0].ddq = math.nan if self.now < _EARLY else 0.0
-        return state
+    state = message()
+    state.motor_state[0].ddq = math.nan if self.now < _EARLY else 0.0
+    return state
 
 
-@wrong_hand("H1-CRC-01")
-class CdrCrc(ReferenceRobot):
+@changes(ReferenceRobot, "state_with_crc", "H1-CRC-01")
+def CdrCrc(self: Any, state_with_crc: Call) -> Any:
     """Computes the CRC over the CDR bytes."""
-
-    def state_with_crc(self) -> bytes:
-        payload = super().state_with_crc()
-        return payload[:-4] + crc32_words(payload[4:-4]).to_bytes(4, "little")
+    payload = state_with_crc()
+    return payload[:-4] + crc32_words(payload[4:-4]).to_bytes(4, "little")
 
 
-@wrong_hand("H1-CRC-01")
-class NoCrc(ReferenceRobot):
+@changes(ReferenceRobot, "state_with_crc", "H1-CRC-01")
+def NoCrc(self: Any, state_with_crc: Call) -> Any:
     """Publishes a CRC of 0."""
-
-    def state_with_crc(self) -> bytes:
-        return super().state_with_crc()[:-4] + bytes(4)
+    return state_with_crc()[:-4] + bytes(4)
 
 
 # ----------------------------------------------------------------------------------------- rate
@@ -145,37 +132,29 @@ class StateAt333Hz(ReferenceRobot):
     period = 0.003
 
 
-@wrong_hand("H1-RATE-03")
-class StateGap(ReferenceRobot):
+@changes(ReferenceRobot, "publish", "H1-RATE-03")
+def StateGap(self: Any, publish: Call) -> Any:
     """Publishes nothing for 0.2 s once."""
-
-    def publish(self) -> list[Sample]:
-        return [] if 0.5 < self.now < 0.7 else super().publish()
+    return [] if 0.5 < self.now < 0.7 else publish()
 
 
-@wrong_hand("H1-ORDER-01")
-class Repeats(ReferenceRobot):
+@changes(ReferenceRobot, "publish", "H1-ORDER-01")
+def Repeats(self: Any, publish: Call) -> Any:
     """Publishes some states twice."""
-
-    def publish(self) -> list[Sample]:
-        found = super().publish()
-        return found * 2 if self.now < _EARLY and self.ticks() % 50 == 0 else found
+    found = publish()
+    return found * 2 if self.now < _EARLY and self.ticks() % 50 == 0 else found
 
 
-@wrong_hand("H1-TICK-01")
-class NoTick(ReferenceRobot):
+@changes(ReferenceRobot, "ticks", "H1-TICK-01")
+def NoTick(self: Any, ticks: Call) -> int:
     """Publishes a tick of 0."""
-
-    def ticks(self) -> int:
-        return 0
+    return 0
 
 
-@wrong_hand("H1-TICK-02")
-class CountsStates(ReferenceRobot):
+@changes(ReferenceRobot, "ticks", "H1-TICK-02")
+def CountsStates(self: Any, ticks: Call) -> Any:
     """Counts states instead of milliseconds in tick."""
-
-    def ticks(self) -> int:
-        return super().ticks() // 2
+    return ticks() // 2
 
 
 # --------------------------------------------------------------------------------------- fields
@@ -194,260 +173,208 @@ class TurnedOnce(ReferenceRobot):
             values[slot] += 2 * math.pi
 
 
-@wrong_hand("H1-FIELD-04")
-class NoSpeed(ReferenceRobot):
+@changes(ReferenceRobot, "shown", "H1-FIELD-04")
+def NoSpeed(self: Any, shown: Call) -> Any:
     """Publishes dq as 0."""
-
-    def shown(self) -> tuple[Floats, Floats, Floats]:
-        q, dq, tau = super().shown()
-        return q, np.zeros_like(dq), tau
+    q, dq, tau = shown()
+    return q, np.zeros_like(dq), tau
 
 
-@wrong_hand("H1-FIELD-05")
-class PositionInUnusedSlot(ReferenceRobot):
+@changes(ReferenceRobot, "message", "H1-FIELD-05")
+def PositionInUnusedSlot(self: Any, message: Call) -> Any:
     """Publishes a position in a slot without a motor."""
-
-    def message(self) -> Any:
-        state = super().message()
-        unused = next(s for s in range(self.robot.slots) if s not in self.robot.used)
-        state.motor_state[unused].q = 0.5
-        return state
+    state = message()
+    unused = next(s for s in range(self.robot.slots) if s not in self.robot.used)
+    state.motor_state[unused].q = 0.5
+    return state
 
 
-@wrong_hand("H1-TEMP-01")
-class NoSensor(ReferenceRobot):
+@changes(ReferenceRobot, "warmth", "H1-TEMP-01")
+def NoSensor(self: Any, warmth: Call) -> Any:
     """Publishes a temperature of 255 where it has none."""
-
-    def warmth(self) -> Any:
-        return 255
+    return 255
 
 
-@wrong_hand("H1-TEMP-02")
-class TemperaturesZero(ReferenceRobot):
+@changes(ReferenceRobot, "warmth", "H1-TEMP-02")
+def TemperaturesZero(self: Any, warmth: Call) -> Any:
     """Publishes motor temperatures of 0."""
-
-    def warmth(self) -> Any:
-        return 0 if self.robot.motor_temperatures == 1 else (0, 0)
+    return 0 if self.robot.motor_temperatures == 1 else (0, 0)
 
 
-@wrong_hand("H1-IMU-01")
-class NoAttitude(ReferenceRobot):
+@changes(ReferenceRobot, "attitude", "H1-IMU-01")
+def NoAttitude(self: Any, attitude: Call) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Publishes a quaternion of zeros."""
-
-    def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        return (0.0,) * 4, (0.0,) * 3
+    return (0.0,) * 4, (0.0,) * 3
 
 
-@wrong_hand("H1-IMU-02")
-class WLast(ReferenceRobot):
+@changes(ReferenceRobot, "attitude", "H1-IMU-02")
+def WLast(self: Any, attitude: Call) -> Any:
     """Publishes the quaternion with w last."""
-
-    def attitude(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        (w, x, y, z), rpy = super().attitude()
-        return (x, y, z, w), rpy
+    (w, x, y, z), rpy = attitude()
+    return (x, y, z, w), rpy
 
 
-@wrong_hand("H1-IMU-03")
-class InG(ReferenceRobot):
+@changes(ReferenceRobot, "gravity", "H1-IMU-03")
+def InG(self: Any, gravity: Call) -> tuple[float, float, float]:
     """Publishes accelerations in g."""
-
-    def gravity(self) -> tuple[float, float, float]:
-        return (0.0, 0.0, 1.0)
+    return (0.0, 0.0, 1.0)
 
 
-@wrong_hand("H1-HEAD-01")
-class NoHead(ReferenceRobot):
+@changes(ReferenceRobot, "message", "H1-HEAD-01")
+def NoHead(self: Any, message: Call) -> Any:
     """Publishes a head of 0."""
-
-    def message(self) -> Any:
-        state = super().message()
-        state.head = (0, 0)
-        return state
+    state = message()
+    state.head = (0, 0)
+    return state
 
 
-@wrong_hand("H1-BMS-01")
-class BatteryChargeZero(ReferenceRobot):
+@changes(ReferenceRobot, "message", "H1-BMS-01")
+def BatteryChargeZero(self: Any, message: Call) -> Any:
     """Publishes a battery charge of 0 %."""
-
-    def message(self) -> Any:
-        state = super().message()
-        state.bms_state.soc = 0
-        return state
+    state = message()
+    state.bms_state.soc = 0
+    return state
 
 
-@wrong_hand("H1-FOOT-01")
-class NegativeFootForce(ReferenceRobot):
+@changes(ReferenceRobot, "message", "H1-FOOT-01")
+def NegativeFootForce(self: Any, message: Call) -> Any:
     """Publishes a negative foot force."""
-
-    def message(self) -> Any:
-        state = super().message()
-        state.foot_force = (-100, 0, 0, 0)
-        return state
+    state = message()
+    state.foot_force = (-100, 0, 0, 0)
+    return state
 
 
-@wrong_hand("H1-REMOTE-01")
-class RemoteRubbish(ReferenceRobot):
+@changes(ReferenceRobot, "remote", "H1-REMOTE-01")
+def RemoteRubbish(self: Any, remote: Call) -> bytes:
     """Publishes uninitialised bytes of the remote control."""
-
-    def remote(self) -> bytes:
-        return b"\xaa\x55" * 20
+    return b"\xaa\x55" * 20
 
 
-@wrong_hand("H1-REMOTE-01")
-class ShiftedRemote(ReferenceRobot):
+@changes(ReferenceRobot, "remote", "H1-REMOTE-01")
+def ShiftedRemote(self: Any, remote: Call) -> bytes:
     """Publishes the remote control's sticks two bytes too early."""
-
-    def remote(self) -> bytes:
-        return struct.pack("<H5f18x", 0, 0.5, 0.7, -0.3, 0.9, -0.25)
+    return struct.pack("<H5f18x", 0, 0.5, 0.7, -0.3, 0.9, -0.25)
 
 
-@wrong_hand("G1-MACH-01")
-class NoMachine(ReferenceRobot):
+@changes(ReferenceRobot, "message", "G1-MACH-01")
+def NoMachine(self: Any, message: Call) -> Any:
     """Publishes a mode_machine of 0."""
-
-    def message(self) -> Any:
-        state = super().message()
-        state.mode_machine = 0
-        return state
+    state = message()
+    state.mode_machine = 0
+    return state
 
 
-@wrong_hand("H1-MODE-01")
-class NoMode(ReferenceRobot):
+@changes(ReferenceRobot, "modes", "H1-MODE-01")
+def NoMode(self: Any, modes: Call) -> list[int]:
     """Publishes mode bytes of 0."""
-
-    def modes(self) -> list[int]:
-        return [0] * self.robot.slots
+    return [0] * self.robot.slots
 
 
 # --------------------------------------------------------------------------------------- motion
 
 
-@wrong_hand("H1-MOVE-01")
-class Halfway(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-MOVE-01")
+def Halfway(self: Any, obey: Call, orders: Orders) -> None:
     """Moves only half of the way to its goals."""
-
-    def obey(self, orders: Orders) -> None:
-        if orders is not self.orders:
-            rest = np.array(self.robot.rest_q)
-            orders.q = rest + (orders.q - rest) / 2
-        super().obey(orders)
+    if orders is not self.orders:
+        rest = np.array(self.robot.rest_q)
+        orders.q = rest + (orders.q - rest) / 2
+    obey(orders)
 
 
-@wrong_hand("H1-MOVE-02")
-class Coupled(ReferenceRobot):
+@changes(ReferenceRobot, "live", "H1-MOVE-02")
+def Coupled(self: Any, live: Call, dt: float) -> None:
     """Its hip moves along with the elbow."""
-
-    def live(self, dt: float) -> None:
-        elbow, hip = self.robot.slot("right_elbow"), self.robot.slot("right_hip_pitch")
-        before = self.q[elbow]
-        super().live(dt)
-        if self.driven:
-            self.q[hip] += 3.0 * (self.q[elbow] - before)
+    elbow, hip = self.robot.slot("right_elbow"), self.robot.slot("right_hip_pitch")
+    before = self.q[elbow]
+    live(dt)
+    if self.driven:
+        self.q[hip] += 3.0 * (self.q[elbow] - before)
 
 
-@wrong_hand("H1-GAIN-01")
-class OwnGains(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-GAIN-01")
+def OwnGains(self: Any, obey: Call, orders: Orders) -> None:
     """Uses its own kp wherever kp is not 0."""
-
-    def obey(self, orders: Orders) -> None:
-        own = np.array(self.robot.client_gains)[:, 0]
-        orders.kp = np.where(orders.kp > 0, own, 0.0)
-        super().obey(orders)
+    own = np.array(self.robot.client_gains)[:, 0]
+    orders.kp = np.where(orders.kp > 0, own, 0.0)
+    obey(orders)
 
 
-@wrong_hand("H1-GAIN-02")
-class NoVelocity(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-GAIN-02")
+def NoVelocity(self: Any, obey: Call, orders: Orders) -> None:
     """Ignores dq."""
-
-    def obey(self, orders: Orders) -> None:
-        orders.dq = np.zeros_like(orders.dq)
-        super().obey(orders)
+    orders.dq = np.zeros_like(orders.dq)
+    obey(orders)
 
 
-@wrong_hand("H1-GAIN-03")
-class NoTorque(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-GAIN-03")
+def NoTorque(self: Any, obey: Call, orders: Orders) -> None:
     """Ignores tau."""
-
-    def obey(self, orders: Orders) -> None:
-        orders.tau = np.zeros_like(orders.tau)
-        super().obey(orders)
+    orders.tau = np.zeros_like(orders.tau)
+    obey(orders)
 
 
-@wrong_hand("H1-GAIN-04")
-class DefaultGains(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-GAIN-04")
+def DefaultGains(self: Any, obey: Call, orders: Orders) -> None:
     """Uses its own kp where kp is 0."""
-
-    def obey(self, orders: Orders) -> None:
-        own = np.array(self.robot.client_gains)[:, 0]
-        idle = (orders.kp == 0) & (orders.dq == 0) & (orders.tau == 0)
-        orders.kp = np.where(idle, own, orders.kp)
-        super().obey(orders)
+    own = np.array(self.robot.client_gains)[:, 0]
+    idle = (orders.kp == 0) & (orders.dq == 0) & (orders.tau == 0)
+    orders.kp = np.where(idle, own, orders.kp)
+    obey(orders)
 
 
-@wrong_hand("H1-FORCE-01")
-class NoForce(ReferenceRobot):
+@changes(ReferenceRobot, "shown", "H1-FORCE-01")
+def NoForce(self: Any, shown: Call) -> Any:
     """Publishes tau_est as 0."""
-
-    def shown(self) -> tuple[Floats, Floats, Floats]:
-        q, dq, tau = super().shown()
-        return q, dq, np.zeros_like(tau)
+    q, dq, tau = shown()
+    return q, dq, np.zeros_like(tau)
 
 
 # --------------------------------------------------------------------------------------- safety
 
 
-@wrong_hand("H1-MODE-02")
-class NoModes(ReferenceRobot):
+@changes(ReferenceRobot, "follows", "H1-MODE-02")
+def NoModes(self: Any, usual: Call, orders: Orders) -> Any:
     """Ignores the mode byte of commands."""
-
-    def follows(self, orders: Orders) -> Any:
-        return np.ones(self.robot.slots, dtype=np.bool_)
+    return np.ones(self.robot.slots, dtype=np.bool_)
 
 
-@wrong_hand("H1-CRC-02")
-class CommandCrcNotChecked(ReferenceRobot):
+@changes(ReferenceRobot, "intact", "H1-CRC-02")
+def CommandCrcNotChecked(self: Any, intact: Call, payload: bytes) -> bool:
     """Does not check the CRC of commands."""
-
-    def intact(self, payload: bytes) -> bool:
-        return True
+    return True
 
 
-@wrong_hand("H1-SAFE-01")
-class Sanitises(ReferenceRobot):
+@changes(ReferenceRobot, "accepts", "H1-SAFE-01")
+def Sanitises(self: Any, accepts: Call, orders: Orders) -> Any:
     """Replaces NaN and infinity by 0, and obeys the rest."""
-
-    def accepts(self, orders: Orders) -> bool:
-        for name in ("q", "dq", "tau", "kp", "kd"):
-            values = getattr(orders, name)
-            setattr(orders, name, np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0))
-        return super().accepts(orders)
+    for name in ("q", "dq", "tau", "kp", "kd"):
+        values = getattr(orders, name)
+        setattr(orders, name, np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0))
+    return accepts(orders)
 
 
-@wrong_hand("H1-SAFE-02")
-class Packed(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-SAFE-02")
+def Packed(self: Any, obey: Call, orders: Orders) -> None:
     """Obeys the slot without a motor as a joint's."""
-
-    def obey(self, orders: Orders) -> None:
-        unused = [s for s in range(self.robot.slots) if s not in self.robot.used]
-        if orders is not self.orders and orders.kp[unused].any():
-            orders.q[0] = orders.q[unused[0]]
-        super().obey(orders)
+    unused = [s for s in range(self.robot.slots) if s not in self.robot.used]
+    if orders is not self.orders and orders.kp[unused].any():
+        orders.q[0] = orders.q[unused[0]]
+    obey(orders)
 
 
-@wrong_hand("H1-SAFE-03")
-class Untyped(_OtherFamily):
+@changes(_OtherFamily, "foreign", "H1-SAFE-03")
+def Untyped(self: Any, foreign: Call, topic: str, type_name: str, payload: bytes) -> None:
     """Decodes and obeys any type that is published on its command topic."""
-
-    def foreign(self, topic: str, type_name: str, payload: bytes) -> None:
-        message = decode(type_name, payload)
-        orders = Orders(message)
-        slots = self.robot.slots
-        for name in ("mode", "q", "dq", "tau", "kp", "kd"):
-            values = np.zeros(slots)
-            given = getattr(orders, name)[:slots]
-            values[: len(given)] = given
-            setattr(orders, name, values)
-        self.obey(orders)
+    message = decode(type_name, payload)
+    orders = Orders(message)
+    slots = self.robot.slots
+    for name in ("mode", "q", "dq", "tau", "kp", "kd"):
+        values = np.zeros(slots)
+        given = getattr(orders, name)[:slots]
+        values[: len(given)] = given
+        setattr(orders, name, values)
+    self.obey(orders)
 
 
 @wrong_hand("H1-SAFE-04")
@@ -462,12 +389,10 @@ class IgnoresCommandsAfterNan(ReferenceRobot):
         return super().accepts(orders) and self.now >= self.until
 
 
-@wrong_hand("G1-SAFE-05")
-class AnyMachine(ReferenceRobot):
+@changes(ReferenceRobot, "accepts", "G1-SAFE-05")
+def AnyMachine(self: Any, accepts: Call, orders: Orders) -> Any:
     """Obeys commands for another machine."""
-
-    def accepts(self, orders: Orders) -> bool:
-        return self.finite(orders)
+    return self.finite(orders)
 
 
 # ------------------------------------------------------------------------------------- watchdog
@@ -480,22 +405,18 @@ class GoesOn(ReferenceRobot):
     timeout = math.inf
 
 
-@wrong_hand("H1-WDOG-02")
-class AnswersOnly(ReferenceRobot):
+@changes(ReferenceRobot, "publish", "H1-WDOG-02")
+def AnswersOnly(self: Any, publish: Call) -> Any:
     """Publishes nothing 0.5 s after the last command."""
-
-    def publish(self) -> list[Sample]:
-        waited = self.now - self.heard
-        return [] if 0.5 < waited < math.inf else super().publish()
+    waited = self.now - self.heard
+    return [] if 0.5 < waited < math.inf else publish()
 
 
-@wrong_hand("H1-WDOG-03")
-class Latches(ReferenceRobot):
+@changes(ReferenceRobot, "obey", "H1-WDOG-03")
+def Latches(self: Any, obey: Call, orders: Orders) -> None:
     """Obeys no command after a time-out."""
-
-    def obey(self, orders: Orders) -> None:
-        if self.now - self.heard <= self.timeout or self.orders is None:
-            super().obey(orders)
+    if self.now - self.heard <= self.timeout or self.orders is None:
+        obey(orders)
 
 
 @wrong_hand("H1-WDOG-04")
@@ -515,13 +436,11 @@ class NoStateForLateSubscribers(ReferenceRobot):
     serves_late_readers = False
 
 
-@wrong_hand("H1-LIFE-02")
-class ObeysFirstClientOnly(ReferenceRobot):
+@changes(ReferenceRobot, "receive", "H1-LIFE-02")
+def ObeysFirstClientOnly(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys only the first client."""
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        if client == 0:
-            super().receive(topic, payload, client)
+    if client == 0:
+        receive(topic, payload, client)
 
 
 @wrong_hand("H1-CLIENT-01")

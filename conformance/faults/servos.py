@@ -8,12 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.faults.any_model import ChokesOnThousands
-from dexkit.conformance.faults.registry import BOTH, has_speeds, takes_floats, wrong_hand
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.faults.any_model import ChokesOnThousands, finite_q, other
+from dexkit.conformance.faults.registry import (
+    BOTH,
+    DQ,
+    Call,
+    Motors,
+    Q,
+    changes,
+    commands,
+    has_speeds,
+    reports,
+    takes_floats,
+    wrong_hand,
+)
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand, Ints
-from dexkit.conformance.virtual.inspire import FtpService
+from dexkit.conformance.virtual.inspire import FtpHand, FtpService
 from dexkit.conformance.virtual.servos import ServoHand, ServoService
 from dexkit.hand import Floats, Side
 from dexkit.models import HandModel, model
@@ -44,13 +55,13 @@ class Thousandths(ServoService):
         return tuple(1000.0 * q for q in super().positions(side))
 
 
+# with an object in one hand, the other one shows that it is held back
 @wrong_hand("BRAINCO-SIDE-01", sides=BOTH)
 class StatesSwapped(ServoService):
     """Publishes each side's state as the other's."""
 
     def fill(self, motors: Any, hand: FingerHand) -> None:
-        other = Side.LEFT if hand.side is Side.RIGHT else Side.RIGHT
-        super().fill(motors, self.hands[other])
+        super().fill(motors, self.hands[other(hand.side)])
 
     def live(self, dt: float) -> None:
         super().live(dt)
@@ -58,7 +69,7 @@ class StatesSwapped(ServoService):
             hand.version += 1
 
     def positions(self, side: Side) -> tuple[float, ...]:
-        return super().positions(Side.LEFT if side is Side.RIGHT else Side.RIGHT)
+        return super().positions(other(side))
 
 
 def _one_in_twelve_is_too_few(hand: HandModel) -> bool:
@@ -75,99 +86,68 @@ class ChokesOnThousandsOfCommands(ChokesOnThousands, ServoService):
 # ----------------------------------------------------------------------------- motion
 
 
-@wrong_hand("BRAINCO-JOINT-01")
-class OtherOrder(ServoService):
+@changes(ServoService, "motors", "BRAINCO-JOINT-01")
+def OtherOrder(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Obeys commands in the opposite order of joints, as another vendor's hand has them."""
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        super().motors(side, motors[::-1])
+    command(side, motors[::-1])
 
 
-class _Reversed(ServoHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        turned = rows.copy()
-        turned[0] = self.low + self.high - rows[0]
-        super().take(turned, mode)
-
-
-@wrong_hand("BRAINCO-MOVE-01")
-class ReversedScale(ServoService):
+@commands(ServoHand, "BRAINCO-MOVE-01")
+def ReversedScale(hand: Any, rows: Floats) -> None:
     """Takes the q of commands the other way round: 0 closed, 1 open."""
-
-    hand_fault = _Reversed
-
-
-class _Shy(ServoHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        away = 0.08 * (self.high - self.low)
-        self.goal = np.clip(self.goal, self.low + away, self.high - away)
+    rows[Q] = hand.low + hand.high - rows[Q]
 
 
-@wrong_hand("BRAINCO-MOVE-09")
-class KeepsFromTheEnds(ServoService):
+@changes(ServoHand, "take", "BRAINCO-MOVE-09")
+def KeepsFromTheEnds(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Stays clear of both ends of each joint's range."""
+    take(rows, mode)
+    away = 0.08 * (hand.high - hand.low)
+    hand.goal = np.clip(hand.goal, hand.low + away, hand.high - away)
 
-    hand_fault = _Shy
 
-
-class _Shakes(ServoHand):
-    def move(self, dt: float, pull: list[float]) -> None:
-        shake = 0.2 * math.sin(2 * math.pi * 12.0 * self.now)
-        super().move(dt, [p + shake if on else p for p, on in zip(pull, self.law_on, strict=True)])
+class _NeverRests(ServoHand):
+    """Its mechanics are computed at rest, too."""
 
     def step(self, dt: float) -> None:
         self.rests = False
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-STILL-02")
-class Vibrates(ServoService):
+@changes(_NeverRests, "move", "BRAINCO-STILL-02")
+def Vibrates(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     """Shakes all joints a little, at rest as well."""
-
-    hand_fault = _Shakes
-
-
-class _Wobbles(ServoHand):
-    def move(self, dt: float, pull: list[float]) -> None:
-        if self.law_on[2]:
-            pull[2] += 0.27 * math.sin(2 * math.pi * 8.0 * self.now)
-        super().move(dt, pull)
-
-    def step(self, dt: float) -> None:
-        self.rests = False
-        super().step(dt)
+    shake = 0.2 * math.sin(2 * math.pi * 12.0 * hand.now)
+    move(dt, [p + shake if on else p for p, on in zip(pull, hand.law_on, strict=True)])
 
 
-@wrong_hand("BRAINCO-MOVE-03", whole=True)
-class Wobbles(ServoService):
+@changes(_NeverRests, "move", "BRAINCO-MOVE-03", whole=True)
+def Wobbles(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     """One joint oscillates about its goal."""
-
-    hand_fault = _Wobbles
-
-
-class _Lazy(ServoHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        super().take(rows, mode)
-        self.reach = [0.4 * r for r in self.reach]
+    if hand.law_on[2]:
+        pull[2] += 0.27 * math.sin(2 * math.pi * 8.0 * hand.now)
+    move(dt, pull)
 
 
-@wrong_hand("BRAINCO-MOVE-04")
-class SlowServos(ServoService):
+@changes(ServoHand, "take", "BRAINCO-MOVE-04")
+def SlowServos(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Takes 0.4 of each speed that is commanded."""
+    take(rows, mode)
+    hand.reach = [0.4 * r for r in hand.reach]
 
-    hand_fault = _Lazy
 
+@wrong_hand("BRAINCO-MOVE-05")
+class Overshoots(ServoHand):
+    """Overshoots a large step by 8 % of the travel, and returns after 0.4 s."""
 
-class _Overshoots(ServoHand):
     asked: Floats | None = None
     true_goal: Floats | None = None
     until = 0.0
 
     def take(self, rows: Floats, mode: Ints) -> None:
-        before = rows[0] if self.asked is None else self.asked
-        jump = np.clip(rows[0], self.low, self.high) - np.clip(before, self.low, self.high)
-        self.asked = rows[0]
+        before = rows[Q] if self.asked is None else self.asked
+        jump = np.clip(rows[Q], self.low, self.high) - np.clip(before, self.low, self.high)
+        self.asked = rows[Q]
         super().take(rows, mode)
         if (np.abs(jump) > 0.1).any():
             self.true_goal, self.until = self.goal, self.now + 0.4
@@ -180,31 +160,40 @@ class _Overshoots(ServoHand):
         super().step(dt)
 
 
-@wrong_hand("BRAINCO-MOVE-05")
-class Overshoots(ServoService):
-    """Overshoots a large step by 8 % of the travel, and returns after 0.4 s."""
-
-    hand_fault = _Overshoots
+# ------------------------------------------------------------------------------- speeds
 
 
-class _Fast(ServoHand):
-    def take(self, rows: Floats, mode: Ints) -> None:
-        fast = rows.copy()
-        fast[1] = 1.0
-        super().take(fast, mode)
-
-
-@wrong_hand("BRAINCO-SPEED-01")
-class AlwaysFast(ServoService):
+@commands(ServoHand, "BRAINCO-SPEED-01")
+def AlwaysFast(hand: Any, rows: Floats) -> None:
     """Moves at full speed, whatever dq is."""
+    rows[DQ] = 1.0
 
-    hand_fault = _Fast
+
+@commands(ServoHand, "BRAINCO-SPEED-02")
+def ZeroIsFullSpeed(hand: Any, rows: Floats) -> None:
+    """Moves at full speed where dq is 0."""
+    rows[DQ] = np.where(rows[DQ] == 0.0, 1.0, rows[DQ])
+
+
+@commands(ServoHand, "BRAINCO-SPEED-03")
+def SpeedOfTheFirst(hand: Any, rows: Floats) -> None:
+    """Moves all joints with the speed of the first one."""
+    rows[DQ] = rows[DQ, 0]
+
+
+@commands(ServoHand, "BRAINCO-SPEED-03")
+def HalfSpeeds(hand: Any, rows: Floats) -> None:
+    """Takes half of each speed below the full one."""
+    rows[DQ] = np.where(rows[DQ] < 0.9, 0.5 * rows[DQ], rows[DQ])
 
 
 # ------------------------------------------------------------------------------ grip
 
 
-class _LetsGo(ServoHand):
+@wrong_hand("BRAINCO-GRIP-01", sides=BOTH, whole=True)
+class LetsGo(ServoHand):
+    """Opens after a second of full current, like a protection that trips."""
+
     pressed = 0.0
 
     def step(self, dt: float) -> None:
@@ -217,13 +206,6 @@ class _LetsGo(ServoHand):
             self.pressed = 0.0
             self.changed()
         super().step(dt)
-
-
-@wrong_hand("BRAINCO-GRIP-01", sides=BOTH, whole=True)
-class LetsGo(ServoService):
-    """Opens after a second of full current, like a protection that trips."""
-
-    hand_fault = _LetsGo
 
 
 @wrong_hand("BRAINCO-GRIP-01", sides=BOTH, whole=True)
@@ -245,11 +227,13 @@ class SilentUnderLoad(ServoService):
         return [] if self.quiet[0] <= self.now < self.quiet[1] else super().publish()
 
 
-class _Vanishes(ServoHand):
+@wrong_hand("FTP-FORCE-06", sides=BOTH, whole=True)
+class ForceVanishes(_NeverRests, FtpHand):
+    """Presses with a twentieth of the force after a second of contact, and does not open."""
+
     pressed = 0.0
 
     def step(self, dt: float) -> None:
-        self.rests = False
         super().step(dt)
         touches = self.touches and any(abs(c) > 0.01 for c in self.contact)
         self.pressed += dt if touches else 0.0
@@ -262,46 +246,28 @@ class _Vanishes(ServoHand):
         super().move(dt, [0.05 * p for p in pull] if self.pressed > 1.0 else pull)
 
 
-@wrong_hand("FTP-FORCE-06", sides=BOTH, whole=True)
-class ForceVanishes(FtpService):
-    """Presses with a twentieth of the force after a second of contact, and does not open."""
-
-    hand_fault = _Vanishes
-
-
 # --------------------------------------------------------------------------- silence
 
 
-class _Opens(ServoHand):
-    def expire(self) -> None:
-        super().expire()
-        self.goal = np.array([j.straight for j in self.model.joints[self.side]])
-
-
-@wrong_hand("BRAINCO-WDOG-01")
-class OpensInSilence(ServoService):
+@changes(ServoHand, "expire", "BRAINCO-WDOG-01")
+def OpensInSilence(hand: Any, expire: Call) -> None:
     """Opens a second after the last command."""
-
-    hand_fault = _Opens
-
-
-class _GoesOn(ServoHand):
-    def expire(self) -> None:
-        return
+    expire()
+    hand.goal = np.array([j.straight for j in hand.model.joints[hand.side]])
 
 
-@wrong_hand("BRAINCO-WDOG-04")
-class GoesOnForEver(ServoService):
+@changes(ServoHand, "expire", "BRAINCO-WDOG-04")
+def GoesOnForEver(hand: Any, expire: Call) -> None:
     """Continues to its last goal without commands."""
-
-    hand_fault = _GoesOn
 
 
 # -------------------------------------------------------------------------- operator
 
 
-class _Smooths(ServoHand):
-    seconds = 0.15
+@wrong_hand("BRAINCO-OPER-02", where=has_speeds)
+class SmoothsGoals(ServoHand):
+    """Smooths its goals over 0.15 s."""
+
     wanted: Floats | None = None
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -319,25 +285,24 @@ class _Smooths(ServoHand):
 
     def step(self, dt: float) -> None:
         if self.wanted is not None:
-            self.goal = self.goal + (self.wanted - self.goal) * dt / self.seconds
+            self.goal = self.goal + (self.wanted - self.goal) * dt / 0.15
         super().step(dt)
-
-
-@wrong_hand("BRAINCO-OPER-02", where=has_speeds)
-class SmoothsGoals(ServoService):
-    """Smooths its goals over 0.15 s."""
-
-    hand_fault = _Smooths
 
 
 # ----------------------------------------------------------------------- bad commands
 
 
-class _SlowAfterNan(ServoHand):
+class _Slows(ServoHand):
+    """Moves with a third of each speed since a bad command."""
+
     slow = False
 
-    def command(self, motors: tuple[Motor, ...]) -> None:
-        self.slow = self.slow or not all(math.isfinite(m.q) for m in motors)
+    def bad(self, motors: Motors) -> bool:
+        """Whether a command is one."""
+        raise AssertionError  # overridden
+
+    def command(self, motors: Motors) -> None:
+        self.slow = self.slow or self.bad(motors)
         super().command(motors)
 
     def take(self, rows: Floats, mode: Ints) -> None:
@@ -346,39 +311,25 @@ class _SlowAfterNan(ServoHand):
             self.reach = [0.33 * r for r in self.reach]
 
 
-@wrong_hand("BRAINCO-ABUSE-01", where=takes_floats)
-class SlowAfterNan(ServoService):
+@changes(_Slows, "bad", "BRAINCO-ABUSE-01", where=takes_floats)
+def SlowAfterNan(hand: Any, bad: Call, motors: Motors) -> bool:
     """Moves with a third of each speed since it has got a command that is not finite."""
-
-    hand_fault = _SlowAfterNan
-
-
-class _SlowAfterFar(_SlowAfterNan):
-    def command(self, motors: tuple[Motor, ...]) -> None:
-        self.slow = self.slow or any(abs(m.q) > _FAR for m in motors)
-        super().command(motors)
+    return not finite_q(motors)
 
 
-@wrong_hand("FTP-ABUSE-01")
-class SlowAfterFar(ServoService):
+@changes(_Slows, "bad", "FTP-ABUSE-01")
+def SlowAfterFar(hand: Any, bad: Call, motors: Motors) -> bool:
     """Moves with a third of its speed since it has got a goal that is far out of range."""
+    return not finite_q(motors) or any(abs(m.q) > _FAR for m in motors)
 
-    hand_fault = _SlowAfterFar
 
-
-@wrong_hand("FTP-MOVE-08", whole=True)
-class DeafAfterOutOfRange(ServoService):
+@changes(ServoService, "motors", "FTP-MOVE-08", whole=True)
+def DeafAfterOutOfRange(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Ignores commands for 0.8 s after one whose goal is far out of range."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.deaf_until: dict[Side, float] = {}
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if any(abs(m.q) > _FAR for m in motors):
-            self.deaf_until[side] = self.now + 0.8
-        if self.now >= self.deaf_until.get(side, 0.0):
-            super().motors(side, motors)
+    if any(abs(m.q) > _FAR for m in motors):
+        self.memory[side] = self.now + 0.8
+    if self.now >= self.memory.get(side, 0.0):
+        command(side, motors)
 
 
 # -------------------------------------------------------------------- forces that are reported
@@ -412,61 +363,46 @@ class _FeelingService(ServoService):
     hand_fault: Any = _Feels
 
 
-@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
-class ForceAgainstClosing(_FeelingService):
+@reports(_FeelingService, "BRAINCO-FORCE-01", sides=BOTH)
+def ForceAgainstClosing(self: Any, motors: Any, hand: Any) -> None:
     """Reports the force of a grip with the other sign."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        if hand.grip > 0.0:  # type: ignore[attr-defined]
-            motors["tau_est"] *= -1.0
+    if hand.grip > 0.0:
+        motors["tau_est"] *= -1.0
 
 
-@wrong_hand("BRAINCO-FIELD-19", sides=BOTH)
-class FullSpeedInContact(ServoService):
+@reports(ServoService, "BRAINCO-FIELD-19", sides=BOTH)
+def FullSpeedInContact(self: Any, motors: Any, hand: Any) -> None:
     """Reports the full speed of a finger that presses on an object."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        if hand.touches:
-            motors["dq"][np.abs(hand.contact[: len(motors)]) > 0.05] = 1.0
+    if hand.touches:
+        motors["dq"][np.abs(hand.contact[: len(motors)]) > 0.05] = 1.0
 
 
-@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
-class ForceZeroedInGrip(_FeelingService):
+@reports(_FeelingService, "BRAINCO-FORCE-01", sides=BOTH)
+def ForceZeroedInGrip(self: Any, motors: Any, hand: Any) -> None:
     """Sets its forces to zero half a second after it has touched."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        if hand.grip > 0.5:  # type: ignore[attr-defined]
-            motors["tau_est"] = 0.0
+    if hand.grip > 0.5:
+        motors["tau_est"] = 0.0
 
 
-@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
-class ForceOfNextJoint(ServoService):
+@reports(ServoService, "BRAINCO-FORCE-01", sides=BOTH)
+def ForceOfNextJoint(self: Any, motors: Any, hand: Any) -> None:
     """Reports each force as its neighbour's."""
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["tau_est"] = np.roll(motors["tau_est"], 1)
+    motors["tau_est"] = np.roll(motors["tau_est"], 1)
 
 
-@wrong_hand("BRAINCO-FORCE-04", sides=BOTH, whole=True)
-class ForceKept(ServoService):
+@reports(ServoService, "BRAINCO-FORCE-04", sides=BOTH, whole=True)
+def ForceKept(self: Any, motors: Any, hand: Any) -> None:
     """Keeps the largest force of each joint for ever."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.most = {s: np.zeros(len(h.q)) for s, h in self.hands.items()}
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        tau, kept = np.array(motors["tau_est"]), self.most[hand.side]
-        kept[:] = np.where(np.abs(tau) > np.abs(kept), tau, kept)
-        motors["tau_est"] = kept
+    tau = np.array(motors["tau_est"])
+    kept = self.memory.setdefault(hand.side, np.zeros(len(hand.q)))
+    kept[:] = np.where(np.abs(tau) > np.abs(kept), tau, kept)
+    motors["tau_est"] = kept
 
 
-class _BacksOff(_Feels):
+@wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
+class ForceBacksOff(_Feels):
+    """Takes its goals back to a seventh of the force as soon as it touches."""
+
     def step(self, dt: float) -> None:
         super().step(dt)
         if self.grip > 0.2:
@@ -477,18 +413,14 @@ class _BacksOff(_Feels):
             self.rests = False
 
 
-@wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
-class ForceBacksOff(_FeelingService):
-    """Takes its goals back to a seventh of the force as soon as it touches."""
+class _Weak(_Feels):
+    """Presses with a part of its force, at times."""
 
-    hand_fault = _BacksOff
-
-
-class _WeakAgain(_Feels):
     weak = False
     part = 0.15
 
     def is_weak(self) -> bool:
+        """Whether it does so now."""
         return False
 
     def step(self, dt: float) -> None:
@@ -503,24 +435,18 @@ class _WeakAgain(_Feels):
             self.law_kp = [self.part * k for k in self.law_kp]
 
 
-class _GivesUp(_WeakAgain):
-    def is_weak(self) -> bool:
-        return self.grip > 1.0
-
-
-@wrong_hand("BRAINCO-FORCE-05", sides=BOTH)
 @wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
-class ForceGivesUp(_FeelingService):
+@changes(_Weak, "is_weak", "BRAINCO-FORCE-05", sides=BOTH)
+def ForceGivesUp(hand: Any, is_weak: Call) -> bool:
     """Presses with a seventh of its force after a second of a grip."""
-
-    hand_fault = _GivesUp
+    return bool(hand.grip > 1.0)
 
 
 @wrong_hand("BRAINCO-FORCE-05", sides=BOTH, whole=True)
 class WeakAfterRestart(_FeelingService):
     """Presses with a seventh of its force after a restart of the service."""
 
-    hand_fault = _WeakAgain
+    hand_fault = _Weak
 
     def take_over(self, before: Any) -> None:
         super().take_over(before)
@@ -528,7 +454,7 @@ class WeakAfterRestart(_FeelingService):
             hand.is_weak = lambda hand=hand: hand.grip > 0.0  # type: ignore[attr-defined]
 
 
-class _ThirdOfItsForce(_WeakAgain):
+class _WeakForOthers(_Weak):
     part = 0.3
     other_client = False
 
@@ -540,7 +466,7 @@ class _ThirdOfItsForce(_WeakAgain):
 class WeakForNewClients(_FeelingService):
     """Presses with less than half of its force since a second program has commanded it."""
 
-    hand_fault = _ThirdOfItsForce
+    hand_fault = _WeakForOthers
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         if client:
@@ -555,83 +481,32 @@ class WeakForNewClients(_FeelingService):
 class _FeelingFtp(FtpService):
     hand_fault = _Feels
 
-    def gripping(self, side: Side, seconds: float) -> bool:
-        hand = self.hands[side]
-        assert isinstance(hand, _Feels)
-        return hand.grip > seconds
 
-
-@wrong_hand("FTP-TOUCH-05", sides=BOTH)
-class TouchStopsInGrip(_FeelingFtp):
+@changes(_FeelingFtp, "touch", "FTP-TOUCH-05", sides=BOTH)
+def TouchStopsInGrip(self: Any, touch: Call) -> list[Sample]:
     """Publishes no touch from 0.4 s of a grip on."""
-
-    def touch(self) -> list[Sample]:
-        quiet = [self.touch_topic(s) for s in self.sides if self.gripping(s, 0.4)]
-        return [sample for sample in super().touch() if sample.topic not in quiet]
+    quiet = [self.touch_topic(s) for s in self.sides if self.hands[s].grip > 0.4]
+    return [sample for sample in touch() if sample.topic not in quiet]
 
 
-@wrong_hand("FTP-TOUCH-05", sides=BOTH)
-class TouchZeroedInGrip(_FeelingFtp):
+@changes(_FeelingFtp, "touched", "FTP-TOUCH-05", sides=BOTH)
+def TouchZeroedInGrip(self: Any, touched: Call, side: Side) -> Any:
     """Sets its tactile areas to zero 0.3 s after it has touched."""
-
-    def touched(self, side: Side) -> bytes:
-        hand = self.hands[side]
-        contact = hand.contact
-        if self.gripping(side, 0.3):
-            hand.contact = [0.0] * len(contact)
-        message = super().touched(side)
-        hand.contact = contact
-        return message
+    hand = self.hands[side]
+    contact = hand.contact
+    if hand.grip > 0.3:
+        hand.contact = [0.0] * len(contact)
+    message = touched(side)
+    hand.contact = contact
+    return message
 
 
-@wrong_hand("FTP-TOUCH-05", sides=BOTH)
-class TouchKept(FtpService):
+@changes(FtpService, "pressures", "FTP-TOUCH-05", sides=BOTH)
+def TouchKept(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Keeps the largest reading of each element for ever."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.most: dict[Side, Floats] = {}
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        self.most[hand.side] = np.maximum(self.most.get(hand.side, pressure), pressure)
-        return self.most[hand.side]
-
-
-# ------------------------------------------------------------------------------- speeds
-
-
-def _speed_fault(change: Any) -> type[ServoHand]:
-    """A hand that takes other speeds than those of a command."""
-
-    class _Hand(ServoHand):
-        def take(self, rows: Floats, mode: Ints) -> None:
-            other = rows.copy()
-            other[1] = change(rows[1])
-            super().take(other, mode)
-
-    return _Hand
-
-
-@wrong_hand("BRAINCO-SPEED-02")
-class ZeroIsFullSpeed(ServoService):
-    """Moves at full speed where dq is 0."""
-
-    hand_fault = _speed_fault(lambda dq: np.where(dq == 0.0, 1.0, dq))
-
-
-@wrong_hand("BRAINCO-SPEED-03")
-class SpeedOfTheFirst(ServoService):
-    """Moves all joints with the speed of the first one."""
-
-    hand_fault = _speed_fault(lambda dq: np.full_like(dq, dq[0]))
-
-
-@wrong_hand("BRAINCO-SPEED-03")
-class HalfSpeeds(ServoService):
-    """Takes half of each speed below the full one."""
-
-    hand_fault = _speed_fault(lambda dq: np.where(dq < 0.9, 0.5 * dq, dq))
+    pressure = pressures(hand)
+    self.memory[hand.side] = np.maximum(self.memory.get(hand.side, pressure), pressure)
+    return self.memory[hand.side]
 
 
 # ---------------------------------------------------------------- after silences and restarts
@@ -641,12 +516,13 @@ class HalfSpeeds(ServoService):
 class LateAfterSilence(ServoService):
     """Obeys commands 0.55 s late for half a second after a silence."""
 
+    heard = slow_until = 0.0
+
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.mail: list[tuple[float, Side, tuple[Motor, ...]]] = []
-        self.heard = self.slow_until = 0.0
+        self.mail: list[tuple[float, Side, Motors]] = []
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         if self.heard and self.now - self.heard > 1.0:
             self.slow_until = self.now + 0.5
         self.heard = self.now
@@ -663,22 +539,8 @@ class LateAfterSilence(ServoService):
         super().brake()
 
 
-class _SwapsSome(ServoService):
-    """Takes the goals of its third and fifth joint for each other, at times."""
-
-    def swaps(self) -> bool:
-        return False
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if self.swaps():
-            order = (0, 1, 4, 3, 2, *range(5, len(motors)))
-            motors = tuple(motors[i] for i in order)
-        super().motors(side, motors)
-
-
-@wrong_hand("BRAINCO-LIFE-02", whole=True)
-class SwapsForNewClients(_SwapsSome):
-    """Mixes two joints up in the commands of a restarted client."""
+class _OfClient(ServoService):
+    """Knows whose command it takes."""
 
     client = 0
 
@@ -686,8 +548,41 @@ class SwapsForNewClients(_SwapsSome):
         self.client = client
         super().receive(topic, payload, client)
 
+
+class _SwapsSome(_OfClient):
+    """Takes the goals of its third and fifth joint for each other, at times."""
+
     def swaps(self) -> bool:
-        return 0 < self.client < 1000 and not self.restarted
+        """Whether it does so now."""
+        raise AssertionError  # overridden
+
+    def motors(self, side: Side, motors: Motors) -> None:
+        if self.swaps():
+            order = (0, 1, 4, 3, 2, *range(5, len(motors)))
+            motors = tuple(motors[i] for i in order)
+        super().motors(side, motors)
+
+
+@changes(_SwapsSome, "swaps", "BRAINCO-LIFE-02", whole=True)
+def SwapsForNewClients(self: Any, swaps: Call) -> bool:
+    """Mixes two joints up in the commands of a restarted client."""
+    return 0 < self.client < 1000 and not self.restarted
+
+
+@changes(_SwapsSome, "swaps", "BRAINCO-LIFE-03", whole=True)
+def SwapsAfterRestart(self: Any, swaps: Call) -> bool:
+    """Mixes two joints up in commands after a restart of the service."""
+    return bool(self.restarted)
+
+
+@changes(_SwapsSome, "swaps", "BRAINCO-WDOG-03", whole=True)
+def SwapsAfterSilence(self: Any, swaps: Call) -> bool:
+    """Mixes two joints up in commands for three seconds after a silence."""
+    heard, until = self.memory.get("heard", 0.0), self.memory.get("until", 0.0)
+    if heard and self.now - heard > 0.5:
+        until = self.now + 3.0
+    self.memory.update(heard=self.now, until=until)
+    return bool(self.now < until)
 
 
 @wrong_hand("BRAINCO-STILL-01", sides=BOTH, whole=True)
@@ -695,58 +590,29 @@ class OldClientReturns(ServoService):
     """Obeys the earlier client's last goals on the left for a quarter of each second."""
 
     client = 0
+    since = 0.0
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.last: dict[Side, tuple[Motor, ...]] = {}
-        self.earlier: dict[Side, tuple[Motor, ...]] = {}
-        self.since = 0.0
+        self.last: dict[Side, Motors] = {}
+        self.earlier: dict[Side, Motors] = {}
 
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         if client < 1000 and client != self.client:
             self.client, self.earlier, self.since = client, dict(self.last), self.now
         super().receive(topic, payload, client)
 
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
+    def motors(self, side: Side, motors: Motors) -> None:
         self.last[side] = motors
         if side is Side.LEFT and (self.now - self.since) % 1.0 > 0.75:
             motors = self.earlier.get(side, motors)
         super().motors(side, motors)
 
 
-@wrong_hand("BRAINCO-SPEED-03", whole=True)
-class OneSpeedForNewClients(ServoService):
+@changes(_OfClient, "motors", "BRAINCO-SPEED-03", whole=True)
+def OneSpeedForNewClients(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Moves all joints with the largest speed of a restarted client's command."""
-
-    client = 0
-
-    def receive(self, topic: str, payload: bytes, client: int) -> None:
-        self.client = client
-        super().receive(topic, payload, client)
-
-    def motors(self, side: Side, motors: tuple[Motor, ...]) -> None:
-        if 0 < self.client < 1000:
-            most = max(m.dq for m in motors)
-            motors = tuple(replace(m, dq=most) for m in motors)
-        super().motors(side, motors)
-
-
-@wrong_hand("BRAINCO-LIFE-03", whole=True)
-class SwapsAfterRestart(_SwapsSome):
-    """Mixes two joints up in commands after a restart of the service."""
-
-    def swaps(self) -> bool:
-        return self.restarted
-
-
-@wrong_hand("BRAINCO-WDOG-03", whole=True)
-class SwapsAfterSilence(_SwapsSome):
-    """Mixes two joints up in commands for three seconds after a silence."""
-
-    heard = until = 0.0
-
-    def swaps(self) -> bool:
-        if self.heard and self.now - self.heard > 0.5:
-            self.until = self.now + 3.0
-        self.heard = self.now
-        return self.now < self.until
+    if 0 < self.client < 1000:
+        most = max(m.dq for m in motors)
+        motors = tuple(replace(m, dq=most) for m in motors)
+    command(side, motors)

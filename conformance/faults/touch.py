@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
-from dexkit.conformance.faults.registry import BOTH, wrong_hand
+from dexkit.conformance.faults.registry import BOTH, Call, changes, wrong_hand
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import FingerHand
 from dexkit.conformance.virtual.inspire import FtpService
-from dexkit.hand import Floats, Side
+from dexkit.hand import Side
 from dexkit.models import INSPIRE_FTP
 from dexkit.traces import TraceEndpoint
 
@@ -27,12 +28,10 @@ class NoTouch(FtpService):
         return []
 
 
-@wrong_hand("FTP-TOUCH-01", brief=True)
-class SpellsSideOut(FtpService):
+@changes(FtpService, "touch_topic", "FTP-TOUCH-01", brief=True)
+def SpellsSideOut(self: Any, touch_topic: Call, side: Side) -> str:
     """Publishes touch on a topic that ends with the side in full."""
-
-    def touch_topic(self, side: Side) -> str:
-        return f"rt/inspire_hand/touch/{side}"
+    return f"rt/inspire_hand/touch/{side}"
 
 
 @wrong_hand("FTP-TOUCH-02", brief=True)
@@ -42,12 +41,10 @@ class NoPalm(FtpService):
     touch_lengths: Mapping[str, int] = {**FtpService.touch_lengths, "palm_touch": 0}
 
 
-@wrong_hand("FTP-TOUCH-03", brief=True)
-class TouchPauses(FtpService):
+@changes(FtpService, "touch", "FTP-TOUCH-03", brief=True)
+def TouchPauses(self: Any, touch: Call) -> Any:
     """Publishes no touch for half a second once, and states all the time."""
-
-    def touch(self) -> list[Sample]:
-        return [] if 2.0 < self.now < 2.5 else super().touch()
+    return [] if 2.0 < self.now < 2.5 else touch()
 
 
 @wrong_hand("FTP-TOUCH-04", brief=True)
@@ -57,19 +54,15 @@ class RareTouch(FtpService):
     touch_period = 0.1
 
 
-@wrong_hand("FTP-SENS-04", sides=BOTH)
-class CountsFromTheThumb(FtpService):
+@changes(FtpService, "pressures", "FTP-SENS-04", sides=BOTH)
+def CountsFromTheThumb(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Publishes the areas of the fingers in the opposite order, the thumb's first."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        pressure = super().pressures(hand)
-        pressure[_TOPS] = pressure[_TOPS[::-1]]
-        return pressure
+    pressure = pressures(hand)
+    pressure[_TOPS] = pressure[_TOPS[::-1]]
+    return pressure
 
 
-@wrong_hand("FTP-TOUCH-06", sides=BOTH)
-class CountsWithoutTouch(FtpService):
+@changes(FtpService, "pressures", "FTP-TOUCH-06", sides=BOTH)
+def CountsWithoutTouch(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Publishes areas that have 400 counts too many: they were set to zero under a load."""
-
-    def pressures(self, hand: FingerHand) -> Floats:
-        return super().pressures(hand) + 400.0
+    return pressures(hand) + 400.0

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
-from dexkit.conformance.faults.registry import wrong_hand
+from dexkit.conformance.faults.registry import Call, changes, wrong_hand
 from dexkit.conformance.usb.frames import Motor, Scale
 from dexkit.conformance.virtual.usb import FOC, ReferenceDevice
 from dexkit.hand import Side
@@ -35,12 +36,10 @@ class OtherRelease(ReferenceDevice):
     release = 0x0200
 
 
-@wrong_hand("DEX3USB-DESC-03")
-class NoSerial(ReferenceDevice):
+@changes(ReferenceDevice, "strings", "DEX3USB-DESC-03")
+def NoSerial(self: Any, strings: Call) -> Any:
     """Has no serial number."""
-
-    def strings(self) -> dict[int, str]:
-        return {**super().strings(), 3: ""}
+    return {**strings(), 3: ""}
 
 
 @wrong_hand("DEX3USB-DESC-04")
@@ -68,12 +67,9 @@ class SmallPackets(ReferenceDevice):
 # ---------------------------------------------------------------------------------- exchange
 
 
-@wrong_hand("DEX3USB-XCHG-01")
-class NoAnswers(ReferenceDevice):
+@changes(ReferenceDevice, "answer", "DEX3USB-XCHG-01")
+def NoAnswers(self: Any, answer: Call) -> None:
     """Answers nothing."""
-
-    def answer(self) -> None:
-        pass
 
 
 @wrong_hand("DEX3USB-XCHG-01")
@@ -88,13 +84,11 @@ class DropsAnswers(ReferenceDevice):
             super().answer()
 
 
-@wrong_hand("DEX3USB-XCHG-02")
-class Echoes(ReferenceDevice):
+@changes(ReferenceDevice, "answer", "DEX3USB-XCHG-02")
+def Echoes(self: Any, answer: Call) -> None:
     """Answers each command twice."""
-
-    def answer(self) -> None:
-        super().answer()
-        super().answer()
+    answer()
+    answer()
 
 
 @wrong_hand("DEX3USB-XCHG-03")
@@ -115,15 +109,13 @@ class Streams(ReferenceDevice):
         return super().read(timeout)
 
 
-@wrong_hand("DEX3USB-XCHG-04")
-class OneAtATime(ReferenceDevice):
+@changes(ReferenceDevice, "answer", "DEX3USB-XCHG-04")
+def OneAtATime(self: Any, answer: Call) -> None:
     """Drops both commands when the second comes before the first is answered."""
-
-    def answer(self) -> None:
-        if self.answers and self.answers[0][0] > self.now:
-            self.answers.clear()
-        else:
-            super().answer()
+    if self.answers and self.answers[0][0] > self.now:
+        self.answers.clear()
+    else:
+        answer()
 
 
 @wrong_hand("DEX3USB-RATE-01")
@@ -148,12 +140,10 @@ class LateAnswers(ReferenceDevice):
 # ------------------------------------------------------------------------------------ frames
 
 
-@wrong_hand("DEX3USB-SIZE-01")
-class AnswersPaddedTo512(ReferenceDevice):
+@changes(ReferenceDevice, "frame", "DEX3USB-SIZE-01")
+def AnswersPaddedTo512(self: Any, frame: Call) -> Any:
     """Fills its answers up to whole packets of 512 bytes."""
-
-    def frame(self) -> bytes:
-        return super().frame().ljust(1536, b"\0")
+    return frame().ljust(1536, b"\0")
 
 
 @wrong_hand("DEX3USB-SIZE-02")
@@ -170,12 +160,10 @@ class SmallFramesOnly(ReferenceDevice):
     accepts = MappingProxyType({734: 140})
 
 
-@wrong_hand("DEX3USB-HEAD-01")
-class OtherHead(ReferenceDevice):
+@changes(ReferenceDevice, "frame", "DEX3USB-HEAD-01")
+def OtherHead(self: Any, frame: Call) -> Any:
     """Sends states with the head of a command."""
-
-    def frame(self) -> bytes:
-        return b"\xfe\xfd" + super().frame()[2:]
+    return b"\xfe\xfd" + frame()[2:]
 
 
 @wrong_hand("DEX3USB-CRC-01")
@@ -190,30 +178,24 @@ class StaleCrc(ReferenceDevice):
         return frame if self.count % 50 else frame[:-20] + b"\1" + frame[-19:]
 
 
-@wrong_hand("DEX3USB-CRC-02")
-class MotorCrc(ReferenceDevice):
+@changes(ReferenceDevice, "motor_packet", "DEX3USB-CRC-02")
+def MotorCrc(self: Any, motor_packet: Call, joint: int) -> Any:
     """Sends motor packets with one wrong bit in the CRC."""
-
-    def motor_packet(self, joint: int) -> bytes:
-        packet = super().motor_packet(joint)
-        return packet[:-1] + bytes([packet[-1] ^ 1])
+    packet = motor_packet(joint)
+    return packet[:-1] + bytes([packet[-1] ^ 1])
 
 
-@wrong_hand("DEX3USB-CRC-03")
-class SensorCrc(ReferenceDevice):
+@changes(ReferenceDevice, "sensor_packet", "DEX3USB-CRC-03")
+def SensorCrc(self: Any, sensor_packet: Call, number: int, elements: int) -> Any:
     """Writes a sensor's temperature after the CRC was computed."""
-
-    def sensor_packet(self, number: int, elements: int) -> bytes:
-        packet = super().sensor_packet(number, elements)
-        return packet[:30] + b"\x1e" + packet[31:]
+    packet = sensor_packet(number, elements)
+    return packet[:30] + b"\x1e" + packet[31:]
 
 
-@wrong_hand("DEX3USB-PACK-01")
-class UndefinedTrailingBytes(ReferenceDevice):
+@changes(ReferenceDevice, "wrap", "DEX3USB-PACK-01")
+def UndefinedTrailingBytes(self: Any, wrap: Call, buses: list[bytes]) -> Any:
     """Sends two undefined bytes after the packets of a bus."""
-
-    def wrap(self, buses: list[bytes]) -> bytes:
-        return super().wrap([*buses[:2], buses[2] + b"\xaa\x55", *buses[3:]])
+    return wrap([*buses[:2], buses[2] + b"\xaa\x55", *buses[3:]])
 
 
 @wrong_hand("DEX3USB-PACK-02")
@@ -234,12 +216,10 @@ class EightSensors(ReferenceDevice):
     sensors = ReferenceDevice.sensors[:-1]
 
 
-@wrong_hand("DEX3USB-SENS-01")
-class ZeroForNothing(ReferenceDevice):
+@changes(ReferenceDevice, "sensor_packet", "DEX3USB-SENS-01")
+def ZeroForNothing(self: Any, sensor_packet: Call, number: int, elements: int) -> Any:
     """Sends 0 where there is no sensor element."""
-
-    def sensor_packet(self, number: int, elements: int) -> bytes:
-        return super().sensor_packet(number, 12)
+    return sensor_packet(number, 12)
 
 
 @wrong_hand("DEX3USB-PACK-03")
@@ -249,71 +229,57 @@ class OtherMap(ReferenceDevice):
     map = ((2, 0), (2, 1), (2, 2), (1, 0), (1, 1), (0, 0), (0, 1))
 
 
-@wrong_hand("DEX3USB-VALUE-01")
-class Unpowered(ReferenceDevice):
+@changes(ReferenceDevice, "supply", "DEX3USB-VALUE-01")
+def Unpowered(self: Any, supply: Call) -> tuple[int, int, int, int]:
     """Reports a supply of 12 V."""
-
-    def supply(self) -> tuple[int, int, int, int]:
-        return (11348, 11348, 11348, 596)
+    return (11348, 11348, 11348, 596)
 
 
-@wrong_hand("DEX3USB-VALUE-02")
-class Faulty(ReferenceDevice):
+@changes(ReferenceDevice, "error", "DEX3USB-VALUE-02")
+def Faulty(self: Any, error: Call, joint: int) -> int:
     """Reports an overheated winding from the start."""
-
-    def error(self, joint: int) -> int:
-        return 0x200 if joint == 2 else 0
+    return 0x200 if joint == 2 else 0
 
 
 # ------------------------------------------------------------------------------------ motion
 
 
-@wrong_hand("DEX3USB-MODE-01")
-class AlwaysFoc(ReferenceDevice):
+@changes(ReferenceDevice, "status", "DEX3USB-MODE-01")
+def AlwaysFoc(self: Any, status: Call, joint: int) -> int:
     """Reports FOC whatever status was commanded."""
-
-    def status(self, joint: int) -> int:
-        return FOC
+    return FOC
 
 
-@wrong_hand("DEX3USB-MODE-02")
-class LockFollows(ReferenceDevice):
+@changes(ReferenceDevice, "driven", "DEX3USB-MODE-02")
+def LockFollows(self: Any, driven: Call, joint: int) -> bool:
     """Follows positions although it is locked."""
-
-    def driven(self, joint: int) -> bool:
-        return not self.tripped[joint]
+    return not self.tripped[joint]
 
 
-@wrong_hand("DEX3USB-MOVE-01")
-class JointCounts(ReferenceDevice):
+@changes(ReferenceDevice, "order", "DEX3USB-MOVE-01")
+def JointCounts(self: Any, usual: Call, joint: int, data: bytes) -> Any:
     """Obeys positions as if they were on the joint side of the gears: 108 times as far."""
-
-    def order(self, joint: int, data: bytes) -> Motor:
-        order = super().order(joint, data)
-        return replace(order, q=order.q * self.joints[joint].gear_ratio)
+    order = usual(joint, data)
+    return replace(order, q=order.q * self.joints[joint].gear_ratio)
 
 
-@wrong_hand("DEX3USB-MOVE-01")
-class Backwards(ReferenceDevice):
+@changes(ReferenceDevice, "move", "DEX3USB-MOVE-01")
+def Backwards(self: Any, move: Call, joint: int, order: Motor, seconds: float) -> None:
     """Moves the first thumb joint the wrong way."""
-
-    def move(self, joint: int, order: Motor, seconds: float) -> None:
-        here = self.q[joint]
-        super().move(joint, order, seconds)
-        if joint == 0:
-            spec = self.joints[joint]
-            self.q[joint] = min(max(2 * here - self.q[joint], spec.q_min), spec.q_max)
+    here = self.q[joint]
+    move(joint, order, seconds)
+    if joint == 0:
+        spec = self.joints[joint]
+        self.q[joint] = min(max(2 * here - self.q[joint], spec.q_min), spec.q_max)
 
 
-@wrong_hand("DEX3USB-MOVE-02")
-class Coupled(ReferenceDevice):
+@changes(ReferenceDevice, "counts", "DEX3USB-MOVE-02")
+def Coupled(self: Any, counts: Call, joint: int) -> Any:
     """The index finger moves along with the middle one."""
-
-    def counts(self, joint: int) -> tuple[int, int, int]:
-        torque, speed, position = super().counts(joint)
-        if joint == 5:
-            position += round(0.05 * self.dq[3] * Scale(self.joints[joint].gear_ratio).q)
-        return torque, speed, position
+    torque, speed, position = counts(joint)
+    if joint == 5:
+        position += round(0.05 * self.dq[3] * Scale(self.joints[joint].gear_ratio).q)
+    return torque, speed, position
 
 
 @wrong_hand("DEX3USB-MOVE-03")
@@ -334,36 +300,30 @@ class ZeroElsewhere(ReferenceDevice):
         return round(self.shift * Scale(self.joints[joint].gear_ratio).q) if joint == 1 else 0
 
 
-@wrong_hand("DEX3USB-UNIT-01")
-class RadiansASecond(ReferenceDevice):
+@changes(ReferenceDevice, "counts", "DEX3USB-UNIT-01")
+def RadiansASecond(self: Any, counts: Call, joint: int) -> Any:
     """Reports speed in a unit a hundred times finer."""
-
-    def counts(self, joint: int) -> tuple[int, int, int]:
-        torque, speed, position = super().counts(joint)
-        return torque, max(-32768, min(32767, speed * 100)), position
+    torque, speed, position = counts(joint)
+    return torque, max(-32768, min(32767, speed * 100)), position
 
 
-@wrong_hand("DEX3USB-UNIT-02")
-class TenthTorque(ReferenceDevice):
+@changes(ReferenceDevice, "counts", "DEX3USB-UNIT-02")
+def TenthTorque(self: Any, counts: Call, joint: int) -> Any:
     """Reports torque in the sibling motor's unit, a hundredth of this one."""
-
-    def counts(self, joint: int) -> tuple[int, int, int]:
-        torque, speed, position = super().counts(joint)
-        return torque // 100, speed, position
+    torque, speed, position = counts(joint)
+    return torque // 100, speed, position
 
 
 # -------------------------------------------------------------------------------- protection
 
 
-@wrong_hand("DEX3USB-PROT-01")
-class SilentTrip(ReferenceDevice):
+@changes(ReferenceDevice, "motor_packet", "DEX3USB-PROT-01")
+def SilentTrip(self: Any, motor_packet: Call, joint: int) -> Any:
     """Stops after the time-out but does not report it."""
-
-    def motor_packet(self, joint: int) -> bytes:
-        kept, self.tripped[joint] = self.tripped[joint], False
-        packet = super().motor_packet(joint)
-        self.tripped[joint] = kept
-        return packet
+    kept, self.tripped[joint] = self.tripped[joint], False
+    packet = motor_packet(joint)
+    self.tripped[joint] = kept
+    return packet
 
 
 @wrong_hand("DEX3USB-PROT-02")
@@ -407,22 +367,18 @@ class ClearsTripByAnyCommand(ReferenceDevice):
         self.lapsed = [False] * len(self.q)
 
 
-@wrong_hand("DEX3USB-PROT-04")
-class TripCannotBeCleared(ReferenceDevice):
+@changes(ReferenceDevice, "command", "DEX3USB-PROT-04")
+def TripCannotBeCleared(self: Any, command: Call, joint: int, order: Motor) -> None:
     """Stays tripped without end."""
-
-    def command(self, joint: int, order: Motor) -> None:
-        kept = self.tripped[joint]
-        super().command(joint, order)
-        self.tripped[joint] = kept
+    kept = self.tripped[joint]
+    command(joint, order)
+    self.tripped[joint] = kept
 
 
-@wrong_hand("DEX3USB-PROT-05")
-class AlwaysProtected(ReferenceDevice):
+@changes(ReferenceDevice, "protected", "DEX3USB-PROT-05")
+def AlwaysProtected(self: Any, protected: Call, joint: int) -> bool:
     """Trips even without protection."""
-
-    def protected(self, joint: int) -> bool:
-        return True
+    return True
 
 
 @wrong_hand("DEX3USB-PROT-06")
@@ -435,20 +391,16 @@ class EarlyTrip(ReferenceDevice):
 # ----------------------------------------------------------------------------------- damaged
 
 
-@wrong_hand("DEX3USB-BAD-01")
-class FrameCrcNotChecked(ReferenceDevice):
+@changes(ReferenceDevice, "good_frame", "DEX3USB-BAD-01")
+def FrameCrcNotChecked(self: Any, good_frame: Call, data: bytes) -> bool:
     """Does not check the frame's CRC."""
-
-    def good_frame(self, data: bytes) -> bool:
-        return len(data) in self.accepts and max(_sizes(data)) <= self.accepts[len(data)]
+    return len(data) in self.accepts and max(_sizes(data)) <= self.accepts[len(data)]
 
 
-@wrong_hand("DEX3USB-BAD-02")
-class PacketCrcNotChecked(ReferenceDevice):
+@changes(ReferenceDevice, "good_packet", "DEX3USB-BAD-02")
+def PacketCrcNotChecked(self: Any, good_packet: Call, data: bytes) -> bool:
     """Does not check the packets."""
-
-    def good_packet(self, data: bytes) -> bool:
-        return data[:1] == b"\xfe"
+    return data[:1] == b"\xfe"
 
 
 @wrong_hand("DEX3USB-BAD-03")
@@ -466,33 +418,27 @@ class FillsUp(ReferenceDevice):
         super().receive(data)
 
 
-@wrong_hand("DEX3USB-BAD-04")
-class CutsOff(ReferenceDevice):
+@changes(ReferenceDevice, "receive", "DEX3USB-BAD-04")
+def CutsOff(self: Any, receive: Call, data: bytes) -> None:
     """Obeys the beginning of a frame that is too long."""
-
-    def receive(self, data: bytes) -> None:
-        super().receive(data[:1234])
+    receive(data[:1234])
 
 
-@wrong_hand("DEX3USB-BAD-05")
-class BusSizeNotChecked(ReferenceDevice):
+@changes(ReferenceDevice, "good_frame", "DEX3USB-BAD-05")
+def BusSizeNotChecked(self: Any, good_frame: Call, data: bytes) -> Any:
     """Obeys a frame whose bus size is larger than its buffer."""
-
-    def good_frame(self, data: bytes) -> bool:
-        past = len(data) in self.accepts and max(_sizes(data)) > self.accepts[len(data)]
-        return past or super().good_frame(data)
+    past = len(data) in self.accepts and max(_sizes(data)) > self.accepts[len(data)]
+    return past or good_frame(data)
 
 
-@wrong_hand("DEX3USB-BAD-06")
-class IdModulo(ReferenceDevice):
+@changes(ReferenceDevice, "packet", "DEX3USB-BAD-06")
+def IdModulo(self: Any, packet: Call, bus: int, data: bytes) -> None:
     """Obeys motor ids modulo the number of a finger's motors."""
-
-    def packet(self, bus: int, data: bytes) -> None:
-        number = data[2] & 15
-        if bus == 1 and 2 <= number < 15 and self.good_packet(data):
-            joint = self.places[bus, number % 2]
-            self.command(joint, self.order(joint, data))
-        super().packet(bus, data)
+    number = data[2] & 15
+    if bus == 1 and 2 <= number < 15 and self.good_packet(data):
+        joint = self.places[bus, number % 2]
+        self.command(joint, self.order(joint, data))
+    packet(bus, data)
 
 
 @wrong_hand("DEX3USB-BAD-07")
@@ -511,12 +457,10 @@ class SilentAfterDamagedFrame(ReferenceDevice):
             super().answer()
 
 
-@wrong_hand("DEX3USB-BAD-08")
-class NoBroadcast(ReferenceDevice):
+@changes(ReferenceDevice, "is_for", "DEX3USB-BAD-08")
+def NoBroadcast(self: Any, is_for: Call, number: int, own: int) -> bool:
     """Ignores packets with id 15, the broadcast."""
-
-    def is_for(self, number: int, own: int) -> bool:
-        return number == own
+    return number == own
 
 
 # -------------------------------------------------------------------------------- connection
