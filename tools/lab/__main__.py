@@ -22,7 +22,7 @@ from tools.lab.devices import Devices
 from tools.lab.initramfs import write_initramfs
 from tools.lab.machine import command_line, run_guest
 from tools.lab.packages import Kernel, fetch, missing
-from tools.lab.report import Case, write_reports
+from tools.lab.report import Case, write_report
 
 ROOT = Path(__file__).resolve().parents[2]
 _PATIENCE = 600.0  # seconds for the whole session in a guest
@@ -104,10 +104,10 @@ def _session(out: Path, options: argparse.Namespace) -> int:
         **{f"{g.name}: {name}": fact for g in guests for name, fact in g.control.facts.items()},
         "whole run": f"{time.monotonic() - started:.0f} s",
     }
-    write_reports(out, cases, facts)
+    write_report(out, cases, facts)
     failed = sum(case.status == "failed" for case in cases)
     skipped = sum(case.status == "skipped" for case in cases)
-    print(f"report: {out / 'report.md'}, {out / 'junit.xml'}; {facts['whole run']}")
+    print(f"report: {out / 'report.md'}; {facts['whole run']}")
     print(f"{len(cases) - failed - skipped} passed, {failed} failed, {skipped} skipped")
     return 1 if failed or not cases else 0
 

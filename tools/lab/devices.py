@@ -8,7 +8,6 @@ and where the joints really were.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,7 +30,6 @@ ADAPTERS = ("DKLAB001", "DKLAB002", "DKLAB003")
 """Serial numbers of the USB-serial adapters: the MX-64's, the Dex1-1 motor's, and that of one that
 only takes a USB port."""
 _PERIOD = 0.01  # seconds between two looks at the joints
-_HEARD, _SHOWN = 1000, 60  # messages on a serial line that are remembered; bytes that are shown
 _LOOK_STEPS = 20  # of a motor's mechanics, 10 ms
 _FOC = 1
 _MOTION = 1e-3  # of a joint, in the record's unit, that is none
@@ -47,7 +45,6 @@ class Record:
         self._positions = positions
         self._places: list[tuple[float, list[float]]] = []
         self._setpoints: list[tuple[float, tuple[object, ...]]] = []
-        self._heard: deque[tuple[float, bytes]] = deque(maxlen=_HEARD)
         self._last: dict[int, tuple[object, ...]] = {}  # of the joints that are driven
         self._released = 0.0  # when the last of them was no longer
         self._clock = RealClock()
@@ -58,11 +55,6 @@ class Record:
         place = [float(q) for q in self._positions()]
         with self._lock:
             self._places.append((self._clock.now(), place))
-
-    def heard(self, data: bytes) -> None:
-        """Note what came to the device's serial line."""
-        with self._lock:
-            self._heard.append((self._clock.now(), bytes(data)))
 
     def setpoint(self, joint: int, *values: object) -> None:
         """Note a command that can move ``joint``; nothing is noted while it stays the same."""
@@ -81,14 +73,11 @@ class Record:
         return {"t": self._clock.now(), "q": [float(q) for q in self._positions()]}
 
     def since(self, start: float) -> dict[str, Any]:
-        """What happened since ``start``: extremes of the joints, how many set-points came,
-        and what the serial line heard of late.
-        """
+        """What happened since ``start``: extremes of the joints, and how many set-points came."""
         self.note_positions()
         with self._lock:
             places = [place for t, place in self._places if t >= start]
             setpoints = [values for t, values in self._setpoints if t >= start]
-            heard = b"".join(data for t, data in self._heard if t >= start)
         columns = list(zip(*places, strict=True))
         return {
             "low": [min(column) for column in columns],
@@ -96,8 +85,6 @@ class Record:
             "q": places[-1],
             "setpoints": len(setpoints),
             "last": repr(setpoints[-1:]),
-            "heard": len(heard),
-            "first": repr(heard[:_SHOWN])[2:-1],
         }
 
     def stopped(self, start: float) -> dict[str, float | None]:
@@ -147,7 +134,6 @@ class Devices:
             "mx64": _record_servo(servo),
             "dex1": _record_motor(motor),
         }
-        _record_line(self.adapters.adapters[0].line, self.records["mx64"])
         self._stopping = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="record", daemon=True)
         self._watcher.start()
@@ -204,16 +190,6 @@ def _record_servo(servo: Any) -> Record:
 
     servo.write_block = write_block
     return record
-
-
-def _record_line(line: Any, record: Record) -> None:
-    receive = line.receive
-
-    def received(data: bytes, now: float) -> None:
-        record.heard(data)
-        receive(data, now)
-
-    line.receive = received
 
 
 def _record_motor(motor: Any) -> Record:

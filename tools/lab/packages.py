@@ -24,7 +24,7 @@ _NEEDED = {
     "dpkg-deb": "dpkg",
 }
 _KERNEL = "linux-image-amd64"
-_GUEST = ("busybox-static", "kmod", "udev", "usbip", "modemmanager", "dbus-daemon")
+_GUEST = ("busybox-static", "kmod", "udev", "usbip")
 """Programs of the guest. It has this machine's files; libraries that this machine lacks are
 unpacked with them."""
 _MERGED = ("bin", "sbin", "lib", "lib64")

@@ -1,4 +1,4 @@
-"""The lab's report: a table for people, JUnit XML for machines."""
+"""The lab's report."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 from dexkit.documents import write_file
 from dexkit.escaping import visible
 
-__all__ = ["REAL", "Case", "junit", "markdown", "write_reports"]
+__all__ = ["REAL", "Case", "markdown", "write_report"]
 
 REAL = """\
 What is real: Debian's kernel and its drivers (usbcore, vhci_hcd, usbfs, usbserial, ftdi_sio), its
-device nodes, sysfs and power management, libusb, udev, ModemManager, pyserial, DDS, and dexkit from
-its checkout.
+device nodes, sysfs and power management, libusb, udev, pyserial, DDS, and dexkit from its checkout.
 
 What is not: the devices (dexkit's emulators, on the host, by USB/IP), the cable (TCP through QEMU's
 user network: no packets on a bus, no bandwidth, no electrical faults), and time in the guest: its
@@ -62,40 +60,6 @@ def _cell(text: str) -> str:
     return visible(text).replace("|", "\\|").replace("\n", "<br>")
 
 
-def junit(cases: Sequence[Case], facts: Mapping[str, Any]) -> bytes:
-    """The report for machines."""
-    count = [case.status for case in cases].count
-    suite = ElementTree.Element(
-        "testsuite",
-        name="dexkit lab",
-        tests=str(len(cases)),
-        failures=str(count("failed")),
-        skipped=str(count("skipped")),
-        time=f"{sum(case.seconds for case in cases):.3f}",
-    )
-    properties = ElementTree.SubElement(suite, "properties")
-    for name, value in facts.items():
-        ElementTree.SubElement(properties, "property", name=name, value=visible(str(value)))
-    for case in cases:
-        element = ElementTree.SubElement(
-            suite,
-            "testcase",
-            classname=f"lab.{case.group}",
-            name=visible(case.name),
-            time=f"{case.seconds:.3f}",
-        )
-        if case.status == "failed":
-            ElementTree.SubElement(element, "failure", message=visible(case.said))
-        elif case.status == "skipped":
-            ElementTree.SubElement(element, "skipped", message=visible(case.said))
-        else:
-            ElementTree.SubElement(element, "system-out").text = visible(case.said)
-    found: bytes = ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
-    return found
-
-
-def write_reports(folder: Path, cases: Sequence[Case], facts: Mapping[str, Any]) -> None:
-    """Write ``report.md`` and ``junit.xml`` into ``folder``."""
-    folder.mkdir(parents=True, exist_ok=True)
+def write_report(folder: Path, cases: Sequence[Case], facts: Mapping[str, Any]) -> None:
+    """Write ``report.md`` into ``folder``."""
     write_file(folder / "report.md", markdown(cases, facts))
-    write_file(folder / "junit.xml", junit(cases, facts).decode())

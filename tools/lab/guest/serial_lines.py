@@ -5,17 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import serial
 
 from dexkit.dds import DdsNode
-from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
-from dexkit.drivers.ezgripper.bus import ServoBus
-from dexkit.drivers.serial_port import exchange_period, latency_timer, latency_warning
-from dexkit.hand import HandCommand, Side
-from dexkit.wire import mx64
+from dexkit.drivers.serial_port import latency_timer, latency_warning
+from dexkit.hand import Side
 from tools.lab.guest.adapters import Adapters
 from tools.lab.guest.bench import (
     Bench,
@@ -30,7 +26,6 @@ from tools.lab.guest.bench import (
 )
 from tools.lab.guest.client import DOMAIN, Client
 from tools.lab.guest.faults import Subject, table
-from tools.lab.guest.modem_manager import PROCESS, manager, run_modem_manager
 from tools.lab.guest.power import freeze_processes
 from tools.lab.guest.probe import ping
 
@@ -55,19 +50,12 @@ def run_serial(bench: Bench) -> None:
         return
     for group, name, do in (
         ("adapter", "an ordinary user who is not in the group dialout", lab.denied),
-        ("ezgripper", "exchanges with the timer at 16 ms", lambda: lab.servo_rate(16)),
         ("doctor", "dexkit doctor finds the 16 ms and says the cure", lab.doctor),
-        ("ezgripper", "exchanges with the timer at 4 ms", lambda: lab.servo_rate(4)),
-        ("ezgripper", "exchanges with the timer at 1 ms", lambda: lab.servo_rate(1)),
         ("adapter", "the udev rule that dexkit's warning names", lab.rule),
         ("adapter", "probe bytes of modem software at plug-in", lab.probes),
         ("ezgripper", "dexkit calibrate ezgripper", lab.calibrate),
-        ("dex1", "6 Mbaud through the emulated FT232H, timer 16 ms", lambda: lab.motor_rate(16)),
-        ("dex1", "6 Mbaud through the emulated FT232H, timer 4 ms", lambda: lab.motor_rate(4)),
-        ("dex1", "6 Mbaud through the emulated FT232H, timer 1 ms", lambda: lab.motor_rate(1)),
     ):
         bench.case(group, name, do)
-    run_modem_manager(bench, lab.adapters)
     for kind in ("ezgripper", "dex1-serial"):
         if not bench.case(kind, f"dexkit serve {kind}", lambda k=kind: lab.serve(k)):  # type: ignore[misc]
             continue
@@ -77,10 +65,8 @@ def run_serial(bench: Bench) -> None:
             ("driver unbound while moving", lab.unbound),
             ("all processes frozen while moving, as for suspending", lab.frozen),
             (f"unplugged while moving, {_CYCLES} times", lab.unplugged),
-            ("plugged in again while ModemManager probes", lab.probed),
         ):
-            if do != lab.probed or kind == "ezgripper":
-                bench.case(f"{kind} faults", name, do)
+            bench.case(f"{kind} faults", name, do)
         lab.end()
     lab.close()
 
@@ -151,35 +137,6 @@ class _Lines:
         if moved > 0.1 or after["setpoints"]:
             raise Failed(f"it moved by {moved:.2f} %, {after['setpoints']} set-points")
         return f"{len(_PROBES)} probes and a break at 3 rates: nothing moved; then {said}"
-
-    # --- rates
-
-    def servo_rate(self, timer: int) -> str:
-        path = self.adapters.path("mx64")
-        self.adapters.set_timer("mx64", timer)
-        bus = ServoBus(path, 1_000_000, timeout=0.2, retries=0)
-        bus.open()
-        try:
-            rate = _rate(lambda: bus.read(1, mx64.PRESENT_CURRENT.address, _READ), 3.0)
-            # instruction 14 bytes, status 11 and the data, return delay of 500 us (factory)
-            line = bus.wire_time(14 + 11 + _READ) + bus.read_item(1, mx64.RETURN_DELAY_TIME) * 2e-6
-        finally:
-            bus.close()
-        most = 1 / exchange_period(line, timer * 1e-3)
-        if rate > most * 1.02:
-            raise Failed(f"{rate:.0f}/s, more than the {most:.0f} that the timer allows")
-        return f"{rate:.1f}/s at 1 Mbaud; the timer and the line allow {most:.1f}"
-
-    def motor_rate(self, timer: int) -> str:
-        path = self.adapters.path("dex1") or self.adapters.plug("dex1")
-        self.adapters.set_timer("dex1", timer)
-        with Dex1Serial(Side.LEFT, Dex1Settings(device=path, timeout=0.2)) as hand:
-            rate = _rate(lambda: hand.exchange(HandCommand.brake(1)), 3.0)
-            said = f"{hand.line_statistics}"
-        most = 1 / exchange_period(46 * 10 / 6e6, timer * 1e-3)
-        if rate > most * 1.02:
-            raise Failed(f"{rate:.0f}/s, more than the {most:.0f} that the timer allows")
-        return f"{path}: {rate:.1f}/s; the timer and the line allow {most:.1f}; {said}"
 
     # --- the services
 
@@ -287,18 +244,6 @@ class _Lines:
         )
         return f"frozen for {took[0]:.1f} s; {table([outcome])}; " + self._obeys()
 
-    def probed(self) -> str:
-        def mend() -> None:
-            self.adapters.plug(self.device)
-            wait_for(lambda: seen.lines("ttyUSB.*prob"), "ModemManager does not probe")
-
-        with manager() as seen, rule(PROCESS):
-            outcome = self._the_subject().strike(lambda: self.adapters.unplug(self.device), mend)
-            said = table([outcome]) + "; " + self._obeys()
-            self.adapters.unplug(self.device)  # it gives up
-        self.adapters.plug(self.device)
-        return said
-
     def end(self) -> None:
         if self.subject is not None:
             self.subject.client.close()
@@ -319,13 +264,3 @@ def _doctor(path: str) -> str:
     # its exit code says that it has found something
     words = ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.5", "--device", path)
     return dexkit(*words)[1]
-
-
-def _rate(exchange: Callable[[], object], seconds: float) -> float:
-    """Exchanges a second, back to back."""
-    exchange()
-    count, started = 0, time.monotonic()
-    while time.monotonic() - started < seconds:
-        exchange()
-        count += 1
-    return count / (time.monotonic() - started)
