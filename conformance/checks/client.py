@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.provenance import STATES, TIMES
 from dexkit.conformance.results import Evidence
 from dexkit.hand import Floats, JointMode
@@ -504,43 +505,41 @@ def waits(ctx: Context) -> Outcome:
         "kp",
     ),
 )
-def ends_at_rest(ctx: Context) -> Outcome:
+@worst("speed_part", "max_speed_stroke", nothing="the recording ends before the client does")
+def ends_at_rest(ctx: Context) -> Figures:
     """The speed of hand and target when the commands end."""
     commands, states = ctx.commands, ctx.states
     limit, look = ctx.requirement.tolerance("max_speed_stroke"), ctx.tolerance("window_s")
     seen = float(states.t[-1]) if len(states) else 0.0
     ends = [part for part in sessions(ctx) if commands.t[part][-1] + 0.5 <= seen]
-    if not ends:
-        return ctx.skipped("the recording ends before the client does")
-    fastest, where, which = 0.0, 0.0, 0
     for part in ends:
         end = float(commands.t[part][-1])
         for joint, spec in enumerate(ctx.joints):
-            if _is_stop(ctx, part.stop - 1, joint):
-                continue
             rows = slice(part.start + int(np.searchsorted(commands.t[part], end - look)), part.stop)
-            speeds = (
-                _speed(commands.t[rows], commands.q[rows, joint]),
-                _speed(
-                    states.t[states.between(end - look, end)],
-                    states.q[states.between(end - look, end), joint],
-                ),
-            )
+            before = states.between(end - look, end)
             # "in motion" includes a moving target while an object holds the hand, and a hand that
             # moves to a resting target
-            if max(speeds) / spec.stroke > fastest:
-                fastest, where, which = max(speeds) / spec.stroke, end, joint
-    text = ctx.named(
-        f"hand and target move by at most {fastest:.0%} of the stroke a second at the end", which
-    )
-    if fastest <= limit:
-        return ctx.passed(f"{fastest:.0%}/s", text)
-    text = ctx.named(
-        f"the last command is sent at {where:.2f} s, while the hand or its target moves by "
-        f"{fastest:.0%} of the stroke a second",
-        which,
-    )
-    return ctx.failed(f"{fastest:.0%}/s", text, ctx.at(ctx.commands.topic, where)).about(which)
+            fastest = max(
+                _speed(commands.t[rows], commands.q[rows, joint]),
+                _speed(states.t[before], states.q[before, joint]),
+            )
+            if _is_stop(ctx, part.stop - 1, joint):
+                fastest = 0.0
+            part_s = fastest / spec.stroke
+            text = (
+                f"the last command is sent at {end:.2f} s, while the hand or its target moves by "
+                f"{part_s:.0%} of the stroke a second"
+            )
+            yield Figure(
+                part_s,
+                end,
+                None,
+                joint,
+                text,
+                limit=limit,
+                shown=f"{part_s:.0%}/s",
+                topic=commands.topic,
+            )
 
 
 def _is_stop(ctx: Context, row: int, joint: int) -> bool:

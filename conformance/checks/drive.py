@@ -4,7 +4,6 @@ against motion.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.firmness import STIFFNESS, nudges
-from dexkit.conformance.checks.grip import Press, torque_scales, worst_of
+from dexkit.conformance.checks.grip import torque_scales
 from dexkit.conformance.checks.motion import (
     Step,
     half_way,
@@ -231,16 +230,16 @@ def as_commanded(ctx: Context) -> Figures:
 
 @check("DEX3-FORCE-05", "DEX3-FORCE-10")
 @with_object
-def joints_as_commanded(ctx: Context) -> Outcome:
+@worst("part", "max_part", nothing="no joint was held back by the object")
+def joints_as_commanded(ctx: Context) -> Figures:
     """The smallest and largest tau_est of pressing joints, relative to kp times the distance to the
     goal.
 
     A requirement without ``max_part`` has no upper limit.
     """
-    pieces = []
-    least, most = ctx.tolerance("min_part"), math.inf
+    limits = [(ctx.tolerance("min_part"), True)]
     if "max_part" in ctx.requirement.tolerances:
-        most = ctx.tolerance("max_part")
+        limits.append((ctx.tolerance("max_part"), False))
     scales = torque_scales(ctx, ctx.tolerance("min_asked_nm"))
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -255,19 +254,20 @@ def joints_as_commanded(ctx: Context) -> Outcome:
             if not spec.closing or min(asked, spec.tau_max) < ctx.tolerance("min_asked_nm"):
                 continue
             felt = abs(float(tau[joint] / scales[joint]))  # its sign is judged by DEX3-FORCE-01
-            limits = least * min(asked, spec.tau_max), most * asked
-            pieces.append(Press.within((felt, felt), limits, (begin, end), joint))
-    worst = worst_of(pieces)
-    if worst is None or worst.joint is None:
-        return ctx.skipped("no joint was held back by the object")
-    asked = worst.limit / (most if worst.over else least)
-    part = worst.felt / asked
-    text = ctx.named(
-        f"tau_est of {worst.felt:.2f} N m in contact, where kp times the distance is "
-        f"{asked:.2f} N m",
-        worst.joint,
-    )
-    return worst.outcome(ctx, f"{part:.0%}", text, part=part)
+            text = f"tau_est of {felt:.2f} N m in contact, where kp times the distance is "
+            for part, at_least in limits:
+                due = min(asked, spec.tau_max) if at_least else asked
+                measure = Measure(felt, part * due, "N m", Quantity.TORQUE, not at_least)
+                yield Figure(
+                    felt / due,
+                    begin,
+                    end,
+                    joint,
+                    f"{text}{due:.2f} N m",
+                    limit=part,
+                    at_least=at_least,
+                    measure=measure,
+                )
 
 
 # ----------------------------------------------------------------------- commands: torque, gains

@@ -40,6 +40,7 @@ class Figure:
     :param text: what was observed there; the joint's name is put before it.
     :param met: the same where the limit is met, if other words are needed then.
     :param limit: if it has one of its own; else the requirement's tolerance, for that joint.
+    :param at_least: whether its limit is the least, if that is not what the limit's name says.
     :param shown: the figure in short, if the unit's usual form does not do.
     :param late: the delay of a good hand that would cause the same, seconds; None for what the unit
         implies: by how much a time is too long, and how long a hand takes to move that far.
@@ -55,6 +56,7 @@ class Figure:
     text: str = ""
     met: str = ""
     limit: float | None = None
+    at_least: bool | None = None
     shown: str = ""
     late: float | Late | None = None
     measure: Measure | None = None
@@ -127,35 +129,37 @@ def judged(
     """The outcome of the worst of some figures.
 
     :param name: of the value in the outcome, which ends with its unit.
-    :param limit: name of the tolerance: ``max_`` and ``min_`` say in which direction it limits.
+    :param limit: name of the tolerance, whose ``max_`` or ``min_`` says in which direction it
+        limits.
     :param nothing: why the requirement cannot be judged, where there is no figure; or the outcome.
     """
-    at_least = limit.startswith("min_")
     found: list[Figure] = []
     for one in figures:
         if isinstance(one, Outcome):
             return one
-        joint = one.joint or 0
-        found.append(
-            one if one.limit is not None else replace(one, limit=ctx.tolerance(limit, joint))
-        )
+        if one.limit is None:
+            one = replace(one, limit=ctx.tolerance(limit, one.joint or 0))
+        if one.at_least is None:
+            one = replace(one, at_least=limit.startswith("min_"))
+        found.append(one)
     if not found:
         return ctx.skipped(nothing) if isinstance(nothing, str) else nothing
-    return _outcome(ctx, max(found, key=lambda f: _beyond(f, at_least)), name, at_least)
+    return _outcome(ctx, max(found, key=_beyond), name)
 
 
-def _beyond(figure: Figure, at_least: bool) -> float:
+def _beyond(figure: Figure) -> float:
     """By how much a figure is beyond its limit, as a part of that; negative where it is met."""
     assert figure.limit is not None
     if math.isnan(figure.value):
         return math.inf
     beyond = figure.value - figure.limit
-    return (-beyond if at_least else beyond) / max(abs(figure.limit), 1e-9)
+    return (-beyond if figure.at_least else beyond) / max(abs(figure.limit), 1e-9)
 
 
-def _outcome(ctx: Context, figure: Figure, name: str, at_least: bool) -> Outcome:
+def _outcome(ctx: Context, figure: Figure, name: str) -> Outcome:
     value, limit, unit = float(figure.value), figure.limit, _unit_of(name)
     assert limit is not None
+    at_least = bool(figure.at_least)
     met = value >= limit if at_least else value <= limit
     shown = figure.shown or (unit.met if met else unit.failed).format(value)
     shown = shown if figure.shown else shown.replace("rad", ctx.unit)
@@ -167,7 +171,7 @@ def _outcome(ctx: Context, figure: Figure, name: str, at_least: bool) -> Outcome
         topic = figure.topic or ctx.states.topic
         places = () if figure.begin is None else (ctx.at(topic, figure.begin, figure.end),)
         outcome = ctx.failed(shown, _named(ctx, figure, text), *places, **values)
-        outcome = replace(outcome, late=_late(ctx, figure, unit, at_least))
+        outcome = replace(outcome, late=_late(ctx, figure, unit))
         if figure.joint is not None:
             outcome = outcome.about(figure.joint)
     measure = figure.measure
@@ -183,13 +187,13 @@ def _named(ctx: Context, figure: Figure, text: str) -> str:
     return text if figure.joint is None else ctx.named(text, figure.joint)
 
 
-def _late(ctx: Context, figure: Figure, unit: _Unit, at_least: bool) -> Late | None:
+def _late(ctx: Context, figure: Figure, unit: _Unit) -> Late | None:
     """The delay of a good hand that would cause this failure; see :class:`Late`."""
     if isinstance(figure.late, Late):
         return figure.late
     seconds = figure.late
     if seconds is None and unit.quantity is Quantity.TIME and figure.limit is not None:
         seconds = figure.value - figure.limit
-    if seconds is None and unit.quantity is Quantity.POSITION and not at_least:
+    if seconds is None and unit.quantity is Quantity.POSITION and not figure.at_least:
         seconds = STROKE_S * abs(figure.value) / ctx.joints[figure.joint or 0].stroke
     return None if seconds is None else Late((max(0.0, float(seconds)),))

@@ -13,8 +13,8 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
-from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
-from dexkit.conformance.checks.grip import Press, worst_of
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
+from dexkit.conformance.checks.grip import pressed
 from dexkit.conformance.checks.motion import noise_at_rest
 from dexkit.conformance.measurement_error import Measure, Quantity
 from dexkit.conformance.median import median
@@ -187,7 +187,9 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
     stiffest = max(1.0, *(n.asked / n.way for n in shown))
     softest = min(1.0, *(n.asked / n.way for n in shown))
     least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
-    pieces: list[Press] = []
+    text = "tau_est of {felt} in contact, where {limit} follow from the stiffness that it shows "
+    text += "without contact"
+    figures: list[Figure] = []
     peaks: list[_Peak] = []
     for piece in contacts(ctx, ctx.touch):
         asked = piece.kp * (piece.q - piece.goal)
@@ -196,17 +198,11 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
         low = least * softest * min(asked, ctx.tolerance("max_asked_nm"))
         high = most * stiffest * asked
         span = piece.begin, piece.end
-        pieces.append(Press.within((piece.tau, piece.tau), (low, high), span))
+        figures += pressed((piece.tau, piece.tau), (low, high), text, *span)
         felt = np.abs(ctx.tau(*span)[:, 0])
         peak = most * stiffest * piece.most
         above = felt[felt > peak]
         peaks.append(_Peak(*span, len(felt), len(above), peak, above))
-    worst = worst_of(pieces)
-    if worst is None:
-        return ctx.skipped("it never pressed on the object for long enough")
-    text = (
-        f"tau_est of {worst.felt:.2f} N m in contact, where {worst.bound} {worst.limit:.2f} N m "
-        "follow from the stiffness that it shows without contact"
-    )
-    hammers = _hammers(ctx, peaks) if worst.part <= 1.0 else None
-    return hammers or worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)
+    nothing = "it never pressed on the object for long enough"
+    outcome = judged(ctx, figures, "tau_nm", "max_tau_nm", nothing=nothing)
+    return _hammers(ctx, peaks) or outcome if outcome.met else outcome

@@ -7,7 +7,7 @@ is compared with that law; a hand whose tau_est has another scale while it moves
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.consistency import contacts
-from dexkit.conformance.checks.figures import with_object
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.conformance.row_selection import Rows
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointMode
 
-__all__ = ["Press", "torque_scales", "worst_of"]
+__all__ = ["pressed", "torque_scales"]
 
 _FREE = ("joint", "step", "fingerprint", "stiff")
 """Phases in which the joints move without contact, by the client's gains."""
@@ -47,63 +47,25 @@ _LAGS_S = tuple(0.002 * i for i in range(21))
 """Ages of commands with which states are compared, 0 to 40 ms: a hand may obey and publish late."""
 
 
-@dataclass(frozen=True)
-class Press:
-    """The tau_est of a piece of contact against the nearer of its two limits.
+def pressed(
+    felt: tuple[float, float],
+    limits: tuple[float, float],
+    text: str,
+    begin: float,
+    end: float,
+    joint: int | None = None,
+) -> Iterator[Figure]:
+    """The tau_est of a piece of contact against both of its limits, N m.
 
-    :param part: of the limit, above 1 where it is not met.
-    :param felt: tau_est, N m.
-    :param over: whether ``limit`` (N m) is the upper one.
+    :param felt: least and greatest tau_est of the piece.
+    :param limits: the least and the greatest that it may be.
+    :param text: what was observed, with places for the value ``felt`` and its limit.
     :param begin: of the piece, s, as ``end``.
-    :param joint: which one it is; None for a gripper.
     """
-
-    part: float
-    felt: float
-    limit: float
-    over: bool
-    begin: float
-    end: float
-    joint: int | None = None
-
-    @classmethod
-    def within(
-        cls,
-        felt: tuple[float, float],
-        limits: tuple[float, float],
-        span: tuple[float, float],
-        joint: int | None = None,
-    ) -> Press:
-        """Compare with both limits.
-
-        :param felt: least and greatest tau_est of the piece, N m.
-        :param limits: the least and the greatest that it may be, N m.
-        """
-        (least, most), (low, high) = felt, limits
-        above = cls(most / high, most, high, True, *span, joint)
-        below = cls(low / max(least, 1e-6), least, low, False, *span, joint)
-        return above if above.part >= below.part else below
-
-    @property
-    def bound(self) -> str:
-        """Which limit it is, in words."""
-        return "at most" if self.over else "at least"
-
-    def outcome(self, ctx: Context, figure: str, text: str, **values: float) -> Outcome:
-        """The outcome of a check whose worst piece this is."""
-        if self.part <= 1.0:
-            outcome = ctx.passed(figure, text, **values)
-        else:
-            place = ctx.at(ctx.states.topic, self.begin, self.end)
-            outcome = ctx.failed(figure, text, place, **values)
-            if self.joint is not None:
-                outcome = outcome.about(self.joint)
-        return outcome.pressed(self.felt, self.limit, at_least=not self.over)
-
-
-def worst_of(pieces: Iterable[Press]) -> Press | None:
-    """The piece that is farthest beyond its limit, or nearest to it; None without pieces."""
-    return max(pieces, key=lambda p: p.part, default=None)
+    for value, limit, least in ((felt[0], limits[0], True), (felt[1], limits[1], False)):
+        bound = f"{'at least' if least else 'at most'} {limit:.3f} N m"
+        shown = text.format(felt=f"{value:.3f} N m", limit=bound)
+        yield Figure(value, begin, end, joint, shown, limit=limit, at_least=least)
 
 
 # ------------------------------------------------------------------------- hands of several joints
@@ -244,21 +206,14 @@ def one_scale(ctx: Context) -> Outcome:
 
 @check("DEX3-FORCE-08")
 @with_object
-def presses_as_it_moves(ctx: Context) -> Outcome:
+@worst("tau_nm", "max_tau_nm", nothing="no joint was held back by the object")
+def presses_as_it_moves(ctx: Context) -> Figures:
     """tau_est of each standing joint that presses on the object, relative to the law."""
-    phases = [p for name in ("squeeze", "touch", "firmer", "regrip") for p in ctx.phases(name)]
-    worst = worst_of(piece for phase in phases for piece in _presses(ctx, *ctx.span(phase)))
-    if worst is None or worst.joint is None:
-        return ctx.skipped("no joint was held back by the object")
-    text = ctx.named(
-        f"tau_est of {worst.felt:.3f} N m in contact, where {worst.bound} {worst.limit:.3f} N m "
-        "follow from its command and from its torque in free motion",
-        worst.joint,
-    )
-    return worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)
+    for phase in (p for name in ("squeeze", "touch", "firmer", "regrip") for p in ctx.phases(name)):
+        yield from _presses(ctx, *ctx.span(phase))
 
 
-def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
+def _presses(ctx: Context, begin: float, end: float) -> Iterator[Figure]:
     """Each joint in each piece in which it stands under an unchanged command."""
     least, window = ctx.tolerance("min_asked_nm"), ctx.tolerance("window_s")
     scales = torque_scales(ctx, least)
@@ -267,7 +222,10 @@ def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
     most = np.array([j.tau_max for j in ctx.joints])
     closing = np.array([j.closing for j in ctx.joints])
     states, commands = ctx.states, ctx.commands
-    found = []
+    text = (
+        "tau_est of {felt} in contact, where {limit} follow from its command and from its torque "
+        "in free motion"
+    )
     for at in np.arange(begin, end - window + 1e-9, 0.5 * window).tolist():
         rows = np.arange(len(states))[states.between(at, at + window)]
         given = (commands.t >= at - ctx.tolerance("settle_s")) & (commands.t <= at + window)
@@ -289,8 +247,7 @@ def _presses(ctx: Context, begin: float, end: float) -> list[Press]:
             ceiling = ctx.tolerance("max_part") * max(own, 1.0) * asked[joint]
             felt_there = float(low[joint]), float(high[joint])
             limits = float(floor), float(ceiling)
-            found.append(Press.within(felt_there, limits, (at, at + window), joint))
-    return found
+            yield from pressed(felt_there, limits, text, at, at + window, joint)
 
 
 @check("DEX3-FORCE-11", "BRAINCO-FORCE-11")
@@ -451,21 +408,15 @@ def grips_as_it_moves(ctx: Context) -> Outcome:
         return ctx.skipped("its torque in free motion is not in proportion to the distance to q")
     softest = min(spring.stiffness, spring.least)
     stiffest = max(spring.stiffness, spring.most)
-    pieces = []
+    text = "tau_est of {felt} in contact, where {limit} follow from the stiffness "
+    text += f"{softest:.1f} to {stiffest:.1f} N m/{ctx.unit} with which it moves without contact"
+    figures: list[Figure] = []
     for piece in contacts(ctx, ctx.touch):
         depth = piece.q - piece.goal
         if stiffest * depth < ctx.tolerance("min_asked_nm"):
             continue
         low = ctx.tolerance("min_part") * min(softest * depth, ctx.tolerance("max_asked_nm"))
         high = ctx.tolerance("max_part") * stiffest * depth
-        felt = piece.tau, piece.tau
-        pieces.append(Press.within(felt, (low, high), (piece.begin, piece.end)))
-    worst = worst_of(pieces)
-    if worst is None:
-        return ctx.skipped("it never pressed on the object for long enough")
-    text = (
-        f"tau_est of {worst.felt:.2f} N m in contact, where {worst.bound} {worst.limit:.2f} N m "
-        f"follow from the {stiffest if worst.over else softest:.1f} N m/{ctx.unit} with which it "
-        "moves without contact"
-    )
-    return worst.outcome(ctx, f"{worst.felt:.2f} N m", text, tau_nm=worst.felt)
+        figures += pressed((piece.tau, piece.tau), (low, high), text, piece.begin, piece.end)
+    nothing = "it never pressed on the object for long enough"
+    return judged(ctx, figures, "tau_nm", "max_tau_nm", nothing=nothing)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.safety import arrival, away_first
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.motor_messages import MotorCodec
@@ -204,12 +205,16 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
 
 
 @check("DEX1-LIFE-06", "DEX3-LIFE-06")
-def no_new_goal(ctx: Context) -> Outcome:
+@worst(
+    "motion_rad",
+    "max_motion_stroke",
+    nothing="no state before the service ended, or none after it started again",
+)
+def no_new_goal(ctx: Context) -> Figures:
     """Distance of the hand, after a restart of its service, from where it may be.
 
     A motor may continue to its last goal (DEX1-LIFE-05), but must not move elsewhere.
     """
-    worst: tuple[float, float, float, int, float, float] | None = None
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         latency = ctx.tolerance("latency_s")
@@ -219,7 +224,7 @@ def no_new_goal(ctx: Context) -> Outcome:
         after = ctx.states.q[later][ctx.states.t[later] > begin + 0.25]
         if len(q) < 3 or not len(after):
             continue
-        for joint, spec in enumerate(ctx.joints):
+        for joint in range(len(ctx.joints)):
             place, found = q[:, joint], float(after[0, joint])
             if not np.isfinite(place).all() or not math.isfinite(found):
                 continue
@@ -228,20 +233,9 @@ def no_new_goal(ctx: Context) -> Outcome:
             recent = place[t >= t[-1] - latency]
             away = max(float(recent.min()) - found, found - float(recent.max()), 0.0)
             moved = abs(speed) >= ctx.tolerance("min_speed_stroke", joint)
-            against = 0.0 if moved and (found - float(place[-1])) * speed > 0.0 else away
-            part = against / spec.stroke
-            if worst is None or part > worst[0]:
-                worst = part, against, float(place[-1]), joint, begin, end
-    if worst is None:
-        return ctx.skipped("no state before the service ended, or none after it started again")
-    _, rad, was, joint, begin, end = worst
-    limit = ctx.tolerance("max_motion_stroke", joint)
-    text = ctx.named(
-        f"found {rad:.2f} {ctx.unit} from the {was:.2f} {ctx.unit} at which the service ended, "
-        "where it was not going",
-        joint,
-    )
-    if rad <= limit:
-        return ctx.passed(f"{rad:.2f} {ctx.unit}", text, motion_rad=rad).placed(rad, limit)
-    outcome = ctx.failed(f"{rad:.2f} {ctx.unit}", text, ctx.at(ctx.states.topic, begin, end))
-    return outcome.about(joint).placed(rad, limit)
+            rad = 0.0 if moved and (found - float(place[-1])) * speed > 0.0 else away
+            text = (
+                f"found {rad:.2f} {ctx.unit} from the {place[-1]:.2f} {ctx.unit} at which the "
+                "service ended, where it was not going"
+            )
+            yield Figure(rad, begin, end, joint, text)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.plots import Plot
 from dexkit.conformance.robot import RobotRecording
 from dexkit.conformance.stimuli.robot import STEP
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.sums import mean, total
-from dexkit.hand import Floats
 from dexkit.messages import Columns
 
 __all__ = ["RobotContext"]
@@ -179,9 +180,10 @@ def within_limits(ctx: RobotContext) -> Outcome:
 
 
 @check("H1-FIELD-04")
-def speed_of_q(ctx: RobotContext) -> Outcome:
+@worst("off_rad_s", "tolerance_rad_s", nothing="no joint moved")
+def speed_of_q(ctx: RobotContext) -> Figures:
     """Compare dq with the change of q of each joint while it moves."""
-    window, worst, which = ctx.tolerance("window_s"), 0.0, -1
+    window = ctx.tolerance("window_s")
     for phase in ctx.phases():
         joint = _index(ctx, phase)
         rows = ctx.states.between(*ctx.span(phase))
@@ -189,19 +191,14 @@ def speed_of_q(ctx: RobotContext) -> Outcome:
         later = np.searchsorted(t, t + window)
         first = np.flatnonzero(later < len(t))
         if len(first) < 10:
-            return ctx.skipped("too few states while joints move")
+            yield ctx.skipped("too few states while joints move")
         later = later[first]
         change = (q[later] - q[first]) / np.maximum(t[later] - t[first], 1e-6)
         sums = np.concatenate(([0.0], np.cumsum(dq)))
         reported = (sums[later] - sums[first]) / (later - first)
         off = mean(np.abs(change - reported))
-        if not off <= worst:
-            worst, which = off, joint
-    name = ctx.joints[which].name if which >= 0 else ""
-    text = f"{name}: dq is off the change of q by {worst:.2f} rad/s on average"
-    if worst <= ctx.tolerance("tolerance_rad_s"):
-        return ctx.passed(f"{worst:.2f} rad/s", text)
-    return ctx.failed(f"{worst:.2f} rad/s", text).about(which)
+        text = f"dq is off the change of q by {off:.2f} rad/s on average"
+        yield Figure(off, joint=joint, text=text, shown=f"{off:.2f} rad/s")
 
 
 @check("H1-FIELD-05")
@@ -408,105 +405,95 @@ def _index(ctx: RobotContext, phase: Phase) -> int:
 def _silent(ctx: RobotContext, phase: Phase) -> Outcome:
     """The outcome without a state in the phase: failed, or not judged if states come later."""
     begin, end = ctx.span(phase)
-    if len(_q(ctx, end, end + _LATE)):
+    if len(ctx.q(end, end + _LATE)):
         return ctx.skipped(f"no state in '{phase.name}', only later")
     place = ctx.at(ctx.states.topic, begin, end)
     return ctx.failed("no state", f"no state during '{phase.name}', nor after it", place)
 
 
-def _q(ctx: RobotContext, begin: float, end: float) -> Floats:
-    """Positions in [begin, end], shape (n, joints)."""
-    return ctx.q(begin, end)
-
-
 @check("H1-MOVE-01", "H1-SAFE-04", "H1-LIFE-02")
-def follows(ctx: RobotContext) -> Outcome:
+@worst("error_rad", "max_error_rad", nothing="no step was made")
+def follows(ctx: RobotContext) -> Figures:
     """Final position of each step of a joint."""
-    worst, where, which = -1.0, None, 0
-    for phase in ctx.phases():
-        if not phase.targets:
-            continue
+    for phase in (p for p in ctx.phases() if p.targets):
         begin, end = ctx.span(phase)
-        q = _q(ctx, begin, end)[-_SOME:]
+        q = ctx.q(begin, end)[-_SOME:]
         if not len(q):
-            return _silent(ctx, phase)
+            yield _silent(ctx, phase)
+            return
         ((joint, goal),) = phase.targets[ctx.side].items()
         error = abs(mean(q[:, joint]) - goal)
         error = error if math.isfinite(error) else math.inf
-        if error > worst:
-            worst, where, which = error, (begin, end), joint
-    if where is None:
-        return ctx.skipped("no step was made")
-    text = f"{ctx.joints[which].name} ends {worst:.3f} rad from its target"
-    if worst <= ctx.tolerance("max_error_rad"):
-        return ctx.passed(f"{worst:.3f} rad", text, error_rad=worst)
-    outcome = ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where))
-    return outcome.about(which).if_late(STROKE_S * worst / STEP)
+        text, late = f"ends {error:.3f} rad from its target", STROKE_S * error / STEP
+        yield Figure(error, begin, end, joint, text, late=late)
 
 
 @check("H1-MOVE-02")
-def independent(ctx: RobotContext) -> Outcome:
+@worst("motion_rad", "max_motion_rad", nothing="no joint was moved")
+def independent(ctx: RobotContext) -> Figures:
     """Motion of other joints while one is commanded."""
-    worst, text, where = -1.0, "", (0.0, 0.0)
-    about: tuple[int, ...] = ()
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        q = _q(ctx, begin, end)
+        q = ctx.q(begin, end)
         if not len(q):
-            return _silent(ctx, phase)
-        moved = np.abs(q - q[0]).max(axis=0)
+            yield _silent(ctx, phase)
+            return
+        moved = np.nan_to_num(np.abs(q - q[0]).max(axis=0), nan=np.inf)
         mine = _index(ctx, phase)
         moved[mine] = 0.0
-        joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
-        if moved[joint] > worst:
-            worst, where, about = float(moved[joint]), (begin, end), (joint, mine)
-            text = f"{ctx.joints[joint].name} moves by {worst:.3f} rad with {ctx.joints[mine].name}"
-    if worst <= ctx.tolerance("max_motion_rad"):
-        return ctx.passed(f"{worst:.3f} rad", text)
-    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where)).about(*about)
+        joint = int(np.argmax(moved))
+        text = f"moves by {moved[joint]:.3f} rad with {ctx.joints[mine].name}"
+        yield Figure(float(moved[joint]), begin, end, joint, text)
 
 
 @check("H1-CRC-02", "H1-MODE-02", "H1-GAIN-04")
 @check("H1-SAFE-01", "H1-SAFE-02", "H1-SAFE-03", "G1-SAFE-05")
-def stays(ctx: RobotContext) -> Outcome:
+@worst("motion_rad", "max_motion_rad", nothing="no such command was sent")
+def stays(ctx: RobotContext) -> Figures:
     """Motion of joints during commands that must have no effect."""
-    worst, text, where, which = -1.0, "", (0.0, 0.0), 0
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
-        before, q = _q(ctx, begin - _LATE, begin)[-_SOME:], _q(ctx, begin, end + _END)
+        before, q = ctx.q(begin - _LATE, begin)[-_SOME:], ctx.q(begin, end + _END)
         if not len(before) or not len(q):
-            return _silent(ctx, phase)
-        moved = np.abs(q - before.mean(axis=0)).max(axis=0)
-        joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
+            yield _silent(ctx, phase)
+            return
+        moved = np.nan_to_num(np.abs(q - before.mean(axis=0)).max(axis=0), nan=np.inf)
+        joint = int(np.argmax(moved))
         kind = f" ({phase.params['kind']})" if "kind" in phase.params else ""
-        if not moved[joint] <= worst:
-            worst, where, which = float(moved[joint]), (begin, end), joint
-            text = f"{ctx.joints[joint].name} moves by {worst:.3f} rad{kind}"
-        if math.isnan(worst):
-            break
-    if worst <= ctx.tolerance("max_motion_rad"):
-        return ctx.passed(f"{worst:.3f} rad", text)
-    return ctx.failed(f"{worst:.2f} rad", text, ctx.at(ctx.states.topic, *where)).about(which)
+        text = f"moves by {moved[joint]:.3f} rad{kind}"
+        yield Figure(float(moved[joint]), begin, end, joint, text)
+
+
+def _alone(ctx: RobotContext) -> tuple[Phase, float, float, int]:
+    """The only phase of a requirement, its begin and end, and its joint."""
+    (phase,) = ctx.phases()
+    return phase, *ctx.span(phase), _index(ctx, phase)
+
+
+def _within(
+    value: float, low: float, high: float, begin: float, end: float, **more: Any
+) -> Figures:
+    """A figure with a least and a greatest value."""
+    yield Figure(value, begin, end, limit=low, at_least=True, **more)
+    yield Figure(value, begin, end, limit=high, at_least=False, **more)
 
 
 @check("H1-GAIN-01")
-def stiffness(ctx: RobotContext) -> Outcome:
+@worst("way_rad", "tolerance_part", nothing="")
+def stiffness(ctx: RobotContext) -> Figures:
     """Displacement of a joint with low kp under a torque."""
-    (phase,) = ctx.phases()
-    begin, end = ctx.span(phase)
-    joint, wanted = _index(ctx, phase), float(phase.params["way"])
-    before, after = (
-        _q(ctx, begin - _LATE, begin)[-_SOME:, joint],
-        _q(ctx, begin, end)[-_SOME:, joint],
-    )
+    phase, begin, end, joint = _alone(ctx)
+    wanted = float(phase.params["way"])
+    before = ctx.q(begin - _LATE, begin)[-_SOME:, joint]
+    after = ctx.q(begin, end)[-_SOME:, joint]
     if not len(before) or not len(after):
-        return _silent(ctx, phase)
+        yield _silent(ctx, phase)
+        return
     way = float(after.mean() - before.mean())
     text = f"it is displaced by {way:.3f} rad; tau / kp is {wanted:.3f} rad"
-    if abs(way / wanted - 1.0) <= ctx.tolerance("tolerance_part"):
-        return ctx.passed(f"{way:.3f} rad", text)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{way:.3f} rad", text, place).about(_index(ctx, phase))
+    low, high = (1 + sign * ctx.tolerance("tolerance_part") for sign in (-1, 1))
+    shown = f"{way:.3f} rad"
+    yield from _within(way / wanted, low, high, begin, end, joint=joint, text=text, shown=shown)
 
 
 def _speed(ctx: RobotContext, phase: Phase, begin: float, end: float) -> float | None:
@@ -517,73 +504,66 @@ def _speed(ctx: RobotContext, phase: Phase, begin: float, end: float) -> float |
 
 
 @check("H1-GAIN-02")
-def velocity(ctx: RobotContext) -> Outcome:
+@worst("speed_part", "high_part", nothing="")
+def velocity(ctx: RobotContext) -> Figures:
     """The speed of a joint with a commanded velocity."""
-    (phase,) = ctx.phases()
-    begin, end = ctx.span(phase)
+    phase, begin, end, joint = _alone(ctx)
     wanted = float(phase.params["speed"])
     speed = _speed(ctx, phase, (begin + end) / 2, end)
     if speed is None:
-        return _silent(ctx, phase)
-    text = f"{speed:.2f} rad/s, commanded {wanted:.2f} rad/s"
-    if ctx.tolerance("low_part") <= speed / wanted <= ctx.tolerance("high_part"):
-        return ctx.passed(f"{speed:.2f} rad/s", text)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{speed:.2f} rad/s", text, place).about(_index(ctx, phase))
+        yield _silent(ctx, phase)
+        return
+    text, shown = f"{speed:.2f} rad/s, commanded {wanted:.2f} rad/s", f"{speed:.2f} rad/s"
+    low, high = ctx.tolerance("low_part"), ctx.tolerance("high_part")
+    yield from _within(speed / wanted, low, high, begin, end, joint=joint, text=text, shown=shown)
 
 
 @check("H1-GAIN-03")
-def torque(ctx: RobotContext) -> Outcome:
+@worst("motion_rad", "min_motion_rad", nothing="")
+def torque(ctx: RobotContext) -> Figures:
     """Motion of a joint under a torque."""
-    (phase,) = ctx.phases()
-    begin, end = ctx.span(phase)
-    q = _q(ctx, begin, end + 0.05)[:, _index(ctx, phase)]
+    phase, begin, end, joint = _alone(ctx)
+    q = ctx.q(begin, end + 0.05)[:, joint]
     if not len(q):
-        return _silent(ctx, phase)
+        yield _silent(ctx, phase)
+        return
     wanted = float(phase.params["torque"])
-    way = math.copysign(1.0, wanted) * (q - q[0])
+    sign = math.copysign(1.0, wanted)
+    way = sign * (q - q[0])
     far = float(way[np.argmax(np.abs(way))])
-    text = f"{wanted:.2f} N m turn it by {far * math.copysign(1.0, wanted):.3f} rad"
-    if far >= ctx.tolerance("min_motion_rad"):
-        return ctx.passed(f"{far:.2f} rad", text)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{far:.2f} rad", text, place).about(_index(ctx, phase))
+    yield Figure(far, begin, end, joint, f"{wanted:.2f} N m turn it by {far * sign:.3f} rad")
 
 
 @check("H1-FORCE-01")
-def reported_torque(ctx: RobotContext) -> Outcome:
+@worst("tau_part", "high_part", nothing="the joint was turned for too short a time")
+def reported_torque(ctx: RobotContext) -> Figures:
     """tau_est while only tau is commanded."""
-    (phase,) = ctx.phases()
-    begin, end = ctx.span(phase)
-    rows = ctx.states.between(begin + 0.01, end)
-    tau = ctx.states.tau[rows, _index(ctx, phase)]
+    phase, begin, end, joint = _alone(ctx)
+    tau = ctx.tau(begin + 0.01, end)[:, joint]
     if len(tau) < 3:
-        return ctx.skipped("the joint was turned for too short a time")
+        return
     wanted, reported = float(phase.params["torque"]), float(np.median(tau))
-    text = f"tau_est is {reported:.2f} N m, tau was {wanted:.2f} N m"
-    if ctx.tolerance("low_part") <= reported / wanted <= ctx.tolerance("high_part"):
-        return ctx.passed(f"{reported:.2f} N m", text)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{reported:.2f} N m", text, place).about(_index(ctx, phase))
+    text, shown = f"tau_est is {reported:.2f} N m, tau was {wanted:.2f} N m", f"{reported:.2f} N m"
+    low, high = ctx.tolerance("low_part"), ctx.tolerance("high_part")
+    part = reported / wanted
+    yield from _within(part, low, high, begin, end, joint=joint, text=text, shown=shown)
 
 
 # ------------------------------------------------------------------------------------- watchdog
 
 
 @check("H1-WDOG-01")
-def damps(ctx: RobotContext) -> Outcome:
+@worst("speed_rad_s", "max_speed_rad_s", nothing="")
+def damps(ctx: RobotContext) -> Figures:
     """Speed of a driven joint some time after the last command."""
-    (phase,) = ctx.phases()
-    begin, end = ctx.span(phase)
+    phase, begin, end, joint = _alone(ctx)
     after = begin + ctx.tolerance("max_s")
     speed = _speed(ctx, phase, after, end)
     if speed is None:
-        return _silent(ctx, phase)
+        yield _silent(ctx, phase)
+        return
     text = f"{after - begin:.1f} s after the last command it turns at {speed:.2f} rad/s"
-    if abs(speed) <= ctx.tolerance("max_speed_rad_s"):
-        return ctx.passed(f"{abs(speed):.3f} rad/s", text)
-    place = ctx.at(ctx.states.topic, after, end)
-    return ctx.failed(f"{speed:.2f} rad/s", text, place).about(_index(ctx, phase))
+    yield Figure(abs(speed), after, end, joint, text, shown=f"{abs(speed):.2f} rad/s")
 
 
 @check("H1-WDOG-02")
@@ -608,31 +588,28 @@ def resumes(ctx: RobotContext) -> Outcome:
     """The jump when commands resume, and the step after it."""
     hold = next(p for p in ctx.phases() if not p.targets)
     begin, end = ctx.span(hold)
-    q = _q(ctx, begin - 0.02, end)
+    q = ctx.q(begin - 0.02, end)
     if not len(q):
         return _silent(ctx, hold)
-    moved = np.abs(q - q[0]).max(axis=0)
-    joint = int(np.argmax(np.nan_to_num(moved, nan=np.inf)))
-    if not moved[joint] <= ctx.tolerance("max_jump_rad"):
-        text = (
-            f"{ctx.joints[joint].name} moves by {moved[joint]:.3f} rad when commands arrive again"
-        )
-        place = ctx.at(ctx.states.topic, begin, end)
-        return ctx.failed(f"{moved[joint]:.2f} rad", text, place).about(joint)
-    return follows(ctx)
+    moved = np.nan_to_num(np.abs(q - q[0]).max(axis=0), nan=np.inf)
+    figures = [
+        Figure(far, begin, end, joint, f"moves by {far:.3f} rad when commands arrive again")
+        for joint, far in enumerate(moved.tolist())
+    ]
+    jump = judged(ctx, figures, "jump_rad", "max_jump_rad", nothing="")
+    return follows(ctx) if jump.met else jump
 
 
 @check("H1-WDOG-04")
-def bridges(ctx: RobotContext) -> Outcome:
+@worst("speed_part", "min_part", nothing="")
+def bridges(ctx: RobotContext) -> Figures:
     """The speed of a driven joint in a short pause."""
-    (phase,) = ctx.phases()
-    begin, end = ctx.span(phase)
+    phase, begin, end, joint = _alone(ctx)
     wanted = float(phase.params["speed"])
     speed = _speed(ctx, phase, begin, end)
     if speed is None:
-        return _silent(ctx, phase)
+        yield _silent(ctx, phase)
+        return
     text = f"{speed:.2f} rad/s in a pause of {end - begin:.2f} s, commanded {wanted:.2f} rad/s"
-    if speed / wanted >= ctx.tolerance("low_part"):
-        return ctx.passed(f"{speed:.2f} rad/s", text)
-    place = ctx.at(ctx.states.topic, begin, end)
-    return ctx.failed(f"{speed:.2f} rad/s", text, place).about(_index(ctx, phase))
+    limit, shown = ctx.tolerance("low_part"), f"{speed:.2f} rad/s"
+    yield Figure(speed / wanted, begin, end, joint, text, limit=limit, shown=shown)

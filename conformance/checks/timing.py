@@ -17,7 +17,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks import Context, Outcome, check, rate_measure
+from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measure
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.median import median, percentile
 from dexkit.conformance.provenance import TIMES
@@ -547,8 +548,15 @@ class Positions:
 @check("DEX1-FRESH-02", "DEX3-FRESH-02", rests_on=(TIMES,))
 def not_frozen(ctx: Context) -> Outcome:
     """The longest interval of equal positions that ends in an impossible jump."""
-    limit = ctx.tolerance("max_frozen_s")
-    worst = 0.0
+    # the first second suffices for a hand that moves in it
+    if not any(len(np.unique(c)) > 3 for q in (ctx.states.q[:500], ctx.states.q) for c in q.T):
+        return ctx.skipped("the hand does not move in this recording")
+    never = ctx.passed("0 ms", "no position was held and then jumped", frozen_s=0.0)
+    return judged(ctx, _frozen(ctx), "frozen_s", "max_frozen_s", nothing=never)
+
+
+def _frozen(ctx: Context) -> Iterator[Figure]:
+    """The longest interval of equal positions of each joint that ends in an impossible jump."""
     for joint in range(len(ctx.joints)):
         course = Positions.from_context(ctx, joint)
         t, q, changes = course.t, course.q, course.changes
@@ -573,39 +581,17 @@ def not_frozen(ctx: Context) -> Outcome:
         for i in np.flatnonzero(frozen):
             # a fast hand may be far away at the next measurement
             if jump[i] <= _speed_after(t, q, int(changes[i + 1])) * ctx.tolerance("max_age_s"):
-                frozen[i] = False
                 continue
             begin[i] = _at_rest_until(ctx, joint, float(q[changes[i]]), begin[i], end[i])
             held[i] = end[i] - begin[i]
-        if not frozen.any():
-            continue
         i = int(np.argmax(held))
-        worst = max(worst, float(held[i]))
-        if held[i] > limit:
+        if held[i] > 0.0:
             at, count = float(begin[i]), int(((t >= begin[i]) & (t <= end[i])).sum())
-            return (
-                ctx.failed(
-                    f"{held[i]:.2f} s",
-                    ctx.named(
-                        f"{count} states in a row with q = {q[changes[i]]:.3f} {ctx.unit} over "
-                        f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} {ctx.unit}",
-                        joint,
-                    ),
-                    ctx.at(ctx.states.topic, at, at + float(held[i])),
-                    frozen_s=float(held[i]),
-                )
-                .about(joint)
-                .timed(float(held[i]), limit)
-                .if_late(float(held[i]) - limit)
+            text = (
+                f"{count} states in a row with q = {q[changes[i]]:.3f} {ctx.unit} over "
+                f"{held[i]:.2f} s, and then a jump of {jump[i]:.2f} {ctx.unit}"
             )
-    # the first second suffices for a hand that moves in it
-    if not any(len(np.unique(c)) > 3 for q in (ctx.states.q[:500], ctx.states.q) for c in q.T):
-        return ctx.skipped("the hand does not move in this recording")
-    return ctx.passed(
-        f"{worst * 1e3:.0f} ms",
-        f"no position was held for more than {worst:.3f} s and then jumped",
-        frozen_s=worst,
-    ).timed(worst, limit)
+            yield Figure(float(held[i]), at, at + float(held[i]), joint, text)
 
 
 def _speed_after(t: Floats, q: Floats, row: int) -> float:
@@ -647,27 +633,18 @@ def _medians(rows: Floats) -> Floats:
 
 
 @check("DEX1-FRESH-01", "DEX3-FRESH-01", "DEX1-FRESH-04", rests_on=(TIMES,))
-def fresh(ctx: Context) -> Outcome:
+@worst("hold_s", "max_hold_s", nothing="the hand does not move in this recording")
+def fresh(ctx: Context) -> Figures:
     """Time without a new position while the hand moves."""
-    worst: Outcome | None = None
     for joint in range(len(ctx.joints)):
-        outcome = _fresh(ctx, joint)
-        if outcome.met is False:
-            return outcome
-        held = outcome.values.get("hold_s", -1.0)
-        if worst is None or held > worst.values.get("hold_s", -1.0):
-            worst = outcome
-    assert worst is not None
-    return worst
+        yield from _fresh(ctx, joint)
 
 
-def _fresh(ctx: Context, joint: int) -> Outcome:
+def _fresh(ctx: Context, joint: int) -> Iterator[Figure]:
     course = Positions.from_context(ctx, joint)
     t, q, changes, size = course.t, course.q, course.changes, course.steps
-    if len(q) < 2:
-        return ctx.skipped("fewer than two states with a position")
     if len(changes) < 3:
-        return ctx.skipped("the hand does not move in this recording")
+        return
     least = ctx.tolerance("min_change_stroke", joint)
     # the joint has moved by less than one step of a coarse encoder meanwhile: no value is old
     explained = 0.0
@@ -681,41 +658,26 @@ def _fresh(ctx: Context, joint: int) -> Outcome:
     since, until = changes[moving], changes[moving + 1]
     step = np.minimum(t[until] - t[until - 1], _STEPS * median(np.diff(t)))
     holds = t[until - 1] - t[since] + step
-    travel = float(np.ptp(q))
     if len(holds) < ctx.tolerance("min_intervals"):
-        if travel < least:
-            return ctx.skipped("the hand does not move in this recording")
-        # only small changes: the values are fresher than required
-        quickest = median(np.diff(t[changes]))
-        return ctx.passed(
-            f"{quickest * 1e3:.1f} ms", "changes from sample to sample", hold_s=quickest
-        ).timed(quickest, ctx.tolerance("max_hold_s"))
+        if float(np.ptp(q)) >= least:
+            # only small changes: the values are fresher than required
+            quickest = median(np.diff(t[changes]))
+            text = "changes from sample to sample"
+            yield Figure(quickest, joint=joint, text=text, shown=f"{quickest * 1e3:.1f} ms")
+        return
     # the median of a few in a row, so that a hand whose values become old later is found
     count = min(_IN_A_ROW, len(holds))
     starts = t[changes[moving]]
     rows = sliding_window_view(holds, count)
     near = starts[count - 1 :] - starts[: len(rows)] <= ctx.tolerance("window_s")
     medians = np.where(near, _medians(rows), median(holds))
-    worst = int(np.argmax(medians))
-    hold = median(holds)
-    text = f"a new value every {hold * 1e3:.1f} ms while moving (median of {len(holds)})"
-    if medians[worst] <= ctx.tolerance("max_hold_s"):
-        met = ctx.passed(f"{hold * 1e3:.1f} ms", ctx.named(text, joint), hold_s=hold)
-        return met.timed(float(medians[worst]), ctx.tolerance("max_hold_s"))
-    begin, end = float(starts[worst]), float(starts[worst + count - 1] + holds[worst + count - 1])
-    hold = float(medians[worst])
-    return (
-        ctx.failed(
-            f"{hold * 1e3:.0f} ms",
-            ctx.named(f"{text}, but every {hold * 1e3:.0f} ms from {begin:.2f} s on", joint),
-            ctx.at(ctx.states.topic, begin, end),
-            hold_s=hold,
-        )
-        .about(joint)
-        .timed(hold, ctx.tolerance("max_hold_s"))
-        .if_late(
-            hold - ctx.tolerance("max_hold_s"),
-            how="mean",
-            best=float(np.percentile(rows[worst], 25)) - ctx.tolerance("max_hold_s"),
-        )
-    )
+    i = int(np.argmax(medians))
+    hold, usual = float(medians[i]), median(holds)
+    begin, end = float(starts[i]), float(starts[i + count - 1] + holds[i + count - 1])
+    met = f"a new value every {usual * 1e3:.1f} ms while moving (median of {len(holds)})"
+    text = f"{met}, but every {hold * 1e3:.0f} ms from {begin:.2f} s on"
+    limit = ctx.tolerance("max_hold_s")
+    best = max(float(np.percentile(rows[i], 25)) - limit, 0.0)
+    late = Late((max(hold - limit, 0.0),), "mean", best)
+    shown = f"{usual * 1e3:.1f} ms" if hold <= limit else f"{hold * 1e3:.0f} ms"
+    yield Figure(hold, begin, end, joint, text, met, shown=shown, late=late)
