@@ -45,7 +45,7 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
-from dexkit.conformance.stimulus_record import RECORD, Planned, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.suspension import sleep_awake
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
@@ -206,7 +206,6 @@ def record_run(
             beats=heart.beats,
             calibration=loopback.result(),
             waits=queue.waits,
-            planned=Planned(plan.phases, plan.rounds),
         )
         recorder.add_metadata(RECORD, stimulus.to_metadata())
     return finished

@@ -129,7 +129,16 @@ def weigh(
     """
     if not all(math.isfinite(m.value) and math.isfinite(m.limit) for m in measures):
         return None  # what never came is no matter of precision
-    found = [replace(m, error=_error(recording, m, places, whole)) for m in measures]
+    found = [
+        # of Python's own numbers: a check's may be NumPy's
+        replace(
+            m,
+            value=float(m.value),
+            limit=float(m.limit),
+            error=_error(recording, m, places, whole),
+        )
+        for m in measures
+    ]
     return min(found, key=_hardest, default=None)
 
 
@@ -158,4 +167,4 @@ def _error(
     seconds = recording.time_error(begin, end)
     if seconds is None:  # no beat fell into a short place
         seconds = recording.time_error(*whole)
-    return None if seconds is None else seconds * abs(measure.per_second)
+    return None if seconds is None else float(seconds * abs(measure.per_second))

@@ -6,30 +6,29 @@ that time through no fault of its own. A process that computes does not wait, ho
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.row_selection import Rows
 from dexkit.conformance.sums import total
-from dexkit.documents import parse_json
-from dexkit.errors import TraceUnsupported
-from dexkit.hand import ROBOT, Floats, Side, Subject
+from dexkit.hand import Floats, Subject
 
-__all__ = ["ProcessWaits", "Starvation", "Waits", "Worst"]
+__all__ = ["ProcessWaits", "Starvation", "SubjectName", "Time", "Waits", "Worst"]
 
-_MOST_PROCESSORS = 2**16
-_LATEST = 2**62  # ns since 1970: the year 2116
 _AROUND = 500_000_000  # ns before and after a place: the kernel counts work in steps of 10 ms
 _FULL = 0.98  # part of the time for which processors that are never idle are counted to work
 
 
-@dataclass(frozen=True)
-class ProcessWaits:
+SubjectName = Annotated[str, msgspec.Meta(pattern="^(left|right|robot)$")]
+Time = Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)]
+"""A time or a duration, nanoseconds or microseconds; 2**62 ns since 1970 is the year 2116."""
+
+
+class ProcessWaits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How long one process waited, in each sample of :class:`Waits`.
 
     :param name: what it is, for messages.
@@ -40,10 +39,10 @@ class ProcessWaits:
     """
 
     name: str
-    pid: int
-    subjects: tuple[Subject, ...]
-    waited_us: list[int] = field(default_factory=list)
-    longest_us: list[int] = field(default_factory=list)
+    pid: Time
+    subjects: tuple[SubjectName, ...]
+    waited_us: list[Time] = []
+    longest_us: list[Time] = []
 
     def __str__(self) -> str:
         return f"{self.name} (pid {self.pid})" if self.pid else self.name
@@ -76,8 +75,7 @@ class Starvation:
     worst: Worst
 
 
-@dataclass(frozen=True)
-class Waits:
+class Waits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How long the processes of a run waited for a processor.
 
     A wait counts in the sample in which it ended.
@@ -90,63 +88,19 @@ class Waits:
     :param processors: how many they could use; 0 where it is not known.
     """
 
-    begin_ns: int = 0
-    t_us: list[int] = field(default_factory=list)
-    processes: list[ProcessWaits] = field(default_factory=list)
-    busy_us: list[int] = field(default_factory=list)
-    own_us: list[int] = field(default_factory=list)
-    processors: int = 0
+    begin_ns: Time = 0
+    t_us: list[Time] = []
+    processes: list[ProcessWaits] = []
+    busy_us: list[Time] = []
+    own_us: list[Time] = []
+    processors: Annotated[int, msgspec.Meta(ge=0, le=2**16)] = 0
 
-    @classmethod
-    def parse(cls, text: str) -> Waits:
-        """Parse the record's content.
-
-        :raises TypeError, ValueError, KeyError, TraceUnsupported: it is damaged.
-        """
-        found = parse_json(text, "the stimulus record", error=TraceUnsupported)
-        times = _numbers(found["t_us"])
-        processes = [
-            ProcessWaits(
-                name=str(p["name"]),
-                pid=_number(p["pid"]),
-                subjects=tuple(ROBOT if s == ROBOT.value else Side(s) for s in p["subjects"]),
-                waited_us=_numbers(p["waited_us"]),
-                longest_us=_numbers(p["longest_us"]),
-            )
-            for p in found["processes"]
-        ]
-        if any(len(x) != len(times) for p in processes for x in (p.waited_us, p.longest_us)):
+    def __post_init__(self) -> None:
+        count = len(self.t_us)
+        if any(len(x) != count for p in self.processes for x in (p.waited_us, p.longest_us)):
             raise ValueError("a process that was not looked at each time")
-        busy, own = _numbers(found["busy_us"]), _numbers(found["own_us"])
-        if not len(busy) == len(own) in (0, len(times)):
+        if not len(self.busy_us) == len(self.own_us) in (0, count):
             raise ValueError("the work of processors was not looked at each time")
-        # records of earlier versions do not have it
-        processors = _number(found.get("processors", 0))
-        if not 0 <= processors <= _MOST_PROCESSORS:
-            raise ValueError(f"{processors} is no number of processors")
-        return cls(_number(found["begin_ns"]), times, processes, busy, own, processors)
-
-    def as_text(self) -> str:
-        """The record's content."""
-        processes = [
-            {
-                "name": p.name,
-                "pid": p.pid,
-                "subjects": [str(s) for s in p.subjects],
-                "waited_us": p.waited_us,
-                "longest_us": p.longest_us,
-            }
-            for p in self.processes
-        ]
-        record = {
-            "begin_ns": self.begin_ns,
-            "t_us": self.t_us,
-            "processes": processes,
-            "busy_us": self.busy_us,
-            "own_us": self.own_us,
-            "processors": self.processors,
-        }
-        return json.dumps(record, separators=(",", ":"))
 
     def starvation(self, subject: Subject, begin_ns: int, end_ns: int) -> Starvation | None:
         """How long a hand's processes waited in [begin, end]; None if it is not known."""
@@ -222,17 +176,3 @@ def _queue(part: float) -> float:
     """How long one waits for a processor, relatively, where they work for this part of the time."""
     part = min(part, _FULL)
     return part / (1.0 - part)
-
-
-def _number(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not -_LATEST <= value <= _LATEST:
-        raise ValueError(f"{value!r} is no whole number that a record may hold")
-    return value
-
-
-def _numbers(values: Sequence[object]) -> list[int]:
-    if set(map(type, values)) == {int}:  # looked at as one, as there are many
-        whole = cast(Sequence[int], values)
-        if min(whole) >= -_LATEST and max(whole) <= _LATEST:
-            return list(whole)
-    return [_number(v) for v in values]

@@ -71,7 +71,13 @@ class RunQueue:
     def waits(self) -> Waits | None:
         """What was measured, once this has ended; None where nothing could be."""
         found = [
-            ProcessWaits(w.name, w.pid, w.subjects, threads.waited_us, threads.longest_us)
+            ProcessWaits(
+                w.name,
+                w.pid,
+                tuple(map(str, w.subjects)),
+                threads.waited_us,
+                threads.longest_us,
+            )
             for w, threads in self._watched.items()
             if threads.seen
         ]

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Literal, TypeVar
 
+import msgspec
 import numpy as np
 
 from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.processor_waits import Waits
+from dexkit.conformance.processor_waits import SubjectName, Time, Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import ROBOT, Floats, Side, Subject
+from dexkit.records import as_plain, from_object, to_record
 
 __all__ = [
     "CALIBRATION_TOPIC",
@@ -25,20 +27,15 @@ __all__ = [
     "Beats",
     "Calibration",
     "Phase",
-    "Planned",
     "Stall",
     "Stimulus",
-    "parse_stalls",
-    "parse_time",
+    "from_metadata",
+    "to_metadata",
 ]
 
-_LATEST = 2**62  # ns since 1970: the year 2116
+T = TypeVar("T")
 
 RECORD = "dexkit.stimulus"
-VERSION = 1
-_VIRTUAL = json.dumps("virtual")  # as every value of the record: JSON
-_EARLIER_ROBOT = "body"
-"""The name of the subject ``robot`` in recordings of earlier versions."""
 CALIBRATION_TOPIC = "rt/dexkit/calibration"
 """The topic on which the kit measures itself; no hand's and no robot's."""
 
@@ -64,46 +61,14 @@ class Phase:
     observed: dict[str, float | None] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Planned:
-    """Which stimuli a run was to apply.
-
-    :param phases: names of the phases that its requirements need.
-    :param rounds: how often it was to go through those between the first motion and the operator.
-    """
-
-    phases: frozenset[str]
-    rounds: int = 1
-
-    @classmethod
-    def parse(cls, text: str) -> Planned:
-        """Parse the record's content.
-
-        :raises TypeError, ValueError, KeyError, TraceUnsupported: it is damaged.
-        """
-        found = _json(text)
-        phases, rounds = found["phases"], found["rounds"]
-        if not isinstance(phases, list) or not all(isinstance(p, str) for p in phases):
-            raise TypeError("the names of the planned phases are no texts")
-        if type(rounds) is not int:
-            raise TypeError(f"{rounds!r} is no number of rounds")
-        return cls(frozenset(phases), rounds)
-
-    def as_text(self) -> str:
-        """The record's content."""
-        return json.dumps({"phases": sorted(self.phases), "rounds": self.rounds})
-
-
-@dataclass(frozen=True)
-class Stall:
+class Stall(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """An interval in which programs waited for a processor."""
 
-    begin_ns: int
-    end_ns: int
+    begin_ns: Time
+    end_ns: Time
 
 
-@dataclass
-class Beats:
+class Beats(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Lateness of the kit's timer over the whole run.
 
     :param begin_ns: log time of offset 0.
@@ -111,21 +76,13 @@ class Beats:
     :param late_us: by how much too late.
     """
 
-    begin_ns: int = 0
-    t_us: list[int] = field(default_factory=list)
-    late_us: list[int] = field(default_factory=list)
+    begin_ns: Time = 0
+    t_us: list[Time] = []
+    late_us: list[Time] = []
 
-    @classmethod
-    def parse(cls, text: str) -> Beats:
-        """Parse the record's content.
-
-        :raises TypeError, ValueError, TraceUnsupported: it is damaged.
-        """
-        found = cls(**_json(text))
-        t, late = [parse_time(t) for t in found.t_us], [parse_time(t) for t in found.late_us]
-        if len(t) != len(late):
+    def __post_init__(self) -> None:
+        if len(self.t_us) != len(self.late_us):
             raise ValueError("a heartbeat without a lateness")
-        return cls(parse_time(found.begin_ns), t, late)
 
     def lateness(self, begin_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Median and 99th percentile of it in [begin, end], seconds; None if it is not known."""
@@ -146,8 +103,7 @@ class Beats:
         return np.asarray(late[(t >= begin) & (t - late <= end)] / 1e6)
 
 
-@dataclass(frozen=True)
-class Calibration:
+class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The kit measured against itself at the begin of a run; see :mod:`~.calibration`.
 
     :param sent: messages, each at a known instant.
@@ -157,22 +113,10 @@ class Calibration:
         one meanwhile, microseconds.
     """
 
-    sent: int = 0
-    delay_us: list[int] = field(default_factory=list)
-    late_us: list[int] = field(default_factory=list)
-    clock_us: int = 0
-
-    @classmethod
-    def parse(cls, text: str) -> Calibration | None:
-        """Parse the record's content; None for an empty text.
-
-        :raises TypeError, ValueError, TraceUnsupported: it is damaged.
-        """
-        if not text:
-            return None
-        found = cls(**_json(text))
-        delays, late = ([parse_time(t) for t in x] for x in (found.delay_us, found.late_us))
-        return cls(parse_time(found.sent), delays, late, parse_time(found.clock_us))
+    sent: Time = 0
+    delay_us: list[Time] = []
+    late_us: list[Time] = []
+    clock_us: Time = 0
 
     @property
     def time_error(self) -> float | None:
@@ -198,7 +142,6 @@ class Stimulus:
     :param waits: how long the hands' processes waited for a processor; None where it was not
         measured.
     :param virtual: whether the run was on a virtual clock, which is never late.
-    :param planned: which stimuli the run was to apply; None in recordings of earlier versions.
     """
 
     phases: list[Phase] = field(default_factory=list)
@@ -208,7 +151,6 @@ class Stimulus:
     calibration: Calibration | None = None
     waits: Waits | None = None
     virtual: bool = False
-    planned: Planned | None = None
 
     def time_error(self, begin_ns: int, end_ns: int) -> float | None:
         """The kit's error of a time in [begin, end], seconds; None if it is not known.
@@ -224,101 +166,91 @@ class Stimulus:
 
     def to_metadata(self) -> dict[str, str]:
         """The record's content."""
-        return {
-            "version": str(VERSION),
-            "phases": json.dumps(
-                [
-                    {
-                        "name": p.name,
-                        "sides": [str(s) for s in p.sides],
-                        "begin_ns": p.begin_ns,
-                        "end_ns": p.end_ns,
-                        "targets": {
-                            str(s): {str(i): q for i, q in joints.items()}
-                            for s, joints in p.targets.items()
-                        },
-                        "params": p.params,
-                        "observed": p.observed,
-                    }
-                    for p in self.phases
-                ]
-            ),
-            "objects": json.dumps({str(s): q for s, q in self.objects.items()}),
-            "stalls": json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls]),
-            "beats": json.dumps(asdict(self.beats)),
-            **({"calibration": json.dumps(asdict(self.calibration))} if self.calibration else {}),
-            **({"waits": self.waits.as_text()} if self.waits is not None else {}),
-            **({"clock": _VIRTUAL} if self.virtual else {}),
-            **({"planned": self.planned.as_text()} if self.planned is not None else {}),
-        }
+        record = _Record(
+            version=1,
+            phases=[from_object(phase, _PhaseRecord) for phase in self.phases],
+            objects={str(side): place for side, place in self.objects.items()},
+            stalls=self.stalls,
+            beats=self.beats,
+            calibration=self.calibration,
+            waits=self.waits,
+            clock="virtual" if self.virtual else None,
+        )
+        return to_metadata(record)
 
     @classmethod
-    def from_metadata(cls, record: Mapping[str, str]) -> Stimulus:
+    def from_metadata(cls, metadata: Mapping[str, str]) -> Stimulus:
         """Parse the record's content.
 
         :raises TraceUnsupported: of another version, or damaged.
         """
-        if record.get("version") != str(VERSION):
-            raise TraceUnsupported(
-                f"stimulus record of version {record.get('version')!r}",
-                hint="judge it with the dexkit that recorded it, or a newer one",
-            )
-        try:
-            phases: list[dict[str, Any]] = _json(record["phases"])
-            return cls(
-                phases=[
-                    Phase(
-                        name=p["name"],
-                        sides=tuple(_subject(s) for s in p["sides"]),
-                        begin_ns=parse_time(p["begin_ns"]),
-                        end_ns=parse_time(p["end_ns"]),
-                        targets={_subject(s): _joints(q) for s, q in p["targets"].items()},
-                        params=dict(p["params"]),
-                        observed=dict(p["observed"]),
-                    )
-                    for p in phases
-                ],
-                objects={
-                    _subject(s): None if q is None else float(q)
-                    for s, q in _json(record["objects"]).items()
-                },
-                stalls=parse_stalls(record["stalls"]),
-                beats=Beats.parse(record.get("beats", "{}")),
-                calibration=Calibration.parse(record.get("calibration", "")),
-                waits=Waits.parse(record["waits"]) if "waits" in record else None,
-                virtual=record.get("clock") == _VIRTUAL,
-                planned=Planned.parse(record["planned"]) if "planned" in record else None,
-            )
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise TraceUnsupported(f"the stimulus record is damaged ({error})") from error
+        record = from_metadata(metadata, _Record, "the stimulus record")
+        return cls(
+            phases=[
+                Phase(
+                    p.name,
+                    tuple(_subject(s) for s in p.sides),
+                    p.begin_ns,
+                    p.end_ns,
+                    {_subject(side): targets for side, targets in p.targets.items()},
+                    p.params,
+                    p.observed,
+                )
+                for p in record.phases
+            ],
+            objects={_subject(side): place for side, place in record.objects.items()},
+            stalls=record.stalls,
+            beats=record.beats,
+            calibration=record.calibration,
+            waits=record.waits,
+            virtual=record.clock == "virtual",
+        )
+
+
+class _PhaseRecord(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    sides: tuple[SubjectName, ...]
+    begin_ns: Time
+    end_ns: Time
+    targets: dict[SubjectName, dict[int, float]]
+    params: dict[str, str]
+    observed: dict[str, float | None]
+
+
+class _Record(msgspec.Struct, omit_defaults=True):
+    version: Literal[1]
+    phases: list[_PhaseRecord]
+    objects: dict[SubjectName, float | None]
+    stalls: list[Stall]
+    beats: Beats
+    calibration: Calibration | None = None
+    waits: Waits | None = None
+    clock: Literal["virtual"] | None = None
 
 
 def _subject(name: str) -> Subject:
-    return ROBOT if name in (ROBOT.value, _EARLIER_ROBOT) else Side(name)
+    return ROBOT if name == ROBOT.value else Side(name)
 
 
-def _joints(value: Any) -> dict[int, float]:
-    """Targets by joint; a bare number, as the first recordings have it, is the only joint's."""
-    if isinstance(value, dict):
-        return {int(i): float(q) for i, q in value.items()}
-    return {0: float(value)}
+def to_metadata(record: object) -> dict[str, str]:
+    """A record as metadata of a recording: the JSON of each of its members."""
+    return {name: json.dumps(value) for name, value in as_plain(record).items()}
 
 
-def parse_stalls(text: str) -> list[Stall]:
-    """Read the stalls of a record.
+def from_metadata(metadata: Mapping[str, str], kind: type[T], origin: str) -> T:
+    """The record that :func:`to_metadata` gave.
 
-    :raises TypeError, ValueError, TraceUnsupported: it is damaged.
+    :raises TraceUnsupported: of another version, or damaged.
     """
-    return [Stall(parse_time(a), parse_time(b)) for a, b in _json(text)]
-
-
-def parse_time(value: Any) -> int:
-    """A time or a duration, nanoseconds or microseconds."""
-    if isinstance(value, bool) or not isinstance(value, int) or not -_LATEST <= value <= _LATEST:
-        raise ValueError(f"{value!r} is not a time")
-    return value
-
-
-def _json(text: str) -> Any:
-    # measured values may be NaN
-    return parse_json(text, "the stimulus record", error=TraceUnsupported, finite=False)
+    if metadata.get("version") != "1":
+        raise TraceUnsupported(
+            f"{origin} is of version {metadata.get('version')!r}",
+            hint="judge it with the dexkit that recorded it, or a newer one",
+        )
+    damaged = f"{origin} is damaged"
+    plain = {
+        # measured values may be NaN
+        name: parse_json(text, damaged, error=TraceUnsupported, finite=False)
+        for name, text in metadata.items()
+    }
+    return to_record(plain, kind, damaged, error=TraceUnsupported)

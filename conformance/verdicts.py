@@ -339,7 +339,7 @@ class Judgement:
             observed=outcome.observed,
             reason=outcome.reason,
             evidence=outcome.evidence[:MOST_PLACES],
-            values=outcome.values,
+            values={name: float(value) for name, value in outcome.values.items()},
             cause=cause if verdict in (Verdict.FAIL, Verdict.WARN) else "",
             blocked_by=blocked_by,
             joints=outcome.joints,

@@ -40,7 +40,7 @@ def to_record(
     :param hint: what to do then.
     """
     try:
-        return msgspec.convert(value, kind, strict=not texts, dec_hook=_from_text)
+        return msgspec.convert(value, kind, strict=not texts, str_keys=True, dec_hook=_from_text)
     except _WRONG as why:
         text = str(why).replace("`", "")
         if place := _PLACE.search(str(why)):
@@ -55,13 +55,22 @@ def from_object(value: object, kind: type[T]) -> T:
 
 def as_plain(record: object) -> Any:
     """The record as plain data, as JSON has it."""
-    return msgspec.to_builtins(record, enc_hook=str)
+    return msgspec.to_builtins(record, enc_hook=_to_plain)
 
 
 def json_schema(kind: type) -> dict[str, Any]:
     """The JSON schema of a type."""
     schema = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "string"})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _to_plain(value: object) -> float | str:
+    """A value of a class that is a number or a text, such as NumPy's floats."""
+    if isinstance(value, float):
+        return float(value)
+    if isinstance(value, str):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} is no part of a record")
 
 
 def _from_text(kind: Any, value: Any) -> Any:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -112,7 +113,12 @@ MANY_SHORT = waits(*[4_000] * 200)
         (FIELD, failure(1.1, 1.2), waits(*[100_000] * 200), False),
         (RATE, failure(1.1, 1.2).if_late(float("inf"), how="mean"), MANY_SHORT, False),
         # those of the other hand do not count
-        (GAP, failure(1.1, 1.3).if_late(0.1), replace(ONE_LONG, processes=[]), False),
+        (
+            GAP,
+            failure(1.1, 1.3).if_late(0.1),
+            msgspec.structs.replace(ONE_LONG, processes=[]),
+            False,
+        ),
         (GAP, failure(1.1, 1.3).if_late(0.1), waits(*[150_000] * 200, side=Side.RIGHT), False),
     ],
 )
@@ -147,12 +153,12 @@ def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
     """Three of its threads compute on two processors: each waits for the others of its own."""
     busy = [2 * SAMPLE_US] * 200
     slow = failure(0.5, 1.5).if_late(0.004, how="mean")
-    own = replace(MANY_SHORT, busy_us=busy, own_us=[round(1.8 * SAMPLE_US)] * 200)
-    others = replace(MANY_SHORT, busy_us=busy, own_us=[SAMPLE_US // 5] * 200)
+    own = msgspec.structs.replace(MANY_SHORT, busy_us=busy, own_us=[round(1.8 * SAMPLE_US)] * 200)
+    others = msgspec.structs.replace(MANY_SHORT, busy_us=busy, own_us=[SAMPLE_US // 5] * 200)
     assert excuse(Machine(others), RATE, slow, Side.LEFT).excused
     assert not excuse(Machine(own), RATE, slow, Side.LEFT).excused
     assert own.others(0, 10**9) == pytest.approx(0.1)  # on processors whose number is not known
-    assert replace(own, busy_us=[0] * 200).others(0, 10**9) == 0.0
+    assert msgspec.structs.replace(own, busy_us=[0] * 200).others(0, 10**9) == 0.0
     assert MANY_SHORT.others(0, 10**9) == 1.0  # not known
 
 
@@ -170,7 +176,7 @@ def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
     ],
 )
 def test_part_of_the_waits_that_other_programs_cause(own: float, busy: float, part: float) -> None:
-    found = replace(
+    found = msgspec.structs.replace(
         MANY_SHORT,
         busy_us=[round(2 * busy * SAMPLE_US)] * 200,
         own_us=[round(2 * own * SAMPLE_US)] * 200,
@@ -184,7 +190,7 @@ def test_more_work_of_others_causes_more_of_the_waits(
     own: float, others: float, more: float
 ) -> None:
     def part(work: float) -> float:
-        return replace(
+        return msgspec.structs.replace(
             MANY_SHORT,
             busy_us=[round((own + work) * SAMPLE_US)] * 200,
             own_us=[round(own * SAMPLE_US)] * 200,
@@ -229,7 +235,7 @@ def test_longer_waits_excuse_more_and_larger_failures_are_excused_less(
 def test_delay_is_at_most_the_time_that_passed(waited: list[int], begin: float) -> None:
     """Threads that wait side by side do not wait longer than the clock runs."""
     found = waits(*(5 * x for x in waited), longest=SAMPLE_US)
-    two = replace(found, processes=found.processes * 2)
+    two = msgspec.structs.replace(found, processes=found.processes * 2)
     delays = two.delays(Side.LEFT, round(begin * 1e9), round(begin * 1e9) + 10**8)
     assert len(delays) <= 12
     assert (delays <= SAMPLE_US / 1e6).all()
@@ -242,7 +248,7 @@ def with_waits(trace: MemoryTrace, found: Waits | None) -> Recording:
     """The recording, with what its left hand's process waited from its first sample on."""
     stimulus = Stimulus.from_metadata(trace.metadata[RECORD])
     first = min(row[0] for rows in trace.rows.values() for row in rows)
-    stimulus.waits = None if found is None else replace(found, begin_ns=first)
+    stimulus.waits = None if found is None else msgspec.structs.replace(found, begin_ns=first)
     trace.metadata[RECORD] = stimulus.to_metadata()
     return Recording.decode(trace)
 
@@ -295,7 +301,9 @@ def test_failure_that_load_cannot_cause_fails_on_a_busy_machine(
 
 
 def test_record_keeps_waits() -> None:
-    found = replace(waits(1, 2, 30, begin_ns=5), busy_us=[1, 0, 2], own_us=[0, 0, 1])
+    found = msgspec.structs.replace(
+        waits(1, 2, 30, begin_ns=5), busy_us=[1, 0, 2], own_us=[0, 0, 1]
+    )
     stimulus = Stimulus(waits=found)
     assert Stimulus.from_metadata(stimulus.to_metadata()).waits == stimulus.waits
     assert Stimulus.from_metadata(Stimulus().to_metadata()).waits is None

@@ -9,16 +9,16 @@ can be judged.
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
-from dexkit.conformance.processor_waits import Waits
-from dexkit.conformance.stimulus_record import Beats, Stall, parse_stalls, parse_time
+import msgspec
+
+from dexkit.conformance.processor_waits import Time, Waits
+from dexkit.conformance.stimulus_record import Beats, Stall, from_metadata, to_metadata
 from dexkit.conformance.usb import RECORD
-from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
 
@@ -35,7 +35,6 @@ __all__ = [
     "topic",
 ]
 
-VERSION = 1
 SCHEMA_NAME = "dexkit_usb/msg/Transfer"
 SCHEMA = """\
 # One bulk transfer as the host saw it. Log time: when it was done; publish time: when submitted.
@@ -117,8 +116,8 @@ class UsbPhase:
     """
 
     name: str
-    begin_ns: int
-    end_ns: int = 0
+    begin_ns: Time
+    end_ns: Time = 0
     params: dict[str, Any] = field(default_factory=dict)
 
 
@@ -153,71 +152,72 @@ class UsbRecord:
 
     def to_metadata(self) -> dict[str, str]:
         """Encode it for the metadata: JSON by side."""
-        record = {"version": str(VERSION)}
-        for side, part in self.sides.items():
-            plain = asdict(part)
-            descriptors = part.descriptors
-            plain["descriptors"] = {
-                "device": descriptors.device.hex(),
-                "configuration": descriptors.configuration.hex(),
-                "strings": {str(i): text for i, text in descriptors.strings.items()},
-                "speed": descriptors.speed,
-            }
-            record[str(side)] = json.dumps(plain)
-        record["stalls"] = json.dumps([[s.begin_ns, s.end_ns] for s in self.stalls])
-        record["beats"] = json.dumps(asdict(self.beats))
-        if self.waits is not None:
-            record["waits"] = self.waits.as_text()
-        return record
+        sides = {str(side): _side_record(part) for side, part in self.sides.items()}
+        record = _Record(version=1, stalls=self.stalls, beats=self.beats, waits=self.waits, **sides)
+        return to_metadata(record)
 
     @classmethod
-    def from_metadata(cls, record: Mapping[str, str]) -> UsbRecord:
+    def from_metadata(cls, metadata: Mapping[str, str]) -> UsbRecord:
         """Read it back.
 
         :raises TraceUnsupported: of another version, or damaged.
         """
-        if record.get("version") != str(VERSION):
-            raise TraceUnsupported(
-                f"USB record of version {record.get('version')!r}",
-                hint="judge it with the dexkit that recorded it, or a newer one",
-            )
-        try:
-            found = cls(
-                stalls=parse_stalls(record["stalls"]),
-                beats=Beats.parse(record.get("beats", "{}")),
-                waits=Waits.parse(record["waits"]) if "waits" in record else None,
-            )
-            for side in Side:
-                if str(side) in record:
-                    found.sides[side] = _side(_json(record[str(side)]))
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise TraceUnsupported(f"the USB record is damaged ({error})") from error
+        record = from_metadata(metadata, _Record, "the USB record")
+        found = cls(stalls=record.stalls, beats=record.beats, waits=record.waits)
+        for side, part in ((Side.LEFT, record.left), (Side.RIGHT, record.right)):
+            if part is not None:
+                found.sides[side] = _side(part)
         return found
 
 
-def _side(plain: dict[str, Any]) -> SideRecord:
-    descriptors = plain["descriptors"]
-    return SideRecord(
-        descriptors=Descriptors(
-            device=bytes.fromhex(descriptors["device"]),
-            configuration=bytes.fromhex(descriptors["configuration"]),
-            strings={int(i): str(text) for i, text in descriptors["strings"].items()},
-            speed=int(descriptors["speed"]),
+Hex = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{2})*$")]
+
+
+class _DescriptorsRecord(msgspec.Struct, forbid_unknown_fields=True):
+    device: Hex
+    configuration: Hex
+    strings: dict[int, str]
+    speed: int
+
+
+class _SideRecord(msgspec.Struct, forbid_unknown_fields=True):
+    descriptors: _DescriptorsRecord
+    buses: list[tuple[int, int]]
+    phases: list[UsbPhase]
+    trouble: str
+
+
+class _Record(msgspec.Struct, omit_defaults=True):
+    version: Literal[1]
+    stalls: list[Stall]
+    beats: Beats
+    waits: Waits | None = None
+    left: _SideRecord | None = None
+    right: _SideRecord | None = None
+
+
+def _side_record(part: SideRecord) -> _SideRecord:
+    device = part.descriptors
+    return _SideRecord(
+        _DescriptorsRecord(
+            device.device.hex(), device.configuration.hex(), dict(device.strings), device.speed
         ),
-        buses=[(int(bus), int(number)) for bus, number in plain["buses"]],
-        phases=[
-            UsbPhase(
-                str(p["name"]),
-                parse_time(p["begin_ns"]),
-                parse_time(p["end_ns"]),
-                dict(p["params"]),
-            )
-            for p in plain["phases"]
-        ],
-        trouble=plain["trouble"],
+        part.buses,
+        part.phases,
+        part.trouble,
     )
 
 
-def _json(text: str) -> Any:
-    # measured values may be NaN
-    return parse_json(text, "the USB record", error=TraceUnsupported, finite=False)
+def _side(record: _SideRecord) -> SideRecord:
+    device = record.descriptors
+    return SideRecord(
+        Descriptors(
+            bytes.fromhex(device.device),
+            bytes.fromhex(device.configuration),
+            device.strings,
+            device.speed,
+        ),
+        record.buses,
+        record.phases,
+        record.trouble,
+    )

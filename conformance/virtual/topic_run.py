@@ -21,7 +21,7 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.stimulus_record import RECORD, Planned, Stimulus
+from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.conformance.virtual.service import Sample, TopicDevice
 from dexkit.hand import Subject
@@ -187,8 +187,7 @@ def run_virtual(plan: Plan[Subject], service_class: type[TopicDevice]) -> Memory
     script = script_for(plan)
     play(script, player.carry_out)
     objects = {s: plan.objects.get(s) for s in plan.sides}
-    planned = Planned(plan.phases, plan.rounds)
-    stimulus = Stimulus(phases=script.phases, objects=objects, virtual=True, planned=planned)
+    stimulus = Stimulus(phases=script.phases, objects=objects, virtual=True)
     player.trace.metadata[RECORD] = stimulus.to_metadata()
     service_class.recorded(player.trace)
     return player.trace
