@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from dexkit.cli.mutants import command
 from dexkit.conformance.faults import generated, outsiders
+from dexkit.conformance.faults.__main__ import command
 from dexkit.conformance.faults.generated import Fault, Generated, dialects, oracle, parse
 from dexkit.conformance.faults.generated.campaign import Campaign, Trial, try_generated
 from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
@@ -21,7 +21,7 @@ from dexkit.conformance.faults.generated.rig import Part, What, compose
 from dexkit.conformance.faults.generated.stimulus import play_order, random_segments
 from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import Level, catalogue
+from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.selection import RunKind
 from dexkit.conformance.virtual import Service
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
@@ -348,17 +348,6 @@ def documented_example() -> str:
     return str(example)
 
 
-def test_the_document_says_which_areas_a_model_has_not() -> None:
-    table = DOCUMENT.read_text().partition("| model | prefix | has not |\n")[2]
-    rows = [line.strip("| ").split(" | ") for line in table.partition("\n\n")[0].splitlines()[1:]]
-    ids = [tuple(r.id.split("-")[:2]) for r in catalogue() if r.level is not Level.INFO]
-    areas = {area for _, area in ids}
-    assert {prefix for _, prefix, _ in rows} == {prefix for prefix, _ in ids}
-    for _, prefix, absent in rows:
-        has = {area for of, area in ids if of == prefix}
-        assert set(absent.split(", ")) == areas - has, prefix
-
-
 def test_the_documented_example_is_loaded(tmp_path: Path) -> None:
     (tmp_path / "grippers.py").write_text(documented_example())
     loaded = outsiders.load(str(tmp_path / "grippers.py"))
@@ -484,19 +473,6 @@ def digest_of_the_code() -> str:
     files = (f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file())
     code = sorted(f for f in files if f.suffix in {".py", ".toml"})
     return hashlib.sha256(b"".join(f.name.encode() + f.read_bytes() for f in code)).hexdigest()
-
-
-def test_the_digest_of_the_code_depends_on_the_requirements(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "conformance" / "requirements"
-    folder.mkdir(parents=True)
-    monkeypatch.setitem(globals(), "ROOT", tmp_path)
-    (folder / "a.toml").write_text("limit = 1")
-    before = digest_of_the_code()
-    assert digest_of_the_code() == before
-    (folder / "a.toml").write_text("limit = 2")
-    assert digest_of_the_code() != before
 
 
 @pytest.mark.soak

@@ -87,12 +87,6 @@ def test_wrong_hand_fails_its_requirement(given: Mutant) -> None:
     assert try_one(given, short=True) == WrongHandResult(given), given.summary
 
 
-@pytest.mark.soak
-@pytest.mark.parametrize("given", mutants(), ids=name_of)
-def test_wrong_hand_fails_only_its_requirements(given: Mutant) -> None:
-    assert try_one(given) == WrongHandResult(given), given.summary
-
-
 def test_every_must_has_a_wrong_hand() -> None:
     musts = {r.id for r in catalogue(None, None) if r.level is Level.MUST}
     assert {t.kills for t in ESSENTIAL} == musts

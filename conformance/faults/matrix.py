@@ -121,7 +121,7 @@ def _blamed(key: tuple[str, str, str]) -> set[str]:
     return blamed(with_key(key))
 
 
-def ignore_interrupts() -> None:
+def _ignore_interrupts() -> None:
     """Ignore Ctrl-C, which goes to every process of the terminal; the first ends the others."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -135,7 +135,7 @@ def in_processes(
     :param stop: ends it early when it becomes true.
     :param jobs: processes; one per processor by default.
     """
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), ignore_interrupts)
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _ignore_interrupts)
     try:
         waiting = {pool.submit(work, one): one for one in given}
         while waiting and not stop:

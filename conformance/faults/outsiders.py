@@ -10,20 +10,18 @@ import gc
 import importlib.util
 import inspect
 import json
-import multiprocessing
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 from rich.markup import escape
 
-from dexkit.conformance.faults.matrix import ignore_interrupts
+from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.hands import under_test
@@ -282,19 +280,12 @@ def try_all(
     :param jobs: processes; one per processor by default.
     :raises ConformanceError: a hand ended its process.
     """
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, ignore_interrupts)
     try:
-        waiting = {pool.submit(_try_one, source, index): index for index in range(count)}
-        while waiting and not stop:
-            for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
-                yield waiting.pop(future), future.result()
+        yield from in_processes(partial(_try_one, source), range(count), stop, jobs)
     except BrokenProcessPool:
         raise ConformanceError(
             "the code of a hand ended its worker process", hint="--jobs 1 shows after which hand"
         ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 _loaded = cache(load)

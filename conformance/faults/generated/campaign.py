@@ -9,11 +9,9 @@ hand must not be blamed for anything.
 from __future__ import annotations
 
 import json
-import multiprocessing
-import signal
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from dexkit.conformance.catch_rates import wilson
 from dexkit.conformance.faults.generated import Generated, parse
 from dexkit.conformance.faults.generated.oracle import Opinion, Severity, examine, shortest
 from dexkit.conformance.faults.generated.rig import Faulty
+from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.outsiders import blame
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.requirements import catalogue
@@ -148,13 +147,8 @@ def judged(trial: Trial, service: type[Faulty], plan: Plan[Subject], run: RunKin
     return replace(trial, failed=failed, warned=warned, errors=errors)
 
 
-def _work(name: str, seed: int, run: RunKind) -> dict[str, Any]:
-    return asdict(try_generated(parse(name), seed, run))
-
-
-def _ignore_interrupts() -> None:
-    # Ctrl-C goes to every process of the terminal; the first one ends the others
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _work(name: str, seed: int, run: RunKind) -> Trial:
+    return try_generated(parse(name), seed, run)
 
 
 @dataclass
@@ -186,17 +180,9 @@ class Campaign:
                 self.trials.append(done[hand.name])
                 yield self.trials[-1]
         todo = [h for h in hands if h.name not in done]
-        pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _ignore_interrupts)
-        try:
-            waiting = {pool.submit(_work, h.name, self.seed, self.kind) for h in todo}
-            while waiting and not stop:
-                ready = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done
-                waiting -= ready
-                for future in ready:
-                    yield self._add(Trial.from_dict(future.result()))
-        finally:
-            # not as a context manager, which would run the waiting trials
-            pool.shutdown(cancel_futures=True)
+        work = partial(_work, seed=self.seed, run=self.kind)
+        for _, trial in in_processes(work, (h.name for h in todo), stop, jobs):
+            yield self._add(trial)
 
     def _add(self, trial: Trial) -> Trial:
         self.trials.append(trial)
