@@ -87,3 +87,20 @@ def test_what_the_examples_import_from_dexkit_exists() -> None:
                         missing.append(f"{path.name}: from {node.module} import {name.name}")
     assert seen > 20
     assert not missing, "\n".join(missing)
+
+
+def test_every_option_in_the_text_of_the_documents_exists() -> None:
+    wrong = []
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        for shown in re.finditer(r"`(?:sudo )?dexkit ([a-z][^`]*)`", path.read_text("utf-8")):
+            command: click.Command | None = cli
+            words = shown[1].replace("|", " ").split()
+            while words and isinstance(command, click.Group):
+                command = command.get_command(click.Context(command), words.pop(0).rstrip(","))
+            if command is None:
+                wrong.append(f"{path.name}: {shown[0]}")
+                continue
+            known = {o for p in command.params for o in (*p.opts, *p.secondary_opts)} | {"--help"}
+            given = {re.split("[=,]", word)[0] for word in words if word.startswith("--")}
+            wrong += [f"{path.name}: {shown[0]}: {option}" for option in given - known]
+    assert not wrong, "\n".join(wrong)

@@ -204,7 +204,6 @@ def page() -> str:
     """The Markdown of docs/sources/real-hands.md."""
     sources, hands = read()
     numbers = {key: number for number, key in enumerate(sources, 1)}
-    facts = [fact for hand in hands for fact in hand.facts]
     lines = [
         "# Sources: what real hands show",
         "",
@@ -223,18 +222,7 @@ def page() -> str:
         "| disputed | reports of real hands differ |",
         "| no evidence | none was found: the fact rests on documents, on code, or on inference |",
         "",
-        '<a id="figures"></a>',
-        "",
-        "## In figures",
-        "",
-        "| hand | facts | " + " | ".join(VERDICTS) + " |",
-        "| --- | --- |" + " --- |" * len(VERDICTS),
     ]
-    for title, own in [*((hand.title, hand.facts) for hand in hands), ("all", facts)]:
-        counted = Counter(fact.verdict for fact in own)
-        figures = " | ".join(str(counted[verdict]) for verdict in VERDICTS)
-        lines.append(f"| {title} | {len(own)} | {figures} |")
-    lines.append("")
     for hand in hands:
         lines += _facts(hand, numbers)
     lines += [
@@ -274,8 +262,18 @@ def bases() -> str:
         "| --- | --- |" + " --- |" * (len(BASES) + len(VERDICTS) + 1),
         *_count_rows(catalogue(None, None)),
         "",
+        "## Facts about real hands",
+        "",
+        "| hand | facts | " + " | ".join(VERDICTS) + " |",
+        "| --- | --- |" + " --- |" * len(VERDICTS),
     ]
-    return "\n".join(lines)
+    hands = read()[1]
+    facts = [fact for hand in hands for fact in hand.facts]
+    for title, own in [*((hand.title, hand.facts) for hand in hands), ("all", facts)]:
+        counted = Counter(fact.verdict for fact in own)
+        figures = " | ".join(str(counted[verdict]) for verdict in VERDICTS)
+        lines.append(f"| {title} | {len(own)} | {figures} |")
+    return "\n".join(lines) + "\n"
 
 
 def files() -> dict[Path, str]:
