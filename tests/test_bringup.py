@@ -314,7 +314,7 @@ def test_bringup_resumes_where_it_was(tmp_path: Path) -> None:
 
 @each("document", [{"motors": 1}, {"motors": {"0.0": {}}}, {"travel": {"x": {"ratio": "y"}}}])
 def test_damaged_findings_are_refused(document: dict[str, object]) -> None:
-    with pytest.raises(UsageError, match="cannot read the findings"):
+    with pytest.raises(UsageError, match="the findings of a bring-up: "):
         Findings.from_document(document, {})
 
 

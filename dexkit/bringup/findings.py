@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dexkit.errors import UsageError
+import msgspec
+
+from dexkit.records import as_plain, to_record
 
 __all__ = ["Findings", "MotorFound", "TravelFound"]
 
@@ -20,6 +22,10 @@ class MotorFound:
 
     joint: str
     sign: int
+
+    def __post_init__(self) -> None:
+        if self.sign not in (1, -1):
+            raise ValueError(f"the sign {self.sign}")
 
 
 @dataclass(frozen=True)
@@ -60,11 +66,8 @@ class Findings:
 
     def to_document(self) -> dict[str, Any]:
         """Everything but the answers, for a JSON file."""
-        return {
-            "motors": {address: vars(found) for address, found in self.motors.items()},
-            "travel": {joint: vars(found) for joint, found in self.travel.items()},
-            "sensors": dict(self.sensors),
-        }
+        document: dict[str, Any] = as_plain(_Details(self.motors, self.travel, self.sensors))
+        return document
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], answers: Mapping[str, str]) -> Findings:
@@ -72,30 +75,12 @@ class Findings:
 
         :raises UsageError: it is something else.
         """
-        try:
-            return cls(
-                {
-                    str(a): MotorFound(str(m["joint"]), {1: 1, -1: -1}[m["sign"]])
-                    for a, m in document.get("motors", {}).items()
-                },
-                {
-                    str(j): TravelFound(
-                        float(t["ratio"]),
-                        float(t["offset"]),
-                        float(t["low"]),
-                        float(t["high"]),
-                        bool(t["confirmed"]),
-                    )
-                    for j, t in document.get("travel", {}).items()
-                },
-                {
-                    str(p): None if a is None else str(a)
-                    for p, a in document.get("sensors", {}).items()
-                },
-                dict(answers),
-            )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise UsageError(
-                f"cannot read the findings of a bring-up: {type(error).__name__}: {error}",
-                hint="start again: dexkit bringup ... --restart",
-            ) from error
+        hint = "start again: dexkit bringup ... --restart"
+        found = to_record(document, _Details, "the findings of a bring-up", hint=hint)
+        return cls(found.motors, found.travel, found.sensors, dict(answers))
+
+
+class _Details(msgspec.Struct):
+    motors: dict[str, MotorFound] = {}
+    travel: dict[str, TravelFound] = {}
+    sensors: dict[str, str | None] = {}

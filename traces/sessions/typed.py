@@ -6,16 +6,13 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from dexkit import records
 from dexkit.documents import parse_json
 from dexkit.errors import SessionError
-from dexkit.escaping import one_line
 
 __all__ = ["Count", "Rate", "Vector", "parse_record", "to_record", "typed"]
 
 T = TypeVar("T")
-
-# UnicodeError: JSON can hold half a surrogate pair, where msgspec expects another type than a text
-_WRONG = (msgspec.ValidationError, RecursionError, UnicodeError)
 
 MOST_JOINTS = 1024
 """Elements of a vector; robots have less than a hundred."""
@@ -37,21 +34,13 @@ def parse_record(text: str, kind: type[T], origin: object) -> T:
 
 
 def to_record(value: Any, kind: type[T], origin: object, *, texts: bool = False) -> T:
-    """A value of the JSON types as a record.
-
-    :param origin: what to call it.
-    :param texts: numbers may stand in texts.
-    :raises SessionError: it is of another form; with the place in the document.
-    """
-    try:
-        return msgspec.convert(value, kind, strict=not texts)
-    except _WRONG as error:
-        raise SessionError(f"{origin}: {one_line(error)}") from error
+    """As :func:`dexkit.records.to_record`, with the error of a session."""
+    return records.to_record(value, kind, origin, texts=texts, error=SessionError)
 
 
 def typed(value: Any, kind: type[T]) -> T | None:
     """The value as a record, number or list of that type; None if it is of another form."""
     try:
-        return msgspec.convert(value, kind)
-    except _WRONG:
+        return to_record(value, kind, "it")
+    except SessionError:
         return None

@@ -9,11 +9,10 @@ hand must not be blamed for anything.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -32,6 +31,7 @@ from dexkit.console import Console
 from dexkit.documents import parse_json, read_text, write_file
 from dexkit.errors import UsageError
 from dexkit.hand import Subject
+from dexkit.records import to_record
 
 __all__ = ["Campaign", "Trial", "graded", "judged", "try_generated"]
 
@@ -61,17 +61,6 @@ class Trial:
     failed: tuple[str, ...] = ()
     warned: tuple[str, ...] = ()
     errors: tuple[str, ...] = ()
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Trial:
-        """Read it back from JSON.
-
-        :raises TypeError: it is no trial.
-        """
-        fields: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in values.items()
-        }
-        return cls(**fields)
 
     @property
     def counts(self) -> bool:
@@ -203,7 +192,7 @@ class Campaign:
                 seed = values.pop("seed")
                 # files of earlier versions hold default runs only
                 run = values.pop("run", str(RunKind.DEFAULT))
-                trial = Trial.from_dict(values)
+                trial = to_record(values, Trial, f"{self.file}:{number}")
             except (UsageError, TypeError, KeyError, AttributeError) as error:
                 if number == len(lines):
                     break  # the line that was being written when the program was stopped
