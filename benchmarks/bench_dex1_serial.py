@@ -7,6 +7,7 @@ and one process drives both, as one service does.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import math
 import tempfile
@@ -18,7 +19,7 @@ from collections.abc import Callable
 from benchmarks import Result
 from benchmarks.native import compiled
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
-from dexkit.emulators.m4010 import emulated_dex1
+from dexkit.emulators.m4010 import Dex1Process
 from dexkit.hand import HandCommand, Side
 from dexkit.wire import m4010
 from dexkit.wire.m4010 import MotorCmd, MotorData
@@ -114,7 +115,7 @@ def run() -> list[Result]:
     """Measure; about 10 seconds."""
     results = []
     limit = 1 / _LINE_TIME
-    with emulated_dex1("both", process=True) as motors:
+    with contextlib.closing(Dex1Process(["--side=both"])) as motors:
         settings = Dex1Settings(device=motors.path, timeout=0.5)
         with Dex1Serial(Side.LEFT, settings) as left, Dex1Serial(Side.RIGHT, settings) as right:
             for name, hands in (("one motor", [left]), ("two motors on a line", [left, right])):

@@ -127,11 +127,9 @@ def read_json(path: Path, *, error: type[DexkitError] = UsageError, hint: str = 
     return parse_json(read_text(path, error=error, hint=hint), path, error=error, hint=hint)
 
 
-def read_toml(
-    path: Path, *, error: type[DexkitError] = UsageError, hint: str = ""
-) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
     """The document in a TOML file; raises as :func:`read_text` and :func:`parse_toml`."""
-    return parse_toml(read_text(path, error=error, hint=hint), path, error=error, hint=hint)
+    return parse_toml(read_text(path), path)
 
 
 def parse_json(

@@ -77,9 +77,9 @@ def one_line(text: object, longest: int = LONGEST) -> str:
     return shown if shown.isprintable() else _BREAK.sub(_escaped, visible(shown))
 
 
-def html(text: object, quote: bool = True) -> str:
+def html(text: object) -> str:
     """``text`` as HTML or XML that shows just that."""
-    return escape(visible(str(text)), quote)
+    return escape(visible(str(text)))
 
 
 class Guard:

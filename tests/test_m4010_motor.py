@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import select
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from dexkit.cli.emulate import command
 from dexkit.emulators.dex1_mechanics import Dex1Mechanics
 from dexkit.emulators.faults import M4010_FAULTS, parse_fault
-from dexkit.emulators.m4010 import Bus, Dex1Motors, Dex1Process, Firmware, Motor, emulated_dex1
+from dexkit.emulators.m4010 import Bus, Dex1Motors, Dex1Process, Firmware, Motor
 from dexkit.emulators.m4010.motor import LOCKING
 from dexkit.errors import DexkitError, EmulatorError, UsageError
 from dexkit.hand import MotorError, Side
@@ -494,8 +495,7 @@ def test_each_motor_can_have_its_own_line(tmp_path: Path) -> None:
 
 
 def test_faults_are_read_from_input_until_its_end(tmp_path: Path) -> None:
-    with emulated_dex1(process=True) as motors:
-        assert isinstance(motors, Dex1Process)
+    with contextlib.closing(Dex1Process(["--side=left"])) as motors:
         with serial.Serial(motors.path, m4010.BAUD_RATE, timeout=0) as port:
             assert exchange(port, MotorCmd(1)) is not None
             motors.inject("silent")
@@ -542,11 +542,6 @@ def test_invalid_settings_are_refused() -> None:
     ):
         with pytest.raises(UsageError):
             wrong()
-    with (
-        pytest.raises(UsageError, match="thread only"),
-        emulated_dex1(process=True, firmware=Firmware()),
-    ):
-        pass
     with pytest.raises(EmulatorError):
         Dex1Process(["--side=up"])
 

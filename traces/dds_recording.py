@@ -49,6 +49,8 @@ _ENDPOINTS_INTERVAL = 0.25
 # Seconds to wait for discovery of the type of a topic asked for by name; on one machine it takes
 # a few tens of milliseconds.
 _DISCOVERY_WAIT = 0.5
+# Seconds between calls of on_tick.
+_TICK = 0.5
 # Seconds between checks of the thread when no sample wakes it.
 _IDLE = 0.1
 # Seconds by which this thread is late from which on it is told.
@@ -324,26 +326,24 @@ def record_topics(
     recorder: Recorder,
     topics: Iterable[str] | None = None,
     *,
-    types: dict[str, str] | None = None,
     stop: threading.Event | None = None,
     duration: float | None = None,
     on_tick: Callable[[DdsRecording], None] | None = None,
-    tick: float = 0.5,
 ) -> DdsRecording:
     """Record until ``stop`` is set or ``duration`` seconds have passed.
 
-    :param on_tick: called every ``tick`` seconds, in the calling thread.
+    :param on_tick: called twice a second, in the calling thread.
     :returns: the recording, stopped: what it subscribed and what it could not.
     :raises UsageError: neither ``stop`` nor ``duration`` would ever end it.
     """
     if stop is None and duration is None:
         raise UsageError("a recording needs a duration or a stop event")
     stop = stop if stop is not None else threading.Event()
-    recording = DdsRecording(node, recorder, topics, types=types)
+    recording = DdsRecording(node, recorder, topics)
     end = None if duration is None else time.monotonic() + duration
     with recording:
         while recorder.error is None:
-            left = tick if end is None else min(tick, end - time.monotonic())
+            left = _TICK if end is None else min(_TICK, end - time.monotonic())
             if left <= 0 or stop.wait(left):
                 break
             if on_tick is not None:

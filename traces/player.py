@@ -13,9 +13,9 @@ and replay continues where it paused. The same happens when publishing itself ca
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,7 +54,6 @@ class PlayStats:
     error_p50: float
     error_p99: float
     error_max: float
-    per_topic: dict[str, int] = field(default_factory=dict)
     pauses: int = 0
 
 
@@ -147,7 +146,6 @@ class Player:
         clock = clock if clock is not None else RealClock()
         stop = stop if stop is not None else threading.Event()
         errors: deque[float] = deque(maxlen=_MAX_ERRORS)
-        counts: Counter[str] = Counter()
         self.sent = 0
         passes = 0
         line = _TimeLine(clock, stop, paused)
@@ -159,7 +157,6 @@ class Player:
                     break
                 errors.append(late)
                 publish(message)
-                counts[message.topic] += 1
                 self.sent += 1
             else:
                 passes += 1
@@ -175,7 +172,6 @@ class Player:
             error_p50=float(p50),
             error_p99=float(p99),
             error_max=float(worst),
-            per_topic=dict(counts),
             pauses=line.pauses,
         )
 

@@ -533,11 +533,11 @@ def duration_option(
     )
 
 
-def real_time_option(*, default: bool = True) -> Callable[[F], F]:
+def real_time_option() -> Callable[[F], F]:
     """``--real-time/--no-real-time``."""
     return click.option(
         "--real-time/--no-real-time",
-        default=default,
+        default=True,
         show_default=True,
         help="Run before ordinary processes where the system permits it (docs/service.md).",
     )
@@ -576,11 +576,9 @@ def host_option(help: str) -> Callable[[F], F]:
     )
 
 
-def port_option(help: str, default: int | None = None) -> Callable[[F], F]:
+def port_option(help: str) -> Callable[[F], F]:
     """``--port N`` of what is served by TCP; None is the command's own choice."""
-    return click.option(
-        "--port", type=click.IntRange(0, 65535), default=default, metavar="N", help=help
-    )
+    return click.option("--port", type=click.IntRange(0, 65535), metavar="N", help=help)
 
 
 def quiet_option() -> Callable[[F], F]:

@@ -137,10 +137,10 @@ def _by_tcp(address: str, own_address: str, seconds: float, stop: threading.Even
     return found
 
 
-def receive_buffer_limit(path: Path = _RMEM) -> int:
+def receive_buffer_limit() -> int:
     """Bytes that a program may ask for as receive buffer (net.core.rmem_max); 0 if unknown."""
     try:
-        return int(path.read_text())
+        return int(_RMEM.read_text())
     except (OSError, ValueError):
         return 0
 

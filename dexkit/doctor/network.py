@@ -26,9 +26,9 @@ def address_of(interface: str) -> str:
     return interface_address(find_interface(interface))
 
 
-def interfaces(proc: Path = Path("/proc")) -> tuple[Interface, ...]:
+def interfaces() -> tuple[Interface, ...]:
     """Network interfaces of this machine."""
-    joined = _joined(proc)
+    joined = _joined()
     found = []
     for _, name in socket.if_nameindex():
         flags, address = interface_flags(name), interface_address(name)
@@ -45,12 +45,12 @@ def interfaces(proc: Path = Path("/proc")) -> tuple[Interface, ...]:
     return tuple(found)
 
 
-def _joined(proc: Path) -> set[str]:
+def _joined() -> set[str]:
     """Interfaces on which some process has joined the multicast group of discovery."""
     found: set[str] = set()
     name = ""
     with contextlib.suppress(OSError):
-        for line in (proc / "net/igmp").read_text().splitlines()[1:]:
+        for line in Path("/proc/net/igmp").read_text().splitlines()[1:]:
             if not line.startswith("\t"):
                 name = line.split()[1].rstrip(":")
             elif line.split()[0] == _GROUP:
@@ -58,14 +58,14 @@ def _joined(proc: Path) -> set[str]:
     return found
 
 
-def dds_sockets(domains: list[int], proc: Path = Path("/proc")) -> tuple[DdsSocket, ...]:
+def dds_sockets(domains: list[int]) -> tuple[DdsSocket, ...]:
     """Processes of this machine that listen on the ports of a domain, one entry each.
 
     Only domains up to 99 are recognised: the ports of higher ones are also handed out to
     ordinary sockets.
     """
     try:
-        lines = (proc / "net/udp").read_text().splitlines()[1:]
+        lines = Path("/proc/net/udp").read_text().splitlines()[1:]
     except OSError:
         return ()
     ports = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable
 from typing import Any
 
 from dexkit.messages import message_types
@@ -54,14 +53,11 @@ def _plain(topic: str) -> str:
     return text.removeprefix("rt/")
 
 
-def closest_topic(topic: str, among: Iterable[str] = ()) -> tuple[str, str] | None:
-    """The hand topic that an unknown name is nearest to, and the difference.
-
-    :param among: names to choose from; default all hand topics.
-    """
+def closest_topic(topic: str) -> tuple[str, str] | None:
+    """The hand topic that an unknown name is nearest to, and the difference."""
     if split_prefix(topic)[1] in HAND_TOPICS:
         return None
-    names = sorted(among or HAND_TOPICS)
+    names = sorted(HAND_TOPICS)
     plain = _plain(topic)
     for name in names:
         if _plain(name) == plain:

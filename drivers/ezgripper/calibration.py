@@ -54,6 +54,10 @@ SPEED = 60.0
 UNLIMITED = 600.0
 """Percent of stroke a second, faster than the motor can be
 (docs/sources/mx64-ezgripper.md#d1)."""
+_FULL_EFFORT = 100.0
+"""Percent, while speeds are measured."""
+_SETTLE, _AVERAGE = 0.5, 0.3
+"""Seconds of holding until the current has settled, and in which it is averaged."""
 _SEARCH_MARGIN = 1500
 """Ticks beyond one stroke after which the search ends without a stop: the gripper may start open
 wider than its stroke."""
@@ -224,7 +228,6 @@ def find_zero(
     *,
     stroke: int = STROKE,
     effort: float = EFFORT,
-    speed: float = SPEED,
     progress: Progress = _ignore_progress,
     cancelled: Cancelled = _never_cancelled,
 ) -> int:
@@ -243,8 +246,8 @@ def find_zero(
         drive,
         start + mx64.EZGRIPPER_CLOSING * reach,
         effort=effort,
-        speed=speed,
-        timeout=_timeout(reach, speed),
+        speed=SPEED,
+        timeout=_timeout(reach, SPEED),
         cancelled=cancelled,
     )
     if not closing.stopped:
@@ -259,8 +262,8 @@ def find_zero(
         drive,
         zero - mx64.EZGRIPPER_CLOSING * stroke,
         effort=effort,
-        speed=speed,
-        timeout=_timeout(stroke, speed),
+        speed=SPEED,
+        timeout=_timeout(stroke, SPEED),
         cancelled=cancelled,
     )
     travel = abs(opening.end.position - zero)
@@ -283,7 +286,6 @@ def measure_speed(
     zero: int,
     *,
     stroke: int = STROKE,
-    effort: float = 100.0,
     runs: int = 3,
     progress: Progress = _ignore_progress,
     cancelled: Cancelled = _never_cancelled,
@@ -299,8 +301,8 @@ def measure_speed(
     for run in range(runs):
         number = f"run {run + 1} of {runs}"
         for _ in range(_TRIES):
-            opening = _measure_run(drive, zero, stroke, effort, cancelled, stroke)
-            closing = _measure_run(drive, zero, 0, effort, cancelled, stroke)
+            opening = _measure_run(drive, zero, stroke, cancelled, stroke)
+            closing = _measure_run(drive, zero, 0, cancelled, stroke)
             if opening is not None and closing is not None:
                 break
             progress(f"{number}: answers came late, once more")
@@ -327,9 +329,7 @@ def measure_distances(
     drive: Drive,
     zero: int,
     *,
-    distances: Sequence[float] = DISTANCES,
     stroke: int = STROKE,
-    effort: float = 100.0,
     progress: Progress = _ignore_progress,
     cancelled: Cancelled = _never_cancelled,
 ) -> tuple[DistanceResult, DistanceResult]:
@@ -340,17 +340,16 @@ def measure_distances(
     are within a percent of the goal.
 
     :param zero: ticks, in any turn.
-    :param distances: percent of stroke, two at least; each is opened from closed, and closed again.
     :raises CalibrationFailed: the fingers do not complete a move.
     """
     opening: list[tuple[float, float]] = []
     closing: list[tuple[float, float]] = []
     _stroke(drive, zero, 0, effort=EFFORT, speed=SPEED, cancelled=cancelled)
-    for percent in distances:
+    for percent in DISTANCES:
         goal = round(percent * stroke / 100)
         for target, found in ((goal, opening), (0, closing)):
             track = _stroke(
-                drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled
+                drive, zero, target, effort=_FULL_EFFORT, speed=UNLIMITED, cancelled=cancelled
             )
             found.append((percent, _arrival(track, zero, target)))
         progress(
@@ -406,11 +405,11 @@ def _stroke(
 
 
 def _measure_run(
-    drive: Drive, zero: int, target: int, effort: float, cancelled: Cancelled, stroke: int
+    drive: Drive, zero: int, target: int, cancelled: Cancelled, stroke: int
 ) -> float | None:
     """Percent of stroke a second; None where the answers near 10 or 90 % came late."""
     # faster than the motor, so the profile does not limit the speed
-    track = _stroke(drive, zero, target, effort=effort, speed=UNLIMITED, cancelled=cancelled)
+    track = _stroke(drive, zero, target, effort=_FULL_EFFORT, speed=UNLIMITED, cancelled=cancelled)
     points = [
         (s.time, relative_position(s.position, zero))
         for s in track.samples
@@ -438,8 +437,6 @@ def measure_current(
     effort: float,
     holding: Callable[[float], bool],
     *,
-    settle: float = 0.5,
-    average: float = 0.3,
     cancelled: Cancelled = _never_cancelled,
 ) -> float:
     """Close on the gauge between the fingers; return the mean motor current, units of 3.36 mA.
@@ -475,9 +472,9 @@ def measure_current(
             _stop_current(drive, sample)
             raise CalibrationFailed("interrupted")
         held = sample.time - started
-        if settle <= held < settle + average:
+        if _SETTLE <= held < _SETTLE + _AVERAGE:
             currents.append(abs(sample.current))
-        elif held >= settle + average:
+        elif held >= _SETTLE + _AVERAGE:
             mean = sum(currents) / len(currents) if currents else abs(sample.current)
             if not holding(mean):
                 return float(mean)

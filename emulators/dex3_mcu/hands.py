@@ -210,14 +210,12 @@ def emulated_dex3(
     *,
     process: bool = False,
     object_pct: float | None = None,
-    start: float | None = None,
     serials: Sequence[str] = (),
     port: int = 0,
     out_endpoint: int = OUT_ENDPOINT,
     in_endpoint: int = IN_ENDPOINT,
     faults: Sequence[str] = (),
     firmware: Firmware | None = None,
-    seed: int = 0,
 ) -> Iterator[Dex3Hands | Dex3Process]:
     """Emulated Dex3-1 hands at ``.url``, that take faults by ``.inject``.
 
@@ -242,11 +240,9 @@ def emulated_dex3(
                 f"--link=usbip://127.0.0.1:{port}",
                 f"--set=out-endpoint={out_endpoint}",
                 f"--set=in-endpoint={in_endpoint}",
-                f"--set=seed={seed}",
                 *([f"--set=serial={','.join(serials)}"] if serials else []),
                 *(f"--fault={spec}" for spec in faults),
                 *([] if object_pct is None else [f"--set=object={object_pct:g}"]),
-                *([] if start is None else [f"--set=start={start:g}"]),
             ]
         )
     else:
@@ -255,12 +251,10 @@ def emulated_dex3(
             port=port,
             serials=serials,
             object_pct=object_pct,
-            start=start,
             out_endpoint=out_endpoint,
             in_endpoint=in_endpoint,
             faults=faults,
             firmware=firmware,
-            seed=seed,
         )
     try:
         yield hands

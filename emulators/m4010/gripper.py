@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dexkit.clock import RealClock
@@ -17,14 +16,13 @@ from dexkit.emulators.m4010.settings import Firmware
 from dexkit.emulators.m4010.wiring import Wiring
 from dexkit.emulators.process import EmulatorProcess
 from dexkit.emulators.serial_port import Port
-from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.temporary_folder import TemporaryFolder
 
 if TYPE_CHECKING:
     from dexkit.emulators.ftdi import FtdiPort
 
-__all__ = ["Dex1Motors", "Dex1Process", "emulated_dex1"]
+__all__ = ["Dex1Motors", "Dex1Process"]
 
 
 class Dex1Motors:
@@ -221,49 +219,3 @@ class Dex1Process(EmulatorProcess):
         if self._directory is not None:
             self._directory.close()
             self._directory = None
-
-
-@contextlib.contextmanager
-def emulated_dex1(
-    side: Side | str = Side.LEFT,
-    *,
-    process: bool = False,
-    object_pct: float | None = None,
-    start_pct: float = 20.0,
-    faults: Sequence[str] = (),
-    firmware: Firmware | None = None,
-) -> Iterator[Dex1Motors | Dex1Process]:
-    """A motor that answers at ``.path``, or both on one line, and takes faults by ``.inject``.
-
-    :param side: ``left``, ``right`` or ``both``.
-    :param process: run it as ``dexkit emulate dex1-motor`` in a process of its own. A client in
-        the same process competes with the thread for the interpreter, so rates are measured
-        against a process; the motors of a thread can be inspected (``.motor``).
-    :param firmware: only in a thread.
-    :raises EmulatorError: it did not become ready.
-    :raises UsageError: an option is invalid.
-    """
-    found: Dex1Motors | Dex1Process
-    if process:
-        if firmware is not None:
-            raise UsageError("firmware can be given to a thread only")
-        found = Dex1Process(
-            [
-                f"--side={side}",
-                f"--set=start={start_pct:g}",
-                *(f"--fault={spec}" for spec in faults),
-                *([] if object_pct is None else [f"--set=object={object_pct:g}"]),
-            ]
-        )
-    else:
-        found = Dex1Motors(
-            tuple(Side) if side == "both" else (Side(side),),
-            object_pct=object_pct,
-            start_pct=start_pct,
-            faults=faults,
-            firmware=firmware,
-        )
-    try:
-        yield found
-    finally:
-        found.close()

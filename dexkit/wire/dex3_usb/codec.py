@@ -303,8 +303,6 @@ class HandCodec:
         *,
         motors: Sequence[int] | None = None,
         sensors: Sequence[int] | None = None,
-        model: int = 0,
-        timeout: int = 0,
         fans: bytes = bytes(2),
     ) -> bytes:
         """A state frame; on each bus the motors, then the sensors.
@@ -315,7 +313,6 @@ class HandCodec:
 
         :param motors: indices of the motors that answer; all by default.
         :param sensors: likewise of the sensors.
-        :param model: ``mode[0]`` of the frame; ``timeout``: ``mode[1]``.
         :raises EncodeError: NaN in q, dq or tau_est of a motor that answers (leave it out of
             ``motors`` instead), or infinity anywhere.
         """
@@ -349,8 +346,6 @@ class HandCodec:
         return pack_state(
             StateFrame(
                 buses=buses,
-                model=model,
-                timeout=timeout,
                 fans=fans,
                 pin_v=_encode_or_zero(units.VOLTAGE, supply.power_v),
                 vin_v=_encode_or_zero(units.VOLTAGE, supply.system_v),
