@@ -78,9 +78,9 @@ soak: $(STAMP) ## the long tests
 pins: $(STAMP) ## whether each wrong hand and sample is judged as pinned (ARGS="--only dds-dex3-1", ARGS=--update; docs/mutants.md)
 	$(RUN) python -m tools.pins $(ARGS)
 
-campaign: $(STAMP) ## fuzz and fault campaign: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record FRESH=1 (docs/campaign.md)
+campaign: $(STAMP) ## fuzz and fault campaign: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record (docs/campaign.md)
 	$(RUN) python -m tools.campaign $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED)) \
-		$(if $(JOBS),--jobs $(JOBS)) $(if $(ONLY),--only $(ONLY)) $(if $(FRESH),--fresh) $(ARGS)
+		$(if $(JOBS),--jobs $(JOBS)) $(if $(ONLY),--only $(ONLY)) $(ARGS)
 
 campaign-sample: $(STAMP) ## a short form of each case of the campaign, two minutes
 	$(RUN) python -m tools.campaign --sample $(if $(JOBS),--jobs $(JOBS)) $(ARGS)

@@ -20,11 +20,11 @@ from tools.campaign.soak import WatchedProcess
 CORPUS = [b"head" + bytes(12)]
 
 
-def _fuzz(name: str, run: object, size: int = 40_000, hang: float = 2.0) -> FuzzCase:
+def _fuzz(name: str, run: object, hang: float = 2.0) -> FuzzCase:
     def prepare(rng: random.Random, scratch: Path) -> Target:
         return Target(mutator(CORPUS, rng), run)  # type: ignore[arg-type]
 
-    return FuzzCase(name, "a planted fault", prepare, size=size, aim=1, hang=hang)
+    return FuzzCase(name, "a planted fault", prepare, hang=hang)
 
 
 def _typed(data: bytes) -> None:
@@ -69,7 +69,6 @@ CRASH = _fuzz("crash", _crash)
 class _Live(Case):
     what = "a planted fault"
     unit = "runs"
-    aim = 1
 
 
 class LeavesChild(_Live):

@@ -16,12 +16,11 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10: dexkit setup-dds")
 
-from dexkit.errors import UsageError
 from tools.campaign.case import ROOT, Finding
 from tools.campaign.mutate import mutator
 from tools.campaign.process import traceback_in
+from tools.campaign.run import Findings
 from tools.campaign.soak import WatchedProcess, slope
-from tools.campaign.state import State
 
 PLANTED = {
     "BROKEN": "ValueError",
@@ -86,27 +85,19 @@ def test_campaign_finds_planted_faults_and_repeats_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_campaign_resumes_and_has_its_own_exit_code_for_its_own_failure(tmp_path: Path) -> None:
-    two = ("--batches", "2", "--jobs", "1")
-    code, _, errors = run(tmp_path, ["CLEAN"], *two, "--seed", "7")
-    assert code == 0, errors
-    (first,) = result(tmp_path)["cases"]
-    code, output, _ = run(tmp_path, ["CLEAN", "Fails"], *two)
+def test_campaign_has_its_own_exit_code_for_its_own_failure(tmp_path: Path) -> None:
+    code, output, errors = run(tmp_path, ["CLEAN", "Fails"], "--sample", "--seed", "7")
     assert code == 2
-    assert "the campaign is wrong here" in json.dumps(result(tmp_path)["cases"])
+    assert "the campaign is wrong here" in errors
     assert "seed 7" in output
-    second = result(tmp_path)["cases"][0]
-    assert second["batches"] > first["batches"]
-    assert second["units"] > first["units"]
-    code, _, errors = run(tmp_path, ["CLEAN"], *two, "--seed", "8")
-    assert code == 2
-    assert "--fresh" in errors
+    done = {c["name"]: c for c in result(tmp_path / "sample")["cases"]}
+    assert done["tests.campaign_cases::CLEAN"]["units"] > 0
 
 
 def test_sigint_prints_the_table_and_leaves_no_process_or_file(tmp_path: Path) -> None:
     process = start(tmp_path, ["Slow"], "--minutes", "5", "--jobs", "1")
     try:
-        log = tmp_path / "workers.log"
+        log = tmp_path / "batches.log"
         while not (log.exists() and "scratch " in log.read_text()):
             assert process.poll() is None
         scratch = log.read_text().split("scratch ")[1].split()[0]
@@ -128,22 +119,14 @@ def test_sigint_prints_the_table_and_leaves_no_process_or_file(tmp_path: Path) -
 
 
 def test_a_finding_is_kept_once_with_its_input(tmp_path: Path) -> None:
-    state = State(tmp_path, "5")
+    findings = Findings(tmp_path)
     one = Finding("fuzz:x", "ValueError", "a.py:f", "first", "5", 3, 4, "00ff")
-    assert state.add(one)
-    assert not state.add(Finding("fuzz:x", "ValueError", "a.py:f", "second", "5", 9, 9, "11"))
-    assert state.add(Finding("fuzz:x", "ValueError", "a.py:g"))
-    assert (tmp_path / "findings" / f"{one.id}.bin").read_bytes() == b"\x00\xff"
-    state.progress_of("fuzz:x").units = 12
-    state.save()
-    again = State.load(tmp_path, None, fresh=False)
-    assert (again.seed, again.progress_of("fuzz:x").units) == ("5", 12)
-    assert again.findings == state.findings
-    assert again.times[one.id] == 2
-    assert not State.load(tmp_path, "6", fresh=True).findings
-    state.path.write_text("{")
-    with pytest.raises(UsageError, match="cannot be read"):
-        State.load(tmp_path, None, fresh=False)
+    assert findings.add(one)
+    assert not findings.add(Finding("fuzz:x", "ValueError", "a.py:f", "second", "5", 9, 9, "11"))
+    assert findings.add(Finding("fuzz:x", "ValueError", "a.py:g"))
+    assert (tmp_path / f"{one.id}.bin").read_bytes() == b"\x00\xff"
+    assert json.loads((tmp_path / f"{one.id}.json").read_text())["detail"] == "first"
+    assert findings.times[one.id] == 2
 
 
 def test_a_seed_gives_the_same_inputs_again() -> None:

@@ -8,11 +8,10 @@ import random
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 from typing import Any, ClassVar
 
 __all__ = ["Batch", "Case", "Finding", "Lane", "Skip", "place_of"]
@@ -79,7 +78,9 @@ class Batch:
     :param seconds: how long a case that has no natural end shall go on.
     :param scratch: an empty folder, removed afterwards.
     :param domain: first of ten DDS domains that no other program uses.
-    :param trace: a file into which the number of each input is written before it is tried.
+    :param only: number of the only input that is of interest.
+    :param index: takes the number of each input before it is tried, in ``value``: the parent
+        process knows it when this one has died.
     """
 
     case: str
@@ -90,7 +91,7 @@ class Batch:
     sample: bool = False
     seconds: float = 1.0
     only: int | None = None
-    trace: Path | None = None
+    index: Any = field(default_factory=lambda: SimpleNamespace(value=-1))
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     units: int = 0
@@ -127,17 +128,13 @@ class Case(ABC):
     :cvar name: how it is called, e.g. ``fuzz:rtps``.
     :cvar what: what is tried, in a few words.
     :cvar unit: what is counted.
-    :cvar aim: how many of them an hour on two cores should reach.
-    :cvar weight: share of the time of its lane, against the other cases of it.
     :cvar limit: seconds after which a batch counts as hanging.
     """
 
     name: str
     what: str
     unit: ClassVar[str]
-    aim: int
     lane: ClassVar[Lane] = Lane.LIVE
-    weight: float = 1.0
     limit: float = 180.0
 
     @abstractmethod
@@ -172,8 +169,3 @@ def _short(filename: str) -> str:
     if path.is_relative_to(ROOT) and "site-packages" not in path.parts:
         return str(path.relative_to(ROOT))
     return "/".join(path.parts[-2:])
-
-
-def unique(findings: Iterable[Finding]) -> list[Finding]:
-    """The first of each kind and place."""
-    return list({f.id: f for f in reversed(list(findings))}.values())[::-1]

@@ -219,12 +219,11 @@ class DeviceCase(Case):
     lane = Lane.LIVE
     limit = 400.0
 
-    def __init__(self, bench: type[DeviceBench], *, restart: bool, aim: int) -> None:
+    def __init__(self, bench: type[DeviceBench], *, restart: bool) -> None:
         self.unit = "restarts" if restart else "unplugs"  # type: ignore[misc]
         what = "started again" if restart else "unplugged and put back"
         self.name = f"{'restart' if restart else 'unplug'}:{bench.name}"
         self.what = f"the emulated {bench.name}, {what} in motion"
-        self.aim = aim
         self._bench, self._restart = bench, restart
 
     def run(self, batch: Batch) -> None:
@@ -356,6 +355,6 @@ def cases() -> list[Case]:
     """Every device, unplugged and restarted."""
     found: list[Case] = []
     for bench in DEVICES:
-        found.append(DeviceCase(bench, restart=False, aim=270))
-        found.append(DeviceCase(bench, restart=True, aim=70))
+        found.append(DeviceCase(bench, restart=False))
+        found.append(DeviceCase(bench, restart=True))
     return found

@@ -46,7 +46,6 @@ class WriteCase(Case):
     """A command that writes one file."""
 
     unit = "disks"
-    aim = 40
 
     def __init__(self, name: str, command: list[str]) -> None:
         self.name = f"disk:{name}"
@@ -102,7 +101,6 @@ class RecordCase(Case):
     """The recorder, whose disk fills up or whose file goes away."""
 
     unit = "disks"
-    aim = 40
     name = "disk:record"
     what = "record, while its disk fills up, its file goes, and two of them"
 

@@ -99,7 +99,6 @@ class OptionsCase(Case):
     name = "options"
     what = "odd values for every option of every command"
     unit = "command lines"
-    aim = 800
     limit = 300.0
 
     def run(self, batch: Batch) -> None:

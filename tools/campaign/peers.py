@@ -128,7 +128,6 @@ class PeerCase(Case):
     def __init__(self, spec: Spec) -> None:
         self.name = f"peers:{spec.name}"
         self.what = f"{spec.name}, among hostile peers"
-        self.aim = 40_000
         self._spec = spec
 
     def run(self, batch: Batch) -> None:

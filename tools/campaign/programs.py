@@ -517,7 +517,6 @@ class KillCase(_Runs):
         super().__init__(spec)
         self.name = f"kill:{spec.name}"
         self.what = f"{spec.name}, ended by SIGKILL, SIGTERM and SIGINT"
-        self.aim = 100
 
     def runs(self, batch: Batch, scene: Scene) -> None:
         endings = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
@@ -559,7 +558,6 @@ class StopCase(_Runs):
         super().__init__(spec)
         self.name = f"stop:{spec.name}"
         self.what = f"{spec.name}, stopped for half a second to three"
-        self.aim = 100
 
     def runs(self, batch: Batch, scene: Scene) -> None:
         program = self.start(batch, scene)

@@ -6,7 +6,18 @@ from collections.abc import Sequence
 from functools import cache
 
 from dexkit.errors import UsageError
+from tools.campaign import devices, disk, options, peers, programs, soak
 from tools.campaign.case import Case
+from tools.campaign.fuzz import devices as fuzzed_devices
+from tools.campaign.fuzz import (
+    drivers,
+    files,
+    messages,
+    packet_codecs,
+    recordings,
+    sessions,
+    sources,
+)
 
 __all__ = ["all_cases", "case", "select"]
 
@@ -14,18 +25,6 @@ __all__ = ["all_cases", "case", "select"]
 @cache
 def all_cases() -> tuple[Case, ...]:
     """Every case, fuzzers first."""
-    from tools.campaign import devices, disk, options, peers, programs, soak
-    from tools.campaign.fuzz import devices as fuzzed_devices
-    from tools.campaign.fuzz import (
-        drivers,
-        files,
-        messages,
-        packet_codecs,
-        recordings,
-        sessions,
-        sources,
-    )
-
     found: list[Case] = []
     fuzzers = (packet_codecs, messages, fuzzed_devices, drivers, recordings, sessions, files)
     for module in (*fuzzers, sources, devices, programs, peers, disk, options, soak):

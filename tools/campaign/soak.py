@@ -92,7 +92,6 @@ class SoakCase(Case):
     name = "soak"
     what = "service, recorder, bridge and client at full rate"
     unit = "seconds of soak"
-    aim = 3600
     lane = Lane.LONG
     limit = 300.0
 

@@ -8,6 +8,7 @@ import os
 import random
 import resource
 import signal
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,10 +57,9 @@ Prepare = Callable[[random.Random, Path], Target]
 
 
 class FuzzCase(Case):
-    """A parser.
+    """A parser, fed for some seconds.
 
     :param prepare: makes the target, given the source of chance and a scratch folder.
-    :param size: inputs in a batch; some half a second of them.
     :param hang: seconds of processor time that one input may take.
     """
 
@@ -67,68 +67,47 @@ class FuzzCase(Case):
     lane = Lane.COMPUTE
     limit = 120.0
 
-    def __init__(
-        self,
-        name: str,
-        what: str,
-        prepare: Prepare,
-        *,
-        size: int,
-        aim: int,
-        weight: float = 1.0,
-        hang: float = HANG,
-    ) -> None:
+    def __init__(self, name: str, what: str, prepare: Prepare, *, hang: float = HANG) -> None:
         self.name = f"fuzz:{name}"
         self.hang = hang
         self.what = what
-        self.size = size
-        self.aim = aim
-        self.weight = weight
         self._prepare = prepare
 
     def run(self, batch: Batch) -> None:  # noqa: D102
         target = self._prepare(batch.random, batch.scratch)
-        size = max(1, self.size // 20) if batch.sample else self.size
+        end = time.monotonic() + batch.seconds
         with _limited(self.hang) as watch:
             try:
-                self._feed(batch, target, size, watch)
+                self._feed(batch, target, end, watch)
             finally:
                 target.close()
 
-    def _feed(self, batch: Batch, target: Target, size: int, watch: _Watch) -> None:
-        make, run, allowed = target.make, target.run, target.allowed
-        mark = None if batch.trace is None else os.open(batch.trace, os.O_WRONLY | os.O_CREAT)
-        done, hangs = -1, 0
-        while done + 1 < size:
+    def _feed(self, batch: Batch, target: Target, end: float, watch: _Watch) -> None:
+        make, run, allowed, now = target.make, target.run, target.allowed, time.monotonic
+        number, hangs, over = -1, 0, False
+        while not over:
             data: Any = None
             try:
                 # the loop is inside the try: entering one for each input would cost a tenth
-                for watch.index in range(done + 1, size):
-                    done = watch.index
-                    if mark is not None:
-                        os.pwrite(mark, b"%20d" % done, 0)
+                while not over:
+                    number += 1
+                    batch.index.value = watch.index = number
                     data = None
                     data = make()
                     try:
                         run(data)
                     except allowed:
                         pass
-                    if done == batch.only:
-                        break
+                    over = now() > end if batch.only is None else number == batch.only
             except (Exception, Hang) as error:
                 watch.index = -1
                 if data is None:
                     raise  # there is no input yet: it is the campaign that is wrong
-                batch.failed(error, index=done, data=as_bytes(data))
+                batch.failed(error, index=number, data=as_bytes(data))
                 hangs += isinstance(error, Hang)
-                if hangs == _HANGS:
-                    break
-            if done == batch.only:
-                break
+                over = hangs == _HANGS or number == batch.only
         watch.index = -1
-        batch.units += done + 1
-        if mark is not None:
-            os.close(mark)
+        batch.units += number + 1
 
     def repeat(self, batch: Batch, data: bytes) -> None:
         """Try one input; text targets take UTF-8."""
@@ -238,7 +217,6 @@ class SeededCase(Case):
     unit = "inputs"
     lane = Lane.COMPUTE
     limit = 120.0
-    aim = 300_000
 
     def __init__(
         self, name: str, what: str, feed: Callable[[Inputs, int], None], *, size: int

@@ -362,35 +362,27 @@ def cases() -> list[FuzzCase]:
     found = [
         FuzzCase(
             f"cdr.{_short(m.name)}", f"payloads of {_short(m.name)}", _cdr(m.name),
-            size=20_000, aim=2_000_000, weight=2.0,
         )
         for m in message_types()
     ]  # fmt: skip
-    slow = 300_000
     return [
         *found,
-        FuzzCase("columns", "samples as columns, against one by one", _columns, size=1_500,
-                 aim=slow),
-        FuzzCase("packed", "payloads in one buffer", _packed, size=20_000, aim=slow),
-        FuzzCase("service.command", "a command through the service's core", _service,
-                 size=8_000, aim=slow),
-        FuzzCase("bridge", "both ways of the bridge", _bridge, size=8_000, aim=slow),
-        FuzzCase("teleop.state", "a state as the teleoperation client reads it", _teleop,
-                 size=40_000, aim=slow),
-        FuzzCase("robot.h1", "a command to the emulated H1", _robot("h1"), size=15_000, aim=slow),
-        FuzzCase("robot.g1", "a command to the emulated G1", _robot("g1"), size=15_000, aim=slow),
-        FuzzCase("rtps.packet", "RTPS packets as the doctor reads them", _rtps_packet,
-                 size=40_000, aim=4_000_000, weight=2.0),
+        FuzzCase("columns", "samples as columns, against one by one", _columns),
+        FuzzCase("packed", "payloads in one buffer", _packed),
+        FuzzCase("service.command", "a command through the service's core", _service),
+        FuzzCase("bridge", "both ways of the bridge", _bridge),
+        FuzzCase("teleop.state", "a state as the teleoperation client reads it", _teleop),
+        FuzzCase("robot.h1", "a command to the emulated H1", _robot("h1")),
+        FuzzCase("robot.g1", "a command to the emulated G1", _robot("g1")),
+        FuzzCase("rtps.packet", "RTPS packets as the doctor reads them", _rtps_packet),
         FuzzCase("rtps.announcement", "an announcement, and the name in it",
-                 _rtps_announcement, size=15_000, aim=1_000_000),
-        FuzzCase("rtps.observer", "the doctor's observer", _observer, size=15_000, aim=1_000_000),
-        FuzzCase("schema.ros2msg", "schemas of recordings", _schema("ros2msg"), size=1_500,
-                 aim=slow),
-        FuzzCase("schema.omgidl", "schemas of recordings", _schema("omgidl"), size=1_500,
-                 aim=slow),
-        FuzzCase("schema.idl", "the parser of dexkit's own IDL", _own_idl, size=1_500, aim=slow),
-        FuzzCase("names", "topics and types", _names, size=2_000, aim=slow),
-        FuzzCase("remote", "keys of the emulated remote", _remote, size=60_000, aim=1_000_000),
+                 _rtps_announcement),
+        FuzzCase("rtps.observer", "the doctor's observer", _observer),
+        FuzzCase("schema.ros2msg", "schemas of recordings", _schema("ros2msg")),
+        FuzzCase("schema.omgidl", "schemas of recordings", _schema("omgidl")),
+        FuzzCase("schema.idl", "the parser of dexkit's own IDL", _own_idl),
+        FuzzCase("names", "topics and types", _names),
+        FuzzCase("remote", "keys of the emulated remote", _remote),
     ]  # fmt: skip
 
 

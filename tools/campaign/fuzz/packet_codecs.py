@@ -351,7 +351,6 @@ def cases() -> list[FuzzCase]:
     """Every fuzzer of this module."""
     instructions, statuses = instruction_packets(), _status_packets()
     both = instructions + statuses
-    fast, slow = 4_000_000, 300_000
     motor = (_motor_commands(), fix_words(0, m4010.COMMAND.head))
     data = (_motor_data(), fix_words(0, m4010.DATA.head))
     serial = [
@@ -359,65 +358,41 @@ def cases() -> list[FuzzCase]:
             "dynamixel.decode",
             "a Dynamixel packet",
             _bytes(both, fix_dynamixel, _decode_dynamixel),
-            size=200_000,
-            aim=fast,
-            weight=3,
         ),
         FuzzCase(
             "dynamixel.parser",
             "a stream of Dynamixel packets, cut anywhere",
             _streams(both, fix_dynamixel, lambda: dynamixel.PacketParser(keep_bad=True), 1024),
-            size=120_000,
-            aim=fast,
-            weight=3,
         ),
         FuzzCase(
             "dynamixel.status",
             "fields of a status packet",
             _bytes(statuses, fix_dynamixel, _status_fields),
-            size=200_000,
-            aim=fast,
-            weight=2,
         ),
         FuzzCase(
             "dynamixel.fast",
             "a combined status",
             _bytes(statuses, None, _split),
-            size=200_000,
-            aim=fast,
-            weight=2,
         ),
         FuzzCase(
             "dynamixel.stuffing",
             "byte stuffing there and back",
             _bytes(both, None, _stuffing),
-            size=320_000,
-            aim=fast,
-            weight=3,
         ),
         FuzzCase(
             "mx64.table",
             "items of the control table",
             _bytes(both, None, _table),
-            size=200_000,
-            aim=fast,
-            weight=2,
         ),
         FuzzCase(
             "m4010.command",
             "a command frame of the M4010",
             _bytes(*motor, _m4010_motor),
-            size=200_000,
-            aim=fast,
-            weight=3,
         ),
         FuzzCase(
             "m4010.data",
             "a data frame of the M4010",
             _bytes(*data, _m4010_data),
-            size=200_000,
-            aim=fast,
-            weight=3,
         ),
         FuzzCase(
             "m4010.parser",
@@ -428,18 +403,12 @@ def cases() -> list[FuzzCase]:
                 lambda: m4010.FrameParser((m4010.COMMAND, m4010.DATA)),
                 26,
             ),
-            size=120_000,
-            aim=fast,
-            weight=2,
         ),
-        FuzzCase("ris.scale", "counts of a quantity", _scale, size=200_000, aim=fast, weight=2),
+        FuzzCase("ris.scale", "counts of a quantity", _scale),
         FuzzCase(
             "crc32",
             "the word CRC",
             _bytes([*motor[0], *_dex3_states()], None, _crc),
-            size=200_000,
-            aim=fast,
-            weight=2,
         ),
     ]
     motor_packet = fix_words(0, dex3_usb.MOTOR_CMD.head)
@@ -448,9 +417,6 @@ def cases() -> list[FuzzCase]:
             f"dex3.{kind.__name__}",
             f"a {kind.__name__} packet of the Dex3-1",
             _bytes(corpus, fix_words(0, structure.head), _pack_again(kind)),
-            size=200_000,
-            aim=fast,
-            weight=2,
         )
         for kind, structure, corpus in (
             (
@@ -479,37 +445,26 @@ def cases() -> list[FuzzCase]:
             "dex3.bus",
             "a bus buffer of the Dex3-1",
             _bytes(buses, motor_packet, _scan),
-            size=120_000,
-            aim=fast,
-            weight=2,
         ),
         FuzzCase(
             "dex3.command-frame",
             "a frame to the Dex3-1",
             _bytes(_dex3_commands(), _fix_command, _parsed_command),
-            size=25_000,
-            aim=slow,
         ),
         FuzzCase(
             "dex3.state-frame",
             "a frame from the Dex3-1",
             _bytes(_dex3_states(), _fix_frame(dex3_usb.STATE), _parsed_state),
-            size=20_000,
-            aim=slow,
         ),
         FuzzCase(
             "dex3.codec",
             "the driver's reading of a state frame",
             _dex3_codec,
-            size=15_000,
-            aim=slow,
         ),
         FuzzCase(
             "dex3.codec-command",
             "the hand's reading of a command frame",
             _dex3_decode_command,
-            size=15_000,
-            aim=slow,
         ),
     ]
     low = [
@@ -517,8 +472,6 @@ def cases() -> list[FuzzCase]:
             "low_level." + name.replace("::msg::dds_::", "."),
             f"image and CRC of {name}",
             _low(name),
-            size=50_000,
-            aim=1_000_000,
         )
         for name in (
             "unitree_go::msg::dds_::LowCmd_",

@@ -152,16 +152,12 @@ def cases() -> list[FuzzCase]:
             "audit",
             "damaged sessions, as an audit judges them",
             _audited,
-            size=20,
-            aim=20_000,
             hang=_HANG,
         ),
         FuzzCase(
             "replay",
             "damaged sessions, as a replay reads and rehearses them",
             _replayed,
-            size=20,
-            aim=20_000,
             hang=_HANG,
         ),
     ]

@@ -593,7 +593,4 @@ def cases() -> list[FuzzCase]:
         ("import.tables", "CSV and Parquet tables, imported", _tables),
         ("export", "recordings whose record of an import is odd, exported", _exported),
     )
-    return [
-        FuzzCase(name, what, prepare, size=40, aim=50_000, weight=6.0, hang=_HANG)
-        for name, what, prepare in every
-    ]
+    return [FuzzCase(name, what, prepare, hang=_HANG) for name, what, prepare in every]
