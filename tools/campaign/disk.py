@@ -19,7 +19,7 @@ from pathlib import Path
 
 from dexkit.errors import DexkitError
 from tools.campaign.case import Batch, Case, Skip
-from tools.campaign.process import Program, traceback_in
+from tools.campaign.process import Program
 from tools.campaign.programs import Scene, _talk
 from tools.campaign.rig import WaitTimeout, until
 
@@ -64,17 +64,16 @@ class WriteCase(Case):
                 continue
             place, limits = self._place(batch, way)
             words = [w.format(out=place, result=result, sample=sample) for w in self._command]
-            program = Program(batch, ["dexkit", *words], limits=limits)
-            code = program.wait(120.0)
+            with Program(batch, ["dexkit", *words], limits=limits) as program:
+                code = program.wait(120.0)
             batch.units += 1
-            traceback = traceback_in(program.output)
-            if traceback is not None:
-                batch.found("traceback", traceback[0], f"{way}: {traceback[1]}\n{program!r}")
+            about, text = f"{self.name} {way}", f"{code}: {program.output[-1000:]}"
+            if program.check_output(batch):
+                pass
             elif code is None or code < 0:
-                batch.found("exit code", f"{self.name} {way}", f"{code}: {program.output[-1000:]}")
-            elif (code == 0 and way != "small") or (code == 0 and not Path(place).stat().st_size):
-                batch.found("reported as done", f"{self.name} {way}", program.output[-1000:])
-            program.end()
+                batch.found("exit code", about, text)
+            elif code == 0 and (way != "small" or not Path(place).stat().st_size):
+                batch.found("reported as done", about, text)
             if way == "small":
                 _release(batch.scratch / "small")
 
@@ -134,8 +133,7 @@ class RecordCase(Case):
         words = ["dexkit", "record", str(path), "--domain", scene.domain, "--force"]
         if way in ("limit", "small"):
             words += ["--compression", "none"]
-        program = Program(batch, words, limits=limits)
-        try:
+        with Program(batch, words, limits=limits) as program:
             until(lambda: "ready:" in program.output or not program.running, "the recorder")
             if way == "deleted" and program.running:
                 until(lambda: path.exists() and path.stat().st_size > 5000, "something recorded")
@@ -146,21 +144,12 @@ class RecordCase(Case):
             program.signal(signal.SIGTERM)
             code = program.wait()
             batch.units += 1
-            traceback = traceback_in(program.output)
-            if traceback is not None:
-                batch.found(
-                    "traceback", traceback[0], f"{way}: {traceback[1]}\n{program.output[-2000:]}"
-                )
-            elif code in (0, None) or (code < 0 and "error:" not in program.output):
-                batch.found(
-                    "reported as done",
-                    f"{self.name} {way}",
-                    f"{code}: {program.output[-2000:]}",
-                )
+            ended_badly = code is not None and code < 0 and "error:" not in program.output
+            if not program.check_output(batch) and (code in (0, None) or ended_badly):
+                text = f"{code}: {program.output[-2000:]}"
+                batch.found("reported as done", f"{self.name} {way}", text)
             if way != "deleted" or code == 0:
                 self._claims(batch, way, path, program.output)
-        finally:
-            program.end()
 
     def _claims(self, batch: Batch, way: str, path: Path, output: str) -> None:
         """Check that it does not report more messages than can be read."""
@@ -170,11 +159,8 @@ class RecordCase(Case):
         if claimed is None or path == Path("/dev/full"):
             return
         readable = 0
-        if path.exists():
-            try:
-                readable = len(list(open_trace(path).messages()))
-            except DexkitError:
-                readable = 0
+        with contextlib.suppress(DexkitError):
+            readable = len(list(open_trace(path).messages())) if path.exists() else 0
         claimed_count = int(claimed[1].replace(",", ""))
         if claimed_count > readable:
             batch.found(
@@ -186,27 +172,17 @@ class RecordCase(Case):
     def _force(self, batch: Batch, scene: Scene, path: Path) -> None:
         """``--force`` on a file that is being recorded: the first one keeps what it has."""
         words = ["dexkit", "record", str(path), "--domain", scene.domain]
-        first = Program(batch, words)
-        second: Program | None = None
-        try:
+        with Program(batch, words) as first:
             until(lambda: path.exists() and path.stat().st_size > 3000, "something recorded")
-            second = Program(batch, [*words, "--force", "--duration", "1"])
-            second.wait()
-            first.signal(signal.SIGTERM)
-            code = first.wait()
+            with Program(batch, [*words, "--force", "--duration", "1"]) as second:
+                second.wait()
+                first.signal(signal.SIGTERM)
+                code = first.wait()
             batch.units += 1
             for program in (first, second):
-                traceback = traceback_in(program.output)
-                if traceback is not None:
-                    batch.found(
-                        "traceback", traceback[0], f"{traceback[1]}\n{program.output[-2000:]}"
-                    )
+                program.check_output(batch)
             if code == 0:
                 self._claims(batch, "force", path, first.output)
-        finally:
-            first.end()
-            if second is not None:
-                second.end()
 
 
 def _sample() -> str:

@@ -6,6 +6,7 @@ here. A traceback is a finding, and an exit code that is none of dexkit's.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import resource
 import shutil
@@ -16,8 +17,8 @@ import click
 
 from dexkit.cli.settings import SettingsOption
 from tools.campaign.case import Batch, Case
-from tools.campaign.process import Program, traceback_in
-from tools.campaign.rig import until
+from tools.campaign.process import Program
+from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["cases", "command_lines"]
 
@@ -153,26 +154,20 @@ class OptionsCase(Case):
         if path == ("doctor",) and rng.random() < 0.5:
             limits = [(resource.RLIMIT_NOFILE, rng.randrange(16, 30))]
         line = ["dexkit", *path, *words, option.opts[0], *odd]
-        program = Program(batch, line, limits=limits)
-        try:
-            until(lambda: "ready:" in program.output or not program.running, "a word", 10.0)
-        except Exception:
-            pass  # some print nothing while they wait
-        if program.running and "ready:" in program.output:
-            program.wait(1.0)
-        program.signal(signal.SIGINT)
-        code = program.wait(30.0)
-        traceback = traceback_in(program.output)
-        shown = " ".join(line)[:400]
-        if traceback is not None:
-            batch.found(
-                "traceback", traceback[0], f"{traceback[1]}\n{shown}\n{program.output[-2000:]}"
-            )
+        with Program(batch, line, limits=limits) as program:
+            with contextlib.suppress(WaitTimeout):  # some print nothing while they wait
+                until(lambda: "ready:" in program.output or not program.running, "a word", 10.0)
+            if program.running and "ready:" in program.output:
+                program.wait(1.0)
+            program.signal(signal.SIGINT)
+            code = program.wait(30.0)
+        text = f"{code}: {' '.join(line)[:400]}\n{program.output[-2000:]}"
+        if program.check_output(batch):
+            pass
         elif code is None:
-            batch.found("does not end", " ".join(path), f"{shown}\n{program.output[-2000:]}")
+            batch.found("does not end", " ".join(path), text)
         elif code not in _CODES and code != -signal.SIGINT:
-            batch.found("exit code", " ".join(path), f"{code}: {shown}\n{program.output[-2000:]}")
-        program.end()
+            batch.found("exit code", " ".join(path), text)
 
 
 def cases() -> list[Case]:

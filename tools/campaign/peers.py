@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import random
+import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +23,7 @@ from dexkit.models import Dialect
 from tools.campaign.case import Batch, Case
 from tools.campaign.fuzz.messages import announcements, filled
 from tools.campaign.mutate import mutator
-from tools.campaign.process import Program, traceback_in
+from tools.campaign.process import Program
 from tools.campaign.programs import SIDE, Scene, Spec, robots_and_hands
 from tools.campaign.rig import WaitTimeout, until
 
@@ -134,24 +135,15 @@ class PeerCase(Case):
         logging.disable()
         scene = Scene(batch)
         with self._spec.stage(scene):
-            program = Program(batch, self._spec.command(scene))
-            try:
-                self._among(batch, scene, program)
-            except WaitTimeout as error:
-                batch.found("not working", self.name, f"{error}\n{program.output[-2000:]}")
-            finally:
-                traceback = traceback_in(program.output)
-                if traceback is not None:
-                    batch.found(
-                        "traceback", traceback[0], f"{traceback[1]}\n{program.output[-3000:]}"
-                    )
-                if program.running:
-                    import signal
-
-                    program.signal(signal.SIGTERM)
-                    if program.wait(30.0) is None:
-                        batch.found("does not end", self.name, program.output[-2000:])
-                program.end()
+            with Program(batch, self._spec.command(scene)) as program:
+                try:
+                    self._among(batch, scene, program)
+                except WaitTimeout as error:
+                    batch.found("not working", self.name, f"{error}\n{program.output[-2000:]}")
+                program.check_output(batch)
+                program.signal(signal.SIGTERM)
+                if program.wait(30.0) is None:
+                    batch.found("does not end", self.name, program.output[-2000:])
             self._spec.after(scene, False)
 
     def _among(self, batch: Batch, scene: Scene, program: Program) -> None:

@@ -40,7 +40,8 @@ def traceback_in(text: str) -> tuple[str, str] | None:
 
 
 class Program:
-    """One run of a command; its own session, its own temporary folder.
+    """One run of a command; its own session, its own temporary folder. A context manager, which
+    kills it if it still runs.
 
     :param command: behind ``python -m``; mostly ``["dexkit", "serve", ...]``.
     :param limits: of its resources, as :func:`resource.setrlimit` takes them.
@@ -101,6 +102,12 @@ class Program:
             while data := os.read(source.fileno(), 65536):
                 out.write(data)
 
+    def __enter__(self) -> Program:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.end()
+
     def __repr__(self) -> str:
         return " ".join(self.command)
 
@@ -148,6 +155,14 @@ class Program:
     def left_behind(self, timeout: float = 20.0) -> list[str]:
         """Those of its children that are not gone some time after it."""
         return [f"{pid}: {command_of(pid)}" for pid in wait_gone(sorted(self.below), timeout)]
+
+    def check_output(self, batch: Batch) -> bool:
+        """Report a traceback in its output, whatever else happens; whether there is one."""
+        found = traceback_in(self.output)
+        if found is not None:
+            place, last = found
+            batch.found("traceback", place, f"{last}\n{self!r}\n{self.output[-3000:]}")
+        return found is not None
 
     def end(self) -> None:
         """Kill it, if it still runs."""

@@ -28,7 +28,7 @@ from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import sweep
 from tools.campaign.case import Batch, Case
 from tools.campaign.devices import DEVICES, M4010, Bench, DeviceBench, Dex3, Mx64, command
-from tools.campaign.process import Program, traceback_in
+from tools.campaign.process import Program
 from tools.campaign.rig import WaitTimeout, until
 
 __all__ = ["Client", "Scene", "Spec", "cases", "robots_and_hands", "specs"]
@@ -474,20 +474,12 @@ class _Runs(Case):
             self.spec.works(scene, program)
         except WaitTimeout as error:
             program.end()
-            self.check_output(batch, program)
+            program.check_output(batch)
             raise WaitTimeout(f"{error}; it printed: {program.output[-1500:]}") from None
         except BaseException:
             program.end()
             raise
         return program
-
-    def check_output(self, batch: Batch, program: Program) -> None:
-        """A traceback is a finding, whatever else happens."""
-        traceback = traceback_in(program.output)
-        if traceback is not None:
-            batch.found(
-                "traceback", traceback[0], f"{traceback[1]}\n{program!r}\n{program.output[-3000:]}"
-            )
 
     def ended(self, batch: Batch, scene: Scene, program: Program, number: int) -> None:
         """Wait for its end and look at everything that it must not leave."""
@@ -501,7 +493,7 @@ class _Runs(Case):
                 batch.found("ended by itself", self.name, f"{code}: {program.output[-2000:]}")
         elif code not in self.spec.codes:
             batch.found("exit code", f"{self.name} {how}", f"{code}: {program.output[-2000:]}")
-        self.check_output(batch, program)
+        program.check_output(batch)
         left = program.left_behind()
         if left:
             batch.found("child left behind", f"{self.name} {how}", "\n".join(left))
@@ -571,7 +563,7 @@ class StopCase(_Runs):
             if program.running or self.spec.ready:
                 self.ended(batch, scene, program, signal.SIGTERM)
             else:
-                self.check_output(batch, program)
+                program.check_output(batch)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 program.process.send_signal(signal.SIGCONT)

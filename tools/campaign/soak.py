@@ -18,7 +18,7 @@ from functools import partial
 from dexkit.models import DEX1_1
 from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.devices import Bench, command
-from tools.campaign.process import Program, traceback_in
+from tools.campaign.process import Program
 from tools.campaign.programs import Client
 from tools.campaign.rig import WaitTimeout
 
@@ -147,11 +147,7 @@ class SoakCase(Case):
                 program.signal(signal.SIGTERM)
                 if program.wait() is None:
                     batch.found("does not end", name, program.output[-2000:])
-                traceback = traceback_in(program.output)
-                if traceback is not None:
-                    batch.found(
-                        "traceback", traceback[0], f"{traceback[1]}\n{program.output[-3000:]}"
-                    )
+                program.check_output(batch)
                 program.end()
 
 

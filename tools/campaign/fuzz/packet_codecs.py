@@ -347,136 +347,62 @@ def _scale(rng: random.Random, scratch: Path) -> Target:
 # --- emulated devices, without a line
 
 
+_LOW = (
+    "unitree_go::msg::dds_::LowCmd_",
+    "unitree_hg::msg::dds_::LowCmd_",
+    "unitree_hg::msg::dds_::LowState_",
+)
+
+
 def cases() -> list[FuzzCase]:
     """Every fuzzer of this module."""
-    instructions, statuses = instruction_packets(), _status_packets()
-    both = instructions + statuses
-    motor = (_motor_commands(), fix_words(0, m4010.COMMAND.head))
-    data = (_motor_data(), fix_words(0, m4010.DATA.head))
-    serial = [
-        FuzzCase(
-            "dynamixel.decode",
-            "a Dynamixel packet",
-            _bytes(both, fix_dynamixel, _decode_dynamixel),
-        ),
-        FuzzCase(
-            "dynamixel.parser",
-            "a stream of Dynamixel packets, cut anywhere",
-            _streams(both, fix_dynamixel, lambda: dynamixel.PacketParser(keep_bad=True), 1024),
-        ),
-        FuzzCase(
-            "dynamixel.status",
-            "fields of a status packet",
-            _bytes(statuses, fix_dynamixel, _status_fields),
-        ),
-        FuzzCase(
-            "dynamixel.fast",
-            "a combined status",
-            _bytes(statuses, None, _split),
-        ),
-        FuzzCase(
-            "dynamixel.stuffing",
-            "byte stuffing there and back",
-            _bytes(both, None, _stuffing),
-        ),
-        FuzzCase(
-            "mx64.table",
-            "items of the control table",
-            _bytes(both, None, _table),
-        ),
-        FuzzCase(
-            "m4010.command",
-            "a command frame of the M4010",
-            _bytes(*motor, _m4010_motor),
-        ),
-        FuzzCase(
-            "m4010.data",
-            "a data frame of the M4010",
-            _bytes(*data, _m4010_data),
-        ),
-        FuzzCase(
-            "m4010.parser",
-            "a stream of M4010 frames, cut anywhere",
-            _streams(
-                motor[0] + data[0],
-                motor[1],
-                lambda: m4010.FrameParser((m4010.COMMAND, m4010.DATA)),
-                26,
-            ),
-        ),
-        FuzzCase("ris.scale", "counts of a quantity", _scale),
-        FuzzCase(
-            "crc32",
-            "the word CRC",
-            _bytes([*motor[0], *_dex3_states()], None, _crc),
-        ),
-    ]
-    motor_packet = fix_words(0, dex3_usb.MOTOR_CMD.head)
-    dex3 = [
-        FuzzCase(
-            f"dex3.{kind.__name__}",
-            f"a {kind.__name__} packet of the Dex3-1",
-            _bytes(corpus, fix_words(0, structure.head), _pack_again(kind)),
-        )
-        for kind, structure, corpus in (
-            (
-                packets.MotorCmd,
-                dex3_usb.MOTOR_CMD,
-                [packets.MotorCmd(1, 1, True, 5, -6, 7, 8, 9).pack()],
-            ),
-            (
-                packets.MotorState,
-                dex3_usb.MOTOR_STATE,
-                [packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()],
-            ),
-            (
-                packets.SensorState,
-                dex3_usb.SENSOR_STATE,
-                [packets.SensorState(1, 0, tuple(range(12)), tuple(range(12))).pack()],
-            ),
-        )
-    ]
-    buses = [packets.MotorCmd(i, 1, True, 0, 0, 0, 0, 0).pack() * 2 for i in range(2)] + [
-        packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()
-        + packets.SensorState(1, 0, (0,) * 12, (0,) * 12).pack()
-    ]
-    dex3 += [
-        FuzzCase(
-            "dex3.bus",
-            "a bus buffer of the Dex3-1",
-            _bytes(buses, motor_packet, _scan),
-        ),
-        FuzzCase(
-            "dex3.command-frame",
-            "a frame to the Dex3-1",
-            _bytes(_dex3_commands(), _fix_command, _parsed_command),
-        ),
-        FuzzCase(
-            "dex3.state-frame",
-            "a frame from the Dex3-1",
-            _bytes(_dex3_states(), _fix_frame(dex3_usb.STATE), _parsed_state),
-        ),
-        FuzzCase(
-            "dex3.codec",
-            "the driver's reading of a state frame",
-            _dex3_codec,
-        ),
-        FuzzCase(
-            "dex3.codec-command",
-            "the hand's reading of a command frame",
-            _dex3_decode_command,
-        ),
-    ]
-    low = [
-        FuzzCase(
-            "low_level." + name.replace("::msg::dds_::", "."),
-            f"image and CRC of {name}",
-            _low(name),
-        )
-        for name in (
-            "unitree_go::msg::dds_::LowCmd_",
-            "unitree_hg::msg::dds_::LowCmd_",
-            "unitree_hg::msg::dds_::LowState_",
-        )
-    ]
-    return serial + dex3 + low
+    statuses = _status_packets()
+    both = instruction_packets() + statuses
+    commands, answers = _motor_commands(), _motor_data()
+    to_motor, from_motor = fix_words(0, m4010.COMMAND.head), fix_words(0, m4010.DATA.head)
+    drive = packets.MotorCmd(1, 1, True, 5, -6, 7, 8, 9).pack()
+    motor = packets.MotorState(1, 1, False, 25, 30, 120, 1, 2, 3).pack()
+    touch = packets.SensorState(1, 0, tuple(range(12)), tuple(range(12))).pack()
+    to_joint = fix_words(0, dex3_usb.MOTOR_CMD.head)
+    from_joint = fix_words(0, dex3_usb.MOTOR_STATE.head)
+    from_sensor = fix_words(0, dex3_usb.SENSOR_STATE.head)
+
+    def parser() -> Any:
+        return dynamixel.PacketParser(keep_bad=True)
+
+    def frames() -> Any:
+        return m4010.FrameParser((m4010.COMMAND, m4010.DATA))
+
+    table: list[tuple[str, str, Prepare]] = [
+        ("dynamixel.decode", "a Dynamixel packet", _bytes(both, fix_dynamixel, _decode_dynamixel)),
+        ("dynamixel.parser", "a stream of Dynamixel packets, cut anywhere",
+         _streams(both, fix_dynamixel, parser, 1024)),
+        ("dynamixel.status", "fields of a status packet",
+         _bytes(statuses, fix_dynamixel, _status_fields)),
+        ("dynamixel.fast", "a combined status", _bytes(statuses, None, _split)),
+        ("dynamixel.stuffing", "byte stuffing there and back", _bytes(both, None, _stuffing)),
+        ("mx64.table", "items of the control table", _bytes(both, None, _table)),
+        ("m4010.command", "a command frame of the M4010", _bytes(commands, to_motor, _m4010_motor)),
+        ("m4010.data", "a data frame of the M4010", _bytes(answers, from_motor, _m4010_data)),
+        ("m4010.parser", "a stream of M4010 frames, cut anywhere",
+         _streams(commands + answers, to_motor, frames, 26)),
+        ("ris.scale", "counts of a quantity", _scale),
+        ("crc32", "the word CRC", _bytes([*commands, *_dex3_states()], None, _crc)),
+        ("dex3.MotorCmd", "a MotorCmd packet of the Dex3-1",
+         _bytes([drive], to_joint, _pack_again(packets.MotorCmd))),
+        ("dex3.MotorState", "a MotorState packet of the Dex3-1",
+         _bytes([motor], from_joint, _pack_again(packets.MotorState))),
+        ("dex3.SensorState", "a SensorState packet of the Dex3-1",
+         _bytes([touch], from_sensor, _pack_again(packets.SensorState))),
+        ("dex3.bus", "a bus buffer of the Dex3-1",
+         _bytes([drive * 2, motor + touch], to_joint, _scan)),
+        ("dex3.command-frame", "a frame to the Dex3-1",
+         _bytes(_dex3_commands(), _fix_command, _parsed_command)),
+        ("dex3.state-frame", "a frame from the Dex3-1",
+         _bytes(_dex3_states(), _fix_frame(dex3_usb.STATE), _parsed_state)),
+        ("dex3.codec", "the driver's reading of a state frame", _dex3_codec),
+        ("dex3.codec-command", "the hand's reading of a command frame", _dex3_decode_command),
+        *((f"low_level.{n.replace('::msg::dds_::', '.')}", f"image and CRC of {n}", _low(n))
+          for n in _LOW),
+    ]  # fmt: skip
+    return [FuzzCase(*row) for row in table]
