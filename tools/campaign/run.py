@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
@@ -314,6 +315,9 @@ def _stop(signum: int, frame: FrameType | None) -> None:
 
 
 def _work(pipe: Connection, index: Any, task: Task) -> None:
+    # The server that forked this process ends when nobody holds this: with the campaign, then, also
+    # where that is killed, and this process with it.
+    os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]
     isolation.die_with_parent()
     isolation.subreaper()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
