@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
-from dexkit.conformance.checks.servos import _repeats, _turns
+from dexkit.conformance.behaviours.stillness import _repeats, _turns
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import StatesSwapped, Vibrates

@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.cli.check import command
+from dexkit.conformance.behaviours.client import returns, sessions, slow_stretches
 from dexkit.conformance.checks import Context, Outcome, check_of
-from dexkit.conformance.checks.client import returns, sessions, slow_stretches
 from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import Mutant, mutants
 from dexkit.conformance.faults.matrix import WrongHandResult as Trial

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.checks import Context
-from dexkit.conformance.checks.consistency import contacts
+from dexkit.conformance.checks.contacts import contacts
 from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.generated import parse

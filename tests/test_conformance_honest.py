@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dexkit.conformance.checks.after_disturbances import fastest
-from dexkit.conformance.checks.motion import Step
+from dexkit.conformance.behaviours.bad_commands import fastest
+from dexkit.conformance.checks.steps import Step
 from dexkit.conformance.claims import Claims
 from dexkit.conformance.faults import any_model, gripper, plan_for
 from dexkit.conformance.faults.registry import mix

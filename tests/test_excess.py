@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dexkit.conformance.checks.tracking import _best_delay
+from dexkit.conformance.behaviours.tracking import _best_delay
 from dexkit.conformance.excess import Course, Excess
 from dexkit.conformance.row_selection import SomeTimes, Times
 from dexkit.hand import Floats

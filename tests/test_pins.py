@@ -154,7 +154,13 @@ EDITS = [
     ),
     ("dexkit/messages/codec.py", "import struct", "import struct, math", True, True),
     # what judges
-    ("dexkit/conformance/checks/fields.py", "return c.passed", "return not c.passed", False, None),
+    (
+        "dexkit/conformance/behaviours/fields.py",
+        "return c.passed",
+        "return not c.passed",
+        False,
+        None,
+    ),
     ("dexkit/conformance/checks/__init__.py", "ROUNDING = 1e-3", "ROUNDING = 2e-3", False, None),
     ("dexkit/conformance/verdicts.py", "HARDEST = 2.0", "HARDEST = 3.0", False, True),
     ("dexkit/conformance/judge.py", "1e6", "1e7", False, True),

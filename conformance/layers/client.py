@@ -39,7 +39,7 @@ def _no_script(name: str) -> type[Any]:
 
 LAYER: Layer[Recording, SideView, Context] = Layer(
     name="client",
-    checks=("dexkit.conformance.checks.client",),
+    checks=("dexkit.conformance.behaviours.client",),
     plots=(Plot(PlotKind.POSITION),),
     decode=hand.LAYER.decode,
     subjects=_commanded,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dexkit.conformance.behaviours import CHECKS
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import Layer
 from dexkit.conformance.layers.preconditions import claimed, not_blocked, not_spoiled
@@ -194,15 +195,7 @@ def with_silence(context: Context, outcome: Outcome) -> Outcome:
 
 LAYER: Layer[Recording, SideView, Context] = Layer(
     name="dds",
-    checks=tuple(
-        f"dexkit.conformance.checks.{name}"
-        for name in (
-            *("discovery", "timing", "fields", "members", "motion", "force", "consistency"),
-            *("velocity", "drive", "safety", "lifecycle", "tracking", "fingers", "each_joint"),
-            *("pressure", "operator", "uncommanded", "servos", "servo_force", "touch"),
-            *("firmness", "grip", "after_disturbances"),
-        )
-    ),
+    checks=CHECKS,
     plots=(Plot(PlotKind.POSITION),),
     decode=_decode,
     subjects=one_by_one,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dexkit.conformance.behaviours import CHECKS
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.layers import Layer, hand
 from dexkit.conformance.layers.preconditions import claimed, not_blocked
@@ -33,10 +34,7 @@ def _decode(trace: TraceLike, name: str | None, sides: Sequence[Subject]) -> Rob
 
 LAYER: Layer[RobotRecording, SideView, RobotContext] = Layer(
     name="robot",
-    checks=tuple(
-        f"dexkit.conformance.checks.{name}"
-        for name in ("robot", "discovery", "timing", "fields", "lifecycle")
-    ),
+    checks=CHECKS,
     plots=(Plot(PlotKind.POSITION),),
     decode=_decode,
     subjects=hand.one_by_one,

@@ -50,6 +50,7 @@ __all__ = [
 
 ROOT = Path(__file__).parents[2]
 SPLIT = (
+    "dexkit.conformance.behaviours",
     "dexkit.conformance.checks",
     "dexkit.conformance.faults",
     "dexkit.conformance.recording",

@@ -1,6 +1,4 @@
-"""Check the topic of a hand's tactile areas; :mod:`~dexkit.conformance.checks.pressure` checks the
-values.
-"""
+"""The topic of an Inspire FTP's tactile areas."""
 
 from __future__ import annotations
 
@@ -8,15 +6,17 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measure
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
-from dexkit.conformance.checks.servo_force import FEW_STANDS, stands
+from dexkit.conformance.checks.stands import FEW_STANDS, stands
 from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.touch import Touch
 from dexkit.hand import Floats
 
-__all__: list[str] = []
-
 _WINDOW_S = 1.0
+
+
 _HELD_S = 0.3  # s at the end of a grip in which its counts are taken
+
+
 _NOTHING = "nothing was received on the touch topic"
 
 

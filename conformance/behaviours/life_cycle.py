@@ -1,4 +1,4 @@
-"""Check start-up, late joiners, restarted clients and services."""
+"""Clients come and go, and the service starts and stops."""
 
 from __future__ import annotations
 
@@ -8,38 +8,10 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
-from dexkit.conformance.checks.safety import arrival, away_first
+from dexkit.conformance.checks.obedience import arrival, away_first
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.motor_messages import MotorCodec
 from dexkit.hand import JointMode
-
-
-@check("DEX1-START-01", "DEX3-START-01", "H1-START-01")
-def state_first(ctx: Context) -> Outcome:
-    """State is published before the first command."""
-    first_state = float(ctx.states.t[0])
-    first_command = float(ctx.commands.t[0])
-    listening = ctx.phases("listen")
-    begin = ctx.span(listening[0])[0] if listening else 0.0
-    if first_command - begin < ctx.tolerance("min_lead_s"):
-        return ctx.skipped("the recording begins after the first commands")
-    lead = first_command - first_state
-    # the kit's client, unlike a genuine one, does not wait for state, so its first command may be
-    # received after the state that it has set off
-    least = ctx.tolerance("min_lead_s") if listening else 0.0
-    if lead > least:
-        return ctx.passed(
-            f"{lead:.2f} s before",
-            f"first state {lead:.2f} s before the first command",
-            lead_s=lead,
-        ).timed(lead, least, at_least=True, span=(first_state, first_command))
-    return ctx.failed(
-        "silent",
-        f"no state for {min(first_command, first_state) - begin:.2f} s; the first came "
-        f"{abs(lead):.3f} s {'before' if lead > 0 else 'after'} the first command was received",
-        ctx.at(ctx.commands.topic, first_command),
-        lead_s=lead,
-    )  # no measure: the margin has no meaning, because the service had plenty of time
 
 
 @check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")

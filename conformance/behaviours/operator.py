@@ -1,4 +1,4 @@
-"""Check the response to an operator, modelled with Unitree's client (phase ``operator``)."""
+"""An operator with the client of xr_teleoperate moves the hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Check the commands that a client sends to a hand: form, values, rate, motion of q, begin and end.
+"""What a client must send.
 
 Intervals are measured by the client's source timestamps, where the recording has them. Only
 commands that drive a joint are compared with its range, because zero gains stop a hand whatever q
@@ -15,23 +15,36 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
+from dexkit.conformance.checks.robot import RobotContext
 from dexkit.conformance.provenance import STATES, TIMES
 from dexkit.conformance.results import Evidence
+from dexkit.conformance.sums import total
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte, model
 from dexkit.other_interfaces import TWO_FINGERS, is_two_fingers
 
 _MOST_PLACES = 5
+
+
 _FEWEST = 20
 """Fewest commands of a session."""
+
+
 _SAME = 1e-6
 """Relative difference of two times that counts as rounding."""
+
+
 _MOVES = 0.02
 """Smallest change of a moving target, as a part of the joint's range."""
+
+
 _COMES_BACK = 4
 """Number of commands within which q returns, if two clients alternate."""
+
+
 _NEAR = 0.25
 """Distance from the old q, as a part of the jump, that counts as returned."""
+
 
 Mask = NDArray[np.bool_]
 
@@ -86,9 +99,6 @@ def _between_stops(ctx: Context, driven: Mask) -> Iterator[tuple[int, NDArray[np
             target = q[part, joint][np.isfinite(q[part, joint])]
             if len(target) and float(np.ptp(target)) > _MOVES * spec.stroke:
                 yield joint, np.arange(part.start, part.stop)
-
-
-# ------------------------------------------------------------------------------ form and values
 
 
 @check("DEX1-CLIENT-01")
@@ -274,8 +284,12 @@ def mode(ctx: Context) -> Outcome:
 
 _LAGS = np.arange(0.0, 0.5, 0.02)
 """Seconds by which a hand may be behind its commands."""
+
+
 _GOES = 0.1
 """Part of the stroke that a goal must move to show whether a joint follows."""
+
+
 _EXPLAINED = 0.5
 """Largest distance of a joint that follows from its goal, as a part of the goal's own motion, both
 as standard deviations."""
@@ -299,9 +313,6 @@ def _follows(ctx: Context, wrong: Mask) -> bool:
         )
         following += least < _EXPLAINED * spread
     return following > moving / 2
-
-
-# ----------------------------------------------------------------------------------------- time
 
 
 def slow_stretches(
@@ -383,9 +394,6 @@ def gap(ctx: Context) -> Outcome:
         *places,
         max_gap_s=longest,
     )
-
-
-# --------------------------------------------------------------------------------------- motion
 
 
 def distance_from_states(ctx: Context, joint: int, memory: float) -> Floats:
@@ -478,9 +486,6 @@ def one_writer(ctx: Context) -> Outcome:
     return ctx.failed("two", text, where, returns=most).about(which)
 
 
-# -------------------------------------------------------------------------------- begin and end
-
-
 @check("DEX1-CLIENT-12", rests_on=(TIMES, STATES))
 def waits(ctx: Context) -> Outcome:
     """Whether a state came before the first command."""
@@ -559,3 +564,35 @@ def _speed(t: Floats, q: Floats) -> float:
         return 0.0
     t, q = t[good], q[good]
     return abs(float(q[-1] - q[0])) / float(t[-1] - t[0]) if t[-1] > t[0] else 0.0
+
+
+@check("H1-CLIENT-01")
+def client_crc(ctx: RobotContext) -> Outcome:
+    """The CRC of commands, except for those that the kit has damaged on purpose."""
+    intact, t = ctx.recording.commands_intact, ctx.commands.t
+    counts = np.ones(len(t), dtype=np.bool_)
+    for phase in ctx.phases("wrong-crc"):
+        begin, end = ctx.span(phase)
+        counts &= (t < begin - 0.02) | (t > end + 0.02)
+    wrong = np.flatnonzero(counts & ~intact)
+    if not len(wrong):
+        return ctx.passed("right", f"{int(counts.sum())} commands")
+    return ctx.failed(
+        f"{len(wrong)} wrong",
+        f"{len(wrong)} of {int(counts.sum())} commands carry a wrong CRC",
+        *(ctx.at(ctx.commands.topic, float(t[i])) for i in wrong[:5]),
+    )
+
+
+@check("H1-CLIENT-02")
+def client_rate(ctx: RobotContext) -> Outcome:
+    """The mean rate of commands."""
+    steps = np.diff(ctx.commands.t)
+    steady = steps[steps <= 0.1]
+    if total(steady) < ctx.tolerance("min_observed_s"):
+        return ctx.skipped("hardly any steady commands in the recording")
+    rate = len(steady) / total(steady)
+    text = f"{len(ctx.commands)} commands, {rate:.0f} Hz while they are sent"
+    if rate >= ctx.tolerance("min_rate_hz"):
+        return ctx.passed(f"{rate:.0f} Hz", text)
+    return ctx.failed(f"{rate:.0f} Hz", text)

@@ -1,5 +1,4 @@
-"""Check the fingers' pressure readings in contact: sensors in the state, or tactile areas on their
-own topic.
+"""Pressures that fingers and palm measure.
 
 What counts is the change of an element from what it read before the contact: a hand's values are
 absolute, and a touch may lower them (docs/sources/real-hands.md#touch-sign). Before the contact is
@@ -11,19 +10,137 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
-from dexkit.conformance.checks.motion import steps_of
+from dexkit.conformance.checks.members import (
+    distinct_values,
+    outside,
+    packet_paths,
+    span_text,
+)
+from dexkit.conformance.checks.steps import steps_of
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, Subject
 from dexkit.models import HandModel
 from dexkit.pressure import NO_VALUE, known
 
-__all__: list[str] = []
+
+@check("DEX3-SENS-05")
+def sensor_temperature(ctx: Context) -> Outcome:
+    """Sensor temperatures in degrees Celsius."""
+    paths = packet_paths(ctx, "temperature")
+    if not paths:
+        return ctx.absent("the states hold no sensor packets")
+    low, high = ctx.tolerance("low"), ctx.tolerance("high")
+    # a slot without an element holds the code for that in its temperature, too
+    wrong = None
+    for path in paths:
+        values = distinct_values(ctx, path)
+        good = ((values >= low) & (values <= high)) | (values == ctx.tolerance("no_value"))
+        if not good.all():
+            wrong = wrong or outside(ctx, [path], low, high)
+    figure = span_text(ctx, paths)
+    if not wrong and figure == "0":
+        return ctx.absent("sensor temperatures are not filled (0 throughout)")
+    return wrong or ctx.passed(f"{figure} C", f"sensor temperatures {figure}")
+
+
+@check("DEX3-SENS-06")
+def sensor_lost(ctx: Context) -> Outcome:
+    """The sensor packets' counts of lost packets."""
+    paths = packet_paths(ctx, "lost")
+    if not paths:
+        return ctx.absent("the states hold no sensor packets")
+    figure = span_text(ctx, paths)
+    return outside(ctx, paths, 0.0, ctx.tolerance("max_lost")) or ctx.passed(
+        figure, f"lost {figure}"
+    )
+
+
+_SLOTS = 12  # of a PressSensorState_
+
+
+def _packets(ctx: Context) -> NDArray[np.intp]:
+    assert ctx.states.columns is not None
+    count = ctx.states.columns.count("press_sensor_state")
+    return count[count >= 0]
+
+
+def _pressure(ctx: Context, packet: int, rows: slice = slice(None)) -> Floats:
+    """A packet's pressures, shape (n, 12)."""
+    assert ctx.states.columns is not None
+    return ctx.states.columns[f"press_sensor_state[{packet}].pressure"][rows]
+
+
+@check("DEX3-SENS-01")
+def packets(ctx: Context) -> Outcome:
+    """Number of sensor packets."""
+    found = np.unique(_packets(ctx))
+    most = ctx.tolerance("max_packets")
+    seen = " or ".join(str(n) for n in found)
+    if len(found) == 1 and found[0] <= most:
+        return ctx.passed(seen, f"{seen} sensor packets in each state")
+    outcome = ctx.failed(seen, f"{seen} sensor packets, from state to state")
+    if len(found) == 1:
+        return outcome.because("Each sensor element is published as a separate packet.")
+    return outcome.because("A packet is published only when its sensor has a new value.")
+
+
+@check("DEX3-SENS-02")
+def pressures(ctx: Context) -> Outcome:
+    """Every pressure is a number that is not negative."""
+    count = int(_packets(ctx).max(initial=0))
+    if not count:
+        return ctx.skipped("the states hold no sensor packets")
+    assert ctx.states.columns is not None
+    have = ctx.states.columns.count("press_sensor_state")
+    for packet in range(count):
+        low, high = ctx.states.columns.extremes(f"press_sensor_state[{packet}].pressure")
+        if low >= 0 and high < np.inf:
+            continue
+        values = _pressure(ctx, packet)
+        good = (np.isfinite(values) & (values >= 0)).all(axis=1) | (have <= packet)
+        if not good.all():
+            i = int(np.argmin(good))
+            slot = int(np.argmin(np.isfinite(values[i]) & (values[i] >= 0)))
+            return ctx.failed(
+                f"{values[i, slot]}",
+                f"pressure {values[i, slot]} in slot {slot} of packet {packet}",
+                ctx.at(ctx.states.topic, float(ctx.states.t[i])),
+            )
+    return ctx.passed("all finite", f"{count} packets of {_SLOTS}")
+
+
+@check("DEX3-SENS-03")
+def no_value(ctx: Context) -> Outcome:
+    """Nine packets; 33 elements, and the code for "no sensor here" elsewhere, always the same."""
+    count = int(_packets(ctx).max(initial=0))
+    if not count:
+        return ctx.absent("the states hold no sensor packets")
+    code = ctx.tolerance("no_value")
+    if count != ctx.tolerance("packets"):
+        return ctx.failed(f"{count} packets", f"{count} sensor packets in a state")
+    marked = [_pressure(ctx, packet) == code for packet in range(count)]
+    elements = count * _SLOTS - sum(int(m[0].sum()) for m in marked)
+    changes = sum(int((m != m[0]).any()) for m in marked)
+    if changes:
+        return ctx.failed("changes", f"the slots without a value change in {changes} packets")
+    text = f"{elements} of {count * _SLOTS} slots hold a value, the others {code:g}"
+    if elements == ctx.tolerance("elements"):
+        return ctx.passed(f"{elements} elements", text)
+    outcome = ctx.failed(f"{elements} elements", text)
+    if elements == count * _SLOTS:
+        return outcome.because("No slot is marked: those without a sensor hold a number, too.")
+    return outcome
+
 
 _BEFORE_S = 0.1  # s before a phase or at its end in which a pressure is taken
+
+
 _REST_S = 0.5  # s before a contact in which the noise is taken
+
 
 _STANDS = 0.02  # of the stroke: motion at the end of a phase that still counts as standing
 

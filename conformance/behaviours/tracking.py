@@ -1,4 +1,4 @@
-"""Check error and delay between command and position over a session."""
+"""The hand follows a session of commands."""
 
 from __future__ import annotations
 
@@ -11,21 +11,29 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Late, Outcome, check
 from dexkit.conformance.checks.figures import Figure, judged
-from dexkit.conformance.checks.motion import own_speed, speed_of, steps_of
+from dexkit.conformance.checks.steps import own_speed, speed_of, steps_of
 from dexkit.conformance.row_selection import Selected, finite_rows
 from dexkit.conformance.sums import mean
 from dexkit.hand import Floats
 
 _GRID = 0.005  # seconds; clients send commands at 200 Hz
+
+
 _TOLERANCES = (
     *("min_session_s", "min_travel_stroke", "blocked_tau_nm", "blocked_speed_rad_s"),
     *("min_speed_rad_s", "min_step_stroke"),
 )
 """Tolerances that the error figures depend on."""
+
+
 _SAME = 1e-12
 """Largest relative difference between sums of squares in different order."""
+
+
 _ROUNDING = 1e-11
 """Largest relative error of a sum of squares."""
+
+
 _STEPS = (16, 4)
 """Step of the coarse search over delays, before the fine search."""
 

@@ -1,0 +1,132 @@
+"""A loaded machine delays neither states nor commands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dexkit.conformance.checks import Context, Outcome, check, rate_measure
+from dexkit.conformance.checks.figures import Figure, Figures, worst
+from dexkit.conformance.checks.obedience import silent
+from dexkit.conformance.checks.steps import obeyed_before, steps_of
+from dexkit.conformance.checks.timing import gaps, least_rate, slow, too_slow
+
+
+@check("DEX1-LOAD-01", "DEX3-LOAD-01")
+def load(ctx: Context) -> Outcome:
+    """Rate and gaps of the state under load."""
+    limit = ctx.tolerance("max_gap_s")
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        clock = ctx.states.clock
+        inside = clock[(clock >= begin) & (clock <= end)]
+        rate = len(inside) / (end - begin)
+        found = gaps(ctx, limit, begin, end)
+        text = f"{rate:.1f} Hz under load"
+        if found:
+            a, b = found[0]
+            text = f"{text}; no state from {a:.3f} to {b:.3f} s"
+            return silent(ctx, found, limit, f"{b - a:.2f} s", text)
+        if slow(ctx, rate):
+            place = ctx.at(ctx.states.topic, begin, end)
+            outcome = ctx.failed(f"{rate:.1f} Hz", text, place, rate_hz=rate)
+            outcome = outcome.rated(rate, least_rate(ctx), end - begin)
+            return too_slow(ctx, outcome, rate, np.diff(inside))
+    span = begin, end
+    met = ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
+    return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))
+
+
+@check("DEX1-LOAD-03", "DEX3-LOAD-03")
+@worst("more_s", "max_more_s", nothing="no motion under load, or none without it to compare with")
+def late_under_load(ctx: Context) -> Figures:
+    """How much later than without load the states show a motion that is commanded under load."""
+    usual = _usual_lags(ctx)
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        for joint, before in usual.items():
+            lag = _lag(ctx, joint, *ctx.span(phase))
+            if lag is not None:
+                text = (
+                    f"q follows {lag:.2f} s behind the command under load, {before:.2f} s without"
+                )
+                more, values = max(0.0, lag - before), {"lag_s": lag}
+                yield Figure(more, *ctx.span(phase), joint, text, values=values)
+
+
+_FREE_STEPS = ("fingerprint", "step", "joint", "center", "recover")
+"""Phases of free steps, without load."""
+
+
+_LAGS = np.arange(0.0, 0.61, 0.01)
+
+
+_FOLLOWS_PART = 0.5
+"""Least part of the way of a motion under load, and of its shape, in which a lag shows."""
+
+
+def _usual_lags(ctx: Context) -> dict[int, float]:
+    """Seconds that q is behind the command in free steps, by joint: the median.
+
+    For a linear hand the mean delay of a step, the integral of what is left of it, is the lag
+    behind a ramp; a hand of limited speed is less behind a slow ramp.
+    """
+    lags: dict[int, list[float]] = {}
+    for phase in (p for name in _FREE_STEPS for p in ctx.phases(name) if obeyed_before(ctx, p)):
+        for step in steps_of(ctx, phase):
+            if abs(step.size) < ctx.tolerance("min_way_stroke", step.joint) or len(step.t) < 5:
+                continue
+            left = (step.final - step.q) / (step.final - step.start or np.inf)
+            if abs(step.final - step.start) >= _FOLLOWS_PART * abs(step.size):
+                spent = np.diff(step.t, prepend=step.begin)
+                lags.setdefault(step.joint, []).append(float(np.sum(left * spent)))
+    return {joint: float(np.median(found)) for joint, found in lags.items()}
+
+
+def _lag(ctx: Context, joint: int, begin: float, end: float) -> float | None:
+    """By how many seconds q follows its command in [begin, end]; None if it does not follow."""
+    rows = ctx.states.between(begin, end)
+    t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
+    given, goals = ctx.commands.t, ctx.commands.q[:, joint]
+    good = np.isfinite(goals)
+    given, goals = given[good], goals[good]
+    if len(t) < 10 or not np.isfinite(q).all() or not len(given):
+        return None
+    shifted = np.searchsorted(given, t[None, :] - _LAGS[:, None], "right") - 1
+    wanted = goals[np.maximum(shifted, 0)]
+    way = float(np.ptp(wanted[0]))
+    if way < ctx.tolerance("min_way_stroke", joint) or np.ptp(q) < _FOLLOWS_PART * way:
+        return None
+    wanted = wanted - wanted.mean(axis=1, keepdims=True)
+    shown = q - q.mean()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        alike = wanted @ shown / np.sqrt((wanted**2).sum(axis=1) * (shown**2).sum())
+    best = int(np.nanargmax(alike))
+    return float(_LAGS[best]) if alike[best] >= _FOLLOWS_PART else None
+
+
+@check("DEX1-LOAD-02", "DEX3-LOAD-02")
+@worst("part", "min_part", nothing="no way under load, or the hand had stopped obeying before")
+def obeys_under_load(ctx: Context) -> Figures:
+    """How far the hand follows the way out and back that it is commanded under load."""
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        begin, end = ctx.span(phase)
+        rows = ctx.given(begin, end)
+        t, goals = ctx.commands.t[rows], ctx.commands.q[rows]
+        before = ctx.q(begin - 0.1, begin)
+        if not len(t) or not len(before) or not np.isfinite(goals).all():
+            continue
+        start = np.median(before, axis=0)
+        for joint in range(len(ctx.joints)):
+            way = goals[:, joint] - goals[0, joint]
+            turn = int(np.argmax(np.abs(way)))
+            size = float(way[turn])
+            if abs(size) < ctx.tolerance("min_way_stroke", joint):
+                continue
+            # it may still be on its way from the load before, or be held off its goal
+            origin = float(goals[0, joint])
+            if (float(start[joint]) - origin) * size < 0:
+                origin = float(start[joint])
+            until = float(t[turn]) + ctx.tolerance("max_delay_s")
+            q = ctx.q(float(t[turn]), until)[:, joint]
+            made = float(((q - origin) / size).max()) if len(q) else 0.0
+            text = f"made {made:.0%} of a way of {size:.2f} {ctx.unit} under load"
+            yield Figure(made, begin, until, joint, text, late=until - begin)

@@ -1,0 +1,443 @@
+"""What happens when commands end, and when they return."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexkit.conformance.behaviours.motion import robot_follows
+from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
+from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
+from dexkit.conformance.checks.obedience import arrival, away_first, silent, stopped
+from dexkit.conformance.checks.robot import RobotContext, no_state, only_phase, speed_between
+from dexkit.conformance.checks.silences import roles_of, stops_moving
+from dexkit.conformance.checks.steps import obeyed_before, steps_of
+from dexkit.conformance.checks.timing import gaps, survived
+from dexkit.conformance.checks.torque_law import torque_scales
+from dexkit.conformance.measurement_error import Measure, Quantity
+from dexkit.conformance.median import median
+from dexkit.hand import Floats
+
+
+def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
+    """(last command, end) of each phase without commands: the requirement's, and ``names``.
+
+    An empty or non-finite command does not count: it must not keep the hand driven.
+    """
+    found = []
+    good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
+    for phase in (*ctx.phases(), *(p for name in names for p in ctx.phases(name))):
+        begin, end = ctx.span(phase)
+        sent = good[good <= end]
+        last = float(sent[-1]) if len(sent) else begin
+        found.append((last, end))
+    return found
+
+
+@check("DEX1-WDOG-01", "DEX1-WDOG-04")
+def brakes(ctx: Context) -> Outcome:
+    """Motion and force after the time-out of a hand that moved or pressed when silence began.
+
+    At rest at its target, braking and holding look alike, so commands end while the hand is driven
+    by a velocity or presses on an object. If it does neither, ``mode`` must change from driven to
+    0.
+    """
+    timeout = ctx.tolerance("timeout_s")
+    states, stroke = ctx.states, ctx.joints[0].stroke
+    proofs: list[str] = []
+    values: dict[str, float] = {}
+    measures: list[Measure] = []
+    for last, end in _silences(ctx):
+        due = last + timeout + ctx.tolerance("grace_s")
+        q_free, q_late = ctx.q(last, last + timeout)[:, 0], ctx.q(due, end)[:, 0]
+        before = ctx.tau(last - 0.2, last)[:, 0]
+        if len(q_late) < 5 or not len(q_free) or not len(before):
+            continue
+        place = ctx.at(states.topic, last + timeout, end)
+        moved, still = float(np.ptp(q_late)), ctx.tolerance("max_motion_stroke")
+        rows = states.between(last, end)
+        stop = stopped(states.t[rows], states.q[rows, 0], last, still, due - last)
+        if moved > still:
+            text = f"moved by {moved:.2f} {ctx.unit} more than {timeout:g} s after the last command"
+            outcome = ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved)
+            return outcome.resting_on(stop)
+        jump, allowed = _jump(ctx, last + timeout, q_late)
+        if jump > allowed:
+            text = f"moved by {jump:.2f} {ctx.unit} while it braked"
+            outcome = ctx.failed(f"{jump:.2f} {ctx.unit}", text, place, motion_rad=jump)
+            return outcome.placed(jump, allowed).if_late(STROKE_S * (jump - allowed) / stroke)
+        # at its stop it stands still even without a brake
+        at_stop = not 0.05 * stroke < float(np.median(q_late)) < 0.95 * stroke
+        if float(np.ptp(q_free)) >= ctx.tolerance("min_travel_stroke") and not at_stop:
+            proofs.append(f"was moving, then moved only {moved:.3f} {ctx.unit}")
+            values["motion_rad"] = moved
+            measures.append(stop)
+        pressed = float(np.median(np.abs(before)))
+        if pressed >= ctx.tolerance("min_tau_nm") and ctx.object_at is not None:
+            found = list(_forces_left(ctx, last, end, before))
+            wrong = judged(ctx, found, "tau_nm", "max_back_nm", nothing="")
+            if not wrong.met:
+                return wrong
+            left = found[-1]
+            measures.append(Measure(left.value, left.limit or 0.0, "N m", Quantity.TORQUE))
+            proofs.append(f"pressed with {pressed:.2f} N m, then with {left.value:.2f} N m")
+            values["tau_nm"] = left.value
+        driven = ctx.states.mode[states.between(last - 0.2, last), 0]
+        if (
+            not proofs
+            and (driven > 0).all()
+            and (states.mode[states.between(due, end), 0] == 0).all()
+        ):
+            proofs.append(f"stood still, and reports the brake: mode {driven[-1]:.0f}, then 0")
+    if not proofs:
+        return ctx.skipped(
+            "this hand neither moved (it does not follow velocity commands) nor pressed on an "
+            "object when the commands stopped, and its mode does not show it: braking cannot be "
+            "distinguished from holding"
+        )
+    figure = "stops" if "motion_rad" in values else "lets go" if values else "says so"
+    return ctx.passed(figure, "; ".join(proofs), **values).resting_on(*measures)
+
+
+def _forces_left(ctx: Context, last: float, end: float, before: Floats) -> Iterator[Figure]:
+    """The forces of a hand that pressed, after its time-out: the other way, soon, and then.
+
+    :param before: its tau_est until the last command, N m.
+    """
+    since = last + ctx.tolerance("timeout_s")
+    due = since + ctx.tolerance("grace_s")
+    pressed = float(np.median(np.abs(before)))
+    sign = 1 if float(np.median(before)) > 0 else -1
+    had = f"pressed with {pressed:.2f} N m at the last command, and"
+    for at, tau in _pieces(ctx, since, end):
+        back = max(-float(np.median(tau)) * sign, 0.0)
+        yield Figure(
+            back, at, end, text=f"{had} drove the other way with {back:.2f} N m after the time-out"
+        )
+    # torque must not return, either
+    begin = min(since + ctx.tolerance("release_s"), end - 0.1)
+    for first, until, part, when in (
+        (due, due + _PIECE_S, "begun_part", f"{due - last:.2f} s later"),
+        (begin, end, "max_tau_part", "after the time-out"),
+    ):
+        sizes = [float(np.median(np.abs(tau))) for _, tau in _pieces(ctx, first, until)]
+        felt, limit = max(sizes, default=0.0), ctx.tolerance(part) * pressed
+        text = f"{had} still with {felt:.2f} N m {when}"
+        yield Figure(felt, since, end, text=text, limit=limit)
+
+
+_PIECE_S = 0.1
+
+
+def _pieces(ctx: Context, begin: float, end: float) -> Iterator[tuple[float, Floats]]:
+    """(time, tau_est) of the consecutive pieces of a stretch."""
+    for at in np.arange(begin, end - 0.99 * _PIECE_S, _PIECE_S).tolist():
+        tau = ctx.tau(at, at + _PIECE_S)[:, 0]
+        if len(tau) >= 3 and np.isfinite(tau).all():
+            yield at, tau
+
+
+def _jump(ctx: Context, at: float, q_late: Floats) -> tuple[float, float]:
+    """Motion of the hand while it braked, and the allowed motion, rad.
+
+    Allowed are the run-out at its last speed and the relaxation of a squeezed object.
+    """
+    states = ctx.states
+    before = states.between(at - 0.15, at - 0.05)
+    q, t = states.q[before, 0], states.t[before]
+    if len(q) < 2:
+        return 0.0, 0.0
+    speed = abs(float(q[-1] - q[0])) / max(float(t[-1] - t[0]), 1e-3)
+    runs_on = speed * (0.05 + ctx.tolerance("grace_s"))
+    jump = abs(float(np.median(q_late)) - float(q[-1]))
+    return jump, ctx.tolerance("max_jump_stroke") + runs_on
+
+
+@check("DEX1-WDOG-02", "DEX3-WDOG-02")
+def state_in_silence(ctx: Context) -> Outcome:
+    """Gaps in the state while no command is sent."""
+    limit = ctx.tolerance("max_gap_s")
+    # a tripped hand must continue to publish
+    silences = _silences(ctx, "guard")
+    spans = [(a, b) for a, b in silences if b - a >= ctx.tolerance("min_silence_s")]
+    if not spans:
+        return ctx.skipped("no pause of commands that was long enough")
+    longest = 0.0
+    for begin, end in spans:
+        found = gaps(ctx, limit, begin, end)
+        if found:
+            a, b = found[0]
+            text = f"no state from {a:.3f} s to {b:.3f} s, in the pause that began at {begin:.3f} s"
+            outcome = silent(ctx, found, limit, f"{b - a:.2f} s", text)
+            return survived(ctx, outcome, max(b - a for a, b in found))
+        clock = ctx.states.clock
+        inside = clock[(clock >= begin) & (clock <= end)]
+        longest = max(longest, float(np.diff(inside).max()) if len(inside) > 1 else 0.0)
+    return ctx.passed(
+        f"{longest * 1e3:.1f} ms", f"longest gap {longest * 1e3:.1f} ms", max_gap_s=longest
+    ).timed(longest, limit, span=(spans[0][0], spans[-1][1]))
+
+
+@check("DEX1-WDOG-03", "DEX3-WDOG-03")
+def resumes(ctx: Context) -> Outcome:
+    """The step after a pause of commands."""
+    begun = judged(
+        ctx, _reactions(ctx), "reaction_s", "max_reaction_s", nothing=ctx.passed("no step")
+    )
+    if not begun.met:
+        return begun
+    for phase in ctx.phases():
+        if obeyed_before(ctx, phase):
+            wrong = away_first(ctx, phase, "after a pause of commands")
+            if wrong is not None:
+                return wrong
+    outcome = arrival(ctx, "after a pause of commands")
+    return outcome.resting_on(*begun.measures) if outcome.met and begun.measures else outcome
+
+
+def _reactions(ctx: Context) -> Figures:
+    """When the steps after a pause begin."""
+    for step in (s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)):
+        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint):
+            continue
+        begun = (step.q - step.start) / step.size >= ctx.tolerance("begun_part")
+        after = float(step.t[np.argmax(begun)] if begun.any() else step.end) - step.begin
+        text = f"after a pause: {step}, but it began to move only after {after:.2f} s"
+        shown = f"after {after:.2f} s"
+        yield Figure(after, step.begin, step.begin + after, step.joint, text, shown=shown)
+
+
+@check("DEX3-WDOG-01")
+def nothing_left_moving(ctx: Context) -> Outcome:
+    """Motion after the time-out of joints driven by a velocity or torque, without protection."""
+    return stops_moving(ctx, roles_of(ctx).driven, guarded=False)
+
+
+@check("DEX5-WDOG-04")
+@with_object
+def all_alike(ctx: Context) -> Outcome:
+    """Which joints that pressed when the commands ended still press after the time-out."""
+    least = ctx.tolerance("min_tau_nm")
+    scales = torque_scales(ctx, least)
+    squeezed = [p.end_ns for p in ctx.phases("squeeze")]
+    judged = False
+    for phase in ctx.phases():
+        if not any(0 <= phase.begin_ns - end < 1e9 for end in squeezed):
+            continue  # it pressed on nothing before
+        begin, end = ctx.span(phase)
+        sent = ctx.commands.t[ctx.commands.t <= begin + 0.05]
+        last = float(sent[-1]) if len(sent) else begin
+        late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+        before, after = (
+            np.abs(ctx.tau(a, b)) / scales for a, b in ((last - 0.2, last), (late, end))
+        )
+        if len(before) < 3 or len(after) < 3:
+            continue
+        had, left = np.median(before, axis=0), np.median(after, axis=0)
+        pressed = np.flatnonzero(had >= least).tolist()
+        judged |= bool(pressed)
+        part = {j: float(left[j] / had[j]) for j in pressed}
+        on = [j for j in pressed if part[j] >= ctx.tolerance("min_part")]
+        off = [j for j in pressed if part[j] <= ctx.tolerance("max_part")]
+        if on and off:
+            names = ctx.joints[on[0]].name, ctx.joints[off[0]].name
+            text = (
+                f"{late - last:.1f} s after the last command {len(on)} joints still press, "
+                f"{names[0]} with {part[on[0]]:.0%} of its force, and {len(off)} do not, "
+                f"{names[1]} with {part[off[0]]:.0%}"
+            )
+            place = ctx.at(ctx.states.topic, late, end)
+            return ctx.failed(f"{len(on)} of {len(pressed)}", text, place).about(*on, *off)
+    if not judged:
+        return ctx.skipped("no joint pressed on the object when the commands ended")
+    return ctx.passed("all alike", "all joints that pressed go on, or none does")
+
+
+@check("BRAINCO-WDOG-01")
+@worst("motion_rad", "max_motion_stroke", nothing="no pause of commands with states")
+def takes_no_detour(ctx: Context) -> Figures:
+    """Deviation of a joint from the way to its last goal while there are no commands."""
+    for begin, end, goal in _pauses(ctx):
+        rows = ctx.states.between(begin, end)
+        t, q = ctx.states.t[rows], ctx.states.q[rows]
+        if len(t) < 5:
+            continue
+        low, high = np.minimum(q[0], goal), np.maximum(q[0], goal)
+        beyond = np.maximum(low - q, q - high)
+        for joint in range(len(ctx.joints)):
+            i = int(np.nanargmax(beyond[:, joint]))
+            rad = max(float(beyond[i, joint]), 0.0)
+            text = f"left the way to its last goal by {rad:.3f} {ctx.unit} without a command"
+            yield Figure(rad, float(t[i]), None, joint, text)
+
+
+@check("BRAINCO-WDOG-04")
+@worst("motion_rad", "max_motion_stroke", nothing="no joint was on its way at the time-out")
+def stops_in_silence(ctx: Context) -> Figures:
+    """Whether a moving joint stands still after the time-out."""
+    for begin, end, goal in _pauses(ctx):
+        late = begin + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
+        q = ctx.q(late, end)
+        if len(q) < 5:
+            continue
+        for joint in range(len(ctx.joints)):
+            if abs(goal[joint] - q[0, joint]) >= ctx.tolerance("min_left_stroke", joint):
+                moved = float(np.ptp(q[:, joint]))
+                text = f"moved by {moved:.2f} {ctx.unit} more than {ctx.tolerance('timeout_s'):g} s"
+                yield Figure(moved, late, end, joint, f"{text} after the last command")
+
+
+def _pauses(ctx: Context) -> list[tuple[float, float, Floats]]:
+    """Last good command, end and its q, of each pause of commands."""
+    commands = ctx.commands
+    good = np.flatnonzero(np.isfinite(commands.q).all(axis=1))
+    found = []
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        sent = good[commands.t[good] <= min(begin + 0.05, end)]
+        if len(sent):
+            last = int(sent[-1])
+            found.append((float(commands.t[last]), end, np.asarray(commands.q[last])))
+    return found
+
+
+_AT_A_STOP = 0.05
+"""Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
+
+
+@check("DEX1-WDOG-05")
+@worst(
+    "motion_rad",
+    "min_motion_stroke",
+    nothing="no command after a pause was alone for long enough",
+)
+def first_command_counts(ctx: Context) -> Figures:
+    """Motion of the hand by the first command after a pause, until the second command."""
+    for step in (s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)):
+        sent = ctx.commands.t[ctx.commands.t >= step.begin]
+        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint) or len(sent) < 2:
+            continue
+        alone = float(sent[1] - sent[0])
+        if alone < ctx.tolerance("min_alone_s"):
+            continue
+        way = (step.q[step.t <= sent[1]] - step.start) * np.sign(step.size)
+        moved = float(way.max()) if len(way) else 0.0
+        text = (
+            f"the first command after a pause, alone for {alone:.2f} s, moved it by {moved:.3f} "
+            f"{ctx.unit} towards {step.target:.2f} {ctx.unit}"
+        )
+        yield Figure(moved, step.begin, step.begin + alone, step.joint, text, late=alone)
+
+
+@check("DEX1-WDOG-06")
+@worst("part", "min_part", nothing="it neither pressed nor moved when the commands stopped")
+def in_force(ctx: Context) -> Figures:
+    """Force or speed shortly before the time-out, relative to that at the last command."""
+    window, states, until = ctx.tolerance("window_s"), ctx.states, ctx.tolerance("until_s")
+    good = ctx.commands.t[np.isfinite(ctx.commands.q).all(axis=1)]
+    for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
+        _, end = ctx.span(phase)
+        sent = good[good <= end]
+        if not len(sent) or end - sent[-1] < until:
+            continue
+        last = float(sent[-1])
+        late = last + until - window
+        spans = [states.between(a, a + window) for a in (last - window, late)]
+        if min(len(states.t[s]) for s in spans) < 5:
+            continue
+        what = ""
+        if ctx.object_at is not None:
+            before, after = (median(np.abs(states.tau[s, 0])) for s in spans)
+            if before >= ctx.tolerance("min_tau_nm"):
+                part, what = after / before, f"presses with {after:.2f} N m, {before:.2f} N m"
+        if not what:
+            before, after = (_speed(states.t[s], states.q[s, 0]) for s in spans)
+            place, spec = median(states.q[spans[1], 0]), ctx.joints[0]
+            near = _AT_A_STOP * spec.stroke
+            free = spec.q_min + near < place < spec.q_max - near
+            free = free and not _arrives(ctx, last, abs(before) * until)
+            if not free or abs(before) < ctx.tolerance("min_speed_stroke"):
+                continue
+            unit = f"{ctx.unit}/s"
+            part, what = after / before, f"moves at {after:.2f} {unit}, {before:.2f} {unit}"
+        text = f"{until:g} s after the last command it {what} at that command"
+        yield Figure(part, late, late + window, text=text)
+
+
+def _arrives(ctx: Context, at: float, way: float) -> bool:
+    """Whether the last command before a time has a position that is nearer than so far, rad."""
+    row = int(np.searchsorted(ctx.commands.t, at, "right")) - 1
+    here = ctx.q(at - 0.05, at)[:, 0]
+    if not ctx.commands.kp[row, 0] > 0 or not len(here):
+        return False
+    return abs(float(ctx.commands.q[row, 0]) - median(here)) < way
+
+
+def _speed(t: Floats, q: Floats) -> float:
+    """Slope of the line through all of them, which noise changes little, rad/s."""
+    t = t - t.mean()
+    return float(t @ (q - q.mean())) / max(float(t @ t), 1e-9)
+
+
+@check("H1-WDOG-01")
+@worst("speed_rad_s", "max_speed_rad_s", nothing="")
+def damps(ctx: RobotContext) -> Figures:
+    """Speed of a driven joint some time after the last command."""
+    phase, begin, end, joint = only_phase(ctx)
+    after = begin + ctx.tolerance("max_s")
+    speed = speed_between(ctx, phase, after, end)
+    if speed is None:
+        yield no_state(ctx, phase)
+        return
+    text = f"{after - begin:.1f} s after the last command it turns at {speed:.2f} rad/s"
+    yield Figure(abs(speed), after, end, joint, text, shown=f"{abs(speed):.2f} rad/s")
+
+
+@check("H1-WDOG-02")
+def robot_state_in_silence(ctx: RobotContext) -> Outcome:
+    """Gaps in the state while no command is sent."""
+    limit, longest = ctx.tolerance("max_gap_s"), 0.0
+    for phase in ctx.phases():
+        begin, end = ctx.span(phase)
+        found = timing.gaps(ctx, limit, begin, end)
+        if found:
+            a, b = found[0]
+            text = f"no state from {a:.3f} s to {b:.3f} s, {a - begin:.2f} s after the last command"
+            outcome = ctx.failed(f"{b - a:.2f} s", text, ctx.at(ctx.states.topic, a, b))
+            return outcome.if_late(b - a - limit)
+        clock = ctx.states.clock[(ctx.states.clock >= begin) & (ctx.states.clock <= end)]
+        longest = max(longest, float(np.diff(clock).max(initial=0.0)))
+    return ctx.passed(f"{longest * 1e3:.0f} ms", f"the longest gap is {longest * 1e3:.1f} ms")
+
+
+@check("H1-WDOG-03")
+def robot_resumes(ctx: RobotContext) -> Outcome:
+    """The jump when commands resume, and the step after it."""
+    hold = next(p for p in ctx.phases() if not p.targets)
+    begin, end = ctx.span(hold)
+    q = ctx.q(begin - 0.02, end)
+    if not len(q):
+        return no_state(ctx, hold)
+    moved = np.nan_to_num(np.abs(q - q[0]).max(axis=0), nan=np.inf)
+    figures = [
+        Figure(far, begin, end, joint, f"moves by {far:.3f} rad when commands arrive again")
+        for joint, far in enumerate(moved.tolist())
+    ]
+    jump = judged(ctx, figures, "jump_rad", "max_jump_rad", nothing="")
+    return robot_follows(ctx) if jump.met else jump
+
+
+@check("H1-WDOG-04")
+@worst("speed_part", "min_part", nothing="")
+def bridges(ctx: RobotContext) -> Figures:
+    """The speed of a driven joint in a short pause."""
+    phase, begin, end, joint = only_phase(ctx)
+    wanted = float(phase.params["speed"])
+    speed = speed_between(ctx, phase, begin, end)
+    if speed is None:
+        yield no_state(ctx, phase)
+        return
+    text = f"{speed:.2f} rad/s in a pause of {end - begin:.2f} s, commanded {wanted:.2f} rad/s"
+    limit, shown = ctx.tolerance("low_part"), f"{speed:.2f} rad/s"
+    yield Figure(speed / wanted, begin, end, joint, text, limit=limit, shown=shown)
