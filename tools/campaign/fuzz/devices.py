@@ -156,13 +156,15 @@ def mx64_line(case: Inputs, count: int) -> None:
         data = _protocol_1(case) if chance < 0.05 else _instruction(case)
         data = case.spoil(data)
         now += case.random.choice((0.0, 1e-4, 1e-3, 2e-3, 5e-3, 0.02))
-        case.run(data, lambda bus=bus, data=data, now=now: _exchange(case, bus, data, now))  # type: ignore[misc]
+        case.begin(data)
+        _exchange(bus, data, now)
         if (i + 1) % _BLOCK == 0:
             now += bus.behind(now) + 2.0  # 4 KiB at 9600 baud take 4 s
-            case.run(b"", lambda bus=bus, now=now: _answer_a_broadcast_ping(bus, now))  # type: ignore[misc]
+            case.begin()
+            _answer_a_broadcast_ping(bus, now)
 
 
-def _exchange(case: Inputs, bus: Bus | MotorBus, data: bytes, now: float) -> bytes:
+def _exchange(bus: Bus | MotorBus, data: bytes, now: float) -> None:
     bus.advance_to(now)
     bus.receive(data, now)
     assert bus._parser.pending <= dxl.MAX_PACKET, "the parser holds more than a packet"
@@ -171,7 +173,6 @@ def _exchange(case: Inputs, bus: Bus | MotorBus, data: bytes, now: float) -> byt
     late = 0.3  # all that was asked is out by then
     out = bus.due(now + late)
     assert len(out) <= 64 * (len(data) + dxl.MAX_PACKET), f"{len(out)} bytes of answers"
-    return out
 
 
 def _answer_a_broadcast_ping(bus: Bus, now: float) -> None:
@@ -200,10 +201,12 @@ def m4010_line(case: Inputs, count: int) -> None:
             )
         data = case.spoil(_motor_frame(case))
         now += case.random.choice((0.0, 1e-4, 1e-3, 5e-3, 0.05))
-        case.run(data, lambda bus=bus, data=data, now=now: _exchange(case, bus, data, now))  # type: ignore[misc]
+        case.begin(data)
+        _exchange(bus, data, now)
         if (i + 1) % _BLOCK == 0:
             now += 2.0
-            case.run(b"", lambda bus=bus, now=now: _motors_answer(bus, now))  # type: ignore[misc]
+            case.begin()
+            _motors_answer(bus, now)
 
 
 def _motor_frame(case: Inputs) -> bytes:
@@ -247,7 +250,8 @@ def dex3(case: Inputs, count: int) -> None:
             usb = Dex3Usb(Dex3Mcu(Side.LEFT, clock=clock, firmware=firmware), clock)
         data = case.spoil(_hand_frame(case))
         clock.advance(case.random.choice((0.0, 1e-4, 1e-3, 5e-3)))
-        case.run(data, lambda usb=usb, data=data: _transfer(usb, data))  # type: ignore[misc]
+        case.begin(data)
+        _transfer(usb, data)
 
 
 def _hand_frame(case: Inputs) -> bytes:
@@ -299,13 +303,10 @@ def robots(case: Inputs, count: int) -> None:
         payload = _sealed(model.cmd_type, bytes(data)) if rnd.random() < 0.8 else bytes(data)
         payload = case.spoil(payload)
         now += rnd.choice((0.0, 1e-3, 2e-3, 0.01))
-
-        def act(robot: RobotMechanics = robot, payload: bytes = payload, now: float = now) -> None:
-            (robot.command if len(payload) % 3 else robot.arm_command)(payload, now)
-            robot.advance(now)
-            robot.state(now)
-
-        case.run(payload, act)
+        case.begin(payload)
+        (robot.command if len(payload) % 3 else robot.arm_command)(payload, now)
+        robot.advance(now)
+        robot.state(now)
 
 
 _FLOATS = (0.0, 1.0, -1.0, 1e3, 1e-30, 2.1e9, 3.4e38, -3.4e38, math.inf, math.nan, 16000.0)
@@ -356,8 +357,8 @@ def usbip_server(case: Inputs, count: int) -> None:
         while made < count:
             stream = b"".join(_message(case) for _ in range(min(40, count - made)))
             made += min(40, count - made)
-            case.number = made
-            case.run(stream, lambda stream=stream: _client(case, hands, stream))  # type: ignore[misc]
+            case.begin(stream)
+            _client(case, hands, stream)
 
 
 def _message(case: Inputs) -> bytes:

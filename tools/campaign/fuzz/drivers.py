@@ -139,26 +139,23 @@ def ezgripper(case: Inputs, count: int) -> None:
                 mock.patch.object(gripper, "latency_warning", return_value=None),
             ):
                 port.honest = rnd.random() < 0.7
-                case.run(b"", lambda hand=hand: _typed(hand.open))  # type: ignore[misc]
+                case.begin()
+                with contextlib.suppress(DexkitError):
+                    hand.open()
             port.honest = False
-        command = rnd.choice(commands)
-        case.run(b"", lambda hand=hand, c=command: _typed(lambda: hand.exchange(c)))  # type: ignore[misc]
+        case.begin()
+        with contextlib.suppress(DexkitError):
+            hand.exchange(rnd.choice(commands))
         if (i + 1) % _BLOCK == 0:
             port.honest = True
-            case.run(b"", hand.close)
+            case.begin()
+            hand.close()
             line.due(clock.advance(2.0))
             line.advance_to(clock.now())
             for servo in line.servos:
                 still = abs(servo.drive.velocity) < 1.0
-                case.expect(
-                    not servo.torque or servo.drive.demand.stopped or still,
-                    "close() left the servo driven",
-                )
-
-
-def _typed(function: Callable[[], object]) -> None:
-    with contextlib.suppress(DexkitError):
-        function()
+                stopped = not servo.torque or servo.drive.demand.stopped
+                assert stopped or still, "close() left the servo driven"
 
 
 # --- Dex1-1's motor
@@ -231,8 +228,10 @@ def motor_line(case: Inputs, count: int) -> None:
         frame = m4010.MotorCmd(0, m4010.Status.BRAKE).pack()
         for _ in range(count):
             with mock.patch("dexkit.drivers.dex1_serial.line.LATE", 0.001):
-                case.run(b"", lambda: _typed(lambda: line.exchange(frame, 0, 0.0005)))
-            case.expect(line._parser.pending < 100, "the parser holds more than a frame")
+                case.begin()
+                with contextlib.suppress(DexkitError):
+                    line.exchange(frame, 0, 0.0005)
+            assert line._parser.pending < 100, "the parser holds more than a frame"
     finally:
         peer.close()
 
@@ -309,18 +308,23 @@ def dex3_usb(case: Inputs, count: int) -> None:
             candidate = Candidate(backend, None, Side.LEFT, "fuzz")
             backend.honest = rnd.random() < 0.8
             with mock.patch.object(dex3_hand, "find_hand", lambda *a, c=candidate, **k: c):
-                case.run(b"", lambda hand=hand: _typed(hand.open))  # type: ignore[misc]
+                case.begin()
+                with contextlib.suppress(DexkitError):
+                    hand.open()
             backend.honest = False
         clock.advance(0.001)
         with mock.patch("dexkit.drivers.dex3_usb.link._LATE_ANSWER_WAIT", 0.0):
             command = rnd.choice((HandCommand.brake(7), HandCommand.position([0.1] * 7)))
-            case.run(b"", lambda hand=hand, c=command: _typed(lambda: hand.exchange(c)))  # type: ignore[misc]
+            case.begin()
+            with contextlib.suppress(DexkitError):
+                hand.exchange(command)
         if (i + 1) % _BLOCK == 0:
             backend.honest = True
-            case.run(b"", hand.close)
+            case.begin()
+            hand.close()
             clock.advance(2.0)
             mcu.advance()
-            case.expect(not any(mcu.mechanics.mode), "close() left a motor driven")
+            assert not any(mcu.mechanics.mode), "close() left a motor driven"
 
 
 # --- USB/IP client
@@ -333,17 +337,14 @@ def usbip_client(case: Inputs, count: int) -> None:
         if i % 20 == 0:
             peer = _Peer(lambda data: _replies(case, data))
             connection = Connection(peer.near, 2)
-
-        def act(connection: Connection = connection) -> None:
-            with contextlib.suppress(USBError):
-                if rnd.random() < 0.5:
-                    connection.exchange(2, bytes(10), 1, 1270, 2, 2)
-                else:
-                    connection.submit(
-                        direction=1, ep=0, setup=bytes(8), transfer_buffer_length=255, timeout_ms=2
-                    )
-
-        case.run(b"", act)
+        case.begin()
+        with contextlib.suppress(USBError):
+            if rnd.random() < 0.5:
+                connection.exchange(2, bytes(10), 1, 1270, 2, 2)
+            else:
+                connection.submit(
+                    direction=1, ep=0, setup=bytes(8), transfer_buffer_length=255, timeout_ms=2
+                )
         if (i + 1) % 20 == 0 or i + 1 == count:
             connection.close()
             peer.close()
@@ -351,7 +352,8 @@ def usbip_client(case: Inputs, count: int) -> None:
     try:
         for _ in range(max(1, count // 20)):
             stream = _greeting(case)
-            case.run(stream, lambda stream=stream: _list(listener, stream))  # type: ignore[misc]
+            case.begin(stream)
+            _list(listener, stream)
     finally:
         listener.close()
 
