@@ -12,7 +12,7 @@ import numpy as np
 from rich.text import Text
 
 from benchmarks import Result
-from dexkit.conformance.report.html import document
+from dexkit.conformance.report.pages import document
 from dexkit.conformance.report.svg_charts import Level, Line, chart
 from dexkit.conformance.report.tables import table
 from dexkit.escaping import html as escape

@@ -14,8 +14,8 @@ import numpy as np
 from dexkit import __version__
 from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import ANSWERS, VERDICTS
+from dexkit.conformance.report.pages import document
 from dexkit.conformance.report.svg_charts import Line, chart
 from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.requirements import catalogue

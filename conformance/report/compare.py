@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from dexkit.conformance.report.html import document
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -16,6 +15,7 @@ from dexkit.conformance.report.labels import (
     model_title,
 )
 from dexkit.conformance.report.markdown import code, plain, table
+from dexkit.conformance.report.pages import document
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.errors import UsageError

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.report.html import document
+from dexkit.conformance.report.pages import document
 from dexkit.conformance.report.svg_charts import Level, Line, chart
 from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.escaping import html as escape

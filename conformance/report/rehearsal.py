@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 from dexkit import __version__
-from dexkit.conformance.report.html import document
+from dexkit.conformance.report.pages import document
 from dexkit.conformance.report.svg_charts import Band, Level, Line, chart
 from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehearsed

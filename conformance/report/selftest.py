@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from dexkit import __version__
 from dexkit.conformance.report.curves import STYLE
-from dexkit.conformance.report.html import document, utc
+from dexkit.conformance.report.html import utc
+from dexkit.conformance.report.pages import document
 from dexkit.conformance.report.svg_charts import Line, chart
 from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.selftest.result import (

@@ -88,7 +88,7 @@ def command(
 def _page(found: Comparison, a: Trace, b: Trace) -> str:
     """The joints of both, on A's clock; those that differ most come first."""
     from dexkit.conformance.report.curves import over_each_other, recorded, topics
-    from dexkit.conformance.report.html import document
+    from dexkit.conformance.report.pages import document
     from dexkit.escaping import html as escape
 
     names = (f"A: {a.path.name}", f"B: {b.path.name}")

@@ -1,0 +1,51 @@
+"""Fill the templates of the pages, in ``templates``. No page loads anything or runs a script.
+
+What is put into a template is text: it is escaped, and characters that cannot be seen are shown,
+unless it is marked as HTML.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from dexkit.escaping import html
+
+__all__ = ["document", "fill"]
+
+_HERE = Path(__file__).parent
+
+
+def fill(template: str, **values: object) -> str:
+    """The page that a template makes of these values."""
+    return _environment().get_template(template).render(values)
+
+
+def document(title: str, content: str) -> str:
+    """A page with the reports' style.
+
+    :param content: HTML.
+    """
+    return fill("document.html", title=title, content=Markup(content))
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(_HERE / "templates"),
+        autoescape=True,
+        finalize=_shown,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["style"] = Markup(_HERE.joinpath("report.css").read_text(encoding="utf-8"))
+    return environment
+
+
+def _shown(value: Any) -> Markup:
+    return value if isinstance(value, Markup) else Markup(html(value))
