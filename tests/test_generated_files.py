@@ -30,7 +30,6 @@ def test_every_generator_contributes() -> None:
     assert made >= {
         "dexkit/messages/unitree_go.py",
         "dexkit/messages/unitree_hg.py",
-        "docs/images/model-dex3-1.svg",
         "docs/layouts/foxglove-dex3-1.json",
         "docs/layouts/plotjuggler-dex3-1.xml",
         "docs/sources/real-hands.md",

@@ -21,7 +21,6 @@ from dexkit.model_facts import describe, indices, names
 from dexkit.models import BUILT_IN, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
 from tests.each import each
-from tools.generate import DOCS
 from tools.generate.hand_layouts import LAYOUTS
 from tools.generate.model_drawing import draw_hand, draw_robot
 from tools.generate.models_page import drawing
@@ -130,11 +129,6 @@ class TestCommandLine:
     def test_indices_are_shortened_to_ranges(self) -> None:
         assert indices([0, 1, 2, 5, 8, 9]) == "0 to 2, 5, 8, 9"
         assert indices([]) == ""
-
-
-def test_every_drawing_belongs_to_a_model() -> None:
-    there = {path.name for path in (DOCS / "images").glob("model-*.svg")}
-    assert there == {f"model-{name}.svg" for name in names()}
 
 
 @pytest.mark.parametrize("name", names())

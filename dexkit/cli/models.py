@@ -33,7 +33,7 @@ _SIDES = ("left", "right")
 def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     """Print the models: joints, limits, topics, types, rates, gains, and backends.
 
-    Without a NAME, an overview. docs/images has the drawings; the shape of the
+    Without a NAME, an overview. 'make docs' makes drawings; the shape of the
     JSON is in dexkit/model_facts.py: one object with a list "models".
     """
     from dexkit.console import Console
@@ -91,10 +91,7 @@ def _overview(console: Console, models: Sequence[dict[str, Any]]) -> None:
             (f"[bold]{data['name']}[/bold]", data["title"], joints, "\n".join(topics), rates_text)
         )
     console.print(_table(("model", "what", "joints", "command, state", "rates"), rows))
-    console.print(
-        "\nCommand rates are xr_teleoperate's. All of a model: dexkit models NAME; "
-        "drawings: docs/images."
-    )
+    console.print("\nCommand rates are xr_teleoperate's. All of a model: dexkit models NAME.")
 
 
 def _unusable(console: Console) -> None:

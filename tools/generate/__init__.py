@@ -4,12 +4,11 @@
 in the repository
 -------------------------------------------------------------------------------------------------
 :mod:`~.message_modules`       dexkit/messages/unitree_*.py, from dexkit/messages/idl/*.idl
-:mod:`~.models_page`           docs/images/model-*.svg, from the model profiles
 :mod:`~.real_hands_page`       docs/sources/real-hands.md, from real_hands.toml
 :mod:`~.layouts`               docs/layouts, for Foxglove and PlotJuggler, from the model profiles
 in build/docs and on the site
 -------------------------------------------------------------------------------------------------
-:mod:`~.models_page`           models.md: joints, limits, topics and rates
+:mod:`~.models_page`           models.md and images/model-*.svg: joints, limits, topics and rates
 :mod:`~.requirement_pages`     requirements/: a page for each requirement
 :mod:`~.conformity_page`       conformity.md, from conformity.toml
 :mod:`~.doctor_page`           diagnoses.md, of the doctor
@@ -47,13 +46,11 @@ def generated_files() -> dict[Path, str]:
     from tools.generate import (
         layouts,
         message_modules,
-        models_page,
         real_hands_page,
     )
 
     return {
         **message_modules.files(),
-        **models_page.files(),
         **real_hands_page.files(),
         **layouts.files(),
     }
@@ -69,8 +66,8 @@ def stale_files() -> dict[Path, str]:
 
 
 def built_pages() -> dict[str, str]:
-    """Markdown of the pages that are not in the repository, by the path that they have on the site:
-    their links are seen from docs/.
+    """Pages and drawings that are not in the repository, by the path that they have on the site;
+    links are seen from docs/.
     """
     from tools.generate import (
         conformity_page,
@@ -82,6 +79,7 @@ def built_pages() -> dict[str, str]:
 
     return {
         "models.md": models_page.page(),
+        **models_page.drawings(),
         "conformity.md": conformity_page.page(),
         "bases.md": real_hands_page.bases(),
         "diagnoses.md": doctor_page.page(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 from dexkit.model_facts import (
@@ -18,10 +17,9 @@ from dexkit.model_facts import (
 )
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS
-from tools.generate import DOCS
 from tools.generate.model_drawing import draw_hand, draw_robot
 
-__all__ = ["drawing", "files", "page"]
+__all__ = ["drawing", "drawings", "page"]
 
 _INTRO = """\
 # The models
@@ -52,9 +50,9 @@ def page() -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def files() -> dict[Path, str]:
-    """The drawings, with their content."""
-    return {DOCS / "images" / f"model-{name}.svg": drawing(name) for name in names()}
+def drawings() -> dict[str, str]:
+    """The drawings, as SVG, by their path in docs/."""
+    return {f"images/model-{name}.svg": drawing(name) for name in names()}
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
