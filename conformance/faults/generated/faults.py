@@ -11,9 +11,9 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from dexkit.conformance.faults.generated.rig import Faulty, Motors, Report, What
+from dexkit.conformance.faults.generated.rig import Motors, Report, What
 from dexkit.conformance.motor_messages import Motor
 from dexkit.conformance.virtual import Sample
 from dexkit.hand import Side
@@ -84,6 +84,19 @@ def _fault(
     return register
 
 
+def _on(
+    base: type[What], hook: str, kind: str, title: str, **flags: Any
+) -> Callable[[Callable[..., Any]], type[What]]:
+    """Register a function as a fault: it is one hook, and its description the summary."""
+
+    def register(function: Callable[..., Any]) -> type[What]:
+        text = (function.__doc__ or "").removesuffix(".")
+        made = type(function.__name__, (base,), {hook: function})
+        return _fault(kind, title, text[:1].lower() + text[1:], **flags)(made)
+
+    return register
+
+
 def _variant(base: type[What], kind: str, title: str, summary: str, **values: object) -> None:
     """Register the same change with other figures."""
     flags = {k: values.pop(k) for k in ("several", "both", "idle") if k in values}
@@ -94,73 +107,50 @@ def _variant(base: type[What], kind: str, title: str, summary: str, **values: ob
 # -------------------------------------------------------------------------------- position
 
 
-class _Reported(What):
-    """Has what faults of the reported values need."""
-
-    def span(self, joint: int) -> float:
-        """The joint's range, rad."""
-        return self.rig.spans[self.side][joint]
-
-    def neighbour(self, joint: int) -> int:
-        """The next joint."""
-        return (joint + 1) % self.rig.codec.joints
-
-
-class _History(_Reported):
+class _History(What):
     """Keeps the values of the last second."""
-
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.past: dict[int, deque[tuple[float, Report]]] = {j: deque() for j in joints}
 
     def before(self, joint: int, values: Report, seconds: float) -> Report:
         """The values of so long ago, or the oldest that are known."""
-        past = self.past[joint]
+        past = self.memory.setdefault(joint, deque())
         now = self.rig.now
         if past and now - past[-1][0] > 0.2:
             past.clear()  # the condition was false in between
         past.append((now, replace(values)))
         while len(past) > 1 and past[1][0] <= now - seconds:
             past.popleft()
-        return past[0][1]
+        found: Report = past[0][1]
+        return found
 
 
-class _Remembering(_Reported):
-    """Keeps a time and a q of each joint from one report to the next."""
-
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.kept: dict[int, tuple[float, float]] = {}
+@_on(What, "report", "position", "q-echo")
+def _echo(self: What, joint: int, values: Report) -> None:
+    """Reports the commanded q."""
+    values.q = self.rig.goal(self.side, joint)
 
 
-@_fault("position", "q-echo", "reports the commanded q")
-class _Echo(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.q = self.rig.goal(self.side, joint)
+@_on(What, "report", "position", "q-echo-slewed")
+def _echo_slewed(self: What, joint: int, values: Report) -> None:
+    """Reports the commanded q at the speed of a good hand."""
+    now = self.rig.now
+    then, q = self.memory.get(joint, (now, values.q))
+    if now - then > 0.1:
+        then, q = now, values.q
+    step = 1.3 * self.span(joint) * (now - then)
+    values.q = q + min(max(self.rig.goal(self.side, joint) - q, -step), step)
+    self.memory[joint] = now, values.q
 
 
-@_fault("position", "q-echo-slewed", "reports the commanded q at the speed of a good hand")
-class _EchoSlewed(_Remembering):
-    def report(self, joint: int, values: Report) -> None:
-        now = self.rig.now
-        then, q = self.kept.get(joint, (now, values.q))
-        if now - then > 0.1:
-            then, q = now, values.q
-        step = 1.3 * self.span(joint) * (now - then)
-        values.q = q + min(max(self.rig.goal(self.side, joint) - q, -step), step)
-        self.kept[joint] = now, values.q
-
-
-@_fault("position", "q-echo-near", "reports the commanded q when it is within a tenth of it")
-class _EchoNear(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        goal = self.rig.goal(self.side, joint)
-        if abs(goal - values.q) < 0.1 * self.span(joint):
-            values.q = goal
+@_on(What, "report", "position", "q-echo-near")
+def _echo_near(self: What, joint: int, values: Report) -> None:
+    """Reports the commanded q when it is within a tenth of it."""
+    goal = self.rig.goal(self.side, joint)
+    if abs(goal - values.q) < 0.1 * self.span(joint):
+        values.q = goal
 
 
 @_fault("position", "q-offset", "reports q with an offset of 6 % of the range")
-class _Offset(_Reported):
+class _Offset(What):
     part = 0.06
 
     def report(self, joint: int, values: Report) -> None:
@@ -172,105 +162,101 @@ _variant(
 )
 
 
-@_fault("position", "q-scale", "reports 88 % of q")
-class _Scale(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        low, _ = self.rig.limits(self.side, joint)
-        values.q = low + 0.88 * (values.q - low)
+@_on(What, "report", "position", "q-scale")
+def _scale(self: What, joint: int, values: Report) -> None:
+    """Reports 88 % of q."""
+    low, _ = self.rig.limits(self.side, joint)
+    values.q = low + 0.88 * (values.q - low)
 
 
 @_fault("position", "q-filter", "reports q through a low-pass filter of 0.15 s")
-class _Filter(_Remembering):
+class _Filter(What):
     seconds = 0.15
 
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
-        then, q = self.kept.get(joint, (now, values.q))
+        then, q = self.memory.get(joint, (now, values.q))
         if now - then > 0.5:
             q = values.q
         q += (values.q - q) * min(1.0, (now - then) / self.seconds)
-        self.kept[joint] = now, q
+        self.memory[joint] = now, q
         values.q = q
 
 
-@_fault("position", "q-predict", "reports where the joint would be in 0.1 s")
-class _Predict(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.q += 0.1 * values.dq
+@_on(What, "report", "position", "q-predict")
+def _predict(self: What, joint: int, values: Report) -> None:
+    """Reports where the joint would be in 0.1 s."""
+    values.q += 0.1 * values.dq
 
 
-@_fault("position", "q-coarse", "reports q in steps of 5 % of the range")
-class _Coarse(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        step = 0.05 * self.span(joint)
-        values.q = step * round(values.q / step)
+@_on(What, "report", "position", "q-coarse")
+def _coarse(self: What, joint: int, values: Report) -> None:
+    """Reports q in steps of 5 % of the range."""
+    step = 0.05 * self.span(joint)
+    values.q = step * round(values.q / step)
 
 
 @_fault("position", "q-stuck", "reports the q of when it began", idle="")
-class _Stuck(_Reported):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.kept: dict[int, tuple[float | None, float]] = {}
-
+class _Stuck(What):
     def report(self, joint: int, values: Report) -> None:
-        since, q = self.kept.get(joint, (None, values.q))
+        since, q = self.memory.get(joint, (None, values.q))
         if since != self.since:
             q = values.q
-        self.kept[joint] = self.since, q
+        self.memory[joint] = self.since, q
         values.q = q
 
 
-@_fault("position", "q-jump", "reports q a quarter of the range off for 30 ms every 0.5 s")
-class _Jump(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        if self.rig.now % 0.5 < 0.03:
-            values.q += 0.25 * self.span(joint) * (1 if self.rig.now % 1.0 < 0.5 else -1)
+@_on(What, "report", "position", "q-jump")
+def _jump(self: What, joint: int, values: Report) -> None:
+    """Reports q a quarter of the range off for 30 ms every 0.5 s."""
+    if self.rig.now % 0.5 < 0.03:
+        values.q += 0.25 * self.span(joint) * (1 if self.rig.now % 1.0 < 0.5 else -1)
 
 
-@_fault("position", "q-mirror", "reports q from the other end")
-class _Mirror(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        low, high = self.rig.limits(self.side, joint)
-        values.q = low + high - values.q
+@_on(What, "report", "position", "q-mirror")
+def _mirror(self: What, joint: int, values: Report) -> None:
+    """Reports q from the other end."""
+    low, high = self.rig.limits(self.side, joint)
+    values.q = low + high - values.q
 
 
-@_fault("position", "q-swap", "reports the q of the next joint", several=True)
-class _Swap(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.q = self.rig.positions(self.side)[self.neighbour(joint)]
+@_on(What, "report", "position", "q-swap", several=True)
+def _swap(self: What, joint: int, values: Report) -> None:
+    """Reports the q of the next joint."""
+    values.q = self.rig.positions(self.side)[self.neighbour(joint)]
 
 
 @_fault("position", "q-slow", "measures q ten times a second")
-class _Slow(_Remembering):
+class _Slow(What):
     period = 0.1
 
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
-        at, q = self.kept.get(joint, (-math.inf, values.q))
+        at, q = self.memory.get(joint, (-math.inf, values.q))
         if now - at >= self.period:
             at, q = now, values.q
-        self.kept[joint] = at, q
+        self.memory[joint] = at, q
         values.q = q
 
 
-@_fault("position", "q-late", "reports the values of 0.12 s before")
-class _Late(_History):
-    def report(self, joint: int, values: Report) -> None:
-        old = self.before(joint, values, 0.12)
-        values.q, values.dq, values.tau = old.q, old.dq, old.tau
+@_on(_History, "report", "position", "q-late")
+def _late(self: _History, joint: int, values: Report) -> None:
+    """Reports the values of 0.12 s before."""
+    old = self.before(joint, values, 0.12)
+    values.q, values.dq, values.tau = old.q, old.dq, old.tau
 
 
-@_fault("position", "q-nan", "reports NaN as q twice a second")
-class _Nan(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        if self.rig.now % 0.5 < self.rig.period:
-            values.q = math.nan
+@_on(What, "report", "position", "q-nan")
+def _nan(self: What, joint: int, values: Report) -> None:
+    """Reports NaN as q twice a second."""
+    if self.rig.now % 0.5 < self.rig.period:
+        values.q = math.nan
 
 
 # --------------------------------------------------------------------- velocity and torque
 
 
-class _Factor(_Reported):
+class _Factor(What):
     """Multiplies one of the values."""
 
     member = ""
@@ -306,34 +292,34 @@ _variant(_Tau, _SPEEDS, "tau-weak", "reports a fifth of tau_est", factor=0.2)
 _variant(_Ddq, _SPEEDS, "ddq-sign", "reports ddq with the wrong sign", factor=-1.0)
 
 
-@_fault(_SPEEDS, "dq-late", "reports the dq of 0.2 s before", needs="dq")
-class _DqLate(_History):
-    def report(self, joint: int, values: Report) -> None:
-        values.dq = self.before(joint, values, 0.2).dq
+@_on(_History, "report", _SPEEDS, "dq-late", needs="dq")
+def _dq_late(self: _History, joint: int, values: Report) -> None:
+    """Reports the dq of 0.2 s before."""
+    values.dq = self.before(joint, values, 0.2).dq
 
 
-@_fault(_SPEEDS, "tau-late", "reports the tau_est of 0.4 s before", needs="tau_est")
-class _TauLate(_History):
-    def report(self, joint: int, values: Report) -> None:
-        values.tau = self.before(joint, values, 0.4).tau
+@_on(_History, "report", _SPEEDS, "tau-late", needs="tau_est")
+def _tau_late(self: _History, joint: int, values: Report) -> None:
+    """Reports the tau_est of 0.4 s before."""
+    values.tau = self.before(joint, values, 0.4).tau
 
 
-@_fault(_SPEEDS, "dq-swap", "reports the dq of the next joint", several=True, needs="dq")
-class _DqSwap(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.dq = self.rig.velocities(self.side)[self.neighbour(joint)]
+@_on(What, "report", _SPEEDS, "dq-swap", several=True, needs="dq")
+def _dq_swap(self: What, joint: int, values: Report) -> None:
+    """Reports the dq of the next joint."""
+    values.dq = self.rig.velocities(self.side)[self.neighbour(joint)]
 
 
-@_fault(_SPEEDS, "tau-swap", "reports the tau_est of the next joint", several=True, needs="tau_est")
-class _TauSwap(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.tau = self.rig.hand_of(self.side).tau[self.neighbour(joint)]
+@_on(What, "report", _SPEEDS, "tau-swap", several=True, needs="tau_est")
+def _tau_swap(self: What, joint: int, values: Report) -> None:
+    """Reports the tau_est of the next joint."""
+    values.tau = self.rig.hand_of(self.side).tau[self.neighbour(joint)]
 
 
-@_fault(_SPEEDS, "tau-offset", "reports tau_est with an offset", needs="tau_est")
-class _TauOffset(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.tau += 0.5 * self.rig.strength(self.side, joint)
+@_on(What, "report", _SPEEDS, "tau-offset", needs="tau_est")
+def _tau_offset(self: What, joint: int, values: Report) -> None:
+    """Reports tau_est with an offset."""
+    values.tau += 0.5 * self.rig.strength(self.side, joint)
 
 
 @_fault(_SPEEDS, "tau-stuck", "reports the tau_est of when it began", needs="tau_est")
@@ -344,10 +330,10 @@ class _TauStuck(_Stuck):
         values.tau = shadow.q
 
 
-@_fault(_SPEEDS, "mode-off", "reports that no joint is driven")
-class _ModeOff(_Reported):
-    def report(self, joint: int, values: Report) -> None:
-        values.mode &= ~0x71 if values.mode > 1 else ~1
+@_on(What, "report", _SPEEDS, "mode-off")
+def _mode_off(self: What, joint: int, values: Report) -> None:
+    """Reports that no joint is driven."""
+    values.mode &= ~0x71 if values.mode > 1 else ~1
 
 
 # --------------------------------------------------------------------------------- command
@@ -371,15 +357,11 @@ class _Commanded(What):
 class _Delays(_Commanded):
     seconds = 0.0
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.queue: deque[tuple[float, Motors]] = deque()
-
     def command(self, motors: Motors) -> Motors | None:
-        now = self.rig.now
-        self.queue.append((now, motors))
-        while self.queue and self.queue[0][0] <= now - self.seconds:
-            self.kept = self.queue.popleft()[1]
+        now, queue = self.rig.now, self.memory.setdefault("queue", deque())
+        queue.append((now, motors))
+        while queue and queue[0][0] <= now - self.seconds:
+            self.kept = queue.popleft()[1]
         kept = self.kept
         return None if kept is None else self.replaced(motors, lambda i, m: kept[i])
 
@@ -434,15 +416,11 @@ class _Deaf(_Commanded):
     def command(self, motors: Motors) -> Motors | None:
         return None if self.whole else self.replaced(motors, self._held)
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.at: dict[int, tuple[float | None, float]] = {}
-
     def _held(self, joint: int, motor: Motor) -> Motor:
-        since, q = self.at.get(joint, (None, 0.0))
+        since, q = self.memory.get(joint, (None, 0.0))
         if since != self.since:
             q = self.rig.positions(self.side)[joint]
-            self.at[joint] = self.since, q
+            self.memory[joint] = self.since, q
         return replace(motor, q=q, dq=0.0, tau=0.0)
 
 
@@ -459,97 +437,81 @@ class _Goals(What):
         """The q that is obeyed instead."""
         raise AssertionError  # overridden
 
-    def span(self, joint: int) -> float:
-        """The joint's range, rad."""
-        return self.rig.spans[self.side][joint]
+
+@_on(_Goals, "q", "command", "cmd-offset")
+def _goal_offset(self: _Goals, joint: int, motor: Motor) -> float:
+    """Goes 7 % of the range beyond the commanded q."""
+    return motor.q + 0.07 * self.span(joint)
 
 
-@_fault("command", "cmd-offset", "goes 7 % of the range beyond the commanded q")
-class _GoalOffset(_Goals):
-    def q(self, joint: int, motor: Motor) -> float:
-        return motor.q + 0.07 * self.span(joint)
+@_on(_Goals, "q", "command", "cmd-scale")
+def _goal_scale(self: _Goals, joint: int, motor: Motor) -> float:
+    """Goes 88 % of the way from the lower end."""
+    low, _ = self.rig.limits(self.side, joint)
+    return low + 0.88 * (motor.q - low)
 
 
-@_fault("command", "cmd-scale", "goes 88 % of the way from the lower end")
-class _GoalScale(_Goals):
-    def q(self, joint: int, motor: Motor) -> float:
-        low, _ = self.rig.limits(self.side, joint)
-        return low + 0.88 * (motor.q - low)
+@_on(_Goals, "q", "command", "cmd-mirror")
+def _goal_mirror(self: _Goals, joint: int, motor: Motor) -> float:
+    """Obeys q from the other end."""
+    low, high = self.rig.limits(self.side, joint)
+    return low + high - motor.q
 
 
-@_fault("command", "cmd-mirror", "obeys q from the other end")
-class _GoalMirror(_Goals):
-    def q(self, joint: int, motor: Motor) -> float:
-        low, high = self.rig.limits(self.side, joint)
-        return low + high - motor.q
+@_on(_Goals, "q", "command", "cmd-slew")
+def _slew(self: _Goals, joint: int, motor: Motor) -> Any:
+    """Moves its goal by half of the range in a second."""
+    now = self.rig.now
+    then, q = self.memory.get(joint, (-math.inf, 0.0))
+    if now - then > 0.3:
+        then, q = now, self.rig.positions(self.side)[joint]
+    step = 0.5 * self.span(joint) * (now - then)
+    q += min(max(motor.q - q, -step), step)
+    self.memory[joint] = now, q
+    return q
 
 
-@_fault("command", "cmd-slew", "moves its goal by half of the range in a second")
-class _Slew(_Goals):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.at: dict[int, tuple[float, float]] = {}
-
-    def q(self, joint: int, motor: Motor) -> float:
-        now = self.rig.now
-        then, q = self.at.get(joint, (-math.inf, 0.0))
-        if now - then > 0.3:
-            then, q = now, self.rig.positions(self.side)[joint]
-        step = 0.5 * self.span(joint) * (now - then)
-        q += min(max(motor.q - q, -step), step)
-        self.at[joint] = now, q
-        return q
+@_on(_Goals, "q", "command", "cmd-dead-band")
+def _dead_band(self: _Goals, joint: int, motor: Motor) -> float:
+    """Ignores changes of q below 5 % of the range."""
+    old = self.memory.get(joint)
+    if old is None or abs(motor.q - old) > 0.05 * self.span(joint):
+        self.memory[joint] = old = motor.q
+    return old
 
 
-@_fault("command", "cmd-dead-band", "ignores changes of q below 5 % of the range")
-class _DeadBand(_Goals):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.at: dict[int, float] = {}
-
-    def q(self, joint: int, motor: Motor) -> float:
-        old = self.at.get(joint)
-        if old is None or abs(motor.q - old) > 0.05 * self.span(joint):
-            self.at[joint] = old = motor.q
-        return old
+@_on(_Goals, "q", "command", "clamp-short")
+def _clamp_short(self: _Goals, joint: int, motor: Motor) -> float:
+    """Stays 8 % of the range away from the ends."""
+    low, high = self.rig.limits(self.side, joint)
+    margin = 0.08 * (high - low)
+    return min(max(motor.q, low + margin), high - margin)
 
 
-@_fault("command", "clamp-short", "stays 8 % of the range away from the ends")
-class _ClampShort(_Goals):
-    def q(self, joint: int, motor: Motor) -> float:
-        low, high = self.rig.limits(self.side, joint)
-        margin = 0.08 * (high - low)
-        return min(max(motor.q, low + margin), high - margin)
+@_on(_Goals, "q", "command", "clamp-sticks")
+def _clamp_sticks(self: _Goals, joint: int, motor: Motor) -> Any:
+    """Keeps the goal of an end until the next is half the range off."""
+    low, high = self.rig.limits(self.side, joint)
+    if not low + 1e-3 < motor.q < high - 1e-3:
+        self.memory[joint] = min(max(motor.q, low), high)
+    kept = self.memory.get(joint)
+    if kept is None or abs(motor.q - kept) > 0.5 * (high - low):
+        self.memory.pop(joint, None)
+        return motor.q
+    return kept
 
 
-@_fault("command", "clamp-sticks", "keeps the goal of an end until the next is half the range off")
-class _ClampSticks(_Goals):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.stuck: dict[int, float] = {}
-
-    def q(self, joint: int, motor: Motor) -> float:
-        low, high = self.rig.limits(self.side, joint)
-        if not low + 1e-3 < motor.q < high - 1e-3:
-            self.stuck[joint] = min(max(motor.q, low), high)
-        kept = self.stuck.get(joint)
-        if kept is None or abs(motor.q - kept) > 0.5 * (high - low):
-            self.stuck.pop(joint, None)
-            return motor.q
-        return kept
+@_on(_Goals, "q", "command", "limits-of-next", several=True)
+def _other_limits(self: _Goals, joint: int, motor: Motor) -> float:
+    """Has the limits of the next joint."""
+    low, high = self.rig.limits(self.side, (joint + 1) % self.rig.codec.joints)
+    return min(max(motor.q, low), high)
 
 
-@_fault("command", "limits-of-next", "has the limits of the next joint", several=True)
-class _OtherLimits(_Goals):
-    def q(self, joint: int, motor: Motor) -> float:
-        low, high = self.rig.limits(self.side, (joint + 1) % self.rig.codec.joints)
-        return min(max(motor.q, low), high)
-
-
-@_fault("command", "cmd-swap", "obeys the q of the next joint", several=True)
-class _GoalSwap(What):
-    def command(self, motors: Motors) -> Motors | None:
-        return self.replaced(motors, lambda i, m: replace(m, q=motors[(i + 1) % len(motors)].q))
+@_on(What, "command", "command", "cmd-swap", several=True)
+def _goal_swap(self: What, motors: Motors) -> Motors | None:
+    """Obeys the q of the next joint."""
+    return self.replaced(motors, lambda i, m: replace(m, q=motors[(i + 1) % len(motors)].q))
 
 
 class _Gains(What):
@@ -563,61 +525,62 @@ class _Gains(What):
         raise AssertionError  # overridden
 
 
-@_fault("command", "gains-fixed", "uses the client's usual gains whatever is sent")
-class _GainsFixed(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        kp, kd = self.rig.gains(joint)
-        return replace(motor, kp=kp, kd=kd)
+@_on(_Gains, "changed", "command", "gains-fixed")
+def _gains_fixed(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Uses the client's usual gains whatever is sent."""
+    kp, kd = self.rig.gains(joint)
+    return replace(motor, kp=kp, kd=kd)
 
 
-@_fault("command", "gains-of-next", "uses the gains of the next joint", several=True)
-class _GainsOfNext(What):
-    def command(self, motors: Motors) -> Motors | None:
-        def changed(joint: int, motor: Motor) -> Motor:
-            other = motors[(joint + 1) % len(motors)]
-            return replace(motor, kp=other.kp, kd=other.kd)
+@_on(What, "command", "command", "gains-of-next", several=True)
+def _gains_of_next(self: What, motors: Motors) -> Motors | None:
+    """Uses the gains of the next joint."""
 
-        return self.replaced(motors, changed)
+    def changed(joint: int, motor: Motor) -> Motor:
+        other = motors[(joint + 1) % len(motors)]
+        return replace(motor, kp=other.kp, kd=other.kd)
 
-
-@_fault("command", "gains-soft", "has an eighth of the stiffness")
-class _GainsSoft(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        return replace(motor, kp=0.125 * motor.kp)
+    return self.replaced(motors, changed)
 
 
-@_fault("command", "gains-stiff", "has eight times the stiffness")
-class _GainsStiff(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        return replace(motor, kp=8.0 * motor.kp)
+@_on(_Gains, "changed", "command", "gains-soft")
+def _gains_soft(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Has an eighth of the stiffness."""
+    return replace(motor, kp=0.125 * motor.kp)
 
 
-@_fault("command", "limp-pulls", "takes zero gains for the usual ones")
-class _LimpPulls(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        if motor.kp != 0 or motor.kd != 0:
-            return motor
-        kp, kd = self.rig.gains(joint)
-        return replace(motor, kp=kp, kd=kd)
+@_on(_Gains, "changed", "command", "gains-stiff")
+def _gains_stiff(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Has eight times the stiffness."""
+    return replace(motor, kp=8.0 * motor.kp)
 
 
-@_fault("command", "full-limps", "takes the usual gains for zero")
-class _FullLimps(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        usual = motor.kp >= 0.9 * self.rig.gains(joint)[0]
-        return replace(motor, kp=0.0, kd=0.0) if usual else motor
+@_on(_Gains, "changed", "command", "limp-pulls")
+def _limp_pulls(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Takes zero gains for the usual ones."""
+    if motor.kp != 0 or motor.kd != 0:
+        return motor
+    kp, kd = self.rig.gains(joint)
+    return replace(motor, kp=kp, kd=kd)
 
 
-@_fault("command", "dq-ignored", "ignores the commanded velocity")
-class _DqIgnored(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        return replace(motor, dq=0.0) if math.isfinite(motor.dq) else motor
+@_on(_Gains, "changed", "command", "full-limps")
+def _full_limps(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Takes the usual gains for zero."""
+    usual = motor.kp >= 0.9 * self.rig.gains(joint)[0]
+    return replace(motor, kp=0.0, kd=0.0) if usual else motor
 
 
-@_fault("command", "tau-ignored", "ignores the commanded torque")
-class _TauIgnored(_Gains):
-    def changed(self, joint: int, motor: Motor) -> Motor:
-        return replace(motor, tau=0.0) if math.isfinite(motor.tau) else motor
+@_on(_Gains, "changed", "command", "dq-ignored")
+def _dq_ignored(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Ignores the commanded velocity."""
+    return replace(motor, dq=0.0) if math.isfinite(motor.dq) else motor
+
+
+@_on(_Gains, "changed", "command", "tau-ignored")
+def _tau_ignored(self: _Gains, joint: int, motor: Motor) -> Motor:
+    """Ignores the commanded torque."""
+    return replace(motor, tau=0.0) if math.isfinite(motor.tau) else motor
 
 
 # ------------------------------------------------------------------------------ state flow
@@ -640,18 +603,14 @@ _variant(_Holds, "state flow", "rate-60", "publishes 60 states a second", period
 _variant(_Holds, "state flow", "rate-20", "publishes 20 states a second", period=1 / 20)
 
 
-@_fault("state flow", "bursts", "publishes what it has every 80 ms")
-class _Bursts(What):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.held: list[Sample] = []
-
-    def publish(self, samples: list[Sample]) -> list[Sample]:
-        self.held += samples
-        if self.held and self.rig.now - self.held[0].sent < 0.08:
-            return []
-        out, self.held = self.held, []
-        return out
+@_on(What, "publish", "state flow", "bursts")
+def _bursts(self: What, samples: list[Sample]) -> list[Sample]:
+    """Publishes what it has every 80 ms."""
+    held: list[Sample] = [*self.memory.pop("held", []), *samples]
+    if held and self.rig.now - held[0].sent < 0.08:
+        self.memory["held"] = held
+        return []
+    return held
 
 
 class _Gaps(What):
@@ -674,26 +633,22 @@ _variant(
 )
 
 
-@_fault("state flow", "silent", "publishes nothing")
-class _Silent(What):
-    def publish(self, samples: list[Sample]) -> list[Sample]:
-        return []
+@_on(What, "publish", "state flow", "silent")
+def _silent(self: What, samples: list[Sample]) -> list[Sample]:
+    """Publishes nothing."""
+    return []
 
 
 class _Stale(What):
     seconds = 0.1
     fresh = False
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.queue: deque[Sample] = deque()
-
     def publish(self, samples: list[Sample]) -> list[Sample]:
-        now = self.rig.now
-        self.queue.extend(samples)
+        now, queue = self.rig.now, self.memory.setdefault("queue", deque())
+        queue.extend(samples)
         out = []
-        while self.queue and self.queue[0].sent <= now - self.seconds:
-            sample = self.queue.popleft()
+        while queue and queue[0].sent <= now - self.seconds:
+            sample = queue.popleft()
             out.append(replace(sample, sent=now) if self.fresh else sample)
         return out[-1:] if self.fresh else out
 
@@ -711,7 +666,6 @@ _variant(
 
 @_fault("state flow", "repeats", "publishes each measurement for 60 ms")
 class _Repeats(What):
-    kept: dict[str, Sample]
     until = -math.inf
 
     def publish(self, samples: list[Sample]) -> list[Sample]:
@@ -720,8 +674,8 @@ class _Repeats(What):
             return samples
         if now >= self.until:
             self.until = now + 0.06
-            self.kept = {x.topic: x for x in samples}
-        return [replace(self.kept.get(x.topic, x), sent=now) for x in samples]
+            self.memory = {x.topic: x for x in samples}
+        return [replace(self.memory.get(x.topic, x), sent=now) for x in samples]
 
 
 @_fault("state flow", "disorder", "publishes states in pairs, the newer one first")
@@ -777,50 +731,46 @@ class _Feeds(What):
         self.seen = count
 
 
-@_fault(
-    "safety",
-    "guard-fed-by-rejected",
-    "takes rejected commands as a sign of life",
-    idle="needs rejected commands alone",
-)
-class _FedByRejected(_Feeds):
-    def events(self) -> int:
-        track = self.rig.tracks[self.side]
-        return track.not_finite + track.malformed + track.foreign
+@_on(_Feeds, "events", "safety", "guard-fed-by-rejected", idle="needs rejected commands alone")
+def _fed_by_rejected(self: _Feeds) -> int:
+    """Takes rejected commands as a sign of life."""
+    track = self.rig.tracks[self.side]
+    return track.not_finite + track.malformed + track.foreign
 
 
-@_fault(
+@_on(
+    _Feeds,
+    "events",
     "safety",
     "guard-fed-by-other",
-    "takes the other hand's commands as a sign of life",
     both=True,
     idle="needs silence on one side alone",
 )
-class _FedByOther(_Feeds):
-    def events(self) -> int:
-        other = self.rig.other(self.side)
-        return 0 if other is None else self.rig.tracks[other].commands
+def _fed_by_other(self: _Feeds) -> int:
+    """Takes the other hand's commands as a sign of life."""
+    other = self.rig.other(self.side)
+    return 0 if other is None else self.rig.tracks[other].commands
 
 
-@_fault("safety", "guard-resumes", "takes up the last command 0.6 s after the time-out")
-class _Resumes(What):
-    def tick(self, dt: float, active: bool) -> None:
-        track = self.rig.tracks[self.side]
-        timeout = self.rig.model.command_timeout
-        if active and track.motors is not None and self.rig.now - track.heard > timeout + 0.6:
-            hand = self.rig.hand_of(self.side)
-            motors = track.motors
-            hand.command(motors if self.rig.codec.joints > 1 else motors[0])
+@_on(What, "tick", "safety", "guard-resumes")
+def _resumes(self: What, dt: float, active: bool) -> None:
+    """Takes up the last command 0.6 s after the time-out."""
+    track = self.rig.tracks[self.side]
+    timeout = self.rig.model.command_timeout
+    if active and track.motors is not None and self.rig.now - track.heard > timeout + 0.6:
+        hand = self.rig.hand_of(self.side)
+        motors = track.motors
+        hand.command(motors if self.rig.codec.joints > 1 else motors[0])
 
 
-@_fault("safety", "gives-way", "pushes open after the time-out")
-class _GivesWay(What):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        silent = self.rig.now - self.rig.tracks[self.side].heard > self.rig.model.command_timeout
-        closing = self.rig.joints[self.side][joint].closing
-        away = -closing if closing else 1
-        commanded = self.rig.tracks[self.side].commands
-        return away * self.rig.strength(self.side, joint) if silent and commanded else tau
+@_on(What, "torque", "safety", "gives-way")
+def _gives_way(self: What, joint: int, tau: float, dt: float) -> float:
+    """Pushes open after the time-out."""
+    silent = self.rig.now - self.rig.tracks[self.side].heard > self.rig.model.command_timeout
+    closing = self.rig.joints[self.side][joint].closing
+    away = -closing if closing else 1
+    commanded = self.rig.tracks[self.side].commands
+    return away * self.rig.strength(self.side, joint) if silent and commanded else tau
 
 
 class _Finite(What):
@@ -846,34 +796,35 @@ class _Finite(What):
         raise AssertionError  # overridden
 
 
-@_fault("safety", "nan-is-zero", "takes what is not finite for 0")
-class _NanIsZero(_Finite):
-    def made(self, joint: int, motor: Motor) -> Motor:
-        def zero(x: float) -> float:
-            return x if math.isfinite(x) else 0.0
+@_on(_Finite, "made", "safety", "nan-is-zero")
+def _nan_is_zero(self: _Finite, joint: int, motor: Motor) -> Motor:
+    """Takes what is not finite for 0."""
 
-        q, dq, tau = zero(motor.q), zero(motor.dq), zero(motor.tau)
-        return Motor(q, dq, tau, zero(motor.kp), zero(motor.kd), motor.mode)
+    def zero(x: float) -> float:
+        return x if math.isfinite(x) else 0.0
 
-
-@_fault("safety", "nan-is-last", "replaces a joint's bad command by its last one")
-class _NanIsLast(_Finite):
-    def made(self, joint: int, motor: Motor) -> Motor:
-        return motor if self.last is None else self.last[joint]
+    q, dq, tau = zero(motor.q), zero(motor.dq), zero(motor.tau)
+    return Motor(q, dq, tau, zero(motor.kp), zero(motor.kd), motor.mode)
 
 
-@_fault("safety", "nan-is-high", "takes what is not finite for the upper limit, with usual gains")
-class _NanIsHigh(_Finite):
-    def made(self, joint: int, motor: Motor) -> Motor:
-        kp, kd = self.rig.gains(joint)
-        q = motor.q if math.isfinite(motor.q) else self.rig.limits(self.side, joint)[1]
-        return Motor(q, 0.0, 0.0, kp, kd, motor.mode)
+@_on(_Finite, "made", "safety", "nan-is-last")
+def _nan_is_last(self: _Finite, joint: int, motor: Motor) -> Motor:
+    """Replaces a joint's bad command by its last one."""
+    return motor if self.last is None else self.last[joint]
 
 
-@_fault("safety", "nan-brakes", "brakes at a value that is not finite, until the next restart")
-class _NanBrakes(What):
-    def command(self, motors: Motors) -> Motors | None:
-        return None if self.rig.tracks[self.side].not_finite else motors
+@_on(_Finite, "made", "safety", "nan-is-high")
+def _nan_is_high(self: _Finite, joint: int, motor: Motor) -> Motor:
+    """Takes what is not finite for the upper limit, with usual gains."""
+    kp, kd = self.rig.gains(joint)
+    q = motor.q if math.isfinite(motor.q) else self.rig.limits(self.side, joint)[1]
+    return Motor(q, 0.0, 0.0, kp, kd, motor.mode)
+
+
+@_on(What, "command", "safety", "nan-brakes")
+def _nan_brakes(self: What, motors: Motors) -> Motors | None:
+    """Brakes at a value that is not finite, until the next restart."""
+    return None if self.rig.tracks[self.side].not_finite else motors
 
 
 @_fault("safety", "length-brakes", "hears nothing for 2 s after a command of another length")
@@ -887,25 +838,25 @@ class _LengthBrakes(What):
         return None if self.rig.now < self.until else motors
 
 
-@_fault("safety", "negative-gains", "applies negative gains")
-class _NegativeGains(What):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        motors = self.rig.tracks[self.side].raw
-        if motors is None or not self.rig.driven(self.side) or not motors[joint].kp < 0:
-            return tau
-        q = self.rig.positions(self.side)[joint]
-        dq = self.rig.velocities(self.side)[joint]
-        return motors[joint].kp * (motors[joint].q - q) - motors[joint].kd * (motors[joint].dq - dq)
+@_on(What, "torque", "safety", "negative-gains")
+def _negative_gains(self: What, joint: int, tau: float, dt: float) -> float:
+    """Applies negative gains."""
+    motors = self.rig.tracks[self.side].raw
+    if motors is None or not self.rig.driven(self.side) or not motors[joint].kp < 0:
+        return tau
+    q = self.rig.positions(self.side)[joint]
+    dq = self.rig.velocities(self.side)[joint]
+    return motors[joint].kp * (motors[joint].q - q) - motors[joint].kd * (motors[joint].dq - dq)
 
 
-@_fault("safety", "far-wraps", "takes a q far out of range modulo the range")
-class _FarWraps(_Goals):
-    def q(self, joint: int, motor: Motor) -> float:
-        low, high = self.rig.limits(self.side, joint)
-        span = high - low
-        if low - span <= motor.q <= high + span:
-            return motor.q
-        return low + (motor.q - low) % span
+@_on(_Goals, "q", "safety", "far-wraps")
+def _far_wraps(self: _Goals, joint: int, motor: Motor) -> float:
+    """Takes a q far out of range modulo the range."""
+    low, high = self.rig.limits(self.side, joint)
+    span = high - low
+    if low - span <= motor.q <= high + span:
+        return motor.q
+    return low + (motor.q - low) % span
 
 
 @_fault("safety", "far-is-deaf", "ignores all commands for 1.5 s after one far out of range")
@@ -940,38 +891,30 @@ class _Moves(What):
             min(max(kp * (place - q), -limit), limit) - kd * self.rig.velocities(self.side)[joint]
         )
 
-    def span(self, joint: int) -> float:
-        """The joint's range, rad."""
-        return self.rig.spans[self.side][joint]
+
+@_on(_Moves, "place", "motion", "homes")
+def _homes(self: _Moves, joint: int) -> float | None:
+    """Goes to its lower end for a second when it begins."""
+    return self.rig.limits(self.side, joint)[0] if self.active_s < 1.0 else None
 
 
-@_fault("motion", "homes", "goes to its lower end for a second when it begins")
-class _Homes(_Moves):
-    def place(self, joint: int) -> float | None:
-        return self.rig.limits(self.side, joint)[0] if self.active_s < 1.0 else None
-
-
-@_fault("motion", "snaps", "goes to its upper end for 0.25 s when it begins")
-class _Snaps(_Moves):
-    def place(self, joint: int) -> float | None:
-        return self.rig.limits(self.side, joint)[1] if self.active_s < 0.25 else None
+@_on(_Moves, "place", "motion", "snaps")
+def _snaps(self: _Moves, joint: int) -> float | None:
+    """Goes to its upper end for 0.25 s when it begins."""
+    return self.rig.limits(self.side, joint)[1] if self.active_s < 0.25 else None
 
 
 @_fault("motion", "drifts", "drifts by 4 % of the range in a second from where it is")
 class _Drifts(_Moves):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.start: dict[int, tuple[float | None, float]] = {}
-
     def place(self, joint: int) -> float | None:
-        since, q = self.start.get(joint, (None, 0.0))
+        since, q = self.memory.get(joint, (None, 0.0))
         if since != self.since:
             q = self.rig.positions(self.side)[joint]
-            self.start[joint] = self.since, q
+            self.memory[joint] = self.since, q
         span = self.span(joint)
         # obeys again for a fifth of the time, so that it moves from elsewhere next
         if self.active_s % 5.0 > 4.0:
-            self.start.pop(joint, None)
+            self.memory.pop(joint, None)
             return None
         return q + 0.04 * span * (self.active_s % 5.0) if self._still(joint) else None
 
@@ -992,42 +935,38 @@ class _Pushes(What):
         raise AssertionError  # overridden
 
 
-@_fault("motion", "kicks", "kicks for 60 ms every 3 s")
-class _Kicks(_Pushes):
-    def push(self) -> float:
-        return 2.0 if self.rig.now % 3.0 < 0.06 else 0.0
+@_on(_Pushes, "push", "motion", "kicks")
+def _kicks(self: _Pushes) -> float:
+    """Kicks for 60 ms every 3 s."""
+    return 2.0 if self.rig.now % 3.0 < 0.06 else 0.0
 
 
-@_fault("motion", "kicks-once", "kicks for 0.1 s when it begins")
-class _KicksOnce(_Pushes):
-    def push(self) -> float:
-        return 2.0 if self.active_s < 0.1 else 0.0
+@_on(_Pushes, "push", "motion", "kicks-once")
+def _kicks_once(self: _Pushes) -> float:
+    """Kicks for 0.1 s when it begins."""
+    return 2.0 if self.active_s < 0.1 else 0.0
 
 
-@_fault("motion", "shakes", "shakes 8 times a second")
-class _Shakes(_Pushes):
-    def push(self) -> float:
-        return 0.6 * math.sin(2 * math.pi * 8.0 * self.rig.now)
+@_on(_Pushes, "push", "motion", "shakes")
+def _shakes(self: _Pushes) -> float:
+    """Shakes 8 times a second."""
+    return 0.6 * math.sin(2 * math.pi * 8.0 * self.rig.now)
 
 
-@_fault("motion", "pulls", "is pulled towards its lower end")
-class _Pulls(_Pushes):
-    def push(self) -> float:
-        return -0.8
+@_on(_Pushes, "push", "motion", "pulls")
+def _pulls(self: _Pushes) -> float:
+    """Is pulled towards its lower end."""
+    return -0.8
 
 
-@_fault("motion", "goal-sags", "lets its goal go by 3 % of the range in a second while it holds")
-class _GoalSags(_Goals):
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.from_: dict[int, tuple[float, float]] = {}
-
-    def q(self, joint: int, motor: Motor) -> float:
-        q, at = self.from_.get(joint, (math.inf, 0.0))
-        if abs(motor.q - q) > 1e-4:
-            q, at = motor.q, self.rig.now
-        self.from_[joint] = q, at
-        return motor.q - 0.03 * self.span(joint) * min(self.rig.now - at, 5.0)
+@_on(_Goals, "q", "motion", "goal-sags")
+def _goal_sags(self: _Goals, joint: int, motor: Motor) -> Any:
+    """Lets its goal go by 3 % of the range in a second while it holds."""
+    q, at = self.memory.get(joint, (math.inf, 0.0))
+    if abs(motor.q - q) > 1e-4:
+        q, at = motor.q, self.rig.now
+    self.memory[joint] = q, at
+    return motor.q - 0.03 * self.span(joint) * min(self.rig.now - at, 5.0)
 
 
 # ----------------------------------------------------------------------------------- force
@@ -1063,28 +1002,28 @@ _variant(
 )
 
 
-@_fault("force", "force-slams", "closes with three times the force on contact")
-class _Slams(_Forces):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        return 3.0 * tau if 0 < self.pressed_s < 0.4 else tau
+@_on(_Forces, "torque", "force", "force-slams")
+def _slams(self: _Forces, joint: int, tau: float, dt: float) -> float:
+    """Closes with three times the force on contact."""
+    return 3.0 * tau if 0 < self.pressed_s < 0.4 else tau
 
 
-@_fault("force", "force-strong", "presses with twice the force")
-class _Strong(_Forces):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        return 2.0 * tau if self.pressed_s > 0 else tau
+@_on(_Forces, "torque", "force", "force-strong")
+def _strong(self: _Forces, joint: int, tau: float, dt: float) -> float:
+    """Presses with twice the force."""
+    return 2.0 * tau if self.pressed_s > 0 else tau
 
 
-@_fault("force", "force-weak", "presses with a quarter of the force")
-class _Weak(_Forces):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        return 0.25 * tau if self.pressed_s > 0 else tau
+@_on(_Forces, "torque", "force", "force-weak")
+def _weak(self: _Forces, joint: int, tau: float, dt: float) -> float:
+    """Presses with a quarter of the force."""
+    return 0.25 * tau if self.pressed_s > 0 else tau
 
 
-@_fault("force", "force-releases", "lets go after 0.5 s of contact, until it is elsewhere")
-class _Releases(_Forces):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        return 0.0 if self.pressed_s > 0.5 else tau
+@_on(_Forces, "torque", "force", "force-releases")
+def _releases(self: _Forces, joint: int, tau: float, dt: float) -> float:
+    """Lets go after 0.5 s of contact, until it is elsewhere."""
+    return 0.0 if self.pressed_s > 0.5 else tau
 
 
 @_fault("force", "force-locks", "does not let go for 3 s after contact")
@@ -1114,12 +1053,12 @@ class _Other(What):
         return self.rig.other(self.side)
 
 
-@_fault("sides", "side-cmd-other", "obeys the other hand's commands")
-class _CmdOther(_Other):
-    def command(self, motors: Motors) -> Motors | None:
-        other = self.other_side()
-        newest = None if other is None else self.rig.tracks[other].raw
-        return motors if newest is None else self.replaced(motors, lambda i, m: newest[i])
+@_on(_Other, "command", "sides", "side-cmd-other")
+def _cmd_other(self: _Other, motors: Motors) -> Motors | None:
+    """Obeys the other hand's commands."""
+    other = self.other_side()
+    newest = None if other is None else self.rig.tracks[other].raw
+    return motors if newest is None else self.replaced(motors, lambda i, m: newest[i])
 
 
 @_fault("sides", "side-cmd-both", "obeys the other hand's changes of q as well")
@@ -1153,45 +1092,41 @@ class _Leak(_Other, _Goals):
         return motor.q + 0.08 * (self.rig.goal(other, joint) - 0.5 * (low + high))
 
 
-@_fault("sides", "side-state-other", "reports the other hand's q")
-class _StateOther(_Other):
-    def report(self, joint: int, values: Report) -> None:
-        other = self.other_side()
-        if other is not None:
-            values.q = self.rig.positions(other)[joint]
+@_on(_Other, "report", "sides", "side-state-other")
+def _state_other(self: _Other, joint: int, values: Report) -> None:
+    """Reports the other hand's q."""
+    other = self.other_side()
+    if other is not None:
+        values.q = self.rig.positions(other)[joint]
 
 
-@_fault(
-    *("sides", "side-tau-other", "reports the other hand's dq and tau_est"),
-    needs="tau_est",
-    areas=("FORCE",),
-)
-class _TauOther(_Other):
-    def report(self, joint: int, values: Report) -> None:
-        other = self.other_side()
-        if other is None:
-            return
-        if "dq" in self.rig.measured_members:
-            values.dq = self.rig.velocities(other)[joint]
-        tau = self.rig.hand_of(other).tau
-        values.tau = tau if isinstance(tau, float) else tau[joint]
+@_on(_Other, "report", "sides", "side-tau-other", needs="tau_est", areas=("FORCE",))
+def _tau_other(self: _Other, joint: int, values: Report) -> None:
+    """Reports the other hand's dq and tau_est."""
+    other = self.other_side()
+    if other is None:
+        return
+    if "dq" in self.rig.measured_members:
+        values.dq = self.rig.velocities(other)[joint]
+    tau = self.rig.hand_of(other).tau
+    values.tau = tau if isinstance(tau, float) else tau[joint]
 
 
-@_fault("sides", "side-push", "is pushed by the other hand's motion")
-class _SidePush(_Other):
-    def torque(self, joint: int, tau: float, dt: float) -> float:
-        other = self.other_side()
-        if other is None:
-            return tau
-        speed = self.rig.velocities(other)[joint] / self.rig.spans[other][joint]
-        return tau + min(max(speed, -1.0), 1.0) * self.rig.strength(self.side, joint)
+@_on(_Other, "torque", "sides", "side-push")
+def _side_push(self: _Other, joint: int, tau: float, dt: float) -> float:
+    """Is pushed by the other hand's motion."""
+    other = self.other_side()
+    if other is None:
+        return tau
+    speed = self.rig.velocities(other)[joint] / self.rig.spans[other][joint]
+    return tau + min(max(speed, -1.0), 1.0) * self.rig.strength(self.side, joint)
 
 
-@_fault("sides", "side-waits", "obeys only while the other hand is commanded at rest")
-class _SideWaits(_Other):
-    def command(self, motors: Motors) -> Motors | None:
-        other = self.other_side()
-        return None if other is not None and self.rig.tracks[other].moving else motors
+@_on(_Other, "command", "sides", "side-waits")
+def _side_waits(self: _Other, motors: Motors) -> Motors | None:
+    """Obeys only while the other hand is commanded at rest."""
+    other = self.other_side()
+    return None if other is not None and self.rig.tracks[other].moving else motors
 
 
 FAULTS: Mapping[str, type[What]] = _found

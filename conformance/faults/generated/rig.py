@@ -126,11 +126,21 @@ class What:
         self.random = random.Random(f"{self.title} {side}")
         self.since: float | None = None
         """When its condition became true, or None while it is not."""
+        self.memory: dict[Any, Any] = {}
+        """What it has to remember."""
 
     @property
     def whole(self) -> bool:
         """Whether it acts on every joint of its side."""
         return len(self.joints) == self.rig.codec.joints
+
+    def span(self, joint: int) -> float:
+        """The joint's range, rad."""
+        return self.rig.spans[self.side][joint]
+
+    def neighbour(self, joint: int) -> int:
+        """The next joint."""
+        return (joint + 1) % self.rig.codec.joints
 
     @property
     def active_s(self) -> float:
