@@ -38,13 +38,6 @@ GO = dialect("unitree_go")
 # ----------------------------------------------------------------------------- composition
 
 
-@pytest.mark.parametrize("name", ["unitree_go", "dex3"])
-def test_names_of_all_hands_of_the_first_order_round_trip(name: str) -> None:
-    every = list(generated.first_order(dialect(name)))
-    assert len({h.name for h in every}) == len(every) > 3000
-    assert all(parse(h.name) == h for h in every[:: len(every) // 500])
-
-
 def test_names_of_samples_round_trip() -> None:
     spoken = dialects()
     wrong = generated.sample(300, 5, spoken)

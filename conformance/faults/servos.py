@@ -336,16 +336,14 @@ def DeafAfterOutOfRange(self: Any, command: Call, side: Side, motors: Motors) ->
 
 
 class _Feels(ServoHand):
-    """Counts the seconds in which it touches the object, and its grips."""
+    """Counts the seconds in which it touches the object."""
 
     grip = 0.0
     off = 9.0
-    grips = 0
 
     def step(self, dt: float) -> None:
         super().step(dt)
         if self.touches and max(map(abs, self.contact)) > 0.02 and not self.free():
-            self.grips += self.grip == 0.0
             self.grip, self.off = self.grip + dt, 0.0
             self.version += 1  # a fault depends on the time
             return

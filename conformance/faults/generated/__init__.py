@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
@@ -26,7 +26,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import MODELS, Dialect, HandModel, dialect, model
 
-__all__ = ["Fault", "Generated", "dialects", "first_order", "parse", "sample", "sample_good"]
+__all__ = ["Fault", "Generated", "dialects", "parse", "sample", "sample_good"]
 
 _SIDES = {"left": (Side.LEFT,), "right": (Side.RIGHT,), "both": tuple(Side)}
 _SECOND = 0.2
@@ -203,22 +203,9 @@ def _joints(spoken: Dialect) -> tuple[str, ...]:
     return ("joint0",) if count == 1 else ("joint0", f"joint{count - 1}", "all")
 
 
-def _whats(spoken: Dialect, kind: str | None = None) -> list[str]:
+def _whats(spoken: Dialect, kind: str) -> list[str]:
     of = model(spoken.model)
-    return [
-        name
-        for name, what in FAULTS.items()
-        if _suits(what, of) and (kind is None or what.kind == kind)
-    ]
-
-
-def first_order(spoken: Dialect) -> Iterator[Generated]:
-    """Every hand of a dialect with one fault under one condition."""
-    for what in _whats(spoken):
-        for side in _SIDES:
-            for joint in _joints(spoken):
-                for when in WHENS:
-                    yield Generated(spoken, (Fault(what, side, joint, (when,)),))
+    return [name for name, w in FAULTS.items() if w.kind == kind and _suits(w, of)]
 
 
 def sample(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:

@@ -103,17 +103,13 @@ class _Predicted(What):
 
     period = 0.01
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.measured: dict[int, tuple[float, float, float, float]] = {}
-
     def report(self, joint: int, values: Report) -> None:
         now = self.rig.now
-        at, q, dq, speed = self.measured.get(joint, (-math.inf, 0.0, 0.0, 0.0))
+        at, q, dq, speed = self.memory.get(joint, (-math.inf, 0.0, 0.0, 0.0))
         if now - at >= self.period - 0.5 * self.rig.tick:
             at, q, dq = now, values.q, values.dq
             speed = self.rig.velocities(self.side)[joint]
-            self.measured[joint] = at, q, dq, speed
+            self.memory[joint] = at, q, dq, speed
         values.q, values.dq = q + speed * (now - at), dq
 
 
@@ -126,14 +122,10 @@ class _Backlash(What):
 
     play = 0.002
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.seen: dict[int, float] = {}
-
     def report(self, joint: int, values: Report) -> None:
         half = 0.5 * self.play * self.rig.spans[self.side][joint]
-        q = self.seen.get(joint, values.q)
-        self.seen[joint] = values.q = min(max(q, values.q - half), values.q + half)
+        q = self.memory.get(joint, values.q)
+        self.memory[joint] = values.q = min(max(q, values.q - half), values.q + half)
 
 
 _add("backlash", _Backlash, "backlash", "has play of 0.2 % of the range before its sensor")
@@ -341,14 +333,11 @@ class _Jitters(_Published):
 
     part = 0.05
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.held: list[Sample] = []
-
     def timed(self, samples: list[Sample]) -> list[Sample]:
-        out, self.held = self.held + samples, []
+        out = [*self.memory.pop("held", []), *samples]
         if len(out) == 1 and not self.rig.ended and self.random.random() < self.part:
-            out, self.held = [], out
+            self.memory["held"] = out
+            return []
         return out
 
 
@@ -386,18 +375,15 @@ _add("brake", _Coasts, "brake-coast", "coasts when it brakes", **_ONE)
 class _Holds(What):
     """Holds the position that it has when the commands have stopped, as a servo does."""
 
-    def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
-        super().__init__(rig, side, joints)
-        self.at: dict[int, float] = {}
-
     def torque(self, joint: int, tau: float, dt: float) -> float:
         if self.rig.driven(self.side) or not self.rig.tracks[self.side].commands:
-            self.at.pop(joint, None)
+            self.memory.pop(joint, None)
             return tau
         q = self.rig.positions(self.side)[joint]
         kp, kd = self.rig.gains(joint)
         dq = self.rig.velocities(self.side)[joint]
-        return kp * (self.at.setdefault(joint, q) - q) - kd * dq
+        at: float = self.memory.setdefault(joint, q)
+        return kp * (at - q) - kd * dq
 
 
 _add("brake", _Holds, "brake-hold", "holds its position when it brakes")
