@@ -135,7 +135,7 @@ class PeerCase(Case):
         logging.disable()
         scene = Scene(batch)
         with self._spec.stage(scene):
-            with Program(batch, self._spec.command(scene)) as program:
+            with Program(batch, self._spec.words(scene)) as program:
                 try:
                     self._among(batch, scene, program)
                 except WaitTimeout as error:

@@ -26,6 +26,7 @@ from dexkit.messages import encode, unitree_go
 from dexkit.models import DEX1_1, MODELS, Dialect
 from dexkit.robots import ROBOTS
 from dexkit.temporary_folder import sweep
+from dexkit.traces import sample_path
 from tools.campaign.case import Batch, Case
 from tools.campaign.devices import DEVICES, M4010, Bench, DeviceBench, Dex3, Mx64, command
 from tools.campaign.process import Program
@@ -123,7 +124,8 @@ Stage = Callable[[Scene], "contextlib.AbstractContextManager[None]"]
 class Spec:
     """A program with the test that it works.
 
-    :param command: its arguments behind ``python -m``.
+    :param command: its arguments behind ``python -m``; with the ``{domain}``, the one ``{beside}``
+        it, a ``{port}``, the ``{scratch}`` folder and a ``{sample}`` of a recording.
     :param stage: what must be there for it.
     :param ready: what it prints when it works.
     :param codes: exit codes that are right after SIGINT and SIGTERM.
@@ -132,12 +134,28 @@ class Spec:
     """
 
     name: str
-    command: Callable[[Scene], list[str]]
+    command: str
     stage: Stage
     ready: str = "ready:"
     codes: tuple[int, ...] = (0,)
     works: Callable[[Scene, Program], None] = lambda scene, program: None
     after: Callable[[Scene, bool], None] = lambda scene, killed: None
+
+    def words(self, scene: Scene) -> list[str]:
+        """The command in a scene."""
+        domain = scene.batch.domain
+        places = {
+            "domain": domain,
+            "beside": domain + 1,
+            "port": 4000 + domain,
+            "scratch": scene.scratch,
+            "sample": sample_path("dex1_pick_place"),
+        }
+        words = [word.format(**places) for word in self.command.split()]
+        if isinstance(scene.bench, DeviceBench) and scene.device is not None:
+            words += scene.bench.options(scene.device)
+            words.append("--wait-for-device")  # on a busy machine it may answer late
+        return words
 
 
 # --- stages
@@ -198,15 +216,12 @@ def _states(scene: Scene, program: Program) -> None:
     scene.client.wait_states()
 
 
-def _topic_flows(
-    topic_type: Callable[[], tuple[str, str]], beside: int = 0
-) -> Callable[[Scene, Program], None]:
+def _topic_flows(topic: str, kind: str, beside: int = 0) -> Callable[[Scene, Program], None]:
     """Samples come on a topic, ``beside`` domains above that of the scene."""
 
     def works(scene: Scene, program: Program) -> None:
         from dexkit.dds import DdsNode
 
-        topic, kind = topic_type()
         with DdsNode(scene.batch.domain + beside, "lo") as node:
             reader = node.reader(topic, kind)
             seen = 0
@@ -218,12 +233,6 @@ def _topic_flows(
                     seen += len(reader.take())
 
     return works
-
-
-def _robot_state(name: str) -> tuple[str, str]:
-    from dexkit.robots import robot
-
-    return "rt/lowstate", robot(name).state_type
 
 
 def _answers(scene: Scene, program: Program) -> None:
@@ -306,17 +315,6 @@ def _output_grows(scene: Scene, program: Program) -> None:
 # --- the programs
 
 
-def _serve(backend: str) -> Callable[[Scene], list[str]]:
-    def command(scene: Scene) -> list[str]:
-        words = ["dexkit", "serve", backend, "--side", "left", "--domain", scene.domain]
-        if isinstance(scene.bench, DeviceBench):
-            words += scene.bench.options(scene.device)
-            words.append("--wait-for-device")  # on a busy machine it may answer late
-        return words
-
-    return command
-
-
 def _served() -> dict[str, Callable[[Path], Bench]]:
     """The benches of ``serve``, by backend: simulated hands with torque control, emulated
     devices.
@@ -329,102 +327,48 @@ def _served() -> dict[str, Callable[[Path], Bench]]:
     return found | {bench.backend: bench for bench in DEVICES}
 
 
-def _sample() -> str:
-    from dexkit.traces import sample_path
-
-    return str(sample_path("dex1_pick_place"))
-
-
 def specs() -> list[Spec]:
     """Every program that runs until it is asked to end."""
     source, target = DEX1_1.dialects[:2]
+    asked, forwarded = source.topics(SIDE)[0], target.topics(SIDE)[0]
+    ends = (0, 1, 130, 143, -2, -15)
 
-    def emulate(*words: str) -> Callable[[Scene], list[str]]:
-        return lambda scene: [
-            "dexkit",
-            "emulate",
-            *(w.replace("SCRATCH", str(scene.scratch)) for w in words),
-        ]
+    def robot(name: str, like: str) -> Spec:
+        works = _topic_flows("rt/lowstate", ROBOTS[like].state_type)
+        return Spec(f"emulate-{name}", f"dexkit emulate {name} --domain {{domain}}", _nothing,
+                    works=works)  # fmt: skip
 
-    def on_domain(*words: str) -> Callable[[Scene], list[str]]:
-        return lambda scene: ["dexkit", *words, "--domain", scene.domain]
-
-    found = [
-        Spec(f"serve-{backend}", _serve(backend), _with_client(bench), works=_states)
-        for backend, bench in _served().items()
-    ]
-    found += [
-        Spec(
-            "bridge",
-            lambda s: [
-                "dexkit", "bridge", "--from", source.name, "--to", target.name,
-                "--side", "left", "--domain", s.domain, "--to-domain", str(s.batch.domain + 1),
-            ],
-            lambda scene: _talk(scene, states=False),
-            works=_topic_flows(lambda: (target.topics(SIDE)[0], target.cmd_type), 1),
+    return [
+        *(
+            Spec(f"serve-{backend}", f"dexkit serve {backend} --side left --domain {{domain}}",
+                 _with_client(bench), works=_states)
+            for backend, bench in _served().items()
         ),
-        Spec(
-            "record",
-            lambda s: [
-                "dexkit", "record", str(s.scratch / "out.mcap"), "--force", "--domain", s.domain,
-            ],
-            _talk,
-            works=_recording_grows,
-            after=_readable,
-        ),
-        Spec(
-            "publish",
-            lambda s: [
-                "dexkit", "publish", _sample(), "--loop", "--wait", "0", "--domain", s.domain,
-                "--topic", source.topics(SIDE)[0],
-            ],
-            _nothing,
-            ready="",
-            codes=(0, 1, 130),
-            works=_topic_flows(lambda: (source.topics(SIDE)[0], source.cmd_type)),
-        ),
-        Spec("emulate-mx64", emulate("mx64", "--link", "SCRATCH/mx64", "--set", "any-baudrate=yes"),
+        Spec("bridge",
+             f"dexkit bridge --from {source.name} --to {target.name} --side left "
+             "--domain {domain} --to-domain {beside}",
+             partial(_talk, states=False), works=_topic_flows(forwarded, target.cmd_type, 1)),
+        Spec("record", "dexkit record {scratch}/out.mcap --force --domain {domain}", _talk,
+             works=_recording_grows, after=_readable),
+        Spec("publish",
+             f"dexkit publish {{sample}} --loop --wait 0 --domain {{domain}} --topic {asked}",
+             _nothing, ready="", codes=(0, 1, 130), works=_topic_flows(asked, source.cmd_type)),
+        Spec("emulate-mx64", "dexkit emulate mx64 --link {scratch}/mx64 --set any-baudrate=yes",
              _emulated(Mx64), works=_answers),
-        Spec("emulate-dex1-motor", emulate("dex1-motor", "--link", "SCRATCH/m4010"),
+        Spec("emulate-dex1-motor", "dexkit emulate dex1-motor --link {scratch}/m4010",
              _emulated(M4010), works=_answers),
-        Spec(
-            "emulate-dex3-usb",
-            lambda s: [
-                "dexkit", "emulate", "dex3-usb",
-                "--link", f"usbip://127.0.0.1:{4000 + s.batch.domain}",
-            ],
-            _emulated(Dex3),
-            works=_usb_answers,
-        ),
-        Spec("emulate-h1", on_domain("emulate", "h1"), _nothing,
-             works=_topic_flows(lambda: _robot_state("h1"))),
-        Spec("emulate-g1", on_domain("emulate", "g1"), _nothing,
-             works=_topic_flows(lambda: _robot_state("g1"))),
-        Spec("emulate-all", on_domain("emulate", "all"), _nothing,
-             works=_topic_flows(lambda: _robot_state("g1"))),
-        Spec(
-            "doctor-watch",
-            lambda s: ["dexkit", "doctor", "--watch", "--domain", s.domain, "--scan", "none",
-                       "--seconds", "0.3"],
-            _talk,
-            ready="",
-            codes=(0, 1, 130, 143, -2, -15),
-            works=_output_grows,
-        ),
-        Spec(
-            "conformance",
-            lambda s: [
-                "pytest", "conformance/", "--backend", "sim-dex1", "--quick", "--side", "left",
-                "-p", "no:cacheprovider", "--domain", s.domain,
-                "--json", str(s.scratch / "result.json"),
-            ],
-            _nothing,
-            ready="",
-            codes=(0, 1, 2, 130, 143, -2, -15),
-            works=_output_grows,
-        ),
+        Spec("emulate-dex3-usb", "dexkit emulate dex3-usb --link usbip://127.0.0.1:{port}",
+             _emulated(Dex3), works=_usb_answers),
+        robot("h1", "h1"),
+        robot("g1", "g1"),
+        robot("all", "g1"),
+        Spec("doctor-watch", "dexkit doctor --watch --domain {domain} --scan none --seconds 0.3",
+             _talk, ready="", codes=ends, works=_output_grows),
+        Spec("conformance",
+             "pytest conformance/ --backend sim-dex1 --quick --side left -p no:cacheprovider "
+             "--domain {domain} --json {scratch}/result.json",
+             _nothing, ready="", codes=(*ends, 2), works=_output_grows),
     ]  # fmt: skip
-    return found
 
 
 def _usb_answers(scene: Scene, program: Program) -> None:
@@ -467,7 +411,7 @@ class _Runs(Case):
 
     def start(self, batch: Batch, scene: Scene) -> Program:
         """Start it and wait until it works."""
-        program = Program(batch, self.spec.command(scene))
+        program = Program(batch, self.spec.words(scene))
         try:
             if self.spec.ready:
                 program.wait_for(self.spec.ready)
