@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -10,34 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.backends import BackendOptions, backend
-from dexkit.cli import cli
 from dexkit.clock import ManualClock
 from dexkit.conformance.behaviours.stillness import _repeats, _turns
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import StatesSwapped, Vibrates
-from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.brainco import BrainCoService
 from dexkit.conformance.virtual.fingers import FingerHand
 from dexkit.doctor.motion_direction import Course, moves_against, swapped
-from dexkit.emulators.sim_brainco import SimBrainCo, sim_brainco
-from dexkit.errors import HandLost, UsageError
-from dexkit.hand import Floats, Hand, HandCommand, HandState, Side
+from dexkit.emulators.sim_brainco import SimBrainCo
+from dexkit.hand import Floats, HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_go
 from dexkit.models import BRAINCO_REVO2, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
 from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
-from dexkit.topics import roles
-from dexkit.watch.fields import parts_of
 from tests.each import each
-from tests.emulated_service import EmulatedService
 
 BRAINCO = dialect("brainco")
 STATES = message_type(BRAINCO.state_type)
@@ -58,26 +49,6 @@ def test_joints_are_in_client_order_and_of_one_travel() -> None:
         assert {(j.q_min, j.q_max, j.closing, j.straight) for j in joints} == {(0.0, 1.0, 1, 0.0)}
     # 130 degrees a second over 1.47 rad
     assert FULL[2] == pytest.approx(math.radians(130) / 1.47)
-
-
-def test_topics_belong_to_the_dialect() -> None:
-    (state,) = roles("rt/brainco/left/state")
-    assert (state.kind, state.dialect.name, state.sides) == ("state", "brainco", (LEFT,))
-
-
-def test_messages_do_not_mention_radians() -> None:
-    text = CliRunner().invoke(cli, ["models", "brainco-revo2"]).output
-    assert "full travel/s" in text
-    assert not RADIANS.search(text)
-    data = CliRunner().invoke(cli, ["models", "brainco-revo2", "--json"]).output
-    assert json.loads(data)["models"][0]["unit"] == "full travel"
-    assert not RADIANS.search(data)
-    (part,) = parts_of("rt/brainco/left/state", BRAINCO.state_type)
-    units = {f.quantity: f.unit for f in part.fields}
-    assert (units["q"], units["dq"], units["tau"]) == ("full travel", "full travel/s", "A")
-    for r in catalogue("brainco-revo2", None):
-        for words in (r.title, r.sentence, r.expected):
-            assert not RADIANS.search(words), r.id
 
 
 # --------------------------------------------------------------------------------- simulated hand
@@ -101,26 +72,6 @@ def hold(
     return state
 
 
-def test_simulated_hand_implements_hand() -> None:
-    hand = SimBrainCo(RIGHT)
-    assert isinstance(hand, Hand)
-    assert (hand.spec.model, hand.spec.n_joints) == ("brainco-revo2", N)
-    assert hand.spec.simulated
-    assert backend("sim-brainco") is sim_brainco
-    with pytest.raises(HandLost):
-        hand.exchange(HandCommand.brake(N))
-
-
-def test_joints_arrive_and_stand_still() -> None:
-    hand, clock = opened()
-    state = hand.exchange(HandCommand.brake(N))
-    assert state.q.tolist() == list(BRAINCO_REVO2.rest_q[LEFT])
-    for goal in (1.0, 0.0, 0.4567):
-        state = hold(hand, clock, goal, 1.5)
-        assert np.abs(state.q - goal).max() <= 0.0005  # it reports thousandths
-        assert not state.dq.any()
-
-
 def test_speed_of_the_command_is_the_speed() -> None:
     for part in (1.0, 0.5, 0.1):
         hand, clock = opened(start=0.0)
@@ -142,20 +93,6 @@ def test_object_stops_the_fingers_and_draws_the_current_limit() -> None:
     state = hand.exchange(HandCommand.brake(N))
     clock.advance(0.1)
     assert np.allclose(hand.exchange(HandCommand.brake(N)).q, 0.5)  # a brake does not let go
-
-
-def test_backend_takes_settings() -> None:
-    hand = sim_brainco.make(BackendOptions(LEFT, settings={"start": "30", "object": "40"}))
-    assert isinstance(hand, SimBrainCo)
-    assert np.allclose(hand.mechanics.q, 0.3)
-    for bad, text in (
-        ({"start": "half"}, "is not a number"),
-        ({"start": "50", "object": "40"}, "inside the object"),
-        ({"object": "0"}, "between 0 and 100"),
-        ({"start": "101"}, "percentage"),
-    ):
-        with pytest.raises(UsageError, match=text):
-            sim_brainco.make(BackendOptions(LEFT, settings=bad))
 
 
 # --------------------------------------------------------------------------------------- dialect
@@ -200,19 +137,6 @@ def test_state_has_six_motors_in_the_vendors_units(q: list[float], fill: Fill) -
     assert [m.tau_est for m in sent.states] == pytest.approx([0.3] * N)
 
 
-def test_hand_holds_one_second_after_the_last_command() -> None:
-    clock = ManualClock()
-    core = HandCore(BRAINCO_REVO2.spec(LEFT, io_rate=500.0, simulated=True), BRAINCO_REVO2, clock)
-    core.opened(core.spec)
-    command = mapping().command(message(q=0.9, dq=1.0), LEFT)
-    assert command is not None
-    assert core.submit(command)
-    clock.advance(0.98)
-    assert not core.next_command().is_brake
-    clock.advance(0.04)
-    assert core.next_command().is_brake
-
-
 # ----------------------------------------------------------------------------------------- client
 
 
@@ -244,23 +168,6 @@ def test_vibration_and_swapped_states_are_found_and_reported_in_parts_of_the_tra
         assert all(not RADIANS.search(r.observed) for r in result.results)
         assert all(not RADIANS.search(name) for r in result.results for name in r.values)
     assert any("full travel" in r.observed for r in result.results)
-
-
-class Emulated(EmulatedService):
-    simulated = SimBrainCo
-
-
-@pytest.mark.soak
-def test_emulated_hand_meets_every_requirement() -> None:
-    result = run_mutant(Emulated, plan_for("brainco"))
-    bad = [
-        r.explain()
-        for r in result.results
-        if r.verdict not in (Verdict.PASS, Verdict.NOT_APPLICABLE)
-    ]
-    assert not bad, "\n".join(bad)
-    passed = {r.requirement.id for r in result.results if r.verdict is Verdict.PASS}
-    assert passed == {r.id for r in catalogue("brainco-revo2")}
 
 
 @each(

@@ -16,21 +16,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.backends import BackendOptions, backend
 from dexkit.clock import ManualClock
 from dexkit.conformance.judge import judge
 from dexkit.conformance.recording import Recording
 from dexkit.conformance.results import Overall, Verdict
-from dexkit.emulators.sim_dex5 import SimDex5, sim_dex5
-from dexkit.errors import HandLost, UsageError
-from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
+from dexkit.emulators.sim_dex5 import SimDex5
+from dexkit.errors import UsageError
+from dexkit.hand import HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX5_1, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
-from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.client_codec import ClientCodec
-from dexkit.topics import roles
 from dexkit.traces import Recorder, open_trace, sample_path, samples
 
 ROOT = Path(__file__).parent.parent
@@ -82,19 +79,6 @@ def test_thumb_has_other_gains_and_outer_joints_share_motors() -> None:
     assert sorted(i for group in DEX5_1.motors for i in group) == list(range(N))
 
 
-def test_rest_positions_are_not_zero_or_at_a_stop() -> None:
-    for side in Side:
-        for q, joint in zip(DEX5_1.rest_q[side], DEX5_1.joints[side], strict=True):
-            assert joint.q_min < q < joint.q_max
-            assert q != 0.0
-
-
-def test_topics_belong_to_the_dialect() -> None:
-    (state,) = roles("rt/dex5/left/state")
-    assert (state.kind, state.dialect.name, state.sides) == ("state", "dex5", (LEFT,))
-    assert [r.kind for r in roles("rt/dex5/right/cmd")] == ["cmd"]
-
-
 # --------------------------------------------------------------------------------- simulated hand
 
 
@@ -113,33 +97,6 @@ def hold(hand: SimDex5, clock: ManualClock, command: HandCommand, seconds: float
     return state
 
 
-def test_simulated_hand_implements_hand() -> None:
-    hand = SimDex5(RIGHT)
-    assert isinstance(hand, Hand)
-    assert (hand.spec.model, hand.spec.n_joints, hand.spec.n_sensors) == ("dex5-1", N, 0)
-    assert hand.spec.simulated
-    assert backend("sim-dex5") is sim_dex5
-    with pytest.raises(HandLost):
-        hand.exchange(HandCommand.brake(N))
-
-
-@pytest.mark.parametrize("side", Side)
-def test_every_joint_reaches_its_target_with_client_gains(side: Side) -> None:
-    hand, clock = opened(side)
-    low, high = hand.spec.q_min, hand.spec.q_max
-    state = hold(hand, clock, HandCommand.brake(N), 0.2)
-    assert state.q.tolist() == list(DEX5_1.rest_q[side])
-    assert not state.mode.any()
-    for part in (0.8, 0.2):
-        goal = low + part * (high - low)
-        state = hold(hand, clock, HandCommand.position(goal, kp=KP, kd=KD), 1.5)
-        assert np.abs(state.q - goal).max() < 0.01
-        assert state.mode.tolist() == [JointMode.FOC] * N
-    assert np.isnan(state.voltage).all()
-    assert state.pressure is None
-    assert state.supply is None
-
-
 def test_joints_press_on_object_towards_closing() -> None:
     hand, clock = opened(RIGHT, object_at=50.0)
     closed = np.where(CLOSING[RIGHT] > 0, hand.spec.q_max, hand.spec.q_min)
@@ -150,16 +107,6 @@ def test_joints_press_on_object_towards_closing() -> None:
     assert (felt[presses] > 0.05).all()
     assert felt[THUMB].max() > 5 * felt[:16].max()
     assert np.abs(state.q[presses] - 0.5 * closed[presses]).max() < 0.02
-
-
-def test_backend_takes_settings_of_hand_with_several_joints() -> None:
-    hand = sim_dex5.make(BackendOptions(LEFT, settings={"start": "0", "object": "40"}))
-    assert isinstance(hand, SimDex5)
-    assert not hand.mechanics.q[CLOSING[LEFT] != 0].any()
-    with pytest.raises(UsageError, match="start=half is not a number"):
-        sim_dex5.make(BackendOptions(LEFT, settings={"start": "half"}))
-    with pytest.raises(UsageError, match="inside the object"):
-        sim_dex5.make(BackendOptions(LEFT, settings={"start": "50", "object": "40"}))
 
 
 # --------------------------------------------------------------------------------------- dialect
@@ -213,22 +160,6 @@ def test_state_has_twenty_joints_and_no_unknown_members(tau: list[float], fill: 
     assert found == pytest.approx(tau, abs=1e-6)
     assert sent.press_sensor_state == []
     assert math.hypot(*sent.imu_state.quaternion) == 0.0
-
-
-def test_hand_brakes_one_second_after_last_command() -> None:
-    clock = ManualClock()
-    core = HandCore(DEX5_1.spec(LEFT, io_rate=500.0, simulated=True), DEX5_1, clock)
-    core.opened(core.spec)
-    command = mapping().command(message([1] * N, kp=0.1), LEFT)
-    assert command is not None
-    clock.advance(0.01)
-    assert core.submit(command)
-    clock.advance(0.98)
-    assert not core.next_command().is_brake
-    clock.advance(0.03)
-    assert core.next_command().is_brake
-    assert core.submit(command)
-    assert not core.next_command().is_brake
 
 
 # --------------------------------------------------------------------------- client and recording

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +18,6 @@ from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import ReversedScale
 from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpHand, FtpService
 from dexkit.emulators.sim_inspire import SimInspireFtp, sim_inspire_ftp
@@ -37,14 +35,12 @@ from dexkit.topics import roles
 from dexkit.traces.names import dds_type
 from dexkit.watch.fields import parts_of
 from tests.each import each
-from tests.emulated_service import EmulatedService
 
 FTP = dialect("inspire_ftp")
 STATE, CTRL = message_type(FTP.state_type), message_type(FTP.cmd_type)
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 N = 6
 FULL_SPEED = INSPIRE_FTP.joints[Side.LEFT][0].dq_max
-RADIANS = re.compile(r"\brad\b|\bradians\b|N m\b|_rad\b")
 
 
 # ------------------------------------------------------------------------------------ on the wire
@@ -125,18 +121,14 @@ def test_topics_have_the_side_as_a_letter() -> None:
     assert INSPIRE_FTP.joints == INSPIRE_DFX.joints
 
 
-def test_messages_do_not_mention_radians() -> None:
+def test_lists_and_their_topics_are_described() -> None:
     text = CliRunner().invoke(cli, ["models", "inspire-ftp"]).output
     assert "rt/inspire_hand/ctrl/{l,r}" in text
     assert "rt/inspire_hand/touch/{l,r}" in text
-    assert not RADIANS.search(text)
     (part,) = parts_of("rt/inspire_hand/state/l", FTP.state_type)
     (q, *_) = [f for f in part.fields if f.quantity == "q"]
     assert (q.path, q.factor, q.unit) == ("angle_act[0]", 0.001, "full travel")
     assert {f.quantity for f in part.fields} == {"q", "tau", "temperature"}
-    for r in catalogue("inspire-ftp", None):
-        for words in (r.title, r.sentence, r.expected):
-            assert not RADIANS.search(words), r.id
 
 
 # ---------------------------------------------------------------------------------- the simulated
@@ -261,23 +253,6 @@ def test_reversed_scale_is_found() -> None:
     result = run_mutant(mix(ReversedScale, FtpService), plan)
     failed = {r.requirement.id for r in result.results if r.verdict is Verdict.FAIL}
     assert "FTP-MOVE-01" in failed
-
-
-class Emulated(EmulatedService):
-    simulated = SimInspireFtp
-
-
-@pytest.mark.soak
-def test_emulated_hands_meet_every_requirement() -> None:
-    result = run_mutant(Emulated, plan_for("inspire_ftp"))
-    bad = [
-        r.explain()
-        for r in result.results
-        if r.verdict not in (Verdict.PASS, Verdict.NOT_APPLICABLE)
-    ]
-    assert not bad, "\n".join(bad)
-    passed = {r.requirement.id for r in result.results if r.verdict is Verdict.PASS}
-    assert passed == {r.id for r in catalogue("inspire-ftp")}
 
 
 @pytest.mark.soak

@@ -10,12 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.backends import BackendOptions, backend
 from dexkit.clock import ManualClock
-from dexkit.emulators.sim_dex1 import SimHand, sim_dex1
-from dexkit.errors import HandLost, UsageError
-from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
-from tests.each import each
+from dexkit.emulators.sim_dex1 import SimHand
+from dexkit.errors import HandLost
+from dexkit.hand import HandCommand, HandState, JointMode
 
 
 def opened(**options: float) -> tuple[SimHand, ManualClock]:
@@ -35,14 +33,6 @@ def hold(
     return state
 
 
-def test_sim_dex1_implements_hand_and_is_registered() -> None:
-    assert isinstance(SimHand(), Hand)
-    made = backend("sim-dex1").create(BackendOptions(Side.RIGHT, settings={"object": "40"}))
-    assert made.spec.side is Side.RIGHT
-    assert made.spec.simulated
-    assert backend("sim-dex1") is sim_dex1
-
-
 def test_position_is_reached_and_held() -> None:
     hand, clock = opened()
     state = hold(hand, clock, HandCommand.position(4.0), 2.0)
@@ -52,13 +42,6 @@ def test_position_is_reached_and_held() -> None:
     assert state.mode[0] == JointMode.FOC
     assert state.measured
     assert state.stamp == clock.now()
-
-
-def test_initial_position_is_not_exactly_zero() -> None:
-    hand, clock = opened()
-    state = hold(hand, clock, HandCommand.brake(1), 0.1)
-    assert state.q[0] == pytest.approx(0.2 * 5.4)
-    assert state.mode[0] == JointMode.BRAKE
 
 
 def teleoperate(hand: SimHand, clock: ManualClock, target: float) -> list[tuple[float, ...]]:
@@ -193,9 +176,3 @@ def test_only_an_open_hand_exchanges() -> None:
     hand.close()
     with pytest.raises(HandLost):
         hand.exchange(HandCommand.brake(1))
-
-
-@each("settings", [{"object": "0"}, {"object": "many"}, {"start": "101"}, {"colour": "red"}])
-def test_bad_settings_are_refused(settings: dict[str, str]) -> None:
-    with pytest.raises(UsageError):
-        sim_dex1.create(BackendOptions(Side.LEFT, settings=settings))
