@@ -135,7 +135,7 @@ def test_every_verdict_is_rendered_from_the_result_alone() -> None:
     assert ">1700000001250000000<" in card
     assert "likely cause, left" in card
     assert "cause plain words right" in card
-    assert f"by <a href='#{result.results[2].requirement.id}'>" in page  # what blocked it
+    assert f'by <a href="#{result.results[2].requirement.id}">' in page  # what blocked it
     assert "reached: <b>topic seen</b> (2 of 5)" in page
     assert "max gap <b>0.25 s</b>" in page
     assert "rate <b>199.5 Hz</b>" in page

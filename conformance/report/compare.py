@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from markupsafe import Markup
+
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -15,11 +17,10 @@ from dexkit.conformance.report.labels import (
     model_title,
 )
 from dexkit.conformance.report.markdown import code, plain, table
-from dexkit.conformance.report.pages import document
+from dexkit.conformance.report.pages import fill
 from dexkit.conformance.requirements import Requirement
 from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.errors import UsageError
-from dexkit.escaping import html as escape
 
 __all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
 
@@ -117,6 +118,11 @@ class Comparison:
         """Changes to a worse verdict."""
         return [change for change in self.changes if change.worse]
 
+    @property
+    def improvements(self) -> list[Change]:
+        """Changes to a better verdict."""
+        return [change for change in self.changes if not change.worse]
+
     def _successors(self) -> list[tuple[int, int]]:
         hands: dict[str, list[int]] = {}
         for index, run in enumerate(self.runs):
@@ -163,89 +169,19 @@ def render_comparison(comparison: Comparison, curves: str = "") -> str:
 
     :param curves: of the runs' recordings, HTML, for the end of the page.
     """
-    runs, names = comparison.runs, comparison.names
-    title = f"{len(runs)} runs as {model_title(runs[0])}"
-    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
-    regressions = comparison.regressions
-    better = [c for c in comparison.changes if not c.worse]
-    differing, agreeing = comparison.differing, comparison.agreeing
-    body = [
-        f"<h1>Comparison: {escape(title)}</h1>",
-        _about(comparison),
-        _changes(comparison, regressions, "Regressions", "bad"),
-        _changes(comparison, better, "Became better", "ok"),
-        f"<h2>Where they differ ({len(differing)})</h2>",
-        _matrix(differing, names, heads) if differing else "<p>Nowhere: all verdicts agree.</p>",
-        f"<h2>Where they agree ({len(agreeing)})</h2>",
-        _matrix(agreeing, names, heads) if agreeing else "<p>Nowhere.</p>",
-        curves,
-    ]
-    return document(f"Comparison: {title}", "".join(body))
-
-
-def _about(comparison: Comparison) -> str:
-    rows = []
-    for run, name in zip(comparison.runs, comparison.names, strict=True):
-        answer, found, real = ANSWERS[run.overall], count_verdicts(run), device_kind(run)
-        stages = ", ".join(f"{side} {stage}" for side, stage in run.stage.items())
-        badge = f' <span class="chip real">{real}</span>' if real else ""
-        rows.append(
-            f'<tr><th scope="row">{escape(name)}{badge}</th>'
-            f'<td data-run="verdict"><b class="{answer.css}">{answer.text}</b></td>'
-            f'<td data-run="passed">{found.passed} of {found.applicable}</td>'
-            f'<td data-run="reached">{escape(stages)}</td>'
-            f'<td data-run="recorded">{escape(run.recorded_at)}</td>'
-            f'<td data-run="dexkit">{escape(run.environment.get("dexkit", "?"))}</td></tr>'
-        )
-    return (
-        '<div class="wrap"><table class="matrix"><thead><tr><th scope="col">run</th>'
-        '<th scope="col">verdict</th><th scope="col">passed</th><th scope="col">reached</th>'
-        '<th scope="col">recorded</th><th scope="col">dexkit</th></tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
-
-
-def _changes(comparison: Comparison, changes: Sequence[Change], title: str, css: str) -> str:
-    if not changes:
-        return ""
-    rows = "".join(
-        f"<li><code>{escape(c.requirement.id)}</code> {escape(_change_text(comparison, c))}</li>"
-        for c in changes
-    )
-    return f'<section class="card {css}"><h2>{title} ({len(changes)})</h2><ul>{rows}</ul></section>'
-
-
-def _matrix(rows: Sequence[Row], names: Sequence[str], heads: str) -> str:
-    lines = []
-    area = ""
-    for row in rows:
-        need = row.requirement
-        if need.area != area:
-            area = need.area
-            lines.append(
-                f'<tr class="area-row"><th scope="colgroup" colspan="{len(names) + 1}">'
-                f"{escape(area)}</th></tr>"
-            )
-        cells = "".join(_cell(name, group) for name, group in zip(names, row.found, strict=True))
-        lines.append(
-            f'<tr><th scope="row"><code>{escape(need.id)}</code> {escape(need.title)} '
-            f'<span class="dim">{need.level}</span></th>{cells}</tr>'
-        )
-    return (
-        f'<div class="wrap"><table class="matrix fixed"><thead><tr><th scope="col">requirement</th>'
-        f"{heads}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
-    )
-
-
-def _cell(name: str, group: Sequence[Result]) -> str:
-    if not group:
-        return f'<td data-run="{escape(name)}" class="na">not asked</td>'
-    word = VERDICTS[worst(r.verdict for r in group)]
-    figure = _figure(group)
-    return (
-        f'<td data-run="{escape(name)}"><b class="{word.css}">{word.text}</b>'
-        + (f"<span>{escape(figure)}</span>" if figure else "")
-        + "</td>"
+    about = f"{len(comparison.runs)} runs as {model_title(comparison.runs[0])}"
+    return fill(
+        "comparison.html",
+        title=f"Comparison: {about}",
+        about=about,
+        comparison=comparison,
+        curves=Markup(curves),
+        ANSWERS=ANSWERS,
+        VERDICTS=VERDICTS,
+        change_text=_change_text,
+        count_verdicts=count_verdicts,
+        device_kind=device_kind,
+        figure=_figure,
     )
 
 
@@ -271,7 +207,7 @@ def render_comparison_markdown(comparison: Comparison) -> str:
     lines += [*table(["run", "verdict", "passed", "recorded"], rows), ""]
     for title, changes in (
         ("Regressions", comparison.regressions),
-        ("Became better", [c for c in comparison.changes if not c.worse]),
+        ("Became better", comparison.improvements),
     ):
         if changes:
             lines += [f"### {title}", ""]

@@ -43,6 +43,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["zip"] = zip
     environment.globals["style"] = Markup(_HERE.joinpath("report.css").read_text(encoding="utf-8"))
     return environment
 
