@@ -21,15 +21,10 @@ from dexkit.robots import ROBOTS
 from dexkit.traces import Trace
 from dexkit.traces.sessions.streams import COMMAND, HAND, STATE, Stream, streams_of
 
-__all__ = ["STYLE", "Recorded", "beside", "over_each_other", "page", "recorded"]
+__all__ = ["Recorded", "beside", "over_each_other", "page", "recorded"]
 
 _WINDOW = 0.5  # seconds over which a rate is counted
 _LEAST = 3  # messages of a topic whose rate is drawn
-STYLE = (
-    "<style>.beside{display:grid;gap:0 18px;grid-template-columns:"
-    "repeat(auto-fit,minmax(min(290px,100%),1fr))}.beside figure{min-width:0}"
-    ".key .other{border-color:var(--open);border-top-style:dashed}</style>"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +77,7 @@ def page(recordings: Sequence[Recorded]) -> str:
 
 def beside(recordings: Sequence[Recorded]) -> str:
     """Every joint: a chart for each recording, on equal axes."""
-    sections = [STYLE, _key()]
+    sections = [_key()]
     for part in _parts(recordings):
         joints = _joints(recordings, part)
         sections.append(f"<h2>{escape(_title(part))}</h2>")
@@ -105,7 +100,7 @@ def beside(recordings: Sequence[Recorded]) -> str:
                 for r, lines in zip(recordings, curves, strict=True)
             ]
             sections.append(_row(recordings, charts))
-    if len(sections) == 2:
+    if len(sections) == 1:
         sections.append("<p>No joints of hands or robots are in it.</p>")
     return "".join(sections)
 
@@ -118,7 +113,7 @@ def over_each_other(
     :param order: (part, kind, joint, what is said of it) of each chart.
     """
     sections = [
-        STYLE + f'<p class="key"><span><i class="state"></i>{escape(one.name)}</span>'
+        f'<p class="key"><span><i class="state"></i>{escape(one.name)}</span>'
         f'<span><i class="other"></i>{escape(other.name)}</span></p>'
     ]
     span = 0.0, max(one.seconds, other.seconds)
