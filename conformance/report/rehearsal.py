@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 
 import numpy as np
+from markupsafe import Markup
 
 from dexkit import __version__
-from dexkit.conformance.report.pages import document
+from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.svg_charts import Band, Level, Line, chart
-from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehearsed
-from dexkit.escaping import html as escape
 from dexkit.hand import Side
 from dexkit.models import model
 from dexkit.traces.replay.machine import End, Phase
@@ -37,41 +36,37 @@ def render(prepared: Prepared, rehearsal: Rehearsal, *, source: str, options: st
     :param source: the session, as it was named.
     :param options: how it was played, as on the command line.
     """
-    sections = [
-        _head(prepared, rehearsal),
-        _facts(rehearsal, source, options),
-        _findings(prepared),
-        *(_hand(rehearsal, side) for side in rehearsal.plan.sides),
-        "<p class='dim'>The emulator is the model's reference hand: its motors obey the law of the "
-        "commands, with inertia, friction and stops that are tuned and not measured, and no "
-        "object. A real hand differs.</p>",
-    ]
-    return document(f"Rehearsal of {rehearsal.plan.name}", "".join(sections))
-
-
-def _head(prepared: Prepared, rehearsal: Rehearsal) -> str:
-    refused, machine = prepared.refused, rehearsal.machine
-    if refused:
-        css, title = "bad", "It is refused"
-        text = "Refused for: " + ", ".join(dict.fromkeys(f.name for f in refused))
-        text += ". What follows is what would happen otherwise."
-    elif machine.end is End.DONE:
-        css, title = "ok", "It can be played"
-        text = "The emulated hand has played it to the end."
-    else:
-        css, title = "bad", "It would be stopped"
-        text = machine.reason
-    return (
-        f'<header class="verdict {css}"><p class="question">Rehearsal of a replay</p>'
-        f"<h1>{title}<small>{escape(rehearsal.plan.name)}</small></h1>"
-        f"<p>{escape(text)}</p></header>"
+    css, answer, about = _answer(prepared, rehearsal)
+    return fill(
+        "rehearsal.html",
+        title=f"Rehearsal of {rehearsal.plan.name}",
+        css=css,
+        answer=answer,
+        about=about,
+        session=rehearsal.plan.name,
+        known=_facts(rehearsal, source, options),
+        findings=prepared.findings,
+        GRADES=_CSS,
+        FIGURES=_FIGURES,
+        hands=[_hand(rehearsal, side) for side in rehearsal.plan.sides],
     )
 
 
-def _facts(rehearsal: Rehearsal, source: str, options: str) -> str:
+def _answer(prepared: Prepared, rehearsal: Rehearsal) -> tuple[str, str, str]:
+    """Class, title and reason of the answer."""
+    if prepared.refused:
+        names = ", ".join(dict.fromkeys(f.name for f in prepared.refused))
+        about = f"Refused for: {names}. What follows is what would happen otherwise."
+        return "bad", "It is refused", about
+    if rehearsal.machine.end is End.DONE:
+        return "ok", "It can be played", "The emulated hand has played it to the end."
+    return "bad", "It would be stopped", rehearsal.machine.reason
+
+
+def _facts(rehearsal: Rehearsal, source: str, options: str) -> dict[str, str]:
     plan, machine = rehearsal.plan, rehearsal.machine
     spoken = plan.dialect
-    rows = {
+    return {
         "session": source,
         "hands": f"{model(spoken.model).title}, {', '.join(map(str, plan.sides))} ({spoken.name})",
         "commands": f"{plan.commands:,} in {plan.duration:.2f} s",
@@ -81,48 +76,28 @@ def _facts(rehearsal: Rehearsal, source: str, options: str) -> str:
         "dexkit": __version__,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    cells = "".join(f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())
-    return f'<dl class="facts">{cells}</dl>'
 
 
-def _findings(prepared: Prepared) -> str:
-    if not prepared.findings:
-        return "<h2>Findings</h2><p>Nothing was found.</p>"
-    rows = [
-        (
-            no_wrap(f"<code>{escape(f.name)}</code>"),
-            no_wrap(f'<b class="{_CSS[f.level]}">{f.level}</b>'),
-            no_wrap(escape(f.where)),
-            escape(f.text),
-            no_wrap(f"<code>{escape(f.option)}</code>") if f.option else escape(f.advice),
-        )
-        for f in prepared.findings
-    ]
-    return "<h2>Findings</h2>" + table(("finding", "verdict", "hand", "what", "cure"), rows)
-
-
-def _hand(rehearsal: Rehearsal, side: Side) -> str:
+def _hand(rehearsal: Rehearsal, side: Side) -> dict[str, object]:
+    """Figures and plots of a hand."""
     hand = rehearsal.hands[side]
     limits = joint_limits(rehearsal.plan.dialect, side)
-    figures = hand.figures(limits.tau)
     bands = [
         Band(str(phase), begin, end)
         for phase, begin, end in rehearsal.phases
         if phase is not Phase.PLAY and end - begin > 0.05
     ]
-    parts = [f"<h2>{str(side).capitalize()} hand</h2>"]
-    if figures:
-        parts.append(_figures(figures, limits.tau.tolist()))
+    figures = _figures(hand.figures(limits.tau), limits.tau.tolist())
     if len(hand.t) < 2:
-        return "".join([*parts, "<p>It was not played.</p>"])
+        return {"side": side, "figures": figures, "plots": []}
     span = (0.0, float(hand.t[-1]))
-    parts.append(_overview(rehearsal, hand, span, bands))
+    plots = [_overview(rehearsal, hand, span, bands)]
     drawn = _drawn(hand, limits.stroke.tolist())
     for j in drawn:
         q = hand.q[:, j]
         middle = float(np.median(q))
         room = 0.05 * float(limits.stroke[j])
-        parts.append(
+        plots.append(
             chart(
                 f"{side} {hand.names[j]}: command and emulated position",
                 [Line("command", "cmd", hand.t, hand.command[:, j]), Line("q", "state", hand.t, q)],
@@ -133,10 +108,12 @@ def _hand(rehearsal: Rehearsal, side: Side) -> str:
                 include=(middle - room, middle + room),
             )
         )
-    rest = [name for j, name in enumerate(hand.names) if j not in drawn]
-    if rest:
-        parts.append(f"<p>Neither commanded to move nor moved: {escape(', '.join(rest))}.</p>")
-    return "".join(parts)
+    return {
+        "side": side,
+        "figures": figures,
+        "plots": [Markup(plot) for plot in plots],
+        "still": [name for j, name in enumerate(hand.names) if j not in drawn],
+    }
 
 
 def _drawn(hand: Rehearsed, strokes: Sequence[float]) -> list[int]:
@@ -179,10 +156,11 @@ def _overview(
     )
 
 
-def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
-    rows = [
+def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> list[tuple[str, ...]]:
+    """A row for each joint."""
+    return [
         (
-            no_wrap(escape(f.name)),
+            f.name,
             f"{f.commanded:.2f}",
             f"{f.moved:.2f}",
             f"{f.rms:.3f}",
@@ -194,15 +172,16 @@ def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> str:
         )
         for f, most in zip(figures, tau_max, strict=True)
     ]
-    heads = (
-        "joint",
-        "commanded over, rad",
-        "moved over, rad",
-        "rms distance, rad",
-        "largest distance, rad",
-        "fastest, rad/s",
-        "largest torque, N·m",
-        "torque ripple rms, N·m",
-        "time at largest torque",
-    )
-    return table(heads, rows)
+
+
+_FIGURES = (
+    "joint",
+    "commanded over, rad",
+    "moved over, rad",
+    "rms distance, rad",
+    "largest distance, rad",
+    "fastest, rad/s",
+    "largest torque, N·m",
+    "torque ripple rms, N·m",
+    "time at largest torque",
+)
