@@ -11,7 +11,8 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,11 @@ from dexkit.hand import JointMode, Side
 from dexkit.models import Dialect, model
 from dexkit.service import HandService
 from dexkit.service.hand_core import HandCore
+from dexkit.service.local import NoTopics, position_command
 from dexkit.teleop.client import JointCommand
 from dexkit.teleop.client_codec import ClientCodec
 from tools.campaign.case import Batch, Case, Lane
-from tools.campaign.rig import LocalNode, WaitTimeout, open_files, until
+from tools.campaign.waiting import WaitTimeout, open_files, until
 
 __all__ = ["DEVICES", "M4010", "Bench", "DeviceBench", "Dex3", "Mx64", "cases", "command"]
 
@@ -249,59 +251,46 @@ class DeviceCase(Case):
             batch.found("threads leak", self.name, str([t.name for t in threading.enumerate()]))
 
     def _rounds(self, batch: Batch, bench: DeviceBench, count: int) -> None:
-        node = LocalNode()
-        topic = bench.dialect.topics(SIDE)[0]
         with contextlib.ExitStack() as power:
             device = power.enter_context(bench.device())
-            service = HandService(bench.hand(), node=node, state_rate=100.0, soft_start=False)
+            hand = bench.hand()
+            service = HandService(hand, node=NoTopics(), state_rate=100.0, soft_start=False)
             with service:
+                driven = _Driven(bench, service.cores[SIDE], device, power)
                 for _ in range(count):
-                    device = self._round(batch, bench, service, node, topic, device, power)
+                    self._round(batch, driven)
                     batch.units += 1
             if service.failure is not None:
                 batch.failed(service.failure)
 
-    def _round(
-        self,
-        batch: Batch,
-        bench: DeviceBench,
-        service: HandService,
-        node: LocalNode,
-        topic: str,
-        device: Any,
-        power: contextlib.ExitStack,
-    ) -> Any:
-        """Move, take away, bring back, look on, move again; the device."""
-        rng = batch.random
-        core = service.cores[SIDE]
+    def _round(self, batch: Batch, hand: _Driven) -> None:
+        """Move, take away, bring back, look on, move again."""
+        rng, bench, counters = batch.random, hand.bench, hand.core.counters
         goals = [bench.low, bench.high]
         rng.shuffle(goals)
-        start = bench.position(device)
-        self._drive(
-            bench, node, topic, goals[0], lambda: abs(bench.position(device) - start) > bench.still
-        )
+        hand.drive(goals[0])
         time.sleep(rng.uniform(0.0, 0.2))
         # the client goes on for some time after the device went, or stops before it
         after = rng.choice((0.0, 0.0, 0.05, 0.3))
         seconds = rng.choice(_PAUSES)
-        opened = core.counters.reconnects
+        opened = counters.reconnects
         if self._restart:
-            power.close()
-            last = self._send_for(bench, node, topic, goals[0], after, core, opened)
+            hand.power.close()
+            last = hand.command_until_back(goals[0], after, opened)
             time.sleep(seconds)
-            device = power.enter_context(bench.device())
+            hand.device = hand.power.enter_context(bench.device())
         else:
-            bench.unplug(device, seconds)
-            last = self._send_for(bench, node, topic, goals[0], after, core, opened)
-        until(lambda: core.counters.reconnects > opened, "the reconnection")
+            bench.unplug(hand.device, seconds)
+            last = hand.command_until_back(goals[0], after, opened)
+        until(lambda: counters.reconnects > opened, "the reconnection")
         # a command that may have come after the reconnection is one that counts
         asked = time.monotonic() - last < 0.1
         # what the driver does when it opens (a brake) is done after a few exchanges
-        done = core.counters.exchanges
-        until(lambda: core.counters.exchanges > done + 3 and core.connected, "exchanges")
-        before = bench.position(device)
+        done = counters.exchanges
+        until(lambda: counters.exchanges > done + 3 and hand.core.connected, "exchanges")
+        before = hand.position
         time.sleep(_WATCHED)
-        moved = abs(bench.position(device) - before)
+        moved = abs(hand.position - before)
         if moved > bench.still + bench.coast and not asked:
             batch.found(
                 "moved unasked",
@@ -309,52 +298,50 @@ class DeviceCase(Case):
                 f"by {moved:.3f} after it was away for {seconds} s; the client stopped {after} s "
                 f"after it went",
             )
-        here = bench.position(device)
-        self._drive(
-            bench, node, topic, goals[1], lambda: abs(bench.position(device) - here) > bench.still
-        )
-        return device
+        hand.drive(goals[1])
 
-    @staticmethod
-    def _send_for(
-        bench: DeviceBench,
-        node: LocalNode,
-        topic: str,
-        goal: float,
-        seconds: float,
-        core: HandCore,
-        opened: int,
-    ) -> float:
+
+@dataclass
+class _Driven:
+    """A hand that is served, its emulated device, and what keeps that powered."""
+
+    bench: DeviceBench
+    core: HandCore
+    device: Any
+    power: contextlib.ExitStack
+
+    @property
+    def position(self) -> float:
+        """The position of the device itself."""
+        return self.bench.position(self.device)
+
+    def _submit(self, part: float) -> None:
+        spec = self.core.spec
+        goal = spec.q_min + part * (spec.q_max - spec.q_min)
+        self.core.submit(position_command(model(spec.model), goal))
+
+    def command_until_back(self, goal: float, seconds: float, opened: int) -> float:
         """Go on commanding until the device is back; when the last command went out."""
         last = 0.0
         end = time.monotonic() + seconds
-        while time.monotonic() < end and core.counters.reconnects == opened:
+        while time.monotonic() < end and self.core.counters.reconnects == opened:
             last = time.monotonic()
-            node.send(topic, bench.message(goal))
+            self._submit(goal)
             time.sleep(0.005)
         return last
 
-    @staticmethod
-    def _drive(
-        bench: DeviceBench, node: LocalNode, topic: str, goal: float, moved: Callable[[], bool]
-    ) -> None:
+    def drive(self, goal: float) -> None:
         """Command until the device has moved; it may be at the goal already, then the other way."""
-        message, began, other = bench.message(goal), time.monotonic(), False
+        start, began = self.position, time.monotonic()
+        other = self.bench.low + self.bench.high - goal
 
-        def step() -> bool:
-            nonlocal message, other
-            if not other and time.monotonic() - began > 3.0:
-                message, other = bench.message(bench.low + bench.high - goal), True
-            node.send(topic, message)
-            return moved()
+        def moved() -> bool:
+            self._submit(goal if time.monotonic() < began + 3.0 else other)
+            return abs(self.position - start) > self.bench.still
 
-        until(step, "the hand to obey a fresh command")
+        until(moved, "the hand to obey a fresh command")
 
 
 def cases() -> list[Case]:
     """Every device, unplugged and restarted."""
-    found: list[Case] = []
-    for bench in DEVICES:
-        found.append(DeviceCase(bench, restart=False))
-        found.append(DeviceCase(bench, restart=True))
-    return found
+    return [DeviceCase(bench, restart=restart) for bench in DEVICES for restart in (False, True)]

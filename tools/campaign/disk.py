@@ -21,7 +21,7 @@ from dexkit.errors import DexkitError
 from tools.campaign.case import Batch, Case, Skip
 from tools.campaign.process import Program
 from tools.campaign.programs import Scene, _talk
-from tools.campaign.rig import WaitTimeout, until
+from tools.campaign.waiting import WaitTimeout, until
 
 __all__ = ["cases"]
 
@@ -47,7 +47,7 @@ class WriteCase(Case):
 
     unit = "disks"
 
-    def __init__(self, name: str, command: list[str]) -> None:
+    def __init__(self, name: str, command: str) -> None:
         self.name = f"disk:{name}"
         self.what = f"{name}, on disks that do not take it"
         self._command = command
@@ -63,7 +63,8 @@ class WriteCase(Case):
             if batch.sample and way != batch.random.choice(("full", "full")):
                 continue
             place, limits = self._place(batch, way)
-            words = [w.format(out=place, result=result, sample=sample) for w in self._command]
+            places = {"out": place, "result": result, "sample": sample}
+            words = [word.format(**places) for word in self._command.split()]
             with Program(batch, ["dexkit", *words], limits=limits) as program:
                 code = program.wait(120.0)
             batch.units += 1
@@ -195,12 +196,12 @@ def cases() -> list[Case]:
     """Everything that writes."""
     return [
         RecordCase(),
-        WriteCase("check-json", ["check", "{sample}", "--json", "{out}"]),
-        WriteCase("check-junit", ["check", "{sample}", "--junit", "{out}"]),
-        WriteCase("check-report", ["check", "{sample}", "--report", "{out}"]),
-        WriteCase("report", ["report", "{result}", "--report", "{out}"]),
-        WriteCase("report-markdown", ["report", "{result}", "--markdown", "{out}"]),
-        WriteCase("report-junit", ["report", "{result}", "--junit", "{out}"]),
-        WriteCase("badge", ["badge", "{result}", "--output", "{out}"]),
-        WriteCase("compare", ["compare", "{result}", "{result}", "--report", "{out}"]),
+        WriteCase("check-json", "check {sample} --json {out}"),
+        WriteCase("check-junit", "check {sample} --junit {out}"),
+        WriteCase("check-report", "check {sample} --report {out}"),
+        WriteCase("report", "report {result} --report {out}"),
+        WriteCase("report-markdown", "report {result} --markdown {out}"),
+        WriteCase("report-junit", "report {result} --junit {out}"),
+        WriteCase("badge", "badge {result} --output {out}"),
+        WriteCase("compare", "compare {result} {result} --report {out}"),
     ]

@@ -18,7 +18,7 @@ import click
 from dexkit.cli.settings import SettingsOption
 from tools.campaign.case import Batch, Case
 from tools.campaign.process import Program
-from tools.campaign.rig import WaitTimeout, until
+from tools.campaign.waiting import WaitTimeout, until
 
 __all__ = ["cases", "command_lines"]
 
@@ -46,51 +46,51 @@ _TEXTS = (
 )
 
 # what makes a command otherwise right, and short
-_BASE: dict[tuple[str, ...], tuple[str, ...]] = {
-    ("backends",): (),
-    ("badge",): ("{result}", "--output", "{scratch}/badge.svg"),
-    ("bridge",): ("--from", "unitree_go", "--to", "unitree_hg", "--duration", "0.3"),
-    ("bringup",): ("dex3-usb", "--side", "left", "--usb", "usbip://127.0.0.1:1"),
-    ("calibrate",): ("ezgripper", "--device", "/dev/null"),
-    ("check",): ("{sample}",),
-    ("compare",): ("{result}", "{result}"),
-    ("doctor",): ("--scan", "none", "--domain", "{domain}", "--seconds", "0.2"),
-    ("emulate", "all"): ("--duration", "0.3", "--domain", "{domain}"),
-    ("emulate", "dex1-motor"): ("--link", "{scratch}/link"),
-    ("emulate", "dex3-usb"): ("--link", "usbip://127.0.0.1:0"),
-    ("emulate", "g1"): ("--duration", "0.3", "--domain", "{domain}"),
-    ("emulate", "h1"): ("--duration", "0.3", "--domain", "{domain}"),
-    ("emulate", "mx64"): ("--link", "{scratch}/link"),
-    ("info",): ("{sample}",),
-    ("install-service",): ("sim-dex1", "--side", "left", "--user", "root", "--dry-run"),
-    ("models",): (),
-    ("record",): ("{scratch}/out.mcap", "--duration", "0.3", "--domain", "{domain}"),
-    ("publish",): ("{sample}", "--wait", "0", "--pace", "500", "--domain", "{domain}"),
-    ("rehearse",): ("{sample}", "--check"),
-    ("report",): ("{result}",),
-    ("serve",): ("sim-dex1", "--side", "left", "--domain", "{domain}"),
-    ("teleop",): ("full-stroke", "--domain", "{domain}"),
+_BASE: dict[str, str] = {
+    "backends": "",
+    "badge": "{result} --output {scratch}/badge.svg",
+    "bridge": "--from unitree_go --to unitree_hg --duration 0.3",
+    "bringup": "dex3-usb --side left --usb usbip://127.0.0.1:1",
+    "calibrate": "ezgripper --device /dev/null",
+    "check": "{sample}",
+    "compare": "{result} {result}",
+    "doctor": "--scan none --domain {domain} --seconds 0.2",
+    "emulate all": "--duration 0.3 --domain {domain}",
+    "emulate dex1-motor": "--link {scratch}/link",
+    "emulate dex3-usb": "--link usbip://127.0.0.1:0",
+    "emulate g1": "--duration 0.3 --domain {domain}",
+    "emulate h1": "--duration 0.3 --domain {domain}",
+    "emulate mx64": "--link {scratch}/link",
+    "info": "{sample}",
+    "install-service": "sim-dex1 --side left --user root --dry-run",
+    "models": "",
+    "record": "{scratch}/out.mcap --duration 0.3 --domain {domain}",
+    "publish": "{sample} --wait 0 --pace 500 --domain {domain}",
+    "rehearse": "{sample} --check",
+    "report": "{result}",
+    "serve": "sim-dex1 --side left --domain {domain}",
+    "teleop": "full-stroke --domain {domain}",
 }
 _CODES = (0, 1, 2, 130)
 
 
-def command_lines() -> dict[tuple[str, ...], list[click.Option]]:
+def command_lines() -> dict[str, list[click.Option]]:
     """Every command that is tried, with its options."""
     from dexkit.cli import cli
 
-    found: dict[tuple[str, ...], list[click.Option]] = {}
+    found: dict[str, list[click.Option]] = {}
 
-    def walk(command: click.Command, path: tuple[str, ...]) -> None:
+    def walk(command: click.Command, path: str) -> None:
         context = click.Context(command)
         if isinstance(command, click.Group):
             for name in command.list_commands(context):
                 below = command.get_command(context, name)
                 if below is not None:
-                    walk(below, (*path, name))
+                    walk(below, f"{path} {name}".strip())
         elif path in _BASE:
             found[path] = [p for p in command.params if isinstance(p, click.Option)]
 
-    walk(cli, ())
+    walk(cli, "")
     return found
 
 
@@ -127,9 +127,7 @@ class OptionsCase(Case):
             shutil.copyfile(original, places["sample"])
             batch.units += 1
 
-    def _try(
-        self, batch: Batch, path: tuple[str, ...], option: click.Option, places: dict[str, str]
-    ) -> None:
+    def _try(self, batch: Batch, path: str, option: click.Option, places: dict[str, str]) -> None:
         rng = batch.random
         odd: list[str] = []
         kind: click.ParamType[Any] = option.type
@@ -149,11 +147,11 @@ class OptionsCase(Case):
             if value.startswith("{"):
                 value = value.format(**places)
             odd = [begin + value]
-        words = [w.format(**places) for w in _BASE[path]]
+        words = [w.format(**places) for w in f"{path} {_BASE[path]}".split()]
         limits = []
-        if path == ("doctor",) and rng.random() < 0.5:
+        if path == "doctor" and rng.random() < 0.5:
             limits = [(resource.RLIMIT_NOFILE, rng.randrange(16, 30))]
-        line = ["dexkit", *path, *words, option.opts[0], *odd]
+        line = ["dexkit", *words, option.opts[0], *odd]
         with Program(batch, line, limits=limits) as program:
             with contextlib.suppress(WaitTimeout):  # some print nothing while they wait
                 until(lambda: "ready:" in program.output or not program.running, "a word", 10.0)
@@ -165,9 +163,9 @@ class OptionsCase(Case):
         if program.check_output(batch):
             pass
         elif code is None:
-            batch.found("does not end", " ".join(path), text)
+            batch.found("does not end", path, text)
         elif code not in _CODES and code != -signal.SIGINT:
-            batch.found("exit code", " ".join(path), text)
+            batch.found("exit code", path, text)
 
 
 def cases() -> list[Case]:

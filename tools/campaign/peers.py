@@ -25,7 +25,7 @@ from tools.campaign.fuzz.messages import announcements, filled
 from tools.campaign.mutate import mutator
 from tools.campaign.process import Program
 from tools.campaign.programs import SIDE, Scene, Spec, robots_and_hands
-from tools.campaign.rig import WaitTimeout, until
+from tools.campaign.waiting import WaitTimeout, until
 
 __all__ = ["cases"]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from tools.campaign import isolation
 from tools.campaign.case import ROOT, Batch
 from tools.campaign.children import command_of, descendants, wait_gone
-from tools.campaign.rig import WaitTimeout, until
+from tools.campaign.waiting import WaitTimeout, until
 
 __all__ = ["Program", "traceback_in"]
 

@@ -30,7 +30,7 @@ from dexkit.traces import sample_path
 from tools.campaign.case import Batch, Case
 from tools.campaign.devices import DEVICES, M4010, Bench, DeviceBench, Dex3, Mx64, command
 from tools.campaign.process import Program
-from tools.campaign.rig import WaitTimeout, until
+from tools.campaign.waiting import WaitTimeout, until
 
 __all__ = ["Client", "Scene", "Spec", "cases", "robots_and_hands", "specs"]
 

@@ -20,7 +20,7 @@ from tools.campaign.case import Batch, Case, Lane
 from tools.campaign.devices import Bench, command
 from tools.campaign.process import Program
 from tools.campaign.programs import Client
-from tools.campaign.rig import WaitTimeout
+from tools.campaign.waiting import WaitTimeout
 
 __all__ = ["GROWTH", "WatchedProcess", "cases", "slope"]
 
