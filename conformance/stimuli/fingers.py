@@ -74,11 +74,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from dexkit.conformance.hands import JointRoles, under_test
 from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
-from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Pose, Steps
+from dexkit.conformance.stimuli.script import NOT_FINITE, Part, Payloads, Pose, Steps
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointMode, Side
 
@@ -162,9 +163,9 @@ _BAD = {
 
 
 _TOGETHER = (
-    ("nan",),
-    ("out-of-range",),
-    ("foreign", "empty", "short", "long", "negative", "status", "wrong-id"),
+    "nan",
+    "out-of-range",
+    "foreign empty short long negative status wrong-id",
 )
 """Bad commands with one step after them, to save time. Each group begins at rest."""
 
@@ -176,6 +177,7 @@ class FingerScript(HandScript):
     _settling = 0.2
     _standing = 0.1
     _least = 0.5
+    _step_most = 1.5
     _beside_s = 0.6
 
     _turn_of_splits = 0
@@ -185,59 +187,50 @@ class FingerScript(HandScript):
     _drives = 0
     """Number of times that joints have been set in motion."""
 
-    def _provoke(self) -> Steps:
-        sides, phases = self.plan.sides, self.plan.phases
-        if "joint" in phases:
-            yield from self._one_by_one()
-        if "step" in phases:
-            self._report("each hand alone; the other one must not move")
-            away = {s: self._pose(s, CLOSED - 5.0) for s in sides}
-            yield from self._in_turn("step", away=away, stand=self._settling)
-        if "fingerprint" in phases:
-            for _ in range(2):
-                yield from self._everyone("fingerprint", self._other_place(), most=1.5)
-        for group in _TOGETHER:
-            yield from self._bad_together(group, most=1.5)
-        if "burst" in phases:
-            yield from self._flood()
-        if phases & {"stiff", "soft", "mild"}:
-            yield from self._stiff_and_soft()
-        for name in ("limp", "lock"):
-            if name in phases:
-                yield from self._unpulled(name)
-        if "mixed" in phases:
-            yield from self._locks_some()
-        if "push" in phases:
-            yield from self._pushes()
-        if "replay" in phases and self.plan.session is not None:
-            yield from self._replay(self.plan.session)
-            yield from self._everyone("center", {s: self._home(s) for s in sides})
-        if "single" in phases:
-            yield from self._single()
-        if "speeds" in phases:
-            yield from self._speeds()
-        if "ends" in phases:
-            yield from self._to_the_ends()
-        if "load" in phases:
-            yield from self._load()
-        if "old-stamps" in phases:
-            yield from self._old_stamps()
-        if "late-joiner" in phases:
-            self._goal.update({s: self._home(s) for s in sides})
-            yield from self._late_joiner()
-        if "old-stamps" in phases:
-            yield from self._to("center", OPEN)
-        guards = bool(phases & {"guard", "guard-latch", "guard-clear"})
-        if "touch" in phases:
-            yield from self._touches()
-        if "firmer" in phases:
-            yield from self._firmer()
-        if guards:
-            yield from self._squeeze_and_guard()
-        elif phases & {"squeeze", "beside-grip", "silence", "resume"}:
-            yield from self._squeeze_and_silence()
-        if phases & {"silence", "resume"}:
-            yield from self._each_silent()
+    def _provocations(self) -> list[Part]:
+        guards = "guard guard-latch guard-clear"
+        guarded = bool(self.plan.phases & set(guards.split()))
+        return [
+            Part.of("joint", self._one_by_one),
+            Part.of("step", self._each_hand),
+            Part.of("fingerprint", self._fingerprint),
+            *(Part.of(kinds, partial(self._bad_together, kinds.split())) for kinds in _TOGETHER),
+            Part.of("burst", self._flood),
+            Part.of("stiff soft mild", self._stiff_and_soft, back=True),
+            Part.of("limp", self._limp, back=True),
+            Part.of("lock", self._all_locked, back=True),
+            Part.of("mixed", self._locks_some, back=True),
+            Part.of("push", self._pushes, back=True),
+            Part.of("replay", self._session),
+            Part.of("single", self._single),
+            Part.of("speeds", self._speeds, back=True),
+            Part.of("ends", self._to_the_ends),
+            Part.of("load", self._load),
+            Part.of("old-stamps", self._old_stamps),
+            Part.of("late-joiner", self._late_joiner_on_the_way),
+            Part.of("old-stamps", self._back),
+            Part.of("touch", self._touches),
+            Part.of("firmer", self._firmer),
+            Part.of(guards, self._squeeze_and_guard),
+            Part.of(
+                "squeeze beside-grip silence resume",
+                self._squeeze_and_silence,
+                applies=not guarded,
+            ),
+            Part.of("silence resume", self._each_silent),
+        ]
+
+    def _back(self) -> Steps:
+        yield from self._to("center", OPEN)
+
+    def _each_hand(self) -> Steps:
+        self._report("each hand alone; the other one must not move")
+        away = {s: self._pose(s, CLOSED - 5.0) for s in self.plan.sides}
+        yield from self._in_turn("step", away=away, stand=self._settling)
+
+    def _late_joiner_on_the_way(self) -> Steps:
+        self._goal.update(self._homes())
+        yield from self._late_joiner()
 
     @property
     def _roles(self) -> JointRoles:
@@ -542,7 +535,6 @@ class FingerScript(HandScript):
             self._goal.update(poses)
         if "soft" in self.plan.phases:
             yield from self._uneven()
-        yield from self._to("center", OPEN)
 
     def _uneven(self) -> Steps:
         """Steps in which some joints are soft and the others are not, three times with others."""
@@ -564,24 +556,21 @@ class FingerScript(HandScript):
             self._end(phase)
             self._goal.update(poses)
 
-    def _unpulled(self, name: str) -> Steps:
-        self._report(
-            "commands without force (zero gains): the hand must not be pulled"
-            if name == "limp"
-            else "locked motors: they must not follow their q"
-        )
+    def _limp(self) -> Steps:
+        self._report("commands without force (zero gains): the hand must not be pulled")
         sides = self.plan.sides
         yield from self._hold(0.1)
-        if name == "limp":
-            # what moves by its weight moves the same way whatever q is
-            for percent in (CLOSED, 0.0):
-                targets = {s: dict(enumerate(self._pose(s, percent))) for s in sides}
-                phase = self._begin(name, sides, targets=targets)
-                yield from self._hold(0.2, self._all(percent, kp=0.0, kd=0.0))
-                self._end(phase)
-        else:
-            yield from self._lock(CLOSED, 0.3)
-        yield from self._to("center", OPEN)
+        # what moves by its weight moves the same way whatever q is
+        for percent in (CLOSED, 0.0):
+            targets = {s: dict(enumerate(self._pose(s, percent))) for s in sides}
+            phase = self._begin("limp", sides, targets=targets)
+            yield from self._hold(0.2, self._all(percent, kp=0.0, kd=0.0))
+            self._end(phase)
+
+    def _all_locked(self) -> Steps:
+        self._report("locked motors: they must not follow their q")
+        yield from self._hold(0.1)
+        yield from self._lock(CLOSED, 0.3)
 
     def _lock(self, percent: float, seconds: float) -> Steps:
         """All motors locked, with a q that is so far closed."""
@@ -630,7 +619,6 @@ class FingerScript(HandScript):
             yield from self._hold(0.35, self._locked(hands, splits))
             self._end(phase)
             self._goal.update(poses)
-        yield from self._to("center", OPEN)
 
     def _speeds(self) -> Steps:
         """Each joint closes with another speed, and one with none."""
@@ -650,7 +638,6 @@ class FingerScript(HandScript):
             phase = self._begin("speeds", sides, targets=targets)
             yield from self._hold(_SPEEDS_SECONDS, hands)
             self._end(phase)
-        yield from self._to("center", OPEN)
 
     def _to_the_ends(self) -> Steps:
         self._report("to both ends of each joint's range, fingers and thumb in turn")
@@ -700,7 +687,6 @@ class FingerScript(HandScript):
             yield from self._hold(_PUSH_SECONDS, motors)
             for phase in phases:
                 self._end(phase)
-        yield from self._to("center", OPEN)
 
     def _pushed(self, side: Side, first: bool) -> dict[int, int]:
         """The flexing joints with 1 where they close and -1 where they open, first or afterwards.
@@ -934,8 +920,7 @@ class FingerScript(HandScript):
         yield from self._hold(_NEW_CLIENT_SECONDS)
         if "speeds" in self.plan.phases:
             yield from self._speeds()
-        else:
-            yield from self._to("center", OPEN)
+        yield from self._back()
 
     def _squeeze(
         self, sides: Sequence[Side], seconds: float, name: str = "squeeze", *, beside: bool = False

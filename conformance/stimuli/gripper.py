@@ -61,10 +61,11 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from dexkit.conformance.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import ASIDE, ASIDE_SECONDS, BETWEEN, HandScript
-from dexkit.conformance.stimuli.script import NOT_FINITE, Payloads, Plan, Pose, Steps
+from dexkit.conformance.stimuli.script import NOT_FINITE, Part, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side
 from dexkit.models import ModeByte
 
@@ -77,17 +78,7 @@ _CLOSES, _OPENS = 0.09, 6.02
 specification: their limits, 0.1 and 6.0, are no exact numbers in a message."""
 _PUSH = (0.25, 1.0)
 """Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
-_LATE = {
-    "grip",
-    "nudge",
-    "squeeze",
-    "release",
-    "soft-grip",
-    "soft",
-    "silence",
-    "resume",
-    "rejected",
-}
+_LATE = "grip nudge squeeze release soft-grip soft silence resume rejected"
 """Phases that come one after the other, as each begins where the one before it ends."""
 _NEARLY = 0.15
 """Part of the stroke to which a free hand is closed before it is driven open."""
@@ -142,8 +133,6 @@ _BAD = {
     "long": "commands for more motors than there are: nothing may move",
     "negative": "negative gains: the hand must not run away",
 }
-_TOGETHER = (("nan",), ("out-of-range",), ("empty", "long"))
-"""Bad commands with one step after them, to save time."""
 
 
 class GripperScript(HandScript):
@@ -161,46 +150,31 @@ class GripperScript(HandScript):
         self._grip: dict[Side, Motors] = {}
         """Commands to a side instead of its goal; no commands if empty."""
 
-    def _provoke(self) -> Steps:
-        sides = self.plan.sides
-        if "step" in self.plan.phases:
-            for side in sides:
-                yield from self._steps(side)
-        if "ends" in self.plan.phases:
-            yield from self._ends()
-        if self.plan.phases & {"grip", "stiffness"}:
-            yield from self._at_first()
-        if "dead-zone" in self.plan.phases and self.plan.dialect.interface_specification:
-            yield from self._dead_zones()
-        if "fingerprint" in self.plan.phases:
-            for _ in range(2):
-                yield from self._everyone("fingerprint", self._other_place())
-        for group in _TOGETHER:
-            yield from self._bad_together(group)
-        if self._gains_used:
-            yield from self._bad_together(("negative",))
-        yield from self._bad_together(("foreign",), most=1.5)
-        yield from self._stiffness(sides)
-        if "burst" in self.plan.phases:
-            yield from self._flood()
-        if self.plan.phases & {"limp", "unlike", "push", "drive", "fed"} and self._gains_used:
-            yield from self._undriven()
-        if not self._gains_used:
-            self._gainless = True
-        if "replay" in self.plan.phases and self.plan.session is not None:
-            yield from self._replay(self.plan.session)
-            yield from self._everyone("center", {s: self._home(s) for s in sides})
-        if "single" in self.plan.phases:
-            yield from self._single()
-        if "load" in self.plan.phases:
-            yield from self._load()
-        if "old-stamps" in self.plan.phases:
-            yield from self._old_stamps()
-        if "late-joiner" in self.plan.phases:
-            self._goal.update(self._nearly_closed())
-            yield from self._late_joiner()
-        if self.plan.phases & _LATE:
-            yield from self._squeeze_and_silence()
+    def _provocations(self) -> list[Part]:
+        gains, zones = self._gains_used, self.plan.dialect.interface_specification
+        bad = self._bad_together
+        return [
+            Part.of("step", self._each_hand),
+            Part.of("ends", self._ends, back=True),
+            Part.of("grip stiffness", self._at_first),
+            Part.of("dead-zone", self._dead_zones, back=True, applies=zones),
+            Part.of("fingerprint", self._fingerprint),
+            Part.of("nan", partial(bad, ["nan"])),
+            Part.of("out-of-range", partial(bad, ["out-of-range"])),
+            Part.of("empty long", partial(bad, ["empty", "long"])),
+            Part.of("negative", partial(bad, ["negative"]), applies=gains),
+            Part.of("foreign", partial(bad, ["foreign"], most=1.5)),
+            Part.of("stiffness", partial(self._stiffness, self.plan.sides)),
+            Part.of("burst", self._flood),
+            Part.of("limp unlike push drive fed", self._undriven, back=True, applies=gains),
+            Part.of("", self._without_gains, applies=not gains),
+            Part.of("replay", self._session),
+            Part.of("single", self._single),
+            Part.of("load", self._load),
+            Part.of("old-stamps", self._old_stamps),
+            Part.of("late-joiner", self._late_joiner_on_the_way),
+            Part.of(_LATE, self._squeeze_and_silence),
+        ]
 
     # -- places -----------------------------------------------------------------------------
 
@@ -254,6 +228,22 @@ class GripperScript(HandScript):
 
     # -- phases -----------------------------------------------------------------------------
 
+    def _back(self) -> Steps:
+        yield from self._everyone("center", self._homes())
+
+    def _without_gains(self) -> Steps:
+        """From here on, as clients of such a dialect send none."""
+        self._gainless = True
+        yield from ()
+
+    def _late_joiner_on_the_way(self) -> Steps:
+        self._goal.update(self._nearly_closed())
+        yield from self._late_joiner()
+
+    def _each_hand(self) -> Steps:
+        for side in self.plan.sides:
+            yield from self._steps(side)
+
     def _steps(self, side: Side) -> Steps:
         self._report(f"large steps of the {side} hand; the other one must not move")
         places = (self._high(), 0), (self._low(side), _VENDORS_MODE), (self._middle(side), 0)
@@ -271,7 +261,6 @@ class GripperScript(HandScript):
             self._goal.update(dict.fromkeys(free, (0.0,)))
             phase = self._begin("ends", free, targets={s: {0: 0.0} for s in free})
             yield from self._until_settled(phase, free, least=0.6, most=2.8)
-        yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _at_first(self) -> Steps:
         """Grip and hold stiffness before any disturbance."""
@@ -321,7 +310,6 @@ class GripperScript(HandScript):
                 self._goal.update(dict.fromkeys(chosen, (q,)))
                 phase = self._begin("dead-zone", chosen, targets={s: {0: end} for s in chosen})
                 yield from self._until_settled(phase, chosen, least=0.6, most=2.8)
-        yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _bad(self, name: str) -> Steps:
         self._report(_BAD[name])
@@ -495,7 +483,6 @@ class GripperScript(HandScript):
             yield from self._drive(sides, 0.16, seconds=0.35)
         if "fed" in self.plan.phases:
             yield from self._fed(sides)
-        yield from self._everyone("center", {s: self._home(s) for s in sides})
 
     def _fed(self, sides: Sequence[Side]) -> Steps:
         """The way back to the middle, with a feed-forward that hardly changes it."""

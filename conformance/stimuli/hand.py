@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from dexkit.command_age import PAUSE
 from dexkit.conformance.motor_messages import MotorCodec, Motors
@@ -16,6 +17,7 @@ from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
+    Part,
     Payloads,
     Plan,
     Pose,
@@ -64,6 +66,8 @@ class HandScript(Script[Side]):
     """The same in every other step."""
     _least = 0.5
     """Least duration of such a step, s."""
+    _step_most = 2.5
+    """Seconds of a step of all sides; see :meth:`_until_settled`."""
     _beside_s = ASIDE_SECONDS
     """Seconds in which a side makes a step while the other one is silent."""
 
@@ -100,29 +104,21 @@ class HandScript(Script[Side]):
             if self.plan.rounds > 1:
                 self._report(f"round {done + 1} of {self.plan.rounds}")
             self._patient = self.plan.rounds > 1 and done == 0
-            yield from self._provoke()
-        if OPERATOR in self.plan.phases:
-            yield from operate(self, self._codec)
-            yield from self._everyone("center", {s: self._home(s) for s in self.plan.sides})
-        if self.plan.phases & {"two-writers", "restart"}:
-            yield from self._two_writers()
-        if "company" in self.plan.phases:
-            yield from self._company()
-        if "restart" in self.plan.phases:
-            self._report("the commanding program is restarted: the new one must be obeyed")
-            yield Restart()
-            yield from self._in_turn("restart")
-            yield from self._grips_again()
-            yield from self._new_client()
-            if "nan" in self.plan.phases:
-                yield from self._again()
-        yield from self._hold(0.1)
-        if self.plan.phases & {"shutdown", "restarted", "service-restart"}:
-            yield from self._service_restart()
+            yield from self._schedule(self._provocations())
+        yield from self._schedule(
+            [
+                Part.of(OPERATOR, self._operator),
+                Part.of("two-writers restart", self._two_writers),
+                Part.of("company", self._company),
+                Part.of("restart", self._client_restart),
+                Part.of("", partial(self._hold, 0.1)),
+                Part.of("shutdown restarted service-restart", self._service_restart),
+            ]
+        )
 
     @abstractmethod
-    def _provoke(self) -> Steps:
-        """Every phase between the first motion and the operator."""
+    def _provocations(self) -> list[Part]:
+        """Every part between the first motion and the operator, in order."""
 
     @abstractmethod
     def _bad(self, name: str) -> Steps:
@@ -167,6 +163,14 @@ class HandScript(Script[Side]):
     @abstractmethod
     def _home(self, side: Side) -> Pose:
         """First pose of the hand: clear of stops and of the object."""
+
+    def _homes(self) -> dict[Side, Pose]:
+        return {s: self._home(s) for s in self.plan.sides}
+
+    def _fingerprint(self) -> Steps:
+        """Steps to compare the ``recover`` steps with."""
+        for _ in range(2):
+            yield from self._everyone("fingerprint", self._other_place(), most=self._step_most)
 
     @abstractmethod
     def _other_place(self) -> dict[Side, Pose]:
@@ -409,11 +413,12 @@ class HandScript(Script[Side]):
                 "recover", self._other_place(), after=self._bad_phases_since_recovery
             )
 
-    def _bad_together(self, names: Sequence[str], *, most: float = 2.5) -> Steps:
+    def _bad_together(self, names: Sequence[str], *, most: float | None = None) -> Steps:
         """Bad commands of these kinds, and a good step after all of them.
 
-        :param most: seconds of the step; see :meth:`_until_settled`.
+        :param most: seconds of the step, if not as of every other one.
         """
+        most = self._step_most if most is None else most
         these = [name for name in names if name in self.plan.phases]
         for name in these:
             if name != these[0]:
@@ -488,6 +493,17 @@ class HandScript(Script[Side]):
                 beside = self._beside_others((side,), ASIDE_SECONDS)
         for ended in (phase, *beside):
             self._end(ended)
+
+    def _operator(self) -> Steps:
+        """Unitree's client in a closed loop, and back to the middle."""
+        yield from operate(self, self._codec)
+        yield from self._everyone("center", self._homes())
+
+    def _session(self) -> Steps:
+        """The recorded session, if there is one, and back to the middle."""
+        if self.plan.session is not None:
+            yield from self._replay(self.plan.session)
+            yield from self._everyone("center", self._homes())
 
     def _replay(self, session: CommandSession) -> Steps:
         sides = [s for s in self.plan.sides if s in session.sides]
@@ -631,6 +647,16 @@ class HandScript(Script[Side]):
                 self._next_ns += self._period_ns
                 yield from self._do(Send(payloads, self._next_ns, by=role))
         self._period_ns = period
+
+    def _client_restart(self) -> Steps:
+        """The commanding program goes away, and another one comes."""
+        self._report("the commanding program is restarted: the new one must be obeyed")
+        yield Restart()
+        yield from self._in_turn("restart")
+        yield from self._grips_again()
+        yield from self._new_client()
+        if "nan" in self.plan.phases:
+            yield from self._again()
 
     def _service_restart(self) -> Steps:
         """End the service and start it again, where the kit can."""

@@ -39,6 +39,7 @@ from dexkit.conformance.robot import WRONG_CRCS, RobotMotorCodec
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
+    Part,
     Plan,
     Restart,
     Role,
@@ -116,29 +117,27 @@ class RobotScript(Script[RobotSubject]):
 
     def _provoke(self) -> Steps:
         """Every phase after the first two."""
-        parts: list[tuple[str, Callable[[], Steps]]] = [
-            ("joint", self._every_joint),
-            ("stiffness", self._stiffness),
-            ("velocity", self._velocity),
-            ("torque", self._torque),
-            ("limp", lambda: self._refused("limp", kp=0.0)),
-            ("off", lambda: self._refused("off", mode=0)),
-            ("wrong-crc", self._wrong_crc),
-            ("nan", self._not_a_number),
-            ("unused", self._unused),
-            ("machine", self._machine),
-            ("foreign", self._foreign),
-            ("recover", lambda: self._step("recover")),
-            ("late-joiner", self._late_joiner),
-            ("pause", lambda: self._silence("pause", 0.3)),
-            ("silence", lambda: self._silence("silence", self._robot.command_timeout + 0.6)),
-            ("resume", self._resume),
-            ("restart", self._restart),
-        ]
-        for name, part in parts:
-            if name in self.plan.phases:
-                yield from part()
-                yield from self._home_again()
+        longer = self._robot.command_timeout + 0.6
+        parts: dict[str, Callable[[], Steps]] = {
+            "joint": self._every_joint,
+            "stiffness": self._stiffness,
+            "velocity": self._velocity,
+            "torque": self._torque,
+            "limp": lambda: self._refused("limp", kp=0.0),
+            "off": lambda: self._refused("off", mode=0),
+            "wrong-crc": self._wrong_crc,
+            "nan": self._not_a_number,
+            "unused": self._unused,
+            "machine": self._machine,
+            "foreign": self._foreign,
+            "recover": lambda: self._step("recover"),
+            "late-joiner": self._late_joiner,
+            "pause": lambda: self._silence("pause", 0.3),
+            "silence": lambda: self._silence("silence", longer),
+            "resume": self._resume,
+            "restart": self._restart,
+        }
+        yield from self._schedule([Part.of(name, play, back=True) for name, play in parts.items()])
 
     # -- orders -----------------------------------------------------------------------------
 
@@ -195,7 +194,7 @@ class RobotScript(Script[RobotSubject]):
         """Hold the joint where it is from now on."""
         self._order[self._slot] = self._holding(self._slot, self._here(self._slot))
 
-    def _home_again(self) -> Steps:
+    def _back(self) -> Steps:
         """Move every joint back to its first position, not as a phase."""
         away = {s: q for s, q in self._start.items() if self._order[s].q != q}
         if away:

@@ -23,6 +23,7 @@ __all__ = [
     "Join",
     "Leave",
     "Observation",
+    "Part",
     "Payloads",
     "Plan",
     "Pose",
@@ -127,6 +128,31 @@ Action = Send | Join | Leave | Restart | StopService | StartService
 Steps = Generator[Action, Observation, None]
 """Part of a script."""
 
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a script: a phase, or some that follow from one another.
+
+    :param phases: their names; it is played in a run that needs any of them, and asks the plan for
+        the others. None: in every run.
+    :param play: its steps, from wherever the hand is.
+    :param back: it leaves the hand elsewhere, and the script moves it back to its first pose.
+    :param applies: whether the dialect has what it is about.
+    """
+
+    phases: frozenset[str]
+    play: Callable[[], Steps]
+    back: bool = False
+    applies: bool = True
+
+    @classmethod
+    def of(
+        cls, phases: str, play: Callable[[], Steps], *, back: bool = False, applies: bool = True
+    ) -> Part:
+        """A part by the names of its phases, with blanks between them."""
+        return cls(frozenset(phases.split()), play, back, applies)
+
+
 S = TypeVar("S", bound=Subject)
 S_co = TypeVar("S_co", bound=Subject, covariant=True)
 
@@ -196,6 +222,19 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
 
         play(self, carry_out, lambda: False)
         return now / 1e9
+
+    def _schedule(self, parts: Sequence[Part]) -> Steps:
+        """Those of the parts that the run needs, in turn."""
+        for part in parts:
+            wanted = not part.phases or part.phases & self.plan.phases
+            if part.applies and wanted:
+                yield from part.play()
+                if part.back:
+                    yield from self._back()
+
+    def _back(self) -> Steps:
+        """Back to the first pose."""
+        yield from ()
 
     def _send(self, payloads: Payloads) -> Steps:
         """Send now, wait for the next tick of the client's rate."""
