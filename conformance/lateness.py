@@ -22,17 +22,15 @@ class Lateness:
     :param total: all of it, seconds: what one thing that happened then may have waited.
     :param mean: of each time, seconds: what a thing that happens again and again waited.
     :param p99: 99th percentile, seconds: what one in a hundred waited.
-    :param best: of the best quarter, seconds: machines are busy by fits.
     """
 
     total: float
     mean: float
     p99: float
-    best: float = 0.0
 
     def figure(self, how: str) -> float:
         """The figure for a delay of that kind; see :class:`~dexkit.conformance.checks.Late`."""
-        figures = {"total": self.total, "chain": self.total, "mean": self.mean, "p99": self.p99}
+        figures = {"total": self.total, "mean": self.mean, "p99": self.p99}
         return figures[how]
 
     @classmethod
@@ -41,5 +39,4 @@ class Lateness:
         if not len(late):
             return None
         beyond = np.maximum(late - IDLE, 0.0)
-        best, p99 = np.percentile(beyond, [25, 99])
-        return cls(total(beyond), mean(beyond), float(p99), float(best))
+        return cls(total(beyond), mean(beyond), float(np.percentile(beyond, 99)))

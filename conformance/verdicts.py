@@ -1,42 +1,21 @@
 """Make a verdict of a requirement and its check's outcome; the same for DDS and USB.
 
-**Machine or hand?** A machine that is short of processor time makes a correct hand look late. Only
-requirements of real time can suffer from it, and only as far as the machine is shown to have been
-late while it was judged:
+**Machine or hand?** A machine that is short of processor time makes a correct hand look late. One
+rule decides. Where the kit's own timer (:mod:`~dexkit.conformance.heartbeat`) or the hand's own
+processes (:mod:`~dexkit.conformance.run_queue`: of all waits the part of which other programs are
+the cause) waited for a processor at the place of a failure, and :data:`LARGER` times that is as
+long as the failure is large, it is *blocked*, and the run is done again. Else it is the hand's.
 
-1. Each failure has a size: the delay, in seconds, that would make a correct hand fail in the same
-   way (:class:`~dexkit.conformance.checks.Late`). A rate of 150 Hz where 200 are asked for is
-   1.7 ms late each time; 50 Hz is 15 ms; a gap of 0.3 s where 0.1 s are allowed is 0.2 s late once.
-2. The kit's own timer is measured all the time (:mod:`~dexkit.conformance.heartbeat`). What it was
-   late by at the failure's place, beyond what is usual on an idle machine, is what the machine has
-   demonstrably lost.
-3. The hand's process may have been hit harder: up to :data:`HARDEST` times that, and up to twice as
-   much again in proportion to the time in which programs waited for a processor (Linux' pressure
-   stall information). Pressure alone excuses nothing: it only scales what was lost.
-4. Load varies. Of what recurs (a rate, a delay), the best quarter of the hand's values must be
-   explained by the best quarter of the timer's as well: a hand that is slow even where the timer is
-   on time is slow by itself.
-5. On an overloaded machine, where the kit's own timer is late by :data:`OVERLOADED` on average over
-   the whole run, single events and motion cannot be judged: how much a computing process was held
-   up is not known there. What 4 does not explain, and what is wrong without moving, still fails.
-6. A failure that is no larger than that at any of its places is *blocked*: the run is done again.
-   A larger one is the hand's, and its result says what the machine does not explain. A run that
-   fails by nothing but such results is done once more, and the second run counts.
+A failure is as large as the delay that would make a correct hand fail in the same way
+(:class:`~dexkit.conformance.checks.Late`): a rate of 150 Hz where 200 are asked for is 1.7 ms late
+each time, a gap of 0.3 s where 0.1 s are allowed 0.2 s once, and the wrong direction is no matter
+of delay. Without such a size it is as large as its place is long. It is blocked only if it is at
+each of its places. A failure that the machine explains in part says so, and the run is done once
+more; the second run counts.
 
-7. Where the hand's processes run on this machine, what they waited for a processor is measured as
-   well (:mod:`~dexkit.conformance.run_queue`), and explains a failure by itself: up to
-   :data:`AGAIN` times what they waited at its place; a single event up to :data:`HOPS` times their
-   longest wait; of all waits the part of which other programs are the cause. To wait is not to
-   compute: a process that is slow by itself is not excused. This holds for motion that is not of
-   real time, too: there a failure without a size is as large as its place is long. Where they
-   waited for :data:`OVERLOADED` in each sample on average over the whole run, no requirement of
-   real time can be judged, but for what 4 does not explain; the direction of motion can.
-8. Apart from load, a MUST that fails by less than the kit's measurement error
-   (:mod:`~dexkit.conformance.measurement_error`) is *blocked* as well: its figure is nearer to the
-   limit than the kit can tell. A pass by less than that remains a pass, and says so.
-
-So a gross failure fails on a busy machine, too; one at the border is blocked there; every failure
-fails on an idle machine.
+Apart from load, a MUST that fails by less than the kit's measurement error
+(:mod:`~dexkit.conformance.measurement_error`) is *blocked* as well: its figure is nearer to the
+limit than the kit can tell. A pass by less than that remains a pass, and says so.
 """
 
 from __future__ import annotations
@@ -48,7 +27,7 @@ from typing import Protocol
 
 from dexkit.conformance.checks import Late, Outcome
 from dexkit.conformance.claims import Claims
-from dexkit.conformance.lateness import IDLE, Lateness
+from dexkit.conformance.lateness import Lateness
 from dexkit.conformance.measurement_error import Measure
 from dexkit.conformance.processor_waits import Starvation
 from dexkit.conformance.requirements import Level, Requirement
@@ -57,34 +36,18 @@ from dexkit.hand import Subject
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]
 
-HARDEST = 2.0
-"""Assumed lateness of a hand's process as a multiple of that of the kit's timer: it has several
-threads, and waits for its device."""
-BUSY_SHARE = 0.5
-"""Part of a failure's time with programs waiting for a processor that makes a machine busy."""
-OVERLOADED = 3e-3
-"""Seconds by which the kit's own timer, of 10 ms, is late on average on an overloaded machine; or
-for which a hand's processes wait on average in a sample of 10 ms."""
-AGAIN = 2.0
-"""Largest delay of a hand as a multiple of what its processes waited: a thread that is late finds
-its turn gone, and waits for the next one, or asks its device again."""
-HOPS = 6
-"""Times that a hand waits for a processor from a command to the state that shows it: to receive it,
-to pass it to the device, there, to pass the answer back, to read it, to publish. A single event is
-late by so many of the longest wait at most, however often there are short ones."""
-AFTERMATH = 1.0
-"""Seconds before a failure from which a wait can still show: in a motion that began late, or in
-that of a driver that has to reach its device again."""
+LARGER = 4.0
+"""Largest delay of a correct hand as a multiple of what was waited: it has several threads, one of
+which finds its turn gone, and waits for its device."""
+BEFORE = 1.0
+"""Seconds before a failure from which a wait of the hand can still show: in a motion that began
+late, or in that of a driver that has to reach its device again; and in which the kit may have been
+late, if the failure has no end."""
 _STILL = ("nothing", "endpoints", "state")
 """Needs of requirements that a hand cannot fail for lack of processor time, unless they are
 real-time requirements."""
 NOTABLE = 0.1
 """Part of a failure that the machine must explain to be mentioned."""
-SHORT = 1.0
-"""Seconds before a failure that has no end, in which the machine may have caused it."""
-
-_TOO_BUSY = "the machine was too busy"
-_BUSY = "the machine was busy"
 
 MOST_PLACES = 5
 """Places that a result names; all of them are looked at before a failure is excused."""
@@ -95,10 +58,6 @@ _NOT_MET = (Verdict.FAIL, Verdict.WARN)
 
 class Machine(Protocol):
     """Data in a recording about the machine that the kit ran on."""
-
-    def starved(self, begin: float, end: float) -> float:
-        """Part of [begin, end], 0 to 1, in which programs waited for a processor."""
-        ...
 
     def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         """Lateness of the kit's own timer in it, s; None if unknown."""
@@ -115,12 +74,10 @@ class Excuse:
 
     :param disturbance: its load, and what was measured of it.
     :param text: what it was like, where it was not idle; else empty.
-    :param final: no load, however heavy, makes a good hand look like this.
     """
 
     disturbance: Disturbance = UNDISTURBED
     text: str = ""
-    final: bool = False
 
     @property
     def excused(self) -> bool:
@@ -143,156 +100,59 @@ def excuse(
     if requirement.needs in _STILL and not requirement.realtime:
         return Excuse()
     spans = [
-        (e.time_s, e.end_s) if e.end_s is not None else (e.time_s - SHORT, e.time_s)
+        (e.time_s, e.end_s) if e.end_s is not None else (e.time_s - BEFORE, e.time_s)
         for e in outcome.evidence
     ]
     if whole is not None and not spans:
         spans = [whole]
-    failures = [
-        _Failure(size, outcome.late, *span)
-        for size, span in zip(_sizes(outcome, spans), spans, strict=True)
+    late = outcome.late or Late(tuple(end - begin for begin, end in spans))
+    sizes = late.seconds
+    if len(sizes) != len(spans):
+        sizes = (max(sizes),) * len(spans)
+    found = [
+        _excuse(machine, subject, size, late.how, *span)
+        for size, span in zip(sizes, spans, strict=True)
     ]
-    overloaded = _overloaded(machine, whole)
-    if requirement.realtime:
-        by_timer = _least([_late(machine, f) for f in failures])
-        overloaded = overloaded or _always_starved(machine, subject, whole)
-        if overloaded and not by_timer.final:
-            by_timer = overloaded
-    else:
-        by_timer = overloaded or Excuse()
-    if by_timer.excused:
-        return by_timer
-    by_waits = _least([_starved(machine, subject, f) for f in failures])
-    return by_waits if by_waits.excused or not by_timer.text else by_timer
-
-
-def _least(found: Sequence[Excuse]) -> Excuse:
-    """The excuse of all places of a failure: the one of that which is hardest to explain."""
+    # of all places the one that is hardest to explain
     return min(found, key=lambda e: e.excused, default=Excuse())
 
 
-@dataclass(frozen=True)
-class _Failure:
-    """A failure at one of its places.
+_HOW = {"total": "in all", "mean": "each time", "p99": "one time in a hundred"}
+
+
+def _excuse(
+    machine: Machine, subject: Subject, size: float, how: str, begin: float, end: float
+) -> Excuse:
+    """Whether waits for a processor explain a failure at one of its places.
 
     :param size: the delay, seconds, that would make a correct hand fail in the same way.
     """
-
-    size: float
-    late: Late | None
-    begin: float
-    end: float
-
-    @property
-    def how(self) -> str:
-        return self.late.how if self.late else "total"
-
-    @property
-    def best(self) -> float:
-        return self.late.best if self.late else 0.0
-
-    @property
-    def finite(self) -> float | None:
-        return self.size if math.isfinite(self.size) else None
-
-
-def _overloaded(machine: Machine, whole: tuple[float, float] | None) -> Excuse | None:
-    """The excuse of a machine that was overloaded during the whole run; None if it was not."""
-    lost = machine.excess_lateness(*whole) if whole is not None else None
-    if lost is None or lost.mean < OVERLOADED:
-        return None
-    return Excuse(
-        Disturbance(Load.TOO_BUSY, lost.mean),
-        f"{_TOO_BUSY} to tell: the kit's own timer was late by {_ms(lost.mean)} each time, over "
-        "the whole run; run again",
-    )
-
-
-def _always_starved(
-    machine: Machine, subject: Subject, whole: tuple[float, float] | None
-) -> Excuse | None:
-    """The excuse of a hand whose processes lacked a processor all the time; None if they had it."""
-    there = machine.starvation(subject, *whole) if whole is not None else None
-    if there is None or there.lost.mean < OVERLOADED:
-        return None
-    return Excuse(
-        Disturbance(Load.TOO_BUSY, there.lost.mean),
-        f"{_TOO_BUSY} to tell: {there.worst.process} waited for a processor for "
-        f"{there.worst.part:.0%} of the whole run; close other programs or use another machine",
-    )
-
-
-def _sizes(outcome: Outcome, spans: Sequence[tuple[float, float]]) -> Sequence[float]:
-    """The delay, in seconds, that would make a correct hand fail at each place."""
-    if outcome.late is None:
-        return [end - begin for begin, end in spans]
-    sizes = outcome.late.seconds
-    return sizes if len(sizes) == len(spans) else [max(sizes)] * len(spans)
-
-
-_HOW = {"total": "in all", "chain": "in all", "mean": "each time", "p99": "one time in a hundred"}
-
-
-def _late(machine: Machine, failure: _Failure) -> Excuse:
-    """Whether what the kit's own timer was late by explains a failure."""
-    size, best = failure.size, failure.best
-    lost = machine.excess_lateness(failure.begin, failure.end)
-    share = min(machine.starved(failure.begin, failure.end), 1.0)
-    if lost is None:
-        return Excuse()
-    measured = lost.figure(failure.how)
-    harder = HARDEST * (1.0 + share)
-    explained = harder * measured
-    was = f"the kit's own timer was late by {_ms(measured)} {_HOW[failure.how]} there"
-    by_fits = best > IDLE + harder * lost.best
-    if not by_fits and measured > 0 and explained >= size:
-        return Excuse(
-            Disturbance(Load.TOO_BUSY, measured, explained, failure.finite),
-            f"{_TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(size)} late; run again",
-        )
-    final = by_fits or failure.finite is None
-    if not (share >= BUSY_SHARE or explained >= NOTABLE * size):
-        return Excuse(final=final)
-    if by_fits:
-        why = f"by fits, and the hand is {_ms(best)} late in its best quarter, too"
-    elif failure.finite is None:
-        why = "no delay makes a good hand look like this"
-    else:
-        why = f"{was}, which explains at most {_ms(explained)} of {_ms(size)}"
-    disturbance = Disturbance(Load.BUSY, measured, explained, failure.finite)
-    return Excuse(disturbance, f"{_BUSY}, but {why}", final)
-
-
-def _starved(machine: Machine, subject: Subject, failure: _Failure) -> Excuse:
-    """Whether the time that the hand's processes waited for a processor explains a failure."""
     # what happens once can be the end of what was held up before
-    before = AFTERMATH if failure.how in ("total", "chain") else 0.0
-    there = machine.starvation(subject, failure.begin - before, failure.end)
-    if there is None:
-        return Excuse()
-    measured = there.lost.figure(failure.how)
-    explained = AGAIN * measured
-    if failure.how == "total":
-        explained = min(explained, HOPS * there.longest)
-    worst = there.worst
-    was = (
-        f"{worst.process} waited for a processor for {worst.part:.0%} of the time there, up to "
-        f"{_ms(worst.longest)} at once"
-    )
-    by_fits = failure.best > IDLE + AGAIN * there.lost.best
-    if not by_fits and measured > 0 and explained >= failure.size:
-        return Excuse(
-            Disturbance(Load.TOO_BUSY, measured, explained, failure.finite),
-            f"{_TOO_BUSY} to tell: {was}, so a good hand may have been {_ms(failure.size)} late; "
-            "close other programs or use another machine",
+    since = begin - BEFORE if how == "total" else begin
+    timer, hand = machine.excess_lateness(begin, end), machine.starvation(subject, since, end)
+    lost, was = 0.0, ""
+    if timer is not None:
+        lost = timer.figure(how)
+        was = f"the kit's own timer was late by {_ms(lost)} {_HOW[how]} there"
+    if hand is not None and hand.lost.figure(how) > lost:
+        lost, worst = hand.lost.figure(how), hand.worst
+        was = (
+            f"{worst.process} waited for a processor for {worst.part:.0%} of the time there, up to "
+            f"{_ms(worst.longest)} at once"
         )
-    if failure.finite is None or explained < NOTABLE * failure.size:
+    explained = LARGER * lost
+    if lost > 0 and explained >= size:
+        return Excuse(
+            Disturbance(Load.TOO_BUSY, lost, explained, size),
+            f"the machine was too busy to tell: {was}, so a good hand may have been {_ms(size)} "
+            "late; close other programs or use another machine",
+        )
+    if not lost or explained < NOTABLE * size or not math.isfinite(size):
         return Excuse()
-    why = f"which explains at most {_ms(explained)} of {_ms(failure.size)}"
-    if by_fits:
-        why = f"but by fits, and the hand is {_ms(failure.best)} late in its best quarter, too"
-    disturbance = Disturbance(Load.BUSY, measured, explained, failure.finite)
-    return Excuse(disturbance, f"{_BUSY}: {was}, {why}")
+    return Excuse(
+        Disturbance(Load.BUSY, lost, explained, size),
+        f"the machine was busy, but {was}, which explains at most {_ms(explained)} of {_ms(size)}",
+    )
 
 
 def _ms(seconds: float) -> str:

@@ -29,7 +29,7 @@ from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Evidence, Load, RunResult, Verdict
 from dexkit.conformance.run_queue import MOST_FILES, RunQueue, Watched
 from dexkit.conformance.stimulus_record import RECORD, Stimulus
-from dexkit.conformance.verdicts import AFTERMATH, HOPS, excuse
+from dexkit.conformance.verdicts import BEFORE, excuse
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.errors import TraceUnsupported
@@ -41,7 +41,7 @@ from tests.each import each
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]
 RATE = BY_ID["DEX1-RATE-01"]
-MOVE = BY_ID["DEX1-MOVE-01"]  # of motion, and not of real time
+MOVE = BY_ID["DEX1-MOVE-01"]
 FIELD = BY_ID["DEX1-FIELD-02"]  # of the states alone
 SAMPLE_US = 10_000
 STATES = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
@@ -62,9 +62,6 @@ class Machine:
 
     def __init__(self, found: Waits) -> None:
         self._waits = found
-
-    def starved(self, begin: float, end: float) -> float:
-        return 0.0
 
     def excess_lateness(self, begin: float, end: float) -> Lateness | None:
         return Lateness(0.0, 0.0, 0.0)
@@ -87,28 +84,24 @@ MANY_SHORT = waits(*[4_000] * 200)
     [
         # the wait of 0.15 s ends at 1.21 s
         (GAP, failure(1.1, 1.3).if_late(0.1), ONE_LONG, True),
-        (GAP, failure(1.1, 1.3).if_late(0.4), ONE_LONG, False),
+        (GAP, failure(1.1, 1.3).if_late(0.7), ONE_LONG, False),
         (GAP, failure(1.1, 1.3).if_late(0.1), waits(*QUIET), False),
         # it shows a while longer, but not before it began
         (GAP, failure(1.3, 1.5).if_late(0.1), ONE_LONG, True),
-        (GAP, failure(1.3 + AFTERMATH, 1.9 + AFTERMATH).if_late(0.1), ONE_LONG, False),
+        (GAP, failure(1.3 + BEFORE, 1.9 + BEFORE).if_late(0.1), ONE_LONG, False),
         (GAP, failure(0.8, 1.0).if_late(0.1), ONE_LONG, False),
-        # many short waits make a single event late by a few of them
-        (GAP, failure(1.0, 1.5).if_late(HOPS * 0.0039), MANY_SHORT, True),
-        (GAP, failure(1.0, 1.5).if_late(HOPS * 0.0041), MANY_SHORT, False),
-        # but a task of many steps by all of them
-        (GAP, failure(1.0, 1.5).if_late(0.8, how="chain"), MANY_SHORT, True),
-        (GAP, failure(1.0, 1.5).if_late(1.0, how="chain"), MANY_SHORT, False),
-        # they make each one late that happens again and again, also at its best
-        (RATE, failure(0.5, 1.5).if_late(0.005, how="mean", best=0.004), MANY_SHORT, True),
-        (RATE, failure(0.5, 1.5).if_late(0.007, how="mean", best=0.004), MANY_SHORT, False),
-        (RATE, failure(0.5, 1.5).if_late(0.005, how="mean", best=0.009), MANY_SHORT, False),
+        # many short waits add up in what happens once
+        (GAP, failure(1.0, 1.5).if_late(1.5), MANY_SHORT, True),
+        (GAP, failure(1.0, 1.5).if_late(2.0), MANY_SHORT, False),
+        # they make each one late that happens again and again
+        (RATE, failure(0.5, 1.5).if_late(0.011, how="mean"), MANY_SHORT, True),
+        (RATE, failure(0.5, 1.5).if_late(0.013, how="mean"), MANY_SHORT, False),
         # one long wait makes no rate low
         (RATE, failure(0.0, 2.0).if_late(0.005, how="mean"), ONE_LONG, False),
-        # motion that is not of real time: only a wait as long as the failure lasts
+        # a motion without a size is as large as it is long
         (MOVE, failure(1.0, 1.5), waits(*QUIET[:120], 500_000, *QUIET[121:]), True),
         (MOVE, failure(1.0, 3.5), ONE_LONG, False),
-        (MOVE, failure(0.0, 2.0), MANY_SHORT, False),
+        (MOVE, failure(0.0, 2.0), waits(*[2_000] * 200), False),
         # no wait makes a wrong field, nor what no delay can make
         (FIELD, failure(1.1, 1.2), waits(*[100_000] * 200), False),
         (RATE, failure(1.1, 1.2).if_late(float("inf"), how="mean"), MANY_SHORT, False),
@@ -126,27 +119,6 @@ def test_waits_excuse_only_failures_they_can_cause(
     requirement: object, outcome: Outcome, found: Waits, excused: bool
 ) -> None:
     assert excuse(Machine(found), requirement, outcome, Side.LEFT).excused is excused  # type: ignore[arg-type]
-
-
-def test_real_time_is_open_where_the_processes_wait_all_the_time() -> None:
-    run = (0.0, 2.0)
-    late = failure(0.5, 1.5).if_late(0.5, how="p99")
-    fits = failure(0.5, 1.5).if_late(0.5, how="p99", best=0.4)
-
-    def excused(found: Waits, requirement: object, outcome: Outcome) -> bool:
-        return excuse(Machine(found), requirement, outcome, Side.LEFT, run).excused  # type: ignore[arg-type]
-
-    often = waits(*[4_100] * 200)
-    assert excused(often, RATE, late)
-    assert not excused(waits(*[3_900] * 200), RATE, late)
-    assert not excuse(Machine(often), RATE, late, Side.LEFT).excused  # not in the whole run
-    # late in its best quarter as well: the hand is slow
-    assert not excused(often, RATE, fits)
-    # which way it moves, and what it says, no wait changes
-    assert not excused(often, MOVE, failure(0.0, 2.0))
-    assert not excused(often, FIELD, failure(1.1, 1.2))
-    text = excuse(Machine(often), RATE, late, Side.LEFT, run).text
-    assert "the service (pid 42) waited for a processor for 41% of the whole run; close" in text
 
 
 def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
@@ -210,7 +182,7 @@ def test_excuse_says_what_happened_and_what_to_do() -> None:
     assert found.disturbance.load is Load.TOO_BUSY
     assert found.disturbance.late_s == pytest.approx(0.15 - IDLE)
     found = excuse(Machine(ONE_LONG), GAP, failure(1.1, 1.3).if_late(0.8), Side.LEFT)
-    assert "which explains at most 298 ms of 800 ms" in found.text
+    assert "which explains at most 596 ms of 800 ms" in found.text
     assert found.disturbance.load is Load.BUSY
 
 
@@ -228,7 +200,6 @@ def test_longer_waits_excuse_more_and_larger_failures_are_excused_less(
         return excuse(machine, GAP, failure(0.0, 1.0).if_late(late), Side.LEFT).excused
 
     assert excused(size, more) >= excused(size, 0) >= excused(size + larger, 0)
-    assert not excused(HOPS * (max(waited) + more) / 1e6 + 1e-6, more)
 
 
 @given(waited=st.lists(st.integers(0, 300_000), max_size=30), begin=st.floats(0, 1))

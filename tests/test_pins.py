@@ -162,7 +162,7 @@ EDITS = [
         None,
     ),
     ("dexkit/conformance/checks/__init__.py", "ROUNDING = 1e-3", "ROUNDING = 2e-3", False, None),
-    ("dexkit/conformance/verdicts.py", "HARDEST = 2.0", "HARDEST = 3.0", False, True),
+    ("dexkit/conformance/verdicts.py", "LARGER = 4.0", "LARGER = 5.0", False, True),
     ("dexkit/conformance/judge.py", "1e6", "1e7", False, True),
     ("dexkit/conformance/recording.py", "_SOME = 50", "_SOME = 51", False, True),
     ("dexkit/conformance/layers/hand.py", "_SILENT = 0.5", "_SILENT = 0.6", False, True),

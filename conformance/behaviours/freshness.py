@@ -158,8 +158,7 @@ def _fresh(ctx: Context, joint: int) -> Iterator[Figure]:
     met = f"a new value every {usual * 1e3:.1f} ms while moving (median of {len(holds)})"
     text = f"{met}, but every {hold * 1e3:.0f} ms from {begin:.2f} s on"
     limit = ctx.tolerance("max_hold_s")
-    best = max(float(np.percentile(rows[i], 25)) - limit, 0.0)
-    late = Late((max(hold - limit, 0.0),), "mean", best)
+    late = Late((max(hold - limit, 0.0),), "mean")
     shown = f"{usual * 1e3:.1f} ms" if hold <= limit else f"{hold * 1e3:.0f} ms"
     yield Figure(hold, begin, end, joint, text, met, shown=shown, late=late)
 

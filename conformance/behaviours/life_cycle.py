@@ -35,7 +35,7 @@ def late_joiner(ctx: Context) -> Outcome:
     )
     least = end - begin if waited is None else waited
     # discovery is a conversation
-    return outcome.timed(least, limit).if_late(least - limit, how="chain")
+    return outcome.timed(least, limit).if_late(least - limit)
 
 
 @check("DEX1-LIFE-02", "DEX3-LIFE-02")
@@ -70,7 +70,7 @@ def restarted_service(ctx: Context) -> Outcome:
         )
         least = min(waited, end - begin)
         outcome = outcome.timed(least, ctx.tolerance("max_wait_s"))
-        return outcome.if_late(waited - ctx.tolerance("max_wait_s"), how="chain")
+        return outcome.if_late(waited - ctx.tolerance("max_wait_s"))
     wrong = away_first(ctx, phase, "after a restart of its service")
     if wrong is not None:
         return wrong
@@ -92,14 +92,14 @@ def shutdown(ctx: Context) -> Outcome:
         seen = "had to be killed" if ended is None else f"took {ended:.1f} s to end"
         outcome = ctx.failed("does not end", f"after SIGTERM the service {seen}", place)
         least, limit = end - begin if ended is None else ended, ctx.tolerance("max_exit_s")
-        return outcome.timed(least, limit).if_late(least - limit, how="chain")
+        return outcome.timed(least, limit).if_late(least - limit)
     if gone is None or gone > ctx.tolerance("max_gone_s"):
         seen = "is still announced" if gone is None else f"was announced for {gone:.1f} s"
         outcome = ctx.failed(
             "still announced", f"the state's publisher {seen} after the service had ended", place
         )
         least, limit = end - begin if gone is None else gone, ctx.tolerance("max_gone_s")
-        outcome = outcome.timed(least, limit).if_late(least - limit, how="chain")
+        outcome = outcome.timed(least, limit).if_late(least - limit)
         return outcome.because(
             "the process ends without deleting its participant, so that its peers wait for the "
             "lease to run out"

@@ -30,7 +30,7 @@ def load(ctx: Context) -> Outcome:
             place = ctx.at(ctx.states.topic, begin, end)
             outcome = ctx.failed(f"{rate:.1f} Hz", text, place, rate_hz=rate)
             outcome = outcome.rated(rate, least_rate(ctx), end - begin)
-            return too_slow(ctx, outcome, rate, np.diff(inside))
+            return too_slow(ctx, outcome, rate)
     span = begin, end
     met = ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
     return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))

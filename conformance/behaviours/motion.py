@@ -29,6 +29,7 @@ def direction(ctx: Context) -> Outcome:
             s.progress,
             f"{s}: {_how_it_missed(s)}",
             met=f"{len(found)} steps, all in the right direction",
+            late=math.inf if s.progress <= -0.05 else None,  # no delay turns a hand round
         )
         for s in found
     ]

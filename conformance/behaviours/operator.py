@@ -108,8 +108,6 @@ def _judge(
         steps = [s for s in found.joints[joint].steps if not of_step(s) < worst]
         places = [ctx.at(ctx.states.topic, s.at, s.end) for s in steps] or places
     size, how = (worst - ctx.tolerance(limit, joint)), "total" if of_step else "mean"
-    if name == "stroke_s":  # the client limits each command by the state before it
-        how = "chain"
     if limit.endswith("_stroke"):
         size *= STROKE_S / ctx.joints[joint].stroke
     return ctx.failed(text(worst), observed, *places, **values).about(joint).if_late(size, how=how)

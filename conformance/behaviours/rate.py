@@ -162,7 +162,7 @@ def rate(ctx: Context) -> Outcome:
             ctx.at(ctx.states.topic, float(ctx.states.t[0]), float(ctx.states.t[-1])),
             rate_hz=mean,
         ).rated(mean, least_rate(ctx), seconds)
-        return too_slow(ctx, outcome, mean, np.diff(clock))
+        return too_slow(ctx, outcome, mean)
     slowed = _slow_stretches(ctx)
     if not slowed:
         text = f"{mean:.1f} Hz over {seconds:.1f} s"
@@ -172,7 +172,6 @@ def rate(ctx: Context) -> Outcome:
     begin, end, _ = slowed[0]
     many = "" if len(slowed) == 1 else f", the first of {len(slowed)} such stretches"
     period = 1 / ctx.tolerance("min_rate_hz")
-    best = min(float(np.percentile(intervals, 25)) for _, _, intervals in slowed) - period
     measures = [
         rate_measure(r, least_rate(ctx), b - a, span=(a, b))
         for r, (a, b, _) in zip(rates, slowed, strict=True)
@@ -184,7 +183,7 @@ def rate(ctx: Context) -> Outcome:
         *(ctx.at(ctx.states.topic, a, b) for a, b, _ in slowed),
         rate_hz=min(rates),
     ).resting_on(*measures)
-    return outcome.if_late(*(1 / r - period for r in rates), how="mean", best=best)
+    return outcome.if_late(*(1 / r - period for r in rates), how="mean")
 
 
 @check("DEX1-RATE-02", "DEX3-RATE-02", "H1-RATE-02", rests_on=(TIMES,))
@@ -208,7 +207,7 @@ def vendor_rate(ctx: Context) -> Outcome:
     outcome = ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
     if rate > most:
         return outcome.rated(rate, most, seconds, at_most=True).if_late(math.inf)
-    return too_slow(ctx, outcome.rated(rate, least, seconds), rate, np.diff(ctx.states.clock))
+    return too_slow(ctx, outcome.rated(rate, least, seconds), rate)
 
 
 @check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03", rests_on=(TIMES,))

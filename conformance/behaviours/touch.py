@@ -104,7 +104,7 @@ def touch_rate(ctx: Context) -> Outcome:
         float(begins[0]),
         text=f"{rate:.0f} Hz on {touch.topic} in most seconds",
         shown=f"{rate:.0f} Hz",
-        late=Late((late,), "mean", late),
+        late=Late((late,), "mean"),
         measure=rate_measure(rate, limit, len(begins) * _WINDOW_S),
         topic=touch.topic,
     )

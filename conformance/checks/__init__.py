@@ -87,16 +87,12 @@ class Late:
     :param seconds: at each of the failure's places, or one for all of them; infinite where no delay
         causes such a failure. For a missing motion, the seconds that a conforming hand takes for
         it: :data:`STROKE_S` for a stroke.
-    :param how: ``total``: a single delay at that place; ``chain``: many delays one after the other,
-        of a task with many steps, as the end of a process or a motion under a client that goes on
-        from each state; ``mean``: a repeated delay, as it lowers a rate; ``p99``: in one of a
-        hundred.
-    :param best: the same for the best quarter of repeated events; 0 if unknown.
+    :param how: ``total``: all delays at that place together; ``mean``: a repeated delay, as it
+        lowers a rate; ``p99``: in one of a hundred.
     """
 
     seconds: tuple[float, ...]
     how: str = "total"
-    best: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -186,10 +182,10 @@ class Outcome:
         measure = Measure(float(torque), float(limit), "N m", Quantity.TORQUE, not at_least)
         return self.resting_on(measure)
 
-    def if_late(self, *seconds: float, how: str = "total", best: float = 0.0) -> Outcome:
+    def if_late(self, *seconds: float, how: str = "total") -> Outcome:
         """Return a copy with the size of the failure; see :class:`Late`."""
         sizes = tuple(max(0.0, float(s)) for s in seconds)
-        return replace(self, late=Late(sizes, how, max(0.0, float(best))))
+        return replace(self, late=Late(sizes, how))
 
 
 class Located(Protocol):

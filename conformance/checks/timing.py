@@ -109,15 +109,11 @@ def least_rate(ctx: Context) -> float:
     return (1 - ctx.tolerance("slack_part")) * ctx.tolerance("min_rate_hz")
 
 
-def too_slow(ctx: Context, outcome: Outcome, rate: float, intervals: Floats) -> Outcome:
-    """The outcome with its size: the delay of each state beyond the limit.
-
-    :param intervals: the intervals of the rate, seconds.
-    """
+def too_slow(ctx: Context, outcome: Outcome, rate: float) -> Outcome:
+    """The outcome with its size: the delay of each state beyond the limit."""
     period = 1 / ctx.tolerance("min_rate_hz")
     size = 1 / rate - period if rate > 0 else math.inf
-    best = float(np.percentile(intervals, 25)) - period if len(intervals) else size
-    return outcome.if_late(size, how="mean", best=best)
+    return outcome.if_late(size, how="mean")
 
 
 def encoder_step(ctx: Context, joint: int) -> float:
