@@ -10,18 +10,17 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from dexkit import __version__
 from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.report.labels import ANSWERS, VERDICTS
-from dexkit.conformance.report.pages import document
+from dexkit.conformance.report.labels import ANSWERS
+from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.svg_charts import Line, chart
-from dexkit.conformance.report.tables import no_wrap, table
 from dexkit.conformance.requirements import catalogue
 from dexkit.conformance.results import Overall, Verdict
 from dexkit.conformance.run_record import catalogue_digest
-from dexkit.escaping import html as escape
 
 __all__ = ["Group", "Summary", "render"]
 
@@ -31,8 +30,6 @@ _ROWS = 60
 """Rows of a group's table."""
 _MOST = 3
 """Requirements that are named for a file or a group."""
-_SHORT = 40
-"""Characters of a file's name that are not broken into lines."""
 _DAY = 86_400.0
 
 
@@ -180,23 +177,29 @@ def render(summary: Summary, *, locations: Sequence[str], left: int = 0) -> str:
 
     :param left: files that were not examined, because the audit was stopped.
     """
-    sections = [
-        _head(summary, left),
-        _facts(summary, locations),
-        _worst(summary, locations),
-        _trend(summary),
-        _requirements(summary, "hand", "Requirements that hands do not meet"),
-        _requirements(summary, "client", "Requirements that clients do not meet"),
-        *(
-            _groups(title, groups, locations)
-            for title, groups in sorted(summary.groups.items(), key=_order)
-        ),
-    ]
-    return document(f"Audit of {_count(summary.all.files, 'file')}", "".join(sections))
-
-
-def _order(item: tuple[str, Any]) -> tuple[bool, str]:
-    return item[0] in ("dialect", "folder"), item[0]
+    css, answer = _answer(summary, left)
+    days = sorted(summary.days)
+    return fill(
+        "audit.html",
+        title=f"Audit of {_count(summary.all.files, 'file')}",
+        summary=summary,
+        css=css,
+        answer=answer,
+        of=f"of {summary.all.files:,}, {_span(summary.all.seconds)}",
+        left=left,
+        ANSWERS={str(overall): ANSWERS[overall] for overall in Overall},
+        known=_facts(summary, locations),
+        worst=summary.worst,
+        trend=_trend(summary, days),
+        changes=_changes(summary, days),
+        middle=_date(days[len(days) // 2]) if days else "",
+        unmet=lambda about: _unmet(summary, about),
+        groups=_groups(summary),
+        short=lambda name: _short(name, locations),
+        count=_count,
+        span=_span,
+        br=Markup("<br>"),
+    )
 
 
 def _count(number: int, what: str) -> str:
@@ -207,34 +210,17 @@ def _span(seconds: float) -> str:
     return f"{seconds / 3600:,.1f} h" if seconds >= 7200 else f"{seconds / 60:.1f} min"
 
 
-def _head(summary: Summary, left: int) -> str:
+def _answer(summary: Summary, left: int) -> tuple[str, str]:
+    """Class and title of the answer."""
     every = summary.all
     if every.failing:
-        css, title = "bad", f"{_count(every.failing, 'file')} with a failure"
-    elif every.unusable or left or not every.files:
-        css, title = "open", "No failure, and not all could be judged"
-    else:
-        css, title = "ok", "No failure"
-    chips = "".join(
-        f'<span class="chip {ANSWERS[o].css}">{summary.overall[str(o)]} {ANSWERS[o].text}</span>'
-        for o in Overall
-    )
-    chips += "".join(
-        f'<span class="chip open">{n} {escape(str(state))}</span>'
-        for state, n in summary.states.items()
-        if state is not State.JUDGED
-    )
-    for n, text in ((summary.damaged, "damaged"), (summary.truncated, "unfinished")):
-        chips += f'<span class="chip open">{n} {text}</span>' if n else ""
-    stopped = f"<p>Stopped before its end: {_count(left, 'file')} not examined.</p>" if left else ""
-    return (
-        f'<header class="verdict {css}"><p class="question">Audit of recorded sessions</p>'
-        f"<h1>{title}<small>of {every.files:,}, {_span(every.seconds)}</small></h1>"
-        f'{stopped}</header><div class="chips">{chips}</div>'
-    )
+        return "bad", f"{_count(every.failing, 'file')} with a failure"
+    if every.unusable or left or not every.files:
+        return "open", "No failure, and not all could be judged"
+    return "ok", "No failure"
 
 
-def _facts(summary: Summary, locations: Sequence[str]) -> str:
+def _facts(summary: Summary, locations: Sequence[str]) -> dict[str, str]:
     times = sorted(summary.days)
     rows = {
         "where": ", ".join(locations),
@@ -245,8 +231,7 @@ def _facts(summary: Summary, locations: Sequence[str]) -> str:
     }
     if summary.clients:
         rows["clients"] = ", ".join(f"{n} {verdict}" for verdict, n in summary.clients.items())
-    cells = "".join(f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in rows.items())
-    return f'<dl class="facts">{cells}</dl>'
+    return rows
 
 
 def _date(seconds: float) -> str:
@@ -254,40 +239,12 @@ def _date(seconds: float) -> str:
 
 
 def _short(name: str, locations: Sequence[str]) -> str:
-    """A file or folder as a cell: without the location, if the page is about one alone."""
-    if len(locations) == 1:
-        name = name.removeprefix(locations[0].rstrip("/") + "/")
-    return no_wrap(escape(name)) if len(name) <= _SHORT else escape(name)
+    """A file or folder, without the location if the page is about one alone."""
+    return name.removeprefix(locations[0].rstrip("/") + "/") if len(locations) == 1 else name
 
 
-def _worst(summary: Summary, locations: Sequence[str]) -> str:
-    lines = summary.worst
-    if not lines:
-        return ""
-    rest = summary.remarkable - len(lines)
-    more = f"<p>{_count(rest, 'file')} more: see the table of files.</p>" if rest else ""
-    rows = []
-    for line in lines:
-        if line.overall:
-            answer = ANSWERS[Overall(line.overall)]
-            text, css = answer.text, answer.css
-            if line.damaged and css == ANSWERS[Overall.PASS].css:
-                text, css = f"{text}, of its readable part", "open"
-            verdict = f'<b class="{css}">{text}</b>'
-        else:
-            verdict = no_wrap(f'<b class="open">{escape(str(line.state))}</b>')
-        found = [f"<code>{escape(name)}</code> {escape(text)}" for name, text in line.failed]
-        found += [f"and {line.more} more"] if line.more else []
-        found += [escape(line.error)] if line.error else []
-        where = f"<span class='dim'>{escape(line.where)}</span>" if line.where else ""
-        name = _short(line.name, locations)
-        rows.append((f"{name}{where and '<br>' + where}", verdict, "<br>".join(found)))
-    return f"<h2>Worst files</h2>{table(('file', 'verdict', 'why'), rows)}{more}"
-
-
-def _trend(summary: Summary) -> str:
+def _trend(summary: Summary, days: Sequence[float]) -> Markup | str:
     """The part of files that fail, and that cannot be used, day by day."""
-    days = sorted(summary.days)
     if len(days) < 2:
         return ""
     x = (np.array(days) - days[0]) / _DAY
@@ -306,11 +263,10 @@ def _trend(summary: Summary) -> str:
         x_unit=f"days since {_date(days[0])}",
         include=(0.0,),
     )
-    changes = _changes(summary, days)
-    return f"<h2>Over time</h2>{plot}{changes}"
+    return Markup(plot)
 
 
-def _changes(summary: Summary, days: Sequence[float]) -> str:
+def _changes(summary: Summary, days: Sequence[float]) -> list[tuple[str, str, str]]:
     """Requirements that fail more, or less, in the later half of the days than before."""
     halves = []
     for some in (days[: len(days) // 2], days[len(days) // 2 :]):
@@ -322,52 +278,30 @@ def _changes(summary: Summary, days: Sequence[float]) -> str:
     before, after = halves
     change = {n: after.get(n, 0.0) - before.get(n, 0.0) for n in before.keys() | after.keys()}
     ordered = sorted(change, key=lambda n: (-abs(change[n]), n))[:10]
-    rows = [
-        (f"<code>{escape(n)}</code>", f"{before.get(n, 0.0):.0%}", f"{after.get(n, 0.0):.0%}")
+    return [
+        (n, f"{before.get(n, 0.0):.0%}", f"{after.get(n, 0.0):.0%}")
         for n in ordered
         if abs(change[n]) >= 0.005
     ]
-    middle = _date(days[len(days) // 2])
-    heads = ("part of files in which it fails", f"before {middle}", "since then")
-    return table(heads, rows) if rows else ""
 
 
-def _requirements(summary: Summary, about: str, title: str) -> str:
+def _unmet(summary: Summary, about: str) -> list[tuple[str, str, int, int]]:
+    """Id, title, failures and warnings of each requirement that is not met, worst first."""
     found = {name: c for (who, name), c in summary.requirements.items() if who == about}
-    if not found:
-        return ""
-    titles = {r.id: r.title for name in LAYERS for r in catalogue(None, name)}
+    titles = {r.id: r.title for name in LAYERS for r in catalogue(None, name)} if found else {}
     ordered = sorted(found, key=lambda n: (-found[n]["fail"], -found[n]["warn"], n))
-    rows = [
-        (
-            f"<code>{escape(n)}</code> {escape(titles.get(n, ''))}",
-            f'<span class="{VERDICTS[Verdict.FAIL].css}">{found[n]["fail"]}</span>',
-            f'<span class="{VERDICTS[Verdict.WARN].css}">{found[n]["warn"]}</span>',
-        )
-        for n in ordered
-    ]
-    return f"<h2>{title}</h2>{table(('requirement', 'files that fail', 'warnings'), rows)}"
+    return [(n, titles.get(n, ""), found[n]["fail"], found[n]["warn"]) for n in ordered]
 
 
-def _groups(title: str, groups: Mapping[str, Group], locations: Sequence[str]) -> str:
-    if len(groups) < 2:
-        return ""
-    ordered = sorted(groups, key=lambda n: (-groups[n].failing / groups[n].files, n))
-    rows = []
-    for name in ordered[:_ROWS]:
-        group = groups[name]
-        most = [f"<code>{escape(n)}</code> ({k})" for n, k in group.failures.most_common(_MOST)]
-        rows.append(
-            (
-                _short(name, locations),
-                f"{group.files:,}",
-                _span(group.seconds),
-                f"{group.failing} ({group.failing / group.files:.0%})",
-                str(group.unusable),
-                ", ".join(most),
+def _groups(summary: Summary) -> list[tuple[str, list[tuple[str, Group]], int]]:
+    """Title, groups and how many are left out: labels first, worst group first."""
+    found = []
+    titles = sorted(summary.groups, key=lambda title: (title in ("dialect", "folder"), title))
+    for title in titles:
+        groups = summary.groups[title]
+        if len(groups) > 1:
+            ordered = sorted(
+                groups.items(), key=lambda item: (-item[1].failing / item[1].files, item[0])
             )
-        )
-    rest = len(ordered) - len(rows)
-    more = f"<p>and {rest} more</p>" if rest else ""
-    heads = (title, "files", "recorded", "failing", "not usable", "most frequent failures")
-    return f"<h2>By {escape(title)}</h2>{table(heads, rows)}{more}"
+            found.append((title, ordered[:_ROWS], max(0, len(ordered) - _ROWS)))
+    return found
