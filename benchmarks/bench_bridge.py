@@ -68,7 +68,7 @@ def echoing(source: int, target: int, type_name: str, topic: str) -> Iterator[No
 def bridging(near: int, far: int) -> Iterator[None]:
     # this process is client and gripper at once, which looks like a bridge back: --force
     with Tool(
-        *("bridge", "--quiet", "--force", "--from", _ACTUATOR.name, "--to", _GO.name),
+        *("bridge", _ACTUATOR.name, _GO.name, "--force"),
         *("--domain", str(near), "--to-domain", str(far)),
     ) as tool:
         tool.wait_ready(threading.Event())

@@ -190,7 +190,7 @@ class Rig:
             tool.wait_ready(self._stop)
 
     def _start_robot(self, emulator: str) -> Tool:
-        arguments = ("emulate", emulator, "--quiet", *self._place_on_dds)
+        arguments = ("emulate", emulator, *self._place_on_dds)
         return self._tool("the emulated robot", self.options.sides, *arguments)
 
     def _start_hands(self) -> list[Tool]:

@@ -268,13 +268,13 @@ def parse_result(data: Any, path: object) -> RunResult:
     if about.get("format") != FORMAT:
         raise UsageError(
             f"{path} is not a result file of dexkit",
-            hint="'dexkit check --json FILE' and the suite's '--json FILE' write them",
+            hint="'dexkit check --result FILE' and the suite's '--json FILE' write them",
         )
     if about.get("version") != VERSION:
         version = one_line(about.get("version"), 40)
         raise UsageError(
             f"{path}: version {version} of {FORMAT} is not read by this dexkit, but {VERSION}",
-            hint="judge the recording again: dexkit check RECORDING.mcap --json RESULT.json",
+            hint="judge the recording again: dexkit check RECORDING.mcap --result RESULT.json",
         )
     hint = "the file is damaged, or of another program; docs/reports.md says what is in it"
     file = to_record(data, ResultFile, path, hint=hint)

@@ -194,13 +194,22 @@ def _setup(name: str, domain: int, other: int) -> Iterator[tuple[Tool, _Hand, in
             hands = enter(Dex3Hands((SIDE,)))
             joints = hands.device(SIDE).mechanics.joints
             tool = enter(
-                _serve("serve", name, "--accept-guesses", "--usb", hands.url, *patient, *options)
+                _serve(
+                    "serve",
+                    name,
+                    "--set",
+                    "guesses=accept",
+                    "--set",
+                    f"usb={hands.url}",
+                    *patient,
+                    *options,
+                )
             )
             hand = _Hand(dialect("dex3"), lambda: np.array([joint.q for joint in joints]))
             yield tool, hand, domain
         elif name == "bridge":
             enter(_serve("serve", "sim-dex1", *options))
-            ends = ("--from", "unitree_actuator", "--to", "unitree_go", "--side", SIDE)
+            ends = ("unitree_actuator", "unitree_go", "--side", SIDE)
             domains = ("--domain", other, "--to-domain", domain)
             tool = enter(_serve("bridge", *ends, *domains))
             look = enter(_published(dialect("unitree_go"), domain))

@@ -69,7 +69,7 @@ def checked(
 ) -> dict[str, Any]:
     """The result file of ``dexkit check``, in a process of its own."""
     subprocess.run(
-        [python, "-m", "dexkit", "check", path, "--json", out],
+        [python, "-m", "dexkit", "check", path, "--result", out],
         env=os.environ | {"PYTHONHASHSEED": hash_seed},
         capture_output=True,
         check=False,

@@ -92,7 +92,8 @@ def commands(tmp_path: Path) -> list[dict[str, object]]:
 def test_a_released_key_stops_the_motor(emulated: Dex3Hands, tmp_path: Path) -> None:
     config = tmp_path / "dex3.json"
     person = Person(
-        "dex3-usb", "--side", "left", "--usb", emulated.url, "--set", f"config={config}", *PATIENT,
+        "dex3-usb", "--side", "left",
+        "--set", f"usb={emulated.url}", "--set", f"config={config}", *PATIENT,
         "--speed", 0.1,
     )  # fmt: skip
     try:
@@ -168,7 +169,7 @@ def test_the_driver_uses_the_findings(tmp_path: Path) -> None:
 def test_unattended_bringup_refuses_real_hands(emulated: Dex3Hands, tmp_path: Path) -> None:
     (tmp_path / "answers.json").write_text('{"motor 0.0 joint": "thumb"}')
     (tmp_path / "none.json").write_text("[1]")
-    place = ["bringup", "dex3-usb", "--side", "left", "--usb", emulated.url, *PATIENT]
+    place = ["bringup", "dex3-usb", "--side", "left", "--set", f"usb={emulated.url}", *PATIENT]
     answers = ["--answers", str(tmp_path / "answers.json")]
     for arguments, said in (
         (place, "needs a terminal"),
@@ -193,7 +194,7 @@ def test_unattended_bringup_refuses_real_hands(emulated: Dex3Hands, tmp_path: Pa
 
 def test_the_plan_is_printed_and_nothing_opened() -> None:
     code, out, _ = hostile.run_command(
-        ["bringup", "dex3-usb", "--side", "right", "--dry-run", "--usb", "usbip://127.0.0.1:1"]
+        ["bringup", "dex3-usb", "--side", "right", "--dry-run", "--set", "usb=usbip://127.0.0.1:1"]
     )
     assert code == 0
     for joint in DEX3_1.joints[Side.RIGHT]:

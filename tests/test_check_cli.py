@@ -37,7 +37,7 @@ def test_recording_with_a_dropout_fails_with_an_explanation(
     files = [tmp_path / name for name in ("r.json", "r.xml", "r.html")]
     code = check(
         sample_path("dex1_hand_dropout"),
-        *("--json", files[0], "--junit", files[1], "--html", files[2]),
+        *("--result", files[0], "--junit", files[1], "--html", files[2]),
     )
     assert code == 1
     out = capsys.readouterr().out
@@ -110,7 +110,7 @@ def test_check_applies_the_claims_of_a_vendor(
     claims.write_text('[hand]\nname = "X"\n[claims]\nvelocity = true\n')
     junit = tmp_path / "r.xml"
     sample = sample_path("dex1_pick_place")
-    assert check(sample, "--capabilities", claims, "--json", out, "--junit", junit) == 0
+    assert check(sample, "--capabilities", claims, "--result", out, "--junit", junit) == 0
     data = json.loads(out.read_text())
     verdicts = {r["id"]: r["verdict"] for r in data["results"]}
     levels = {r["id"]: r["requirement"]["level"] for r in data["results"]}
@@ -132,7 +132,7 @@ def test_verbose_lists_requirements_without_a_verdict(capsys: pytest.CaptureFixt
 
 def test_unwritable_result_file_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     name = "/no/such/directory/r.json"
-    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--json", name) == 2
+    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--result", name) == 2
     assert f"error: cannot write {name}: No such file or directory" in capsys.readouterr().err
 
 

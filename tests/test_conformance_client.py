@@ -253,7 +253,7 @@ def test_check_exits_by_the_hand_and_names_the_client(tmp_path: Path) -> None:
         for (topic, kind), rows in spoiled(five_hertz).rows.items():
             for log_ns, sent_ns, payload in rows:
                 recorder.put(topic, kind, payload, log_time_ns=log_ns, publish_time_ns=sent_ns)
-    run = CliRunner().invoke(command, [str(path), "--json", str(out)])
+    run = CliRunner().invoke(command, [str(path), "--result", str(out)])
     assert run.exit_code == Overall.INCONCLUSIVE.exit_code, run.output
     assert "DEX1-CLIENT-05 (MUST) client, left: fail" in run.output
     assert "because of the client (DEX1-CLIENT-05)" in run.output

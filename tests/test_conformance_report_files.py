@@ -329,7 +329,7 @@ def test_page_of_a_robot_or_of_usb_is_drawn_from_the_recording_beside_its_result
     with Recorder(recording) as recorder:
         failed = written(recorder)
     first, again = tmp_path / "first.html", tmp_path / "again.html"
-    run("check", recording, "--json", result, "--html", first)
+    run("check", recording, "--result", result, "--html", first)
     verdicts = {r.requirement.id: r.verdict for r in read_json(result).results}
     assert verdicts[failed] is Verdict.FAIL
     done = run("report", result, "--html", again)

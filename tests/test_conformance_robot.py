@@ -265,7 +265,7 @@ def test_recording_is_judged_from_its_file(name: str, tmp_path: Path) -> None:
     assert f"{name.upper()}-CRC-01-robot" in (tmp_path / "junit.xml").read_text()
 
 
-FILES = {"--json": "result.json", "--html": "report.html", "--junit": "junit.xml"}
+FILES = {"--result": "result.json", "--html": "report.html", "--junit": "junit.xml"}
 
 
 def test_recording_without_stimulus_is_judged_in_part(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_a_hand_that_was_never_brought_up_gets_no_command(
     with emulated_dex3((Side.LEFT,), process=False) as emulated:
         with pytest.raises(HandRefused, match=r"not been brought up.*zero of each") as e:
             hand_at(emulated.url, config=file, **PATIENT).open()
-        assert "--accept-guesses" in str(e.value.hint)
+        assert "guesses=accept" in str(e.value.hint)
         with hand_at(emulated.url, config=file, guesses=True, **PATIENT) as hand:
             key = hand.serial
         assert "guessed: the place of each motor" in caplog.text

@@ -99,7 +99,15 @@ def test_served_hand_unplugged_in_motion_comes_back_without_motion(
     with (
         emulated_dex3(process=True) as emulated,
         serving(
-            *("dex3-usb", "--side", "left", "--usb", emulated.url, "--accept-guesses"),
+            *(
+                "dex3-usb",
+                "--side",
+                "left",
+                "--set",
+                f"usb={emulated.url}",
+                "--set",
+                "guesses=accept",
+            ),
             *("--domain", dds_domain, "--state-rate", 500),
         ) as service,
     ):

@@ -441,7 +441,8 @@ def test_hand_prints_its_address_commands_and_counters(signum: signal.Signals) -
         f"  usbip --tcp-port {port} attach -r 127.0.0.1 -b 1-1",
         f"  usbip --tcp-port {port} attach -r 127.0.0.1 -b 1-2",
         "  lsusb -d 34b7:",
-        f"without kernel support: dexkit serve dex3-usb --accept-guesses --usb usbip://127.0.0.1:{port}",
+        f"without kernel support: dexkit serve dex3-usb --set guesses=accept "
+        f"--set usb=usbip://127.0.0.1:{port}",
     ]
     with usbip.host.open(busid="1-2", transport=usbip.USBIP("127.0.0.1", int(port))) as handle:
         handle.bulk_out(0x02, bytes(1234))

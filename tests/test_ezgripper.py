@@ -830,7 +830,7 @@ def test_torque_off_is_tried_when_opening_fails_late(
 
 
 @pytest.mark.usefixtures("_patient_servo")
-def test_calibration_on_the_command_line(tmp_path: Path) -> None:
+def test_calibration_on_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "sub" / "ezgripper.json"
     with emulated(start=60.0, closed_at=3900) as gripper:
         common = ["--device", gripper.path, "--config", str(path)]
@@ -844,7 +844,8 @@ def test_calibration_on_the_command_line(tmp_path: Path) -> None:
         asked = CliRunner().invoke(calibrate_command, common)
         assert isinstance(asked.exception, UsageError)
 
-        done = CliRunner().invoke(calibrate_command, [*common, "--yes", "--speed", "--runs", "1"])
+        monkeypatch.setattr("dexkit.cli.calibrate._RUNS", 1)
+        done = CliRunner().invoke(calibrate_command, [*common, "--yes", "--measure", "speed"])
         assert done.exit_code == 0, (done.output, done.exception)
         assert not gripper.servo.torque
         content = json.loads(path.read_text())
@@ -1053,7 +1054,7 @@ def test_the_force_table_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyP
             calibrate_command,
             [
                 *("--device", gripper.path, "--config", str(path)),
-                *("--force", "--up-to", "30", "--yes"),
+                *("--measure", "force", "--effort", "30", "--yes"),
             ],
             input="2\n6\n",
         )

@@ -248,7 +248,7 @@ def test_both_servos_of_a_pair_are_calibrated(
         "dexkit.cli.calibrate.GripperSettings", partial(GripperSettings, timeout=0.2)
     )
     config = tmp_path / "config.json"
-    arguments = ["--ids", "2,1", "--config", str(config), "--yes"]
+    arguments = ["--id", "2,1", "--config", str(config), "--yes"]
     with pair() as gripper:
         found = CliRunner().invoke(calibrate_command, ["--device", gripper.path, *arguments])
         assert found.exit_code == 0, found.output
@@ -259,9 +259,9 @@ def test_both_servos_of_a_pair_are_calibrated(
 
 
 def test_a_pair_that_is_not_calibrated_is_refused(tmp_path: Path) -> None:
-    arguments = ["--ids", "2,1", "--config", str(tmp_path / "config.json"), "--yes"]
+    arguments = ["--id", "2,1", "--config", str(tmp_path / "config.json"), "--yes"]
     with pair() as gripper:
-        for extra in (["--id", "3"], ["--force"], ["--set-baudrate", "57600"]):
+        for extra in (["--measure", "force"], ["--set-baudrate", "57600"]):
             refused = CliRunner().invoke(
                 calibrate_command, ["--device", gripper.path, *arguments, *extra]
             )

@@ -26,7 +26,7 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 COMMANDS = {
     "sqlite3": ("export", "{source}", "--to", "rosbag2", "--out", "{out}"),
-    "mcap": ("export", "{source}", "--to", "rosbag2", "--storage", "mcap", "--out", "{out}"),
+    "mcap": ("export", "{source}", "--to", "rosbag2", "--set", "storage=mcap", "--out", "{out}"),
     "parquet": ("export", "{source}", "--to", "parquet", "--out", "{out}"),
     "csv": ("export", "{source}", "--to", "csv", "--out", "{out}"),
     "lerobot": ("export", "{source}", "--to", "lerobot", "--out", "{out}"),

@@ -29,7 +29,7 @@ from tests import hostile
 _SAMPLE = "<sample>"
 _FIXED: dict[tuple[str, ...], list[str]] = {
     ("badge",): ["<result>"],
-    ("bridge",): ["--from", "unitree_go", "--to", "unitree_hg"],
+    ("bridge",): ["unitree_go", "unitree_hg"],
     ("bringup",): ["dex3-usb", "--side", "left"],
     ("calibrate",): ["--yes"],
     ("check",): [_SAMPLE],

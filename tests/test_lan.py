@@ -389,7 +389,7 @@ def test_every_program_on_loopback_filters_its_sockets(
 ) -> None:
     """Of those that listen; the service is above."""
     recording = tmp_path / "a.mcap"
-    ends = ("--from", "unitree_actuator", "--to", "unitree_go")
+    ends = ("unitree_actuator", "unitree_go")
     commands: dict[str, tuple[object, ...]] = {
         "bridge": ("bridge", *ends, "--domain", 111, "--to-domain", 112),
         "robot": ("emulate", "h1", "--domain", 113),
@@ -446,17 +446,15 @@ _LISTENING: dict[str, tuple[object, ...]] = {
     "emulate lerobot-g1": ("emulate", "lerobot-g1", "--domain", 122),
     "emulate rh56 --link tcp://...": ("emulate", "rh56", "--link", "tcp://127.0.0.1:1502"),
     "view": ("view", "--no-open", "--domain", 123),
-    "view --to foxglove": ("view", "--to", "foxglove", "--domain", 124),
-    "view --to rerun": (
-        *("view", "--to", "rerun", "--out", "rerun+http://127.0.0.1:9/proxy", "--domain", 125),
-    ),
+    "view --foxglove": ("view", "--foxglove", "--domain", 124),
+    "view --rerun": (*("view", "--rerun", "rerun+http://127.0.0.1:9/proxy", "--domain", 125),),
 }
-_ON_DDS = ("doctor", "emulate lerobot-g1", "view", "view --to foxglove", "view --to rerun")
+_ON_DDS = ("doctor", "emulate lerobot-g1", "view", "view --foxglove", "view --rerun")
 _NEEDS = {
     "emulate lerobot-g1": "zmq",
     "view": "viser",
-    "view --to foxglove": "foxglove",
-    "view --to rerun": "rerun",
+    "view --foxglove": "foxglove",
+    "view --rerun": "rerun",
 }
 _TABLE = ROOT / "docs" / "security.md"
 

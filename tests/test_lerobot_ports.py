@@ -29,6 +29,7 @@ from dexkit.messages import message_type
 from dexkit.messages.unitree_hg import IMUState_, LowState_, MotorState_
 from dexkit.robots import G1
 from dexkit.wire import low_level
+from tests.cli_helpers import running
 from tests.dds_helpers import dds_domain, dds_node, free_domain, take_until, wait_until
 from tests.each import each
 from tests.lerobot_client import LerobotClient, command_json
@@ -315,29 +316,25 @@ def test_emulate_all_for_lerobot_starts_robot_hands_and_ports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("dexkit.cli.emulate.all._Processes", NoProcesses)
-    result = CliRunner().invoke(cli, ["emulate", "all", "--for", "lerobot", "--ports", "1,2,3"])
+    result = CliRunner().invoke(cli, ["emulate", "all", "--for", "lerobot"])
     assert result.exit_code == 0, result.output
     assert NoProcesses.commands == {
         "g1": ("emulate", "g1", "--domain", "0", "--interface", "lo"),
         "hands": (*("serve", "sim-dex1", "--side", "both", "--domain", "0", "--interface", "lo"),),
-        "lerobot": ("emulate", "lerobot-g1", "--domain", "0", "--ports", "1,2,3"),
+        "lerobot": ("emulate", "lerobot-g1", "--domain", "0"),
     }
     assert "--robot.type=unitree_g1" in result.output
 
 
-def test_command_serves_the_ports_until_its_time_is_up() -> None:
+def test_command_serves_the_ports_until_it_is_told_to_end() -> None:
     domain = str(free_domain())
-    result = CliRunner().invoke(
-        cli,
-        ["emulate", "lerobot-g1", "--domain", domain, "--ports", "0,0,0", "--duration", "0.1"],
-    )
-    assert result.exit_code == 0, result.output
-    # a busy machine has warnings, too
-    lines = [line for line in result.output.splitlines() if line.startswith(("ready:", "stopped:"))]
-    ready, stopped = lines
+    with running("emulate", "lerobot-g1", "--domain", domain, "--ports", "0,0,0") as process:
+        ready = process.ready()
+        code, rest, errors = process.end(signal.SIGINT)
+    assert code == 0, errors
     assert ready.startswith("ready: LeRobot's g1 on 127.0.0.1: commands ")
     assert ready.endswith(f"; domain {domain}, lo")
-    assert stopped.startswith("stopped: 0 states, 0 commands, 0 forwarded, 0 refused, ")
+    assert rest.startswith("stopped: 0 states, 0 commands, 0 forwarded, 0 refused, ")
 
 
 @pytest.mark.soak
@@ -371,7 +368,6 @@ def test_g1_moves_by_commands_of_lerobot_and_stops_cleanly() -> None:
     ("arguments", "text"),
     [
         (["all", "--for", "lerobot", "--robot", "h1"], "does not support the h1"),
-        (["all", "--ports", "1,2,3"], "needs --for lerobot"),
         (["lerobot-g1", "--ports", "1,2"], "three of them"),
         (["lerobot-g1", "--ports", "1,2,70000"], "three of them"),
     ],

@@ -349,7 +349,7 @@ def test_full_disk_is_reported_with_the_number_of_messages_written(tmp_path: Pat
     def small_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
 
-    options = ("--topic", STATE, "--domain", domain, "--compression", "none")
+    options = ("--topic", STATE, "--domain", domain)
     with (
         recorder("default", out, *options, preexec_fn=small_files) as process,
         DdsNode(domain) as node,

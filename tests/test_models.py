@@ -80,7 +80,7 @@ class TestCommandLine:
         assert run("dex1-1", "h1") == f"{run('dex1-1')}\n{run('h1')}"
 
     def test_all_models_are_printed(self) -> None:
-        assert run("--all") == "\n".join(run(name) for name in names())
+        assert run(*names()) == "\n".join(run(name) for name in names())
 
     def test_unknown_model_is_refused(self) -> None:
         result = CliRunner().invoke(cli, ["models", "dex9"])

@@ -222,5 +222,5 @@ def test_terminal_bytes_are_decoded_to_keys(data: bytes, expected: list[str]) ->
 def test_a_log_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.touch()
-    result = CliRunner().invoke(cli, ["monitor", "--log", str(path)])
+    result = CliRunner().invoke(cli, ["monitor", "--record", str(path)])
     assert "a.mcap exists" in str(result.exception)

@@ -45,11 +45,11 @@ _ELSEWHERE = {
     ("audit", "--out"),  # a folder: tests/test_audit.py
     ("export", "--out"),  # one, too: tests/test_sessions_export.py
     ("bringup", "--save-answers"),  # at the end of a session: tests/test_bringup_cli.py
-    ("selftest", "--json"),  # after the test of a hand, as others write
+    ("selftest", "--result"),  # after the test of a hand, as others write
     ("selftest", "--report"),
     ("demo", "--out"),  # a folder, made before anything starts
     ("install-service", "--directory"),  # tests/test_install_service.py
-    ("monitor", "--log"),  # a key begins it: tests/test_monitor_terminal.py
+    ("monitor", "--record"),  # a key begins it: tests/test_monitor_terminal.py
     ("setup-dds", "--wheel"),  # tests/test_setup_dds.py
     ("setup-dds", "--log"),
     ("teleop", "--record"),  # as 'record' writes
@@ -74,7 +74,7 @@ def test_unwritable_output_file_of_any_option_is_an_error(
 ) -> None:
     _, whole = hostile.judged_result(tmp_path)
     recording = tmp_path / "short.mcap"
-    assert hostile.run_command(["cut", str(whole), str(recording), "--to", "1"])[0] == 0
+    assert hostile.run_command(["cut", str(whole), str(recording), "--window", ":1"])[0] == 0
     given = {"<result>": str(tmp_path / "good.json"), _SAMPLE: str(recording)}
     (tmp_path / "out").mkdir()
     there = tmp_path / "out" / "there"
@@ -124,7 +124,7 @@ def test_full_or_closed_standard_output_is_an_error(
         ["report", result, "--markdown", "-"],
         ["compare", result, result],
         ["check", "--list", "--dialect", "dex3"],
-        ["teleop", "--list"],
+        ["teleop"],
     ):
         for place, code in ((full, 2), (pipe, 141)):
             # as the interpreter opens it, with buffer and without
@@ -169,7 +169,7 @@ def test_output_without_standard_streams_goes_into_no_other_file(
     done = subprocess.run(
         [
             *("sh", "-c", 'exec "$@" >&- 2>&-', "sh"),
-            *command_line("check", str(recording), "--json", str(out), "--require", "DEX1-RATE"),
+            *command_line("check", str(recording), "--result", str(out), "--require", "DEX1-RATE"),
         ],
         check=False,
         timeout=60,
@@ -266,9 +266,9 @@ def test_no_command_overwrites_its_input_or_writes_a_file_twice(tmp_path: Path) 
         ("report", result, "--html", new, "--junit", new),
         ("badge", result, "-o", result),
         ("compare", result, "--html", result),
-        ("compare", result, "--html", new, "--markdown", tmp_path / "." / "new"),
-        ("check", session, "--json", session),
-        ("check", session, "--json", new, "--html", new),
+        ("check", session, "--junit", new, "--html", tmp_path / "." / "new"),
+        ("check", session, "--result", session),
+        ("check", session, "--result", new, "--html", new),
     ):
         found = CliRunner().invoke(cli, list(map(str, arguments)))
         assert isinstance(found.exception, UsageError), (arguments, found.output)

@@ -37,7 +37,7 @@ def test_frames_are_not_blamed_for_what_they_do_not_have(
     for i, item in enumerate(found["data"]):
         item |= {"timestamp": 1.7e9 + i / 30} if timed else {}
     source = episode(tmp_path / "e", streamed(found))
-    assert dexkit("import", source, tmp_path / "a.mcap", "--hand", hand)[0] == 0
+    assert dexkit("import", source, tmp_path / "a.mcap", "--set", f"hand={hand}")[0] == 0
     assert not_met(tmp_path / "a.mcap") == {}
 
 
@@ -64,7 +64,7 @@ def test_times_of_reception_are_no_source_times(tmp_path: Path) -> None:
 def test_topics_that_were_not_asked_for_are_not_missing(tmp_path: Path, topics: list[str]) -> None:
     """Discovery names the writer of a topic that the recorder was not to store."""
     options = [word for topic in topics for word in ("--topic", topic)]
-    code, output = dexkit("cut", PINCH, tmp_path / "a.mcap", "--to", "3", *options)
+    code, output = dexkit("cut", PINCH, tmp_path / "a.mcap", "--window", ":3", *options)
     assert code == 0, output
     assert open_trace(tmp_path / "a.mcap").endpoints
     assert not_met(tmp_path / "a.mcap") == {}

@@ -920,7 +920,7 @@ def test_every_source_that_import_knows_is_replayed(tmp_path: Path) -> None:
         (made, ()),
         (tmp_path / "episode_0001" / "data.json", ()),
         (lines, ()),
-        (lerobot, ("--episode", "episode_000000")),
+        (lerobot, ()),
         (tmp_path / "rosbag2", ()),
         (tmp_path / "parquet", ()),
         (recording, ()),
@@ -981,8 +981,8 @@ def test_several_sessions_need_a_choice(tmp_path: Path) -> None:
     for i in range(2):
         episode(tmp_path / "task" / f"episode_000{i}", whole(document(20, "dex3-1")))
     code, output = dexkit("rehearse", tmp_path / "task", "--check")
-    assert (code, "--episode episode_0000" in output) == (2, True)
-    code, output = dexkit("rehearse", tmp_path / "task", "--check", "--episode", "episode_0001")
+    assert (code, "dexkit import" in output) == (2, True)
+    code, output = dexkit("rehearse", tmp_path / "task" / "episode_0001", "--check")
     assert (code, "thin-rate" in output) == (1, True)
 
 

@@ -339,7 +339,7 @@ def against(recording: Path, result: object, *more: object) -> tuple[int, str, s
 def result(tmp_path: Path, session: Path) -> Path:
     """The result file that ``dexkit check`` writes of the session."""
     path = tmp_path / "result.json"
-    code, out, _ = hostile.run_command(["check", str(session), "--json", str(path)])
+    code, out, _ = hostile.run_command(["check", str(session), "--result", str(path)])
     assert code == 1  # a hand that drops out
     assert sha256_of_file(session) in out
     return path
@@ -378,7 +378,7 @@ def test_command_finds_removed_failures(result: Path, session: Path) -> None:
 
 def test_command_names_an_honest_part(tmp_path: Path, session: Path) -> None:
     part = tmp_path / "part.json"
-    words = ["check", str(session), "--require", "DEX1-TOPIC", "--json", str(part)]
+    words = ["check", str(session), "--require", "DEX1-TOPIC", "--result", str(part)]
     assert hostile.run_command(words)[0] == 0
     code, out, _ = against(session, part)
     assert code == 0

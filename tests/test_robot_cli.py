@@ -20,6 +20,7 @@ from dexkit.errors import EmulatorError, TopicConflict
 from dexkit.messages import encode
 from dexkit.robots import G1, H1
 from dexkit.wire.low_level import encode_with_crc, verify_payload
+from tests.cli_helpers import running
 from tests.dds_helpers import free_domain, take_until, wait_until
 from tests.robot_helpers import low_cmd
 
@@ -91,7 +92,7 @@ def test_emulated_robot_serves_until_it_is_stopped(node: DdsNode) -> None:
 
 
 def test_two_robots_on_one_domain(node: DdsNode) -> None:
-    arguments = ["h1", "--domain", str(node.domain), "--duration", "0.2", "--set", "real-time=no"]
+    arguments = ["h1", "--domain", str(node.domain), "--set", "real-time=no"]
     stop, ready = threading.Event(), threading.Event()
     thread = threading.Thread(
         target=run_robot, args=(H1,), kwargs={"domain": node.domain, "stop": stop, "ready": ready}
@@ -105,10 +106,12 @@ def test_two_robots_on_one_domain(node: DdsNode) -> None:
         assert "--force" in str(refused.exception.hint)
         with pytest.raises(TopicConflict):
             EmulatedRobot(G1, node=node).start()  # another robot, on the same topics
-        forced = CliRunner().invoke(command, [*arguments, "--force"], standalone_mode=False)
-        assert forced.exception is None
+        with running("emulate", *arguments, "--force") as forced:
+            forced.ready()
+            code, rest, errors = forced.end(signal.SIGTERM)
+        assert code == 0, errors
         # on a busy machine it counts pauses as well
-        assert re.search(r"^stopped: .*\bstates \d", forced.output, re.MULTILINE)
+        assert re.search(r"^stopped: .*\bstates \d", rest, re.MULTILINE)
     finally:
         stop.set()
         thread.join()

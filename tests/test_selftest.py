@@ -443,10 +443,10 @@ LEFT = ["--side", "left"]
         (["--external", *LEFT, "--dialect", "dex3", "--device", "x"], "for a backend"),
         (["sim-dex1", *LEFT, "--joint", "thumb"], "no joint 'thumb'"),
         (["sim-dex3", *LEFT], "there is no terminal"),
-        (["sim-dex1", *LEFT, "--speed", "2"], "--speed"),
+        (["sim-dex1", *LEFT, "--fraction", "2"], "--fraction"),
         (["ezgripper", *LEFT, "--device", "/dev/ttyUSB0"], "whether the hand is free"),
         (["--external", *LEFT, "--dialect", "unitree_go"], "whether the hand is free"),
-        (["sim-dex1", *LEFT, "--accept-guesses"], "guesses nothing"),
+        (["sim-dex1", *LEFT, "--set", "guesses=accept"], "no setting 'guesses'"),
     ],
 )
 def test_wrong_usage_is_refused_before_anything_moves(arguments: list[str], text: str) -> None:

@@ -213,13 +213,9 @@ class TestArguments:
             (["sim-dex1", "--side", "left", "--set", "colour=red"], "no setting 'colour'"),
             (["sim-dex1", "--side", "left", "--set", "colour"], "not KEY=VALUE"),
             (["sim-dex1", "--side", "left", "--set", "right.start=1"], "only the left"),
-            (
-                ["dex3-usb", "--side", "left", "--usb", "usbip://h", "--set", "left.usb=system"],
-                "different places",
-            ),
             (["sim-dex1", "--side", "left", "--dialect", "dex3"], "has no dialect dex3"),
             (["sim-dex3", "--side", "left", "--dialect", "unitree_go"], "its dialects: dex3"),
-            (["sim-dex1", "--side", "left", "--usb", "usbip://x:1"], "no setting 'usb'"),
+            (["sim-dex1", "--side", "left", "--set", "usb=usbip://x:1"], "no setting 'usb'"),
             (["ezgripper", "--side", "left"], "names none for the left hand"),
             (
                 ["ezgripper", "--side", "both", "--device", "/dev/x"],

@@ -200,7 +200,7 @@ def test_an_episode_beyond_the_recording_is_refused(tmp_path: Path, pick: Path) 
     part = tmp_path / "part.mcap"
     whole = open_trace(pick)
     middle = (int(at[len(at) // 2]) - whole.first_ns) / 1e9
-    assert dexkit("cut", whole.path, part, "--to", middle)[0] == 0
+    assert dexkit("cut", whole.path, part, "--window", f":{middle}")[0] == 0
     code, output = dexkit("import", folder, tmp_path / "m.mcap", "--wire", part)
     assert code == 2
     assert "%" in output

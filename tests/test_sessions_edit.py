@@ -113,32 +113,36 @@ def test_a_phase_is_cut_with_its_record(tmp_path: Path) -> None:
     assert (code, text) == (2, "run.mcap has no phase walk")
 
 
-def test_a_cut_beyond_the_recording_names_the_option_that_is(tmp_path: Path) -> None:
+def test_a_cut_beyond_the_recording_names_the_time_that_is(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    for option, time in (("--from", 100), ("--to", -1000)):
-        code, text = dexkit("cut", PICK, out, option, time)
+    for window, time in (("100:", 100), (":-1000", -1000)):
+        code, text = dexkit("cut", PICK, out, f"--window={window}")
         assert code == 2
-        assert text.startswith(f"{option} {time}: nothing is left, {PICK.name} is ")
-    assert dexkit("cut", PICK, out, "--from", 3, "--to", 3)[1] == "--to must be later than --from"
+        assert text.startswith(f"{time} s: nothing is left, {PICK.name} is ")
+    assert "B must be later than A" in dexkit("cut", PICK, out, "--window", "3:3")[1]
+    for window in ("3", "a:b", "1:nan"):
+        refused = CliRunner().invoke(cli, ["cut", str(PICK), str(out), "--window", window])
+        assert refused.exit_code == 2
+        assert "--window" in refused.output
 
 
 def test_failed_cut_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     for arguments in (
-        ["--from", 1000],
+        ["--window", "1000:"],
         ["--topic", "rt/nothing"],
         ["--phase", "step"],
-        ["--from", 3, "--to", 3],
+        ["--window", "3:3"],
     ):
         code, _ = dexkit("cut", PICK, out, *arguments)
         assert code == 2
         assert not out.exists()
     kept = write(out, b"something else")
     assert dexkit("cut", PICK, out)[0] == 2
-    assert dexkit("cut", PICK, out, "--force", "--from", 1000)[0] == 2
+    assert dexkit("cut", PICK, out, "--overwrite", "--window", "1000:")[0] == 2
     assert kept.read_bytes() == b"something else"
-    assert dexkit("cut", PICK, out, "--force", "--to", 1)[0] == 0
-    assert dexkit("cut", out, out, "--force")[0] == 2
+    assert dexkit("cut", PICK, out, "--overwrite", "--window", ":1")[0] == 0
+    assert dexkit("cut", out, out, "--overwrite")[0] == 2
 
 
 def test_a_damaged_recording_is_cut_as_far_as_it_can_be_read(tmp_path: Path) -> None:

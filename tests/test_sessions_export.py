@@ -122,7 +122,9 @@ def test_damaged_tables_lose_their_rows_only(tmp_path: Path, part: Path) -> None
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 def test_a_bag_gives_the_payloads_back(tmp_path: Path, part: Path, storage: str) -> None:
     out = tmp_path / "bag"
-    code, output = dexkit("export", part, "--to", "rosbag2", "--storage", storage, "--out", out)
+    code, output = dexkit(
+        "export", part, "--to", "rosbag2", "--set", f"storage={storage}", "--out", out
+    )
     assert (code, "publish time" in output) == (0, True)
     with AnyReader([out]) as reader:
         topics = {c.topic for c in reader.connections}
@@ -174,7 +176,7 @@ def test_a_table_with_columns_of_other_types_is_refused(
     assert there == len(open_trace(part).definitions) - 1
 
 
-@each("to", ["csv", "parquet", "rosbag2", "rosbag2 --storage mcap"])
+@each("to", ["csv", "parquet", "rosbag2", "rosbag2 --set storage=mcap"])
 def test_times_after_2262_are_told(tmp_path: Path, to: str) -> None:
     mt = message_type("unitree_hg::msg::dds_::HandState_")
     data = mt.encode(mt.cls())

@@ -56,7 +56,16 @@ def vectors(table: Any, name: str) -> np.ndarray:
 
 def test_every_value_of_a_dataset_is_that_of_the_recording(tmp_path: Path, part: Path) -> None:
     code, output = dexkit(
-        "export", part, "--to", "lerobot", "--out", tmp_path / "d", "--fps", 30, "--task", "pinch"
+        "export",
+        part,
+        "--to",
+        "lerobot",
+        "--out",
+        tmp_path / "d",
+        "--set",
+        "fps=30",
+        "--set",
+        "task=pinch",
     )
     assert code == 0, output
     assert "dq, tau, kp, kd of the commands" in output
@@ -112,7 +121,7 @@ def test_every_value_of_a_dataset_is_that_of_the_recording(tmp_path: Path, part:
 def test_a_task_that_is_no_text_is_escaped(tmp_path: Path, part: Path) -> None:
     out = tmp_path / "d"
     task = b"pick \xff".decode("utf-8", "surrogateescape")  # as the command line has it
-    assert dexkit("export", part, "--to", "lerobot", "--out", out, "--task", task)[0] == 0
+    assert dexkit("export", part, "--to", "lerobot", "--out", out, "--set", f"task={task}")[0] == 0
     tasks = pq.read_table(out / "meta" / "tasks.parquet").to_pylist()
     assert [row["task"] for row in tasks] == ["pick \\udcff"]
 
@@ -158,7 +167,7 @@ def test_no_frame_lies_in_a_gap(tmp_path: Path) -> None:
             assert ages.max() <= 0.1e9 + 1000
         assert np.allclose(np.diff(run.times_ns), 2e7, atol=2)
     code, output = dexkit(
-        "export", trace.path, "--to", "lerobot", "--out", tmp_path / "d", "--fps", 50
+        "export", trace.path, "--to", "lerobot", "--out", tmp_path / "d", "--set", "fps=50"
     )
     assert (code, f"as {len(runs)} episodes" in output) == (1, True)
     info, _ = read(tmp_path / "d")
@@ -179,7 +188,7 @@ def test_pictures_are_taken_over_as_they_are(tmp_path: Path, cameras: int) -> No
             Image.new("RGB", (8 + c, 6), (10 * i, c, 0)).save(out, "PNG")
             made[c, i] = out.getvalue()
             (source / "colors" / f"{i}_{c}.png").write_bytes(made[c, i])
-    for options in ((), ("--embed-pictures",)):
+    for options in ((), ("--set", "embed-pictures=yes")):
         recording = tmp_path / f"r{len(options)}.mcap"
         assert dexkit("import", source, recording, *options)[0] == 0
         out = tmp_path / f"d{len(options)}"
@@ -336,7 +345,16 @@ def test_any_episode_comes_back_as_it_was(
 
 def test_a_recording_becomes_an_episode_that_the_importer_reads(tmp_path: Path, part: Path) -> None:
     code, output = dexkit(
-        "export", part, "--to", "episodes", "--out", tmp_path / "t", "--fps", 30, "--task", "pinch"
+        "export",
+        part,
+        "--to",
+        "episodes",
+        "--out",
+        tmp_path / "t",
+        "--set",
+        "fps=30",
+        "--set",
+        "task=pinch",
     )
     assert code == 0, output
     back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())
@@ -373,7 +391,9 @@ def test_recordings_without_joints_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("lerobot*"))
     assert dexkit("export", tmp_path / "a.mcap", "--to", "csv", "--out", tmp_path / "c")[0] == 0
     assert (
-        dexkit("export", tmp_path / "a.mcap", "--to", "csv", "--out", tmp_path / "d", "--fps", 3)[0]
+        dexkit(
+            "export", tmp_path / "a.mcap", "--to", "csv", "--out", tmp_path / "d", "--set", "fps=3"
+        )[0]
         == 2
     )
 
@@ -411,7 +431,9 @@ def touched(out: Path, *, lost: range = range(0), short: bool = False) -> Path:
 def test_touch_is_in_datasets_and_episodes(tmp_path: Path) -> None:
     source = touched(tmp_path / "a.mcap")
     for form in ("lerobot", "episodes"):
-        code, output = dexkit("export", source, "--to", form, "--out", tmp_path / form, "--fps", 30)
+        code, output = dexkit(
+            "export", source, "--to", form, "--out", tmp_path / form, "--set", "fps=30"
+        )
         assert (code, "rt/inspire_hand/touch" in output) == (0, False), output
     info, table = read(tmp_path / "lerobot")
     names = info["features"]["observation.pressure"]["names"]
@@ -452,7 +474,7 @@ def test_times_after_2262_end_no_export(tmp_path: Path, topic: str) -> None:
     found = document(frames=20)
     found["data"][-1]["extra"] = 1  # kept beside joints and pictures
     source = episode(tmp_path / "e", whole(found), 1, 20)
-    assert dexkit("import", source, tmp_path / "a.mcap", "--embed-pictures")[0] == 0
+    assert dexkit("import", source, tmp_path / "a.mcap", "--set", "embed-pictures=yes")[0] == 0
     trace = open_trace(tmp_path / "a.mcap")
     assert {topic} <= {*trace.topics, ""}
     with RecordingWriter(tmp_path / "b.mcap") as writer:
@@ -463,7 +485,7 @@ def test_times_after_2262_end_no_export(tmp_path: Path, topic: str) -> None:
             writer.put(numbers[m.topic, m.type_name], m.data, stamp, stamp)
         writer.add_metadata(RECORD, trace.metadata[RECORD])
     for form in ("lerobot", "episodes"):
-        for more in ([], ["--fps", 30]):
+        for more in ([], ["--set", "fps=30"]):
             out = tmp_path / f"{form}{len(more)}"
             code, output = dexkit("export", tmp_path / "b.mcap", "--to", form, "--out", out, *more)
             assert code in (0, 1, 2), output

@@ -225,9 +225,9 @@ def test_swapped_states_are_exchanged_and_reported(tmp_path: Path) -> None:
     assert "Inspire" in record["correction 1"]
     left = streams(trace)["left_hand", STATE]
     assert np.array_equal(left.q, positions(good, "states", "left_ee"))
-    for options, text in (((), whole(good)), (("--keep-sides",), whole(bad))):
+    for options, text in (((), whole(good)), (("--set", "keep-sides=yes"), whole(bad))):
         (tmp_path / "e" / "data.json").write_text(text)
-        code, _ = dexkit("import", tmp_path / "e", tmp_path / "e.mcap", "--force", *options)
+        code, _ = dexkit("import", tmp_path / "e", tmp_path / "e.mcap", "--overwrite", *options)
         record = open_trace(tmp_path / "e.mcap").metadata[RECORD]
         assert "correction 1" not in record
         assert (code, "problem 1" in record) == ((1, True) if options else (0, False))
@@ -257,9 +257,9 @@ def test_a_hand_of_an_unknown_model_is_a_group_of_joints(tmp_path: Path) -> None
         item["states"]["left_ee"]["qpos"] = [700.0] * 7
     code, output = dexkit("import", episode(tmp_path / "f", whole(found)), tmp_path / "f.mcap")
     assert (code, "far outside its limits" in output) == (1, True)
-    code, output = dexkit("import", tmp_path / "f", tmp_path / "g.mcap", "--hand", "dex1-1")
+    code, output = dexkit("import", tmp_path / "f", tmp_path / "g.mcap", "--set", "hand=dex1-1")
     assert (code, "which is no dex1-1" in output) == (1, True)
-    assert dexkit("import", tmp_path / "f", tmp_path / "h.mcap", "--hand", "dex9")[0] == 2
+    assert dexkit("import", tmp_path / "f", tmp_path / "h.mcap", "--set", "hand=dex9")[0] == 2
 
 
 def test_pictures_are_referenced_or_embedded(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_pictures_are_referenced_or_embedded(tmp_path: Path) -> None:
     first = next(trace.messages([reference_topic("color_1")]))
     assert json.loads(ros_types.decode_string(first.data)) == {"path": "colors/000000_color_1.jpg"}
     assert trace.metadata[RECORD]["pictures_folder"] == "."
-    code, output = dexkit("import", source, tmp_path / "b.mcap", "--embed-pictures")
+    code, output = dexkit("import", source, tmp_path / "b.mcap", "--set", "embed-pictures=yes")
     assert (code, "neither JPEG nor PNG" in output) == (1, True)
     trace = open_trace(tmp_path / "b.mcap")
     pictures = [
@@ -291,7 +291,7 @@ def test_pictures_elsewhere_are_not_read(tmp_path: Path) -> None:
         item["colors"]["color_2"] = "link.jpg"
     source = episode(tmp_path / "e", whole(found))
     (source / "link.jpg").symlink_to(tmp_path / "secret.jpg")
-    code, output = dexkit("import", source, tmp_path / "e.mcap", "--embed-pictures")
+    code, output = dexkit("import", source, tmp_path / "e.mcap", "--set", "embed-pictures=yes")
     assert code == 1
     assert (output.count("leads out of it"), output.count("through a link")) == (3, 1)
     assert not [t for t in open_trace(tmp_path / "e.mcap").topics if "color" in t]
@@ -468,7 +468,7 @@ def test_names_of_several_models_are_no_hand_unless_one_is_named(tmp_path: Path)
     assert {s.model for s in streams_of(open_trace(tmp_path / "a.mcap"))} == {""}
     for hand, rounded in (("inspire-dfx", False), ("inspire-ftp", True)):
         out = tmp_path / f"{hand}.mcap"
-        code, output = dexkit("import", source, out, "--hand", hand)
+        code, output = dexkit("import", source, out, "--set", f"hand={hand}")
         assert code == 0, output
         assert ("is rounded to the whole numbers of" in output) == rounded
         got = streams(open_trace(out))
@@ -912,7 +912,7 @@ def test_check_reads_bags_of_every_kind(tmp_path: Path, kind: str) -> None:
         (source / "metadata.yaml").write_text(text)
     elif kind == "packed":
         (source,) = source.glob("*.mcap")
-    result = CliRunner().invoke(cli, ["check", str(source), "--json", str(tmp_path / "r.json")])
+    result = CliRunner().invoke(cli, ["check", str(source), "--result", str(tmp_path / "r.json")])
     assert result.exit_code == 0, result.output
     seconds = json.loads((tmp_path / "r.json").read_text())["duration_s"]
     assert seconds > 1.5  # of both halves

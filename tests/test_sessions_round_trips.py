@@ -42,7 +42,7 @@ def imported(folder: Path, hand: str, sides: tuple[Side, ...] = BOTH) -> Path:
         for key in ("states", "actions"):
             item[key] = {n: v for n, v in item[key].items() if n.startswith(sides)}
     source = episode(folder / "e", streamed(found))
-    code, output = dexkit("import", source, folder / "a.mcap", "--hand", hand)
+    code, output = dexkit("import", source, folder / "a.mcap", "--set", f"hand={hand}")
     assert code == 0, output
     return folder / "a.mcap"
 
@@ -70,7 +70,7 @@ def test_a_hand_comes_back_as_the_same_messages(
             "import",
             tmp_path / form,
             tmp_path / f"{form}.mcap",
-            *(("--hand", hand) if form == "episodes" else ()),
+            *(("--set", f"hand={hand}") if form == "episodes" else ()),
         )
         assert code == 0, output
         assert messages(tmp_path / f"{form}.mcap") == expected, form

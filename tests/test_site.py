@@ -8,12 +8,8 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from dexkit.cli import cli
 from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.result_file import write_json
-from tests.report_helpers import result_of_every_kind
 from tools.site import hooks
 
 ROOT = Path(__file__).parent.parent
@@ -83,19 +79,3 @@ def test_ids_of_requirements_become_links() -> None:
     )
     for text in ("# DEX1-RATE-01", "[DEX1-RATE-01](x.md)", "DEX1-RATE-99"):
         assert hooks.requirement_links(text, "page.md") == text
-
-
-def test_reports_link_to_the_pages_of_requirements(tmp_path: Path) -> None:
-    result = tmp_path / "result.json"
-    write_json(result_of_every_kind("a"), result)
-    out = tmp_path / "report.html"
-    arguments = ["report", str(result), "--html", str(out), "--catalogue"]
-    done = CliRunner().invoke(cli, [*arguments, "https://example.org/requirements/"])
-    assert done.exit_code == 0, done.output
-    found = re.findall(r'href="https://example.org/requirements/([^"]+)"', out.read_text())
-    assert found
-    assert {Path(name).stem for name in found} <= {
-        r.id for layer in ("dds", "robot", "usb", "client") for r in catalogue(layer=layer)
-    }
-    refused = CliRunner().invoke(cli, [*arguments, "javascript:alert(1)"])
-    assert refused.exit_code == 2

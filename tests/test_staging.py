@@ -386,7 +386,7 @@ def test_a_name_with_a_slash_at_its_end_is_no_file(tmp_path: Path, session: Path
     out = tmp_path / "out.html"
     for arguments in (
         ["info", str(session), "--html", f"{out}/"],
-        ["check", str(session), "--json", f"{out}/"],
+        ["check", str(session), "--result", f"{out}/"],
         ["check", str(session), "--junit", f"{out}/"],
         ["cut", str(session), f"{out}/"],
         ["record", f"{out}/"],

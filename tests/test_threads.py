@@ -87,9 +87,9 @@ def test_worker_that_returns_raises_nothing() -> None:
 # -- each program ----------------------------------------------------------------------------------
 
 SERVE = ("serve", "sim-dex1", "--side", "left", "--quiet", "--domain")
-BRIDGE = ("bridge", "--from", "unitree_actuator", "--to", "unitree_go", "--domain")
+BRIDGE = ("bridge", "unitree_actuator", "unitree_go", "--domain")
 RECORD = ("record", "OUT", "--topic", STATE, "--domain")
-ROBOT = ("emulate", "g1", "--quiet", "--domain")
+ROBOT = ("emulate", "g1", "--domain")
 
 # (command, whose method dies, method)
 PROGRAMS: list[tuple[tuple[str, ...], type, str]] = [

@@ -216,7 +216,7 @@ def test_record_keeps_an_existing_file(tmp_path: Path) -> None:
     out = write(tmp_path / "out.mcap", b"precious")
     done = run("record", out, "--duration", "1", "--domain", free_domain())
     assert done.returncode == 2
-    assert "--force" in done.stderr
+    assert "--overwrite" in done.stderr
     assert out.read_bytes() == b"precious"
 
 

@@ -165,7 +165,7 @@ def opened(session: SessionFile, most: int) -> Iterator[tuple[Path, OpenFile | N
                 raise TooLarge(
                     f"it has {source.size} bytes, more than can be copied, and its server does "
                     "not give parts of it",
-                    hint="--max-size",
+                    hint="copy it to this machine",
                 )
             for piece in source.pieces():
                 digest.update(piece)
@@ -178,7 +178,7 @@ def opened(session: SessionFile, most: int) -> Iterator[tuple[Path, OpenFile | N
             for piece in source.pieces():
                 size += len(piece)
                 if size > most:
-                    raise TooLarge(f"it has more than {most} bytes", hint="--max-size")
+                    raise TooLarge(f"it has more than {most} bytes", hint="copy it to this machine")
                 digest.update(piece)
                 copy.write(piece)
         yield path, None, digest.hexdigest()

@@ -14,9 +14,9 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     FILE,
+    OUTPUT_FILE,
     dialect_option,
     jobs_option,
-    json_file_option,
     list_option,
     require_option,
     seed_option,
@@ -130,7 +130,9 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     "--from", "source", metavar="FILE_OR_MODULE", help="Try the hands of a Python file or module."
 )
 @list_option("Only list the hands, with model, requirement and sides.")
-@json_file_option("Write the score as JSON.")
+@click.option(
+    "--json", "json_path", type=OUTPUT_FILE, metavar="FILE", help="Write the score as JSON."
+)
 @jobs_option()
 @verbose_option("Print the fault of every wrong hand.")
 def command(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import Number, jobs_option, out_option, quiet_option
+from dexkit.cli.options import Number, jobs_option, out_option
 from dexkit.cli.status_line import StatusLine
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
@@ -35,9 +35,9 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
 )
 @click.argument("locations", nargs=-1, required=True, metavar="PATH|URL...")
 @out_option(
-    "audit-out", "Folder for journal, tables and page. Results of unchanged files are reused."
+    "Folder for journal, tables and page. Results of unchanged files are reused.",
+    "audit-out",
 )
-@click.option("--fresh", is_flag=True, help="Judge all files again.")
 @click.option(
     "--fail-on",
     type=click.Choice(_FAIL_ON),
@@ -52,14 +52,6 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     default="auto",
     show_default=True,
     help="Format of the tables; auto is Parquet if pyarrow is installed.",
-)
-@click.option(
-    "--label",
-    "labels",
-    multiple=True,
-    metavar="KEY",
-    help="Group sessions also by this key of their metadata, in addition to robot, operator, task "
-    "and site; may be repeated.",
 )
 @jobs_option()
 @click.option(
@@ -86,29 +78,15 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     metavar="MIB",
     help="Memory for one file.",
 )
-@click.option(
-    "--max-size",
-    type=click.IntRange(1, 2**24),
-    default=8192,
-    show_default=True,
-    metavar="MIB",
-    help="Largest object of a URL that is copied to the temporary folder; larger ones are read in "
-    "place by range requests, several times.",
-)
-@quiet_option()
 def command(
     locations: tuple[str, ...],
     out: Path,
-    fresh: bool,
     fail_on: str,
     table_format: str,
-    labels: tuple[str, ...],
     jobs: int | None,
     ray: str | None,
     timeout: float,
     memory: int,
-    max_size: int,
-    quiet: bool,
 ) -> None:
     """Judge every recorded session (mcap file) in folders or behind URLs, as 'dexkit check' does.
 
@@ -126,20 +104,19 @@ def command(
         raise click.UsageError(
             "--jobs counts processes on this machine; it cannot be combined with --ray"
         )
-    limits = Limits(seconds=timeout, memory=memory * 2**20, max_size=max_size * 2**20)
+    limits = Limits(seconds=timeout, memory=memory * 2**20)
     audit = Audit(
         locations,
         out.absolute(),
-        labels=[*LABELS, *labels],
+        labels=LABELS,
         limits=limits,
-        fresh=fresh,
         parquet=None if table_format == "auto" else table_format == "parquet",
         working_folder=Path.cwd(),
     )
     # Python's worker processes begin with the working folder in front of their import path
     os.chdir("/")
     runner = limits.pool(jobs) if ray is None else Cluster(ray, limits).run
-    status = StatusLine(quiet)
+    status = StatusLine(quiet=False)
     last = 0.0
 
     def progress(outcome: AuditProgress) -> None:

@@ -9,7 +9,6 @@ import click
 from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
-    grade_option,
     output_option,
 )
 from dexkit.cli.report import write_text
@@ -25,24 +24,18 @@ from dexkit.documents import check_output_paths
 )
 @click.argument("result", type=LocalPath(exists=True), metavar="RESULT.json")
 @output_option("FILE.svg", "Where to write it; - prints it.", "badge.svg")
-@grade_option(
-    "Draw only the badge of this grade. The drop-in badge is never drawn alone if safety failed.  "
-    "[default: both, side by side]"
-)
-def command(result: Path, output: Path, grade: str | None) -> None:
+def command(result: Path, output: Path) -> None:
     """Draw the badges of a result: drop-in and safety.
 
     A badge says if the hand was emulated, simulated or only recorded, and how many requirements
     could not be judged.
     """
     from dexkit.conformance.report.badge import badge_text, badges, render_badge
-    from dexkit.conformance.requirements import Kind
     from dexkit.conformance.result_file import read_json
 
     check_output_paths([output], [result])
     found = read_json(result)
-    kind = None if grade is None else Kind(grade)
-    write_text(output, render_badge(found, kind))
+    write_text(output, render_badge(found))
     if str(output) != "-":
-        for drawn in badges(kind, found):
+        for drawn in badges(None, found):
             click.echo(f"{output}: {' | '.join(badge_text(found, drawn))}")

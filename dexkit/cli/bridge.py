@@ -6,7 +6,7 @@ import logging
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import click
@@ -15,11 +15,8 @@ from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     DOMAIN,
     dds_options,
-    duration_option,
     force_option,
     found_interface,
-    quiet_option,
-    real_time_option,
     side_option,
 )
 from dexkit.cli.status_line import MOST_REMARKS, log_to_stderr
@@ -50,8 +47,8 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
         1: "it failed while it ran, or another program publishes the same topics",
     },
 )
-@click.option("--from", "source", type=_DIALECTS, required=True, help="Dialect of the client.")
-@click.option("--to", "target", type=_DIALECTS, required=True, help="Dialect of the gripper.")
+@click.argument("client", type=_DIALECTS, metavar="CLIENT")
+@click.argument("gripper", type=_DIALECTS, metavar="GRIPPER")
 @side_option("Grippers to translate for.", default="both")
 @dds_options()
 @click.option(
@@ -64,30 +61,26 @@ _DIALECTS = click.Choice([d.name for d in DEX1_1.dialects])
     metavar="IF",
     help="Network interface of the gripper.  [default: that of the client]",
 )
-@duration_option()
 @force_option()
-@real_time_option()
-@quiet_option()
 def command(
-    source: str,
-    target: str,
+    client: str,
+    gripper: str,
     sides: tuple[Side, ...],
     domain: int,
     interface: str,
     to_domain: int | None,
     to_interface: str | None,
-    duration: float | None,
     force: bool,
-    real_time: bool,
-    quiet: bool,
 ) -> int:
     """Translate between Dex1 dialects: commands from a client to a Dex1-1, and states back.
 
+    CLIENT and GRIPPER are the dialects of the two sides.
+
     \b
     client xr_teleoperate v1.1 (--sim), gripper with today's service:
-      dexkit bridge --from unitree_actuator --to unitree_go
+      dexkit bridge unitree_actuator unitree_go
     today's client on domain 1, gripper of the DDS specification on the robot:
-      dexkit bridge --from unitree_go --to unitree_hg --to-domain 0 --to-interface eth0
+      dexkit bridge unitree_go unitree_hg --to-domain 0 --to-interface eth0
 
     Prints "ready: ..." when the topics are up. No message is repeated: when the client stops, the
     gripper gets no commands and brakes (docs/bridge.md).
@@ -95,15 +88,15 @@ def command(
     from dexkit.bridge import Bridge, BridgeEnd
     from dexkit.dds import DdsNode
 
-    status = sys.stderr.isatty() and not quiet
-    log_to_stderr(quiet, status, "dexkit.bridge.counters")
+    status = sys.stderr.isatty()
+    log_to_stderr(False, status, "dexkit.bridge.counters")
     far_domain = domain if to_domain is None else to_domain
     far_interface = interface
     if to_interface is not None:
         far_interface = found_interface(click.get_current_context(), to_interface)
     with (
         # before any thread is started: they inherit it
-        real_time_priority() if real_time else nullcontext(True),
+        real_time_priority(),
         stop_on_signals() as stop,
         ExitStack() as nodes,
     ):
@@ -112,8 +105,8 @@ def command(
         if (far_domain, far_interface) != (domain, interface):
             far = nodes.enter_context(DdsNode(domain=far_domain, interface=far_interface))
         bridge = Bridge(
-            BridgeEnd(near, dialect(source)),
-            BridgeEnd(far, dialect(target)),
+            BridgeEnd(near, dialect(client)),
+            BridgeEnd(far, dialect(gripper)),
             sides=sides,
             force=force,
         )
@@ -124,7 +117,7 @@ def command(
                 f"{' and '.join(map(str, bridge.sides))}"
             )
             sys.stdout.flush()
-            trouble = _watch(bridge, stop, duration, status, force)
+            trouble = _watch(bridge, stop, status, force)
         bridge.log_counters()
     if isinstance(bridge.failure, TopicConflict):
         raise bridge.failure
@@ -135,22 +128,15 @@ def command(
     return 0
 
 
-def _watch(
-    bridge: Bridge, stop: StopRequest, duration: float | None, status: bool, force: bool
-) -> str | None:
-    """Print a status line and hints, until asked to stop or time is up.
+def _watch(bridge: Bridge, stop: StopRequest, status: bool, force: bool) -> str | None:
+    """Print a status line and hints, until asked to stop.
 
     :returns: the program that started and made the bridge a loop; then the bridge ends, too.
     """
     started = time.monotonic()
     logged: set[str] = set()
     rates = _rates(bridge)
-    while not stop:
-        left = None if duration is None else started + duration - time.monotonic()
-        if left is not None and left <= 0:
-            break
-        if stop.wait(_STATUS_PERIOD if left is None else min(left, _STATUS_PERIOD)):
-            break
+    while not stop.wait(_STATUS_PERIOD):
         if bridge.failure is not None:
             break
         if not force and (found := bridge.reverse_bridge()):

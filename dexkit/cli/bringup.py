@@ -22,7 +22,6 @@ from dexkit.cli.options import (
     device_option,
     dry_run_option,
     side_option,
-    usb_option,
 )
 from dexkit.cli.remarks import remark
 from dexkit.cli.settings import key_and_value, set_option
@@ -51,7 +50,6 @@ _LOST_ANSWERS = 3
 @side_option("Hand to bring up.", required=True)
 @device_option("Serial number, address or port of the device.")
 @set_option("Setting of the backend, e.g. config=FILE; 'dexkit backends' lists the settings.")
-@usb_option("USB hand")
 @click.option(
     "--torque",
     type=Number(0.01, 3.0),
@@ -88,7 +86,6 @@ def command(
     sides: tuple[Side, ...],
     device: str | None,
     settings: tuple[str, ...],
-    usb: str | None,
     torque: float | None,
     speed: float | None,
     dry_run: bool,
@@ -114,8 +111,7 @@ def command(
         raise UsageError(
             f"the backend {backend_name} has no bring-up", hint=f"these have: {', '.join(having)}"
         )
-    texts = _settings(settings, usb)
-    options = BackendOptions(sides[0], device, texts)
+    options = BackendOptions(sides[0], device, _settings(settings))
     options.refuse_unknown(kind.settings)
     bench: Bench = kind.bringup.load()(options)
     effort = Effort.from_plan(bench.plan, torque, speed)
@@ -145,9 +141,9 @@ def command(
         documents.write_file(save_answers, json.dumps(session.findings.answers, indent=2) + "\n")
 
 
-def _settings(texts: tuple[str, ...], usb: str | None) -> dict[str, str]:
-    values = {}
-    for text in (*texts, *([] if usb is None else [f"usb={usb}"])):
+def _settings(texts: tuple[str, ...]) -> dict[str, str]:
+    values: dict[str, str] = {}
+    for text in texts:
         key, value = key_and_value(text)
         if key in values:
             raise UsageError(f"{key} is given twice")

@@ -43,6 +43,12 @@ from dexkit.wire import mx64
 
 __all__ = ["command"]
 
+_HIGHEST_ID = 252
+_HIGHEST_BAUDRATE = 12_000_000
+_RUNS = 3
+"""Strokes each way for the speed."""
+_MOST_CLOSING = 60.0
+_LEAST_FORCE = 10.0
 _FORCE_EFFORTS = (10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 80.0)
 """Percent, as far as they are below the most that is asked for."""
 
@@ -50,32 +56,41 @@ _FORCE_EFFORTS = (10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 80.0)
 class _NumberOrAuto(click.ParamType):  # type: ignore[type-arg]
     name = "N|auto"
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> object:
         if value == "auto" or isinstance(value, int):
             return value
-        if re.fullmatch("[0-9]{1,9}", str(value)) and int(str(value)) <= self._most:
+        if re.fullmatch("[0-9]{1,9}", str(value)) and int(str(value)) <= _HIGHEST_BAUDRATE:
             return int(str(value))
         self.fail(
-            f"{one_line(value, 40)!r} is neither a number from 0 to {self._most} nor 'auto'",
+            f"{one_line(value, 40)!r} is neither a number up to {_HIGHEST_BAUDRATE} nor 'auto'",
             param,
             ctx,
         )
 
 
 class _Ids(click.ParamType):  # type: ignore[type-arg]
-    name = "N,N"
+    """One or two servo ids as a tuple, or ``auto``."""
+
+    name = "N[,N]|auto"
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> object:
-        if re.fullmatch("[0-9]{1,3},[0-9]{1,3}", str(value)):
-            return tuple(int(part) for part in str(value).split(","))
-        self.fail(f"{one_line(value, 40)!r} is not two servo ids, such as 1,2", param, ctx)
+        if value == "auto" or isinstance(value, tuple):
+            return value
+        words = str(value).split(",")
+        if len(words) <= 2 and all(
+            re.fullmatch("[0-9]{1,3}", word) and int(word) <= _HIGHEST_ID for word in words
+        ):
+            return tuple(map(int, words))
+        self.fail(
+            f"{one_line(value, 40)!r} is neither a servo id up to {_HIGHEST_ID}, nor two (1,2), "
+            "nor 'auto'",
+            param,
+            ctx,
+        )
 
 
 @click.command(
@@ -94,55 +109,37 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
 )
 @click.option(
     "--id",
-    "servo_id",
-    type=_NumberOrAuto(252),
-    default=1,
-    show_default=True,
-    help="Servo id, or auto.",
-)
-@click.option(
-    "--ids",
+    "ids",
     type=_Ids(),
-    metavar="N,N",
-    help="Instead of --id: the two servos of a quad gripper. Each is calibrated alone, the other "
-    "one limp or held open.",
+    default="1",
+    show_default=True,
+    metavar="N[,N]|auto",
+    help="Servo id, or auto; N,N are the two servos of a quad gripper. Each of them is calibrated "
+    "alone, the other one limp or held open.",
 )
 @click.option(
     "--baudrate",
-    type=_NumberOrAuto(12_000_000),
+    type=_NumberOrAuto(),
     default=1_000_000,
     show_default=True,
     help="Bits per second, or auto to try the known rates.",
 )
 @click.option(
+    "--measure",
+    type=click.Choice(["zero", "speed", "distances", "force"]),
+    default="zero",
+    show_default=True,
+    help="The zero; with speed also the speed, at full effort; with distances also moves of "
+    "several distances, whose overhead is printed; or only the force table, with a gauge.",
+)
+@click.option(
     "--effort",
-    type=Number(5, 60),
-    default=calibration.EFFORT,
-    show_default=True,
-    help="Effort while searching the closed position, percent.",
-)
-@click.option("--speed", is_flag=True, help="Also measure the speed, at full effort.")
-@click.option(
-    "--runs",
-    type=click.IntRange(1, 20),
-    default=3,
-    show_default=True,
-    help="Strokes each way for --speed.",
-)
-@click.option(
-    "--distances",
-    is_flag=True,
-    help="With --speed: also time moves of several distances, and print the overhead of a move.",
-)
-@click.option("--force", is_flag=True, help="Measure the force table with a gauge instead.")
-@click.option(
-    "--up-to",
-    type=Number(10, 100),
-    default=ControlSettings().effort,
-    show_default=True,
+    type=Number(5, 100),
     metavar="PCT",
-    help="With --force: the largest effort, as in 'serve --set effort=PCT'. A higher effort heats "
-    "the motor more while the gauge is read.",
+    help=f"Effort while searching the closed position, at most {_MOST_CLOSING:g}  "
+    f"[default: {calibration.EFFORT:g}]; of a force table the largest effort, as in 'serve --set "
+    f"effort=PCT', at least {_LEAST_FORCE:g}  [default: {ControlSettings().effort:g}]. A higher "
+    "effort heats the motor more.",
 )
 @click.option(
     "--set-baudrate",
@@ -163,22 +160,17 @@ def command(
     gripper: str,
     device: str | None,
     side: str | None,
-    servo_id: int | str,
-    ids: tuple[int, ...] | None,
+    ids: tuple[int, ...] | str,
     baudrate: int | str,
-    effort: float,
-    speed: bool,
-    runs: int,
-    distances: bool,
-    force: bool,
-    up_to: float,
+    measure: str,
+    effort: float | None,
     set_baudrate: str | None,
     config: Path | None,
     dry_run: bool,
     yes: bool,
     show: bool,
 ) -> None:
-    """Measure and store a gripper's zero and, with --speed, its speed.
+    """Measure and store a gripper's zero, its speed or its force table.
 
     The gripper MOVES: it closes until it is stopped, then opens. It must be empty and free. The
     result is stored under the adapter's USB serial number (without one, under its path), so that it
@@ -206,18 +198,21 @@ def command(
         )
     if device is None:
         device = stored_device(store, Side(side))
-    if distances and (force or not speed):
-        raise UsageError("--distances is for --speed", hint="give both: --speed --distances")
-    if ids is not None:
-        if ctx.get_parameter_source("servo_id") is not click.core.ParameterSource.DEFAULT:
-            raise UsageError("give --id of one servo, or --ids of two, not both")
-        for option, given in (("--force", force), ("--set-baudrate", set_baudrate)):
-            if given:
-                raise UsageError(f"{option} is for one servo at a time", hint="give --id")
+    force = measure == "force"
+    if effort is None:
+        effort = ControlSettings().effort if force else calibration.EFFORT
+    if force and effort < _LEAST_FORCE:
+        raise UsageError(f"--effort {effort:g}: a force table needs {_LEAST_FORCE:g} or more")
+    if not force and effort > _MOST_CLOSING:
+        raise UsageError(f"--effort {effort:g}: the gripper closes with at most {_MOST_CLOSING:g}")
+    pair = not isinstance(ids, str) and len(ids) == 2
+    for option, given in (("--measure force", force), ("--set-baudrate", set_baudrate)):
+        if pair and given:
+            raise UsageError(f"{option} is for one servo at a time", hint="give --id N")
     console = Console()
     configuration = GripperSettings(
-        id=servo_id if isinstance(servo_id, int) else None,
-        ids=ids or (),
+        id=None if isinstance(ids, str) else ids[0],
+        ids=ids if pair and not isinstance(ids, str) else (),
         baudrate=baudrate if isinstance(baudrate, int) else None,
         config=config,
     )
@@ -244,7 +239,7 @@ def command(
                 servo = unit.servo
                 console.print(f"servo {servo.id} on {servo.bus.path} is set up; key {unit.key}")
                 if force:
-                    table = _force(hand, servo, console, stop, up_to)
+                    table = _force(hand, servo, console, stop, effort)
                     records[unit.key] = GripperRecord(force_table=table)
                 else:
                     records[unit.key] = _zero_and_speed(
@@ -252,9 +247,8 @@ def command(
                         console,
                         stop,
                         effort,
-                        runs if speed else 0,
+                        measure,
                         stroke=unit.stroke,
-                        distances=distances,
                     )
         except calibration.CalibrationFailed:
             if stop:
@@ -284,10 +278,9 @@ def _zero_and_speed(
     console: Console,
     stop: StopRequest,
     effort: float,
-    runs: int,
+    measure: str,
     *,
     stroke: int,
-    distances: bool,
 ) -> GripperRecord:
     def progress(text: str) -> None:
         console.print(text)
@@ -299,13 +292,13 @@ def _zero_and_speed(
         servo, stroke=stroke, effort=effort, progress=progress, cancelled=cancelled
     )
     console.print(f"zero: {zero} ticks")
-    if not runs:
+    if measure == "zero":
         return GripperRecord(zero=zero)
     result = calibration.measure_speed(
-        servo, zero, stroke=stroke, runs=runs, progress=progress, cancelled=cancelled
+        servo, zero, stroke=stroke, runs=_RUNS, progress=progress, cancelled=cancelled
     )
     console.print(f"speed: opens {result.opening:.0f} %/s, closes {result.closing:.0f} %/s")
-    if distances:
+    if measure == "distances":
         ways = calibration.measure_distances(
             servo, zero, stroke=stroke, progress=progress, cancelled=cancelled
         )
@@ -323,7 +316,7 @@ def _force(
     zero = hand.record.zero
     if zero is None:
         raise UsageError(
-            "the zero is not known yet", hint="run 'dexkit calibrate' without --force first"
+            "the zero is not known yet", hint="run 'dexkit calibrate' without --measure first"
         )
     points = [(0.0, 0.0)]
     for effort in (*(e for e in _FORCE_EFFORTS if e < up_to), up_to):

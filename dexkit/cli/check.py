@@ -16,12 +16,12 @@ from dexkit.cli.options import (
     dialect_option,
     grade_option,
     html_option,
-    json_file_option,
     junit_option,
     level_option,
     list_option,
     prefix_option,
     require_option,
+    result_option,
     side_option,
     verbose_option,
 )
@@ -77,7 +77,7 @@ _MOST = 40
     help="Judge again and compare with this result, without any other option.",
 )
 @list_option(option_texts.LIST)
-@json_file_option(option_texts.RESULT)
+@result_option(option_texts.RESULT)
 @junit_option()
 @html_option()
 @verbose_option("Also print what could not be judged, and why.")
@@ -92,7 +92,7 @@ def command(
     capabilities: Path | None,
     against: Path | None,
     list_only: bool,
-    json_path: Path | None,
+    result_path: Path | None,
     junit_path: Path | None,
     html_path: Path | None,
     verbose: bool,
@@ -121,7 +121,7 @@ def command(
     from dexkit.digests import sha256_of_file
     from dexkit.traces.sessions.judgeable import judgeable
 
-    check_output_paths([json_path, junit_path, html_path], [recording, capabilities])
+    check_output_paths([result_path, junit_path, html_path], [recording, capabilities])
     view, model_name, also = None, None, ""
     if dialect != "auto":
         model_name = dialect if dialect in ROBOTS else DIALECTS[dialect].model
@@ -166,10 +166,10 @@ def command(
     print_result(result, console, verbose=verbose, more="-v shows why")
     if also:
         console.print(also)
-    if json_path:
+    if result_path:
         from dexkit.conformance.result_file import write_json
 
-        write_json(result, json_path)
+        write_json(result, result_path)
     if junit_path:
         from dexkit.conformance.report.junit import write_junit
 

@@ -11,7 +11,6 @@ from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
     html_option,
-    markdown_option,
 )
 from dexkit.cli.report import recording_beside, write_text
 from dexkit.digests import sha256_of_file
@@ -39,9 +38,8 @@ if TYPE_CHECKING:
     metavar="A.json B.json ...",
 )
 @html_option()
-@markdown_option(default="print it")
-def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Path | None) -> None:
-    """Compare results of several hands, or of several versions of one.
+def command(results: tuple[Path, ...], html_path: Path | None) -> None:
+    """Compare results of several hands, or of several versions of one; prints Markdown.
 
     Runs of the same hand (its name in capabilities.toml, else the backend) are compared in order of
     time; a worse verdict is listed as a regression. The page also shows the curves of their
@@ -57,16 +55,16 @@ def command(results: tuple[Path, ...], html_path: Path | None, markdown_path: Pa
     if other := [path for path in results if path.suffix in (".mcap", ".bag", ".db3")]:
         raise UsageError(
             f"{other[0]} is a recording, not a result",
-            hint="dexkit diff A B compares two recordings; dexkit check RECORDING --json FILE "
+            hint="dexkit diff A B compares two recordings; dexkit check RECORDING --result FILE "
             "writes the result of one",
         )
-    check_output_paths([html_path, markdown_path], results)
+    check_output_paths([html_path], results)
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
     if html_path:
         write_text(html_path, render_comparison(comparison, _curves(comparison, results)))
         click.echo(f"report: {html_path}", err=True)
-    if markdown_path or not html_path:
-        write_text(markdown_path or Path("-"), render_comparison_markdown(comparison))
+    else:
+        click.echo(render_comparison_markdown(comparison), nl=False)
     regressions = comparison.regressions
     if regressions:
         names = ", ".join(dict.fromkeys(c.requirement.id for c in regressions))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,12 +11,31 @@ from dexkit.cli.command_help import Command
 from dexkit.cli.options import FILE, OUTPUT_FILE, Number, overwrite_option, topic_option
 from dexkit.cli.remarks import remarks
 from dexkit.errors import UsageError
+from dexkit.escaping import one_line
 
 if TYPE_CHECKING:
     from dexkit.traces import Trace
     from dexkit.traces.sessions.edit import Metadata, Span
 
 __all__ = ["command"]
+
+
+class _Window(click.ParamType):  # type: ignore[type-arg]
+    name = "A:B"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float | None, float | None]:
+        if isinstance(value, tuple):
+            return value
+        begin, colon, end = str(value).partition(":")
+        if not colon:
+            self.fail(f"{one_line(value, 40)!r} is not A:B, such as 2.5:8, 2.5: or :-1", param, ctx)
+        seconds = Number()
+        return (
+            seconds.convert(begin, param, ctx) if begin else None,
+            seconds.convert(end, param, ctx) if end else None,
+        )
 
 
 @click.command(
@@ -31,18 +50,11 @@ __all__ = ["command"]
 @click.argument("file", type=FILE)
 @click.argument("out", type=OUTPUT_FILE)
 @click.option(
-    "--from",
-    "begin",
-    type=Number(),
-    metavar="S",
-    help="Cut from S seconds after the start of the recording.",
-)
-@click.option(
-    "--to",
-    "end",
-    type=Number(),
-    metavar="S",
-    help="Cut to S seconds after the start of the recording.",
+    "--window",
+    type=_Window(),
+    default=(None, None),
+    metavar="A:B",
+    help="Cut from A to B seconds after the start of the recording; either may be left out.",
 )
 @click.option(
     "--phase",
@@ -50,14 +62,6 @@ __all__ = ["command"]
     multiple=True,
     metavar="NAME",
     help="The phases of that name of a conformance run; may be repeated.",
-)
-@click.option(
-    "--margin",
-    type=Number(min=0),
-    default=0.0,
-    show_default=True,
-    metavar="S",
-    help="Seconds to keep before and after each phase.",
 )
 @click.option(
     "--stretch",
@@ -70,13 +74,11 @@ __all__ = ["command"]
 def command(
     file: Path,
     out: Path,
-    begin: float | None,
-    end: float | None,
+    window: tuple[float | None, float | None],
     phases: tuple[str, ...],
-    margin: float,
     stretch: int | None,
     topics: tuple[str, ...],
-    force: bool,
+    overwrite: bool,
 ) -> int:
     """Write a part of the recording FILE to OUT.
 
@@ -87,7 +89,7 @@ def command(
     from dexkit.traces.sessions.edit import cut
 
     trace = open_trace(file)
-    spans, metadata = _spans(trace, begin, end, phases, margin)
+    spans, metadata = _spans(trace, *window, phases)
     written = cut(
         trace,
         out,
@@ -95,7 +97,7 @@ def command(
         topics=topics or None,
         stretch=None if stretch is None else stretch - 1,
         metadata=metadata,
-        overwrite=force,
+        overwrite=overwrite,
     )
     remarks("warning", trace.warnings)
     if trace.attachments:
@@ -109,7 +111,6 @@ def _spans(
     begin: float | None,
     end: float | None,
     phases: tuple[str, ...],
-    margin: float,
 ) -> tuple[list[Span], Metadata]:
     """The times to keep, and the metadata without phases that are not whole in them."""
     from dexkit.conformance.stimulus_record import RECORD, Stimulus
@@ -119,25 +120,21 @@ def _spans(
     first, last = trace.first_ns, trace.last_ns + 1
     low = first if begin is None else _instant(trace, begin)
     high = last if end is None else _instant(trace, end)
-    for option, seconds, outside in (
-        ("--from", begin, low >= last),
-        ("--to", end, high <= first),
-    ):
+    for seconds, outside in ((begin, low >= last), (end, high <= first)):
         if seconds is not None and outside:
             raise UsageError(
-                f"{option} {seconds:g}: nothing is left, {trace.path.name} is "
-                f"{trace.duration:g} s long",
+                f"{seconds:g} s: nothing is left, {trace.path.name} is {trace.duration:g} s long",
                 hint="times count from the first message, negative ones from the last",
             )
     if high <= low:
-        raise UsageError("--to must be later than --from")
+        raise UsageError("--window A:B: B must be later than A")
     spans = [Span(low, high)]
     stimulus = Stimulus.from_metadata(trace.metadata[RECORD]) if RECORD in trace.metadata else None
     if phases:
         if stimulus is None:
             raise UsageError(
                 f"{trace.path.name} has no phases: it was not recorded by a conformance run",
-                hint="name times with --from and --to",
+                hint="name times with --window",
             )
         known = [p for p in stimulus.phases if p.end_ns]
         if missing := set(phases) - {p.name for p in known}:
@@ -145,15 +142,10 @@ def _spans(
                 f"{trace.path.name} has no phase {', '.join(sorted(missing))}",
                 hint=f"it has: {', '.join(dict.fromkeys(p.name for p in known))}",
             )
-        extra = round(margin * 1e9)
-        limits = [
-            (max(p.begin_ns - extra, low), min(p.end_ns + extra, high))
-            for p in known
-            if p.name in phases
-        ]
+        limits = [(max(p.begin_ns, low), min(p.end_ns, high)) for p in known if p.name in phases]
         spans = [Span(b, e) for b, e in limits if e > b]
         if not spans:
-            raise UsageError(f"no phase {', '.join(phases)} lies between --from and --to")
+            raise UsageError(f"no phase {', '.join(phases)} lies in the window")
     if stimulus is None:
         return spans, trace.metadata
     stimulus.phases = [

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import domain_option, out_option, view_option
+from dexkit.cli.options import out_option, view_option
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
 from dexkit.stop_signals import stop_on_signals
@@ -36,16 +36,15 @@ _INTRO = (
         2: "they could not be judged",
     },
 )
-@out_option("demo-out", "Where to write report.html, recording.mcap and result.json.")
+@out_option("Where to write report.html, recording.mcap and result.json.", "demo-out")
 @click.option(
     "--backend",
     default="ezgripper",
     show_default=True,
     help="Backend to demonstrate, with an emulated device.",
 )
-@domain_option("DDS domain.  [default: a free one]")
 @view_option()
-def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
+def command(out: Path, backend: str, view: bool) -> None:
     """Run the conformance suite on two emulated EZGrippers; takes about 90 seconds.
 
     Traffic stays on this machine, on a DDS domain of its own.
@@ -57,7 +56,6 @@ def command(out: Path, backend: str, domain: int | None, view: bool) -> None:
     out.mkdir(parents=True, exist_ok=True)
     options = SuiteOptions.make(
         backend=backend,
-        domain=domain,
         json=out / "result.json",
         report=out / "report.html",
         recording=out / "recording.mcap",

@@ -7,12 +7,30 @@ from pathlib import Path
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import FILE
+from dexkit.cli.options import FILE, out_option
 from dexkit.cli.remarks import remark, remarks
+from dexkit.cli.settings import Setting, Settings, settings_option
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
 
 __all__ = ["command"]
+
+_SETTINGS = (
+    Setting(
+        "storage",
+        "sqlite3|mcap",
+        click.Choice(["sqlite3", "mcap"]),
+        "Storage of a ROS 2 bag.",
+        "sqlite3",
+    ),
+    Setting(
+        "fps",
+        "N",
+        click.IntRange(1, 1000),
+        "Frames per second, for lerobot and episodes.  [default: measured]",
+    ),
+    Setting("task", "TEXT", click.STRING, "Task of all episodes.  [default: the recording's]"),
+)
 
 
 @click.command(
@@ -33,21 +51,8 @@ __all__ = ["command"]
     required=True,
     help="The format.",
 )
-@click.option("--out", type=FILE, required=True, metavar="DIR", help="The folder to write.")
-@click.option(
-    "--storage",
-    type=click.Choice(["sqlite3", "mcap"]),
-    default="sqlite3",
-    show_default=True,
-    help="Storage of a ROS 2 bag.",
-)
-@click.option(
-    "--fps",
-    type=click.IntRange(1, 1000),
-    metavar="N",
-    help="Frames per second, for lerobot and episodes.  [default: measured]",
-)
-@click.option("--task", metavar="TEXT", help="Task of all episodes.  [default: the recording's]")
+@out_option("The folder to write.")
+@settings_option(_SETTINGS)
 @click.option(
     "--pictures",
     type=FILE,
@@ -59,9 +64,7 @@ def command(
     sessions: tuple[Path, ...],
     form: str,
     out: Path,
-    storage: str,
-    fps: int | None,
-    task: str | None,
+    settings: Settings,
     pictures: Path | None,
 ) -> int:
     """Write the recordings SESSION... to the folder DIR in another format.
@@ -72,6 +75,7 @@ def command(
     from dexkit.traces import open_trace
     from dexkit.traces.sessions import rosbag, topic_tables
 
+    fps, task = settings["fps"], settings["task"]
     if pictures is not None and not pictures.is_dir():
         raise UsageError(f"--pictures {pictures} is not a folder")
     if form in ("lerobot", "episodes"):
@@ -79,7 +83,7 @@ def command(
         text = None if task is None else task.encode("utf-8", "backslashreplace").decode()
         return _frames(sessions, form, out, fps, text, pictures)
     if fps is not None or task is not None or pictures is not None:
-        raise UsageError(f"--fps, --task and --pictures are for lerobot and episodes, not {form}")
+        raise UsageError(f"fps, task and --pictures are for lerobot and episodes, not {form}")
     several = len(sessions) > 1
     if several and len({p.stem for p in sessions}) < len(sessions):
         raise UsageError("two of the recordings have the same name", hint="export them one by one")
@@ -90,7 +94,7 @@ def command(
             trace = open_trace(path)
             target.parent.mkdir(parents=True, exist_ok=True)
             if form == "rosbag2":
-                written, lost = rosbag.export_bag(trace, target, storage=storage)
+                written, lost = rosbag.export_bag(trace, target, storage=settings["storage"])
             else:
                 written, lost = topic_tables.export_tables(trace, target, form)
         except DexkitError as error:

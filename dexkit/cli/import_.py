@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import FILE, overwrite_option, session_options
+from dexkit.cli.options import FILE, Number, overwrite_option
 from dexkit.cli.remarks import remark, remarks
+from dexkit.cli.settings import YES_OR_NO, Setting, Settings, settings_option
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
 
@@ -19,6 +20,25 @@ if TYPE_CHECKING:
     from dexkit.traces.sessions.sources import Entry
 
 __all__ = ["command"]
+
+_SETTINGS = (
+    Setting(
+        "rate",
+        "HZ",
+        Number(min=0.1, max=2000),
+        "Frames per second, if the source has no times.  [default: the source's]",
+    ),
+    Setting(
+        "hand",
+        "MODEL",
+        click.STRING,
+        "Model of the hands, e.g. dex3-1, or none.  [default: detected by joints and limits]",
+    ),
+    Setting("keep-sides", "yes|no", YES_OR_NO, "Do not exchange hands that look swapped.", False),
+    Setting(
+        "embed-pictures", "yes|no", YES_OR_NO, "Put single pictures into the recording.", False
+    ),
+)
 
 
 @click.command(
@@ -33,26 +53,35 @@ __all__ = ["command"]
 )
 @click.argument("source", type=FILE)
 @click.argument("out", type=FILE)
-@session_options()
+@click.option(
+    "--from",
+    "form",
+    type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
+    help="The format of SOURCE.  [default: detected by its files]",
+)
+@click.option(
+    "--episode",
+    "chosen",
+    multiple=True,
+    metavar="NAME",
+    help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
+)
+@settings_option(_SETTINGS)
 @click.option(
     "--wire",
     type=FILE,
     metavar="FILE",
     help="A recording (.mcap) of the same session; the frames get the times of its messages.",
 )
-@click.option("--embed-pictures", is_flag=True, help="Put single pictures into the recording.")
 @overwrite_option("existing recordings")
 def command(
     source: Path,
     out: Path,
     form: str | None,
     chosen: tuple[str, ...],
-    rate: float | None,
-    hand: str | None,
+    settings: Settings,
     wire: Path | None,
-    embed_pictures: bool,
-    keep_sides: bool,
-    force: bool,
+    overwrite: bool,
 ) -> int:
     """Write the sessions of SOURCE as recordings.
 
@@ -65,9 +94,10 @@ def command(
     from dexkit.traces.sessions.paths import file_name
     from dexkit.traces.sessions.sources import choose, find
 
+    hand = settings["hand"]
     if hand not in (None, "none"):
         model(hand)  # refused before anything is read
-    options = Options(rate=rate, hand=hand, correct=not keep_sides)
+    options = Options(rate=settings["rate"], hand=hand, correct=not settings["keep-sides"])
     entries = find(source, form, options)
     if wire is not None:
         entries = _beside(source, entries, wire, options)
@@ -87,7 +117,7 @@ def command(
             if (other := written.setdefault(target, entry.name)) != entry.name:
                 raise SessionError(f"its recording would have the name of {other}'s")
             target.parent.mkdir(parents=True, exist_ok=True)
-            report = entry.convert(target, embed_pictures, force)
+            report = entry.convert(target, settings["embed-pictures"], overwrite)
         except (DexkitError, OSError, MemoryError) as error:
             if len(entries) == 1:
                 raise

@@ -37,14 +37,12 @@ __all__ = ["command"]
     is_flag=True,
     help="Put the later files on the first one's clock, by the messages that both have.",
 )
-@click.option("--keep-duplicates", is_flag=True, help="Keep messages that several files have.")
 @overwrite_option("OUT")
 def command(
     files: tuple[Path, ...],
     shifts: tuple[str, ...],
     aligned: bool,
-    keep_duplicates: bool,
-    force: bool,
+    overwrite: bool,
 ) -> int:
     """Write several recordings to OUT as one, in order of time.
 
@@ -66,7 +64,7 @@ def command(
         else:
             moved.append(-clock_offset(traces[0], trace))
             click.echo(f"{path}: shifted by {moved[-1]:+.6f} s")
-    result = merge(traces, out, shifts=moved, keep_duplicates=keep_duplicates, overwrite=force)
+    result = merge(traces, out, shifts=moved, overwrite=overwrite)
     for trace in traces:
         remarks("warning", trace.warnings, trace.path)
         if trace.attachments:

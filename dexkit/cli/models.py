@@ -28,9 +28,8 @@ _SIDES = ("left", "right")
     cls=Command,
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--all", "every", is_flag=True, help="Print every detail of every model.")
 @json_option("Print JSON, always with every detail.")
-def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
+def command(names: tuple[str, ...], as_json: bool) -> None:
     """Print the models: joints, limits, topics, types, rates, gains, and backends.
 
     Without a NAME, an overview. 'make docs' makes drawings; the shape of the
@@ -40,13 +39,13 @@ def command(names: tuple[str, ...], every: bool, as_json: bool) -> None:
     from dexkit.model_facts import describe
     from dexkit.model_facts import names as all_names
 
-    models = [describe(name) for name in (names if names and not every else all_names())]
+    models = [describe(name) for name in (names or all_names())]
     if as_json:
         click.echo(json.dumps({"models": models}, indent=1))
         return
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     console = Console(width=width)
-    if not (names or every):
+    if not names:
         _overview(console, models)
         _unusable(console)
         return

@@ -13,13 +13,13 @@ import click
 
 from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
-    FILE,
     Number,
     dds_options,
     duration_option,
     json_option,
     prefix_option,
     prefixed_topics,
+    record_option,
     topic_option,
 )
 from dexkit.errors import DexkitError, UsageError
@@ -61,12 +61,7 @@ _PAGE = 10  # lines
     metavar="S",
     help="Seconds between updates.  [default: 0.2 on a terminal, 1 with --json, else 10]",
 )
-@click.option(
-    "--log",
-    type=FILE,
-    metavar="FILE",
-    help="File that the key r records to.  [default: monitor-DATE-TIME.mcap]",
-)
+@record_option("File that the key r records to.  [default: monitor-DATE-TIME.mcap]")
 @duration_option()
 def command(
     topics: tuple[str, ...],
@@ -75,7 +70,7 @@ def command(
     interface: str,
     as_json: bool,
     period: float | None,
-    log: Path | None,
+    record_path: Path | None,
     duration: float | None,
 ) -> int:
     """Show hands, robots and topics in the terminal: joints, rates, ages, gaps, faults, events.
@@ -87,8 +82,8 @@ def command(
 
     Without a terminal it prints events as lines, and every ten seconds a line for each hand.
     """
-    if log is not None and log.exists():
-        raise UsageError(f"{log} exists", hint="choose another name for the recording")
+    if record_path is not None and record_path.exists():
+        raise UsageError(f"{record_path} exists", hint="choose another name for the recording")
     from dexkit.dds import DdsNode
     from dexkit.doctor.hand_domains import HandsElsewhere, listening_domain
     from dexkit.monitor.terminal import has_terminal
@@ -104,7 +99,7 @@ def command(
         chosen, remark = listening_domain(domain, interface)
         node = stack.enter_context(DdsNode(domain=chosen, interface=interface))
         listener = stack.enter_context(Listener(node, Collector(), patterns))
-        recording = stack.enter_context(_Log(log, chosen, node.interface, topics))
+        recording = stack.enter_context(_Log(record_path, chosen, node.interface, topics))
         elsewhere = HandsElsewhere(chosen, node.interface)
         watch = _Watch(listener, recording, period or _PERIODS[mode], duration, elsewhere)
         where = f"domain {chosen} on {node.interface}"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,17 +33,14 @@ __all__ = [
     "domain_option",
     "dry_run_option",
     "duration_option",
-    "episode_option",
     "force_option",
     "found_interface",
     "grade_option",
-    "guesses_option",
     "host_option",
     "html_option",
     "interface_option",
     "interfaces_option",
     "jobs_option",
-    "json_file_option",
     "json_option",
     "junit_option",
     "level_option",
@@ -60,18 +57,17 @@ __all__ = [
     "prefixed_topics",
     "quiet_option",
     "real_time_option",
+    "record_option",
     "recording_option",
     "require_option",
+    "result_option",
     "seed_option",
-    "session_options",
     "side_option",
     "topic_option",
-    "usb_option",
     "verbose_option",
     "view_option",
     "wait_for_interface_option",
     "wait_option",
-    "with_guesses",
     "yes_option",
 ]
 
@@ -311,52 +307,6 @@ def force_option() -> Callable[[F], F]:
 # ------------------------------------------------------------------------------ sessions
 
 
-def session_options() -> Callable[[F], F]:
-    """``--from`` (``form``), ``--episode`` (``chosen``), ``--rate``, ``--hand`` and
-    ``--keep-sides``: what a session of another format is, and how it is read.
-    """
-    options = (
-        click.option(
-            "--from",
-            "form",
-            type=click.Choice(["episodes", "jsonl", "lerobot", "rosbag2", "tables"]),
-            help="The format of SOURCE.  [default: detected by its files]",
-        ),
-        episode_option(),
-        click.option(
-            "--rate",
-            type=Number(min=0.1, max=2000),
-            metavar="HZ",
-            help="Frames per second, if the source has no times.  [default: the source's]",
-        ),
-        click.option(
-            "--hand",
-            metavar="MODEL",
-            help="Model of the hands, e.g. dex3-1, or none.  [default: detected by joints and "
-            "limits]",
-        ),
-        click.option("--keep-sides", is_flag=True, help="Do not exchange hands that look swapped."),
-    )
-
-    def decorate(function: F) -> F:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
-
-
-def episode_option() -> Callable[[F], F]:
-    """``--episode``, repeated, as ``chosen``."""
-    return click.option(
-        "--episode",
-        "chosen",
-        multiple=True,
-        metavar="NAME",
-        help="Only this session of SOURCE, e.g. episode_0003; may be repeated.",
-    )
-
-
 def pace_option(more: str = "") -> Callable[[F], F]:
     """``--pace``: a factor of time."""
     return click.option(
@@ -420,41 +370,6 @@ def device_option(help: str) -> Callable[[F], F]:
 def devices_option(help: str) -> Callable[[F], F]:
     """``--device``, repeated, as ``devices``; :func:`devices_by_side` reads them."""
     return click.option("--device", "devices", multiple=True, metavar="PATH", help=help)
-
-
-def usb_option(hands: str) -> Callable[[F], F]:
-    """``--usb URL``.
-
-    :param hands: what the help calls the devices: ``USB hand`` or ``USB hands``.
-    """
-    return click.option(
-        "--usb",
-        metavar="URL",
-        help=f"{hands} on usbip://HOST:PORT instead of this machine's; short for --set usb=URL.",
-    )
-
-
-def guesses_option() -> Callable[[F], F]:
-    """``--accept-guesses``; :func:`with_guesses` makes a setting of it."""
-    return click.option(
-        "--accept-guesses",
-        is_flag=True,
-        help="Command also a hand that was never brought up, on what dexkit guesses of it; short "
-        "for --set guesses=accept.",
-    )
-
-
-def with_guesses(settings: Sequence[str], known: Collection[str], accept: bool) -> tuple[str, ...]:
-    """The settings, with that of ``--accept-guesses``.
-
-    :param known: names of the backend's settings.
-    :raises UsageError: the backend guesses nothing.
-    """
-    if not accept:
-        return tuple(settings)
-    if "guesses" not in known:
-        raise UsageError("--accept-guesses: this backend guesses nothing about its hand")
-    return (*settings, "guesses=accept")
 
 
 def yes_option(question: str) -> Callable[[F], F]:
@@ -590,11 +505,11 @@ def quiet_option() -> Callable[[F], F]:
 
 
 def overwrite_option(what: str) -> Callable[[F], F]:
-    """``--force`` of the commands that write a recording.
+    """``--overwrite`` of the commands that write a recording.
 
     :param what: is overwritten.
     """
-    return click.option("--force", is_flag=True, help=f"Overwrite {what}.")
+    return click.option("--overwrite", is_flag=True, help=f"Overwrite {what}.")
 
 
 def json_option(help: str) -> Callable[[F], F]:
@@ -602,9 +517,9 @@ def json_option(help: str) -> Callable[[F], F]:
     return click.option("--json", "as_json", is_flag=True, help=help)
 
 
-def json_file_option(help: str) -> Callable[[F], F]:
-    """``--json FILE`` of the commands that write their result, as ``json_path``."""
-    return click.option("--json", "json_path", type=OUTPUT_FILE, metavar="FILE", help=help)
+def result_option(help: str) -> Callable[[F], F]:
+    """``--result FILE`` of the commands that write their result (JSON), as ``result_path``."""
+    return click.option("--result", "result_path", type=OUTPUT_FILE, metavar="FILE", help=help)
 
 
 def html_option(help: str = option_texts.PAGE, *, report: bool = True) -> Callable[[F], F]:
@@ -614,6 +529,17 @@ def html_option(help: str = option_texts.PAGE, *, report: bool = True) -> Callab
     """
     names = ("--report", "--html") if report else ("--html",)
     return click.option(*names, "html_path", type=OUTPUT_FILE, metavar="FILE", help=help)
+
+
+def record_option(help: str) -> Callable[[F], F]:
+    """``--record FILE``, as ``record_path``: what is seen meanwhile is recorded there."""
+    return click.option(
+        "--record",
+        "record_path",
+        type=LocalPath(dir_okay=False),
+        metavar="FILE.mcap",
+        help=help,
+    )
 
 
 def output_option(metavar: str, help: str, default: str | None = None) -> Callable[[F], F]:
@@ -628,13 +554,17 @@ def output_option(metavar: str, help: str, default: str | None = None) -> Callab
     )
 
 
-def out_option(default: str, help: str) -> Callable[[F], F]:
-    """``--out DIR``: the folder for all that a command writes."""
+def out_option(help: str, default: str | None = None) -> Callable[[F], F]:
+    """``--out DIR``: the folder for all that a command writes.
+
+    :param default: None where it must be named.
+    """
     return click.option(
         "--out",
-        type=LocalPath(file_okay=False),
-        default=Path(default),
-        show_default=True,
+        type=LocalPath(file_okay=default is None),
+        default=None if default is None else Path(default),
+        required=default is None,
+        show_default=default is not None,
         metavar="DIR",
         help=help,
     )

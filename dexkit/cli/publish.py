@@ -16,7 +16,6 @@ from dexkit.cli.command_help import Command
 from dexkit.cli.consent import Consent
 from dexkit.cli.options import (
     FILE,
-    Number,
     dds_options,
     force_option,
     loop_option,
@@ -62,12 +61,6 @@ _LINGER = 0.1
 @topic_option("Publish", "those that end in /cmd")
 @pace_option()
 @loop_option()
-@click.option(
-    "--max-gap",
-    type=Number(min=0, min_open=True),
-    metavar="S",
-    help="Shorten longer pauses to S seconds.  [default: keep them]",
-)
 @dds_options()
 @wait_option("Wait up to S seconds for a subscriber of each topic; 0 starts at once.")
 @force_option()
@@ -76,7 +69,6 @@ def command(
     topics: tuple[str, ...],
     pace: float,
     loop: bool,
-    max_gap: float | None,
     domain: int,
     interface: str,
     wait: float,
@@ -95,7 +87,7 @@ def command(
 
     trace = open_trace(file)
     try:
-        player = Player(trace, topics or None, speed=pace, loop=loop, max_gap=max_gap)
+        player = Player(trace, topics or None, speed=pace, loop=loop)
     finally:  # more may be found while the messages are read
         for warning in trace.warnings:
             click.echo(one_line(f"warning: {warning}", REMARK), err=True)

@@ -62,13 +62,6 @@ __all__ = ["command"]
     help="Directory in which xr_teleoperate writes episodes meanwhile; their frames get the times "
     "of the recorded messages.",
 )
-@click.option(
-    "--compression",
-    type=click.Choice(["zstd", "lz4", "none"]),
-    default="zstd",
-    show_default=True,
-    help="Compression of the chunks in the file.",
-)
 def command(
     out: Path,
     topics: tuple[str, ...],
@@ -76,9 +69,8 @@ def command(
     domain: int | None,
     interface: str,
     duration: float | None,
-    force: bool,
+    overwrite: bool,
     episodes: Path | None,
-    compression: str,
 ) -> int:
     """Record DDS topics to OUT, an mcap file, until Ctrl-C.
 
@@ -96,8 +88,10 @@ def command(
     from dexkit.traces.dds_recording import record_topics
     from dexkit.traces.names import dds_topic
 
-    if out.exists() and not out.is_dir() and not force:
-        raise UsageError(f"{out} exists", hint="choose another name, or overwrite it with --force")
+    if out.exists() and not out.is_dir() and not overwrite:
+        raise UsageError(
+            f"{out} exists", hint="choose another name, or overwrite it with --overwrite"
+        )
     topics = prefixed_topics(topics, prefix)
     before = _episodes(episodes) if episodes is not None else {}
     started = time.monotonic()
@@ -109,9 +103,7 @@ def command(
             remark("note", why)
         elsewhere = HandsElsewhere(chosen, interface)
         asked = {"topics": " ".join(map(dds_topic, topics))} if topics else None
-        recorder = Recorder(
-            out, overwrite=force, keep_empty=False, compression=compression, metadata=asked
-        )
+        recorder = Recorder(out, overwrite=overwrite, keep_empty=False, metadata=asked)
         status = _Status(recorder, started, elsewhere)
         with recorder:
             what = ", ".join(topics) if topics else "every known type"
@@ -140,7 +132,7 @@ def command(
     )
     merged = True
     if episodes is not None:
-        merged = _merge_episodes(out, episodes, before, force)
+        merged = _merge_episodes(out, episodes, before, overwrite)
     return 1 if dropped or recording.losses or recorder.displaced or not merged else 0
 
 

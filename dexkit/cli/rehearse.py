@@ -13,7 +13,6 @@ from dexkit.cli.replay_session import checked_session, guards, print_refusal, se
 from dexkit.cli.settings import Settings
 from dexkit.errors import UsageError
 from dexkit.escaping import REMARK, one_line
-from dexkit.redaction import redact
 
 if TYPE_CHECKING:
     from dexkit.conformance.virtual.rehearsal import Rehearsal
@@ -101,7 +100,7 @@ def _options(ctx: click.Context) -> str:
             values = value.texts if isinstance(value, Settings) else value
             shown = values if isinstance(values, tuple) else [values]
             words += [word for one in shown for word in (parameter.opts[0], str(one))]
-    return redact(" ".join(words))
+    return " ".join(words)
 
 
 def _print_rehearsal(rehearsal: Rehearsal) -> None:

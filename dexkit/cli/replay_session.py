@@ -14,7 +14,6 @@ from dexkit.cli.options import (
     FILE,
     Number,
     dialect_option,
-    episode_option,
     pace_option,
     side_option,
 )
@@ -142,7 +141,6 @@ def session_to_play() -> Callable[[F], F]:
             help="Play despite this finding; may be repeated.",
         ),
         settings_option(_SETTINGS),
-        episode_option(),
     )
 
     def decorate(function: F) -> F:
@@ -160,7 +158,6 @@ def checked_session(
     pace: float,
     accept: tuple[str, ...],
     settings: Settings,
-    chosen: tuple[str, ...],
 ) -> tuple[RecordedCommands, Prepared]:
     """Read a session, check it and print what was found.
 
@@ -169,7 +166,7 @@ def checked_session(
     from dexkit.traces.replay.commands import read_session
     from dexkit.traces.replay.prepare import ReplayOptions, prepare
 
-    session = read_session(source, chosen)
+    session = read_session(source)
     prepared = prepare(
         session,
         ReplayOptions(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,8 +18,6 @@ from dexkit.cli.options import (
 )
 from dexkit.documents import check_output_paths, write_file
 from dexkit.errors import UsageError
-from dexkit.escaping import one_line
-from dexkit.redaction import redact
 
 if TYPE_CHECKING:
     from dexkit.conformance.recording import Recording
@@ -33,18 +30,6 @@ def write_text(path: Path, text: str) -> None:
         click.echo(text, nl=False)
     else:
         write_file(path, text)
-
-
-def _address(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
-    """An address of the web without credentials, or a path; no other scheme."""
-    if redact(text, text) != text:
-        raise click.BadParameter(
-            f"{redact(text, text)}: everybody who has the page would read what *** stands for; "
-            "leave it out"
-        )
-    if not re.match(r"https?://|[\w./-]*$", text):
-        raise click.BadParameter(f"{one_line(text)} is no address that begins with http")
-    return text
 
 
 @click.command(
@@ -60,14 +45,6 @@ def _address(ctx: click.Context, parameter: click.Parameter, text: str) -> str:
 @html_option()
 @markdown_option()
 @junit_option()
-@click.option(
-    "--catalogue",
-    default="",
-    metavar="URL",
-    callback=_address,
-    help="Let the page link to the page of each requirement there, e.g. the folder requirements/ "
-    "of the site that 'make docs-site' builds.",
-)
 @verbose_option("Also print what could not be judged, and why.")
 def command(
     result: Path,
@@ -75,12 +52,11 @@ def command(
     html_path: Path | None,
     markdown_path: Path | None,
     junit_path: Path | None,
-    catalogue: str,
     verbose: bool,
 ) -> None:
     """Write the reports of a result file.
 
-    A result file comes from 'dexkit check --json FILE' or from the conformance suite with
+    A result file comes from 'dexkit check --result FILE' or from the conformance suite with
     '--json FILE'. Without an option the result is printed as a table.
     """
     from dexkit.conformance.report.html import write_html
@@ -98,7 +74,7 @@ def command(
         if file is not None:
             view = _matching_recording(file, found, given=recording is not None)
         shown = file if view is not None else None
-        write_html(found, view, html_path, recording=shown, catalogue=catalogue)
+        write_html(found, view, html_path, recording=shown)
     if markdown_path:
         write_text(markdown_path, render_markdown(found))
     if junit_path:

@@ -19,13 +19,10 @@ from dexkit.cli.options import (
     device_option,
     dialect_option,
     force_option,
-    guesses_option,
     html_option,
-    json_file_option,
     one_side_option,
-    quiet_option,
+    result_option,
     wait_option,
-    with_guesses,
     yes_option,
 )
 from dexkit.cli.settings import key_and_value, set_option
@@ -65,7 +62,6 @@ whose client asks for all of it, are tried at it."""
 @one_side_option("Hand to test.", required=True)
 @device_option("Path or serial number of the device.")
 @set_option("Setting of the backend; 'dexkit backends' lists them.")
-@guesses_option()
 @dialect_option("With --external: the dialect of the hand.")
 @click.option(
     "--joint",
@@ -75,33 +71,23 @@ whose client asks for all of it, are tried at it."""
     help="Test only this joint; may be repeated.  [default: all]",
 )
 @click.option(
-    "--speed",
+    "--fraction",
     type=Number(0.05, 1.0),
-    metavar="PART",
-    help="Largest test speed, as a part of the full speed.  [default: 0.25; 1 for position servos]",
-)
-@click.option(
-    "--lead",
-    type=Number(0.02, 0.5),
-    default=0.18,
-    show_default=True,
-    metavar="Q",
-    help="Largest distance of a command from its joint's position, which limits the torque to kp "
-    "times Q.",
+    metavar="F",
+    help="Largest test speed, as a fraction of the full speed.  "
+    "[default: 0.25; 1 for position servos]",
 )
 @click.option(
     "--touch/--no-touch",
     default=True,
     help="Ask for each tactile element to be pressed, where the model has some.  [default: touch]",
 )
-@click.option("--name", default="", metavar="TEXT", help="Name or serial number of the hand.")
-@json_file_option("Where to write the result.  [default: selftest-MODEL-SIDE-TIME.json]")
+@result_option("Where to write the result.  [default: selftest-MODEL-SIDE-TIME.json]")
 @html_option()
 @dds_options()
 @wait_option("With --external: wait up to S seconds for the hand.")
 @force_option()
 @yes_option("whether the hand is free to move")
-@quiet_option()
 def command(backend_name: str | None, **given: Any) -> int:
     """Test one hand: its joints one by one, and its tactile elements.
 
@@ -117,8 +103,8 @@ def command(backend_name: str | None, **given: Any) -> int:
         raise UsageError(
             "name one hand: a backend, or --external", hint="'dexkit backends' lists the backends"
         )
-    if given["external"] and (given["device"] or given["settings"] or given["accept_guesses"]):
-        raise UsageError("--device, --set, --accept-guesses are for a backend, not for --external")
+    if given["external"] and (given["device"] or given["settings"]):
+        raise UsageError("--device and --set are for a backend, not for --external")
     if backend_name is not None and given["dialect"]:
         raise UsageError("--dialect is for --external: a backend is driven without DDS")
     if given["external"] and given["dialect"] is None:
@@ -138,7 +124,6 @@ def command(backend_name: str | None, **given: Any) -> int:
         about = {
             "backend": backend_name or "external",
             "device": given["device"] or "",
-            "name": given["name"],
         }
         json_path, page = _outputs(given, spec.model)
         check_output_paths([json_path, page], [])
@@ -156,20 +141,18 @@ def command(backend_name: str | None, **given: Any) -> int:
             hand.spec,  # opening may have refined its rate
             dialect=spoken,
             joint_speeds=getattr(hand, "joint_speeds", None),
-            lead=given["lead"],
         )
-        speed = given["speed"] or (1.0 if setup.servo else _SPEED)
+        speed = given["fraction"] or (1.0 if setup.servo else _SPEED)
         test = SelfTest(Procedure(setup, joints=joints, speed=speed, touch=touch))
-        if not given["quiet"]:
-            count = len(joints) if joints is not None else spec.n_joints
-            click.echo(
-                f"ready: testing {count} joint{'s' if count > 1 else ''} of the {spec.side} "
-                f"{model_by_name(spec.model).title}; space, q or Ctrl-C stops",
-                err=True,
-            )
+        count = len(joints) if joints is not None else spec.n_joints
+        click.echo(
+            f"ready: testing {count} joint{'s' if count > 1 else ''} of the {spec.side} "
+            f"{model_by_name(spec.model).title}; space, q or Ctrl-C stops",
+            err=True,
+        )
         pressed = stack.enter_context(keys())
         consent = Consent(pressed, stop)
-        with _turn(stop, pressed, given["quiet"]) as turn:
+        with _turn(stop, pressed) as turn:
             run(hand, test, turn=turn, resume=consent)
     if consent.missing:
         return consent.explain()
@@ -188,8 +171,7 @@ def _hand(
         from dexkit.backends import BackendOptions, backend
 
         kind = backend(name)
-        texts = with_guesses(given["settings"], kind.settings, given["accept_guesses"])
-        settings = dict(map(key_and_value, texts))
+        settings = dict(map(key_and_value, given["settings"]))
         return kind.create(BackendOptions(side, given["device"], settings)), None
     from dexkit.conformance.selftest.external import ExternalHand
     from dexkit.dds import DdsNode
@@ -258,18 +240,18 @@ def _touch(name: str, wanted: bool) -> bool:
 def _outputs(given: dict[str, Any], model: str) -> tuple[Path, Path]:
     """Paths of result and page; an earlier run is overwritten only if a name is given."""
     stem = f"selftest-{model}-{given['side']}-{datetime.now():%Y%m%d-%H%M%S}"
-    json_path, page = given["json_path"], given["html_path"]
+    json_path, page = given["result_path"], given["html_path"]
     if json_path is None:
         json_path = Path(f"{stem}.json") if page is None else page.with_suffix(".json")
     return json_path, page or json_path.with_suffix(".html")
 
 
 @contextmanager
-def _turn(stop: StopRequest, pressed: Keys, quiet: bool) -> Iterator[Callable[[SelfTest], None]]:
+def _turn(stop: StopRequest, pressed: Keys) -> Iterator[Callable[[SelfTest], None]]:
     """Shows progress and questions, and takes keys, in each turn of a test."""
     from dexkit.conformance.selftest.supervision import End
 
-    status = StatusLine(quiet)
+    status = StatusLine(quiet=False)
     said = ""
 
     def turn(test: SelfTest) -> None:
@@ -289,7 +271,7 @@ def _turn(stop: StopRequest, pressed: Keys, quiet: bool) -> Iterator[Callable[[S
             text = f"touch: {now}; Enter goes on without"
         if status:
             status.show(one_line(text, REMARK))
-        elif not quiet:
+        else:
             click.echo(one_line(text, REMARK), err=True)
 
     try:

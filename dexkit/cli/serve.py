@@ -21,15 +21,12 @@ from dexkit.cli.options import (
     devices_option,
     dialect_option,
     force_option,
-    guesses_option,
     prefix_option,
     quiet_option,
     real_time_option,
     side_option,
-    usb_option,
     view_option,
     wait_for_interface_option,
-    with_guesses,
 )
 from dexkit.cli.settings import key_and_value, set_option
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
@@ -67,8 +64,6 @@ _LONELY = 10.0  # seconds without a client before a hint
     "Setting of the backend, e.g. object=40; left.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."
 )
-@usb_option("USB hands")
-@guesses_option()
 @dialect_option(
     "Topics, types and units.  [default: the model's first: "
     + ", ".join(f"{m.dialects[0].name} ({m.name})" for m in MODELS.values())
@@ -119,8 +114,6 @@ def command(
     sides: tuple[Side, ...],
     devices: tuple[str, ...],
     settings: tuple[str, ...],
-    usb: str | None,
-    accept_guesses: bool,
     dialect: str | None,
     prefix: str,
     domain: int | None,
@@ -144,18 +137,9 @@ def command(
     Without --domain, a device is served on domain 0 (the robot's) and everything else on
     domain 1 (that of xr_teleoperate's simulation mode).
     """
-    if usb is not None:
-        for text in settings:
-            if text.partition("=")[0].rpartition(".")[2] == "usb":
-                raise UsageError(
-                    f"--usb {usb} and --set {text} name different places",
-                    hint="--usb is short for --set usb=URL, for all hands",
-                )
-        settings = (*settings, f"usb={usb}")
     status = StatusLine(quiet)
     log_to_stderr(quiet, status.on_terminal, "dexkit.service.counters")
     kind = backend(backend_name)
-    settings = with_guesses(settings, kind.settings, accept_guesses)
     by_side = devices_by_side(devices, sides)
     values = _settings(settings, sides)
     hands = [kind.create(BackendOptions(side, by_side.get(side), values[side])) for side in sides]

@@ -15,18 +15,17 @@ import click
 from dexkit.cli.command_help import Command
 from dexkit.cli.consent import Consent
 from dexkit.cli.options import (
-    LocalPath,
     dds_options,
     dialect_option,
     duration_option,
     force_option,
     json_option,
-    list_option,
+    record_option,
     side_option,
     wait_option,
 )
 from dexkit.cli.stop_keys import keys
-from dexkit.errors import DexkitError, UsageError
+from dexkit.errors import DexkitError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, DIALECTS, MODELS, Dialect
 from dexkit.models import dialect as dialect_by_name
@@ -66,7 +65,6 @@ _MS = 1e3
     },
 )
 @click.argument("profile_name", metavar="PROFILE", required=False)
-@list_option("List the profiles and exit.")
 @dialect_option(
     "Dialect of the hands: "
     + "; ".join(f"{', '.join(d.name for d in m.dialects)} ({m.name})" for m in MODELS.values())
@@ -94,18 +92,11 @@ _MS = 1e3
     is_flag=True,
     help="Do not clip the commands of a Dex1-1, as xr_teleoperate --sim.",
 )
-@click.option(
-    "--record",
-    "record_path",
-    type=LocalPath(dir_okay=False),
-    metavar="F.mcap",
-    help="Also record the hands' topics, for 'dexkit check'.",
-)
+@record_option("Also record the hands' topics, for 'dexkit check'.")
 @force_option()
 @json_option("Print the measurements as JSON (docs/teleop.md).")
 def command(
     profile_name: str | None,
-    list_only: bool,
     dialect: str,
     domain: int,
     interface: str,
@@ -120,7 +111,7 @@ def command(
 ) -> int:
     """Drive a hand as xr_teleoperate does, and measure its response: delay, lag, overshoot.
 
-    PROFILE names a motion of the operator ('dexkit teleop --list'), or is a recording FILE.mcap
+    PROFILE names a motion of the operator (without it they are listed), or is a recording FILE.mcap
     whose commands are the operator's targets. The client waits for the state of both hands,
     clips each Dex1-1 command to 0.18 rad of the last state and smooths it, as the genuine one
     does. The default domain is 1, the simulation's:
@@ -129,11 +120,9 @@ def command(
     At the end, on Ctrl-C too, the hands are commanded to hold their position. If this program was
     suspended for more than a second, it asks before it moves them on; without a terminal it ends.
     """
-    if list_only:
+    if profile_name is None:
         _list()
         return 0
-    if profile_name is None:
-        raise UsageError("no profile is given", hint="'dexkit teleop --list' lists them")
     spoken = dialect_by_name(dialect)
     chosen = _profile(profile_name, spoken)
     client = client_for(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     FILE,
     dds_options,
-    duration_option,
     host_option,
     port_option,
     topic_option,
@@ -62,7 +60,7 @@ __all__ = ["command", "recorded"]
     multiple=True,
     metavar="ORIGIN",
     help="Also answer web pages of this origin, such as https://viewer.example:8443, and requests "
-    "to its host; may be repeated.  [default: the page itself; Foxglove's with --to foxglove]",
+    "to its host; may be repeated.  [default: the page itself; Foxglove's with --foxglove]",
 )
 @click.option(
     "--open/--no-open",
@@ -85,18 +83,17 @@ __all__ = ["command", "recorded"]
     "meshes); SIDE is left, right or robot; may be repeated.",
 )
 @click.option(
-    "--to",
-    type=click.Choice(["rerun", "foxglove"]),
-    help="Show it in another viewer instead of on dexkit's page: Rerun (see --out), or Foxglove, "
-    "which connects to ws://127.0.0.1:8765 (--host, --port).",
+    "--foxglove",
+    is_flag=True,
+    help="Show it in Foxglove instead of on dexkit's page: it connects to ws://127.0.0.1:8765 "
+    "(--host, --port).",
 )
 @click.option(
-    "--out",
+    "--rerun",
     metavar="FILE.rrd|URL",
-    help="With --to rerun: write this file, or send to a viewer that is running "
+    help="Show it in Rerun instead: write this file, or send to a viewer that is running "
     "(rerun+http://127.0.0.1:9876/proxy).",
 )
-@duration_option()
 def command(
     recordings: tuple[Path, ...],
     live: bool,
@@ -109,9 +106,8 @@ def command(
     open_browser: bool | None,
     judge: bool,
     urdfs: tuple[str, ...],
-    to: str | None,
-    out: str | None,
-    duration: float | None,
+    foxglove: bool,
+    rerun: str | None,
 ) -> None:
     """Show hands and robots on a page in the browser: motion, faults and events.
 
@@ -121,58 +117,53 @@ def command(
     two recordings are shown side by side. Ctrl-C ends it.
 
     Needs the extra 'view': pip install 'dexkit[view]'. The page loads nothing from the network.
-    --to rerun and --to foxglove need the extra of that name instead.
+    --rerun and --foxglove need the extra of that name instead.
     """
     if len(recordings) + live > 2:
         raise UsageError("at most two recordings can be shown at once")
-    if (out is None) is (to == "rerun"):
-        raise UsageError("--to rerun and --out go together", hint="--to rerun --out session.rrd")
-    if to == "rerun" and origins:
-        raise UsageError("--allow-origin is for what listens; --to rerun does not")
+    if rerun is not None and foxglove:
+        raise UsageError("--rerun and --foxglove exclude each other")
+    if rerun is not None and origins:
+        raise UsageError("--allow-origin is for what listens; --rerun does not")
+    on_page = rerun is None and not foxglove
     from dexkit.view.forward import forward
 
     # names the extra before anything else is done
-    if to is None:
+    if on_page:
         from dexkit.view.browser_page import Page
-    elif to == "rerun":
+    elif rerun is not None:
         from dexkit.view.rerun_viewer import RerunViewer
     else:
         from dexkit.view.foxglove_viewer import DEFAULT_PORT, FoxgloveViewer
 
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
-        sources: list[Source] = [recorded(path, judge and to is None) for path in recordings]
+        sources: list[Source] = [recorded(path, judge and on_page) for path in recordings]
         if live or not recordings:
             sources.insert(0, _live(stack, domain, interface, topics))
         skeletons = _skeletons(urdfs)
         what = " beside ".join(one_line(s.title) for s in sources)
-        if duration is not None:
-            timer = threading.Timer(duration, stop.set)
-            timer.daemon = True
-            timer.start()
-        if to is None:
+        if on_page:
             page = stack.enter_context(
                 Page(sources, host=host, port=port, origins=origins, skeletons=skeletons)
             )
             click.echo(f"ready: {page.url} shows {what}")
             _open(page.url, open_browser)
             page.run(stop.event)
-        elif out is not None:
+        elif rerun is not None:
             status = stack.enter_context(contextlib.closing(_Written()))
-            rerun = stack.enter_context(contextlib.closing(RerunViewer(out)))
-            click.echo(f"ready: {what} to {redact(out, out)}")
-            paced = "://" in out
+            viewer = stack.enter_context(contextlib.closing(RerunViewer(rerun)))
+            click.echo(f"ready: {what} to {redact(rerun, rerun)}")
+            paced = "://" in rerun
             forward(
-                sources, rerun, stop.event, skeletons=skeletons, paced=paced, progress=status.show
+                sources, viewer, stop.event, skeletons=skeletons, paced=paced, progress=status.show
             )
         else:
             chosen = DEFAULT_PORT if port is None else port
-            foxglove = stack.enter_context(
-                contextlib.closing(FoxgloveViewer(host, chosen, origins))
-            )
-            click.echo(f"ready: {foxglove.url} shows {what}")
+            served = stack.enter_context(contextlib.closing(FoxgloveViewer(host, chosen, origins)))
+            click.echo(f"ready: {served.url} shows {what}")
             while not stop.event.is_set():  # a recording begins again
-                forward(sources, foxglove, stop.event, skeletons=skeletons)
+                forward(sources, served, stop.event, skeletons=skeletons)
     click.echo("stopped")
 
 

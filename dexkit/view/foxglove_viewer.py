@@ -23,7 +23,7 @@ try:
     from foxglove.channels import SceneUpdateChannel
 except ImportError as error:
     raise ExtraMissing(
-        "--to foxglove needs the package foxglove-sdk", hint="pip install 'dexkit[foxglove]'"
+        "--foxglove needs the package foxglove-sdk", hint="pip install 'dexkit[foxglove]'"
     ) from error
 
 __all__ = ["DEFAULT_PORT", "ORIGINS", "SCENE", "FoxgloveViewer", "numbers_topic"]

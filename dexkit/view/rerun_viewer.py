@@ -21,7 +21,7 @@ try:
     import rerun as rr
 except ImportError as error:
     raise ExtraMissing(
-        "--to rerun needs the package rerun-sdk", hint="pip install 'dexkit[rerun]'"
+        "--rerun needs the package rerun-sdk", hint="pip install 'dexkit[rerun]'"
     ) from error
 
 __all__ = ["RerunViewer"]

@@ -151,7 +151,7 @@ class Dex3Usb:
                 f"hand {key} has not been brought up: {store.path} does not say "
                 f"{', '.join(guessed)}",
                 hint=f"dexkit bringup dex3-usb --side {self._spec.side} finds them; "
-                "--set config=FILE names another file; --accept-guesses commands the hand on "
+                "--set config=FILE names another file; --set guesses=accept commands the hand on "
                 "dexkit's guesses",
             )
         if guessed:

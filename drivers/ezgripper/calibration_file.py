@@ -189,7 +189,7 @@ class Store:
         if unit not in (None, CURRENT_UNIT):
             raise UsageError(
                 f"{where}: the force table is in {unit!r}, not in {CURRENT_UNIT!r}",
-                hint="measure it: dexkit calibrate ezgripper --force",
+                hint="measure it: dexkit calibrate ezgripper --measure force",
             )
         table = self._get_section(content, _FORCE).get(key)
         if table is not None and not isinstance(table, dict):

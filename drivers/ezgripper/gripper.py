@@ -307,7 +307,7 @@ class EZGripper:
             log.warning(
                 "the force_lookup of %s has no unit and is read in units of %s; a table of SAKE's "
                 "driver may be in units of register 40. tau_est is wrong then: measure it with "
-                "'dexkit calibrate ezgripper --force', or set force_lookup_unit to %r",
+                "'dexkit calibrate ezgripper --measure force', or set force_lookup_unit to %r",
                 key,
                 CURRENT_UNIT,
                 CURRENT_UNIT,

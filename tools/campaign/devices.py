@@ -200,7 +200,7 @@ class Dex3(DeviceBench):
 
     def options(self, device: Any) -> list[str]:
         """Its server; nobody has brought up an emulated hand, whose wiring is dexkit's guess."""
-        return ["--usb", device.url, "--accept-guesses"]
+        return ["--set", f"usb={device.url}", "--set", "guesses=accept"]
 
     def position(self, device: Any) -> float:
         """Sum of the joints' positions without sign, rad."""

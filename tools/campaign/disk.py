@@ -56,7 +56,7 @@ class WriteCase(Case):
         logging.disable()
         result = batch.scratch / "result.json"
         sample = _sample()
-        made = Program(batch, ["dexkit", "check", sample, "--json", str(result)])
+        made = Program(batch, ["dexkit", "check", sample, "--result", str(result)])
         if made.wait() not in (0, 1):
             raise RuntimeError(made.output)
         for way in ("full", "limit", "read-only", "missing", "folder", "small"):
@@ -131,9 +131,7 @@ class RecordCase(Case):
         elif way == "force":
             self._force(batch, scene, path)
             return
-        words = ["dexkit", "record", str(path), "--domain", scene.domain, "--force"]
-        if way in ("limit", "small"):
-            words += ["--compression", "none"]
+        words = ["dexkit", "record", str(path), "--domain", scene.domain, "--overwrite"]
         with Program(batch, words, limits=limits) as program:
             until(lambda: "ready:" in program.output or not program.running, "the recorder")
             if way == "deleted" and program.running:
@@ -171,11 +169,11 @@ class RecordCase(Case):
             )
 
     def _force(self, batch: Batch, scene: Scene, path: Path) -> None:
-        """``--force`` on a file that is being recorded: the first one keeps what it has."""
+        """``--overwrite`` on a file that is being recorded: the first one keeps what it has."""
         words = ["dexkit", "record", str(path), "--domain", scene.domain]
         with Program(batch, words) as first:
             until(lambda: path.exists() and path.stat().st_size > 3000, "something recorded")
-            with Program(batch, [*words, "--force", "--duration", "1"]) as second:
+            with Program(batch, [*words, "--overwrite", "--duration", "1"]) as second:
                 second.wait()
                 first.signal(signal.SIGTERM)
                 code = first.wait()
@@ -196,7 +194,7 @@ def cases() -> list[Case]:
     """Everything that writes."""
     return [
         RecordCase(),
-        WriteCase("check-json", "check {sample} --json {out}"),
+        WriteCase("check-result", "check {sample} --result {out}"),
         WriteCase("check-junit", "check {sample} --junit {out}"),
         WriteCase("check-report", "check {sample} --report {out}"),
         WriteCase("report", "report {result} --report {out}"),

@@ -49,8 +49,8 @@ _TEXTS = (
 _BASE: dict[str, str] = {
     "backends": "",
     "badge": "{result} --output {scratch}/badge.svg",
-    "bridge": "--from unitree_go --to unitree_hg --duration 0.3",
-    "bringup": "dex3-usb --side left --usb usbip://127.0.0.1:1",
+    "bridge": "unitree_go unitree_hg",
+    "bringup": "dex3-usb --side left --set usb=usbip://127.0.0.1:1",
     "calibrate": "ezgripper --device /dev/null",
     "check": "{sample}",
     "compare": "{result} {result}",
@@ -58,8 +58,8 @@ _BASE: dict[str, str] = {
     "emulate all": "--duration 0.3 --domain {domain}",
     "emulate dex1-motor": "--link {scratch}/link",
     "emulate dex3-usb": "--link usbip://127.0.0.1:0",
-    "emulate g1": "--duration 0.3 --domain {domain}",
-    "emulate h1": "--duration 0.3 --domain {domain}",
+    "emulate g1": "--domain {domain}",
+    "emulate h1": "--domain {domain}",
     "emulate mx64": "--link {scratch}/link",
     "info": "{sample}",
     "install-service": "sim-dex1 --side left --user root --dry-run",
@@ -116,7 +116,7 @@ class OptionsCase(Case):
         (batch.scratch / "empty").touch()
         original = sample_path("dex1_hand_dropout")
         shutil.copyfile(original, places["sample"])
-        made = Program(batch, ["dexkit", "check", places["sample"], "--json", places["result"]])
+        made = Program(batch, ["dexkit", "check", places["sample"], "--result", places["result"]])
         if made.wait() not in (0, 1):
             raise RuntimeError(made.output)
         lines = {path: options for path, options in command_lines().items() if options}

@@ -345,10 +345,10 @@ def specs() -> list[Spec]:
             for backend, bench in _served().items()
         ),
         Spec("bridge",
-             f"dexkit bridge --from {source.name} --to {target.name} --side left "
+             f"dexkit bridge {source.name} {target.name} --side left "
              "--domain {domain} --to-domain {beside}",
              partial(_talk, states=False), works=_topic_flows(forwarded, target.cmd_type, 1)),
-        Spec("record", "dexkit record {scratch}/out.mcap --force --domain {domain}", _talk,
+        Spec("record", "dexkit record {scratch}/out.mcap --overwrite --domain {domain}", _talk,
              works=_recording_grows, after=_readable),
         Spec("publish",
              f"dexkit publish {{sample}} --loop --wait 0 --domain {{domain}} --topic {asked}",

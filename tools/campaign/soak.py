@@ -102,7 +102,7 @@ class SoakCase(Case):
         commands = {
             "serve": ["serve", "sim-dex1", "--side", "left", "--domain", domain],
             "record": ["record", str(batch.scratch / "soak.mcap"), "--domain", domain],
-            "bridge": ["bridge", "--from", source.name, "--to", target.name, "--side",
+            "bridge": ["bridge", source.name, target.name, "--side",
                        "left", "--domain", beside, "--to-domain", domain],
         }  # fmt: skip
         programs: dict[str, Program] = {}

@@ -99,22 +99,21 @@ class RecordedCommands:
                 f"{self.name} has no commands to a hand that dexkit knows{has}",
                 hint="'dexkit publish' publishes the command topics of a recording as they are"
                 if self.form == "recording"
-                else "'dexkit import --hand MODEL' states the hands' model",
+                else "'dexkit import --set hand=MODEL' states the hands' model",
             )
         return model(self.dialect.model)
 
 
-def read_session(source: Path, chosen: Sequence[str] = ()) -> RecordedCommands:
+def read_session(source: Path) -> RecordedCommands:
     """The commands in a recording, or in a session of any format that ``dexkit import`` reads.
 
-    :param chosen: the session's name, where the source has several.
     :raises SessionError: there is no session, or it cannot be read.
-    :raises UsageError: the source has several sessions, or none of that name.
+    :raises UsageError: the source has several sessions.
     :raises TraceError: the recording cannot be read.
     """
-    if not chosen and _is_recording(source):
+    if _is_recording(source):
         return read_trace(open_trace(source), source.name)
-    (entry,) = choose(source, find(source, None, DEFAULT), chosen, one=True)
+    (entry,) = choose(source, find(source, None, DEFAULT), (), one=True)
     with TemporaryFolder("replay") as folder:
         path = folder / "session.mcap"
         report = entry.convert(path, False, False)

@@ -353,7 +353,7 @@ class _Preparation:
                 "nominal-time",
                 f"the source has no usable times: frames are played at {session.nominal_rate:g} a "
                 "second, which is what was asked for when it was recorded, not what was measured",
-                advice="'dexkit import --rate HZ' states another rate, --pace 0.5 plays it slower",
+                advice="'dexkit import --set rate=HZ' states another rate, --pace 0.5 is slower",
             )
         if session.others and session.dialect is not None:
             self.note("not-played", ", ".join(session.others))

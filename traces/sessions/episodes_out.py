@@ -274,7 +274,7 @@ def _at_items(
         if t not in items:
             raise SessionError(
                 f"{trace.path}: {what}: {t} ns is not the time of a frame of the imported episode",
-                hint="--fps N samples the recording instead",
+                hint="--set fps=N samples the recording instead",
             )
 
 

@@ -156,7 +156,7 @@ class Dataset:
         self.info = parse_record(text, _Info, path)
         fps = options.rate if options.rate is not None else typed(self.info.fps, Rate)
         if fps is None:
-            raise SessionError(f"{path} has no rate (fps)", hint="state it: --rate")
+            raise SessionError(f"{path} has no rate (fps)", hint="state it: --set rate=HZ")
         self.fps = fps
         self.refused: dict[str, SessionError] = {}
         self._tables: dict[Path, Any] = {}
@@ -459,7 +459,7 @@ class Dataset:
             models = ", ".join(hand.name for hand, _ in fitting)
             problems.add(
                 f"{side}{HAND} may be one of {models}; it is kept as a group of joints, unless "
-                f"--hand says which"
+                f"--set hand=MODEL says which"
             )
         if len(fitting) != 1:
             return None

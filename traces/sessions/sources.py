@@ -126,7 +126,8 @@ def choose(
     if one and len(chosen) > 1:
         raise UsageError(
             f"{source} has {len(chosen)} sessions",
-            hint=f"choose one: --episode {chosen[0].name}",
+            hint="make a recording of one: "
+            f"dexkit import {source} one.mcap --episode {chosen[0].name}",
         )
     return chosen
 

@@ -17,7 +17,7 @@ import click
 from dexkit.backends import simulators
 from dexkit.child_processes import READY_TIMEOUT, Tool
 from dexkit.cli.command_help import Command
-from dexkit.cli.emulate.lerobot import LOOPBACK, parse_ports, ports_option
+from dexkit.cli.emulate.lerobot import LOOPBACK
 from dexkit.cli.options import (
     dds_options,
     dialect_option,
@@ -73,7 +73,6 @@ _XR_HANDS, _LEROBOT_HANDS = "dex3", "dex1"  # each client's own default
     "Setting of the hands, e.g. object=40; right.object=40 is for one hand. 'dexkit backends' "
     "lists the settings."
 )
-@ports_option
 @dds_options(default_domain=None, domain_default_text="1; 0 for lerobot")
 @duration_option()
 @force_option()
@@ -85,7 +84,6 @@ def emulate_all(
     hands: str | None,
     dialect: str | None,
     settings: tuple[str, ...],
-    ports: str | None,
     domain: int | None,
     interface: str,
     duration: float | None,
@@ -114,21 +112,25 @@ def emulate_all(
         raise click.UsageError(
             "--for lerobot uses loopback only; it cannot be combined with --interface"
         )
-    if ports is not None and not for_lerobot:
-        raise click.UsageError("--ports needs --for lerobot")
     if hands == "none" and (dialect or settings):
         raise click.UsageError("--dialect and --set need hands")
     common = ["--domain", str(domain), "--interface", interface]
-    common += ["--force"] * force + ["--quiet"] * quiet
+    common += ["--force"] * force
     parts = {robot: ("emulate", robot, *common)}
     if hands != "none":
         own = [option for text in settings for option in ("--set", text)]
         own += ["--dialect", dialect] if dialect else []
-        parts["hands"] = ("serve", _SIMULATORS[_HANDS[hands].name], "--side", "both", *own, *common)
+        parts["hands"] = (
+            "serve",
+            _SIMULATORS[_HANDS[hands].name],
+            "--side",
+            "both",
+            *own,
+            *common,
+            *["--quiet"] * quiet,
+        )
     if for_lerobot:
-        places = [] if ports is None else ["--ports", ",".join(map(str, parse_ports(ports)))]
-        more = ["--domain", str(domain), *places, *["--quiet"] * quiet]
-        parts[_LEROBOT] = ("emulate", "lerobot-g1", *more)
+        parts[_LEROBOT] = ("emulate", "lerobot-g1", "--domain", str(domain))
     with (
         stop_on_signals() as stop,
         viewer(domain, interface, stop.event, click.echo) if view else nullcontext(),

@@ -61,8 +61,8 @@ def _how_to(hands: Dex3Hands) -> list[str]:
     lines += [f"  usbip {tcp}attach -r {host} -b {busid}" for busid in hands.busids]
     lines += [
         "  lsusb -d 34b7:",
-        "without kernel support: dexkit serve dex3-usb --accept-guesses "
-        f"--usb usbip://{host}:{port}",
+        "without kernel support: dexkit serve dex3-usb --set guesses=accept "
+        f"--set usb=usbip://{host}:{port}",
     ]
     return lines
 

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import domain_option, duration_option, quiet_option
+from dexkit.cli.options import domain_option, host_option
 from dexkit.cli.status_line import StatusLine, log_to_stderr
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.robots import G1
 from dexkit.stop_signals import stop_on_signals
 
-__all__ = ["LOOPBACK", "emulate_lerobot_g1", "parse_ports", "ports_option"]
+__all__ = ["LOOPBACK", "emulate_lerobot_g1"]
 
 LOOPBACK = "127.0.0.1"
 _PERIOD = 0.5  # seconds between two looks
 _INTERFACE = "lo"
-
-ports_option = click.option(
-    "--ports",
-    metavar="C,S,P",
-    help="TCP ports of commands, states and pictures; 0 lets the system choose. "
-    " [default: LeRobot's, 6000,6001,5555]",
-)
 
 
 @click.command(
@@ -39,23 +31,17 @@ ports_option = click.option(
     },
 )
 @domain_option("DDS domain of the emulated G1, on loopback.", 0)
+@host_option("Address to listen on. Another one than of loopback lets other machines command.")
 @click.option(
-    "--address",
-    default=LOOPBACK,
-    metavar="IP",
-    help="Address to listen on. Another one than of loopback lets other machines command.",
+    "--ports",
+    metavar="C,S,P",
+    help="TCP ports of commands, states and pictures; 0 lets the system choose. "
+    " [default: LeRobot's, 6000,6001,5555]",
 )
-@ports_option
-@click.option("--no-camera", is_flag=True, help="Send no pictures.")
-@duration_option()
-@quiet_option()
 def emulate_lerobot_g1(
     domain: int,
-    address: str,
+    host: str,
     ports: str | None,
-    no_camera: bool,
-    duration: float | None,
-    quiet: bool,
 ) -> None:
     """Serve the ports of LeRobot's robot server for an emulated G1.
 
@@ -70,27 +56,22 @@ def emulate_lerobot_g1(
     from dexkit.dds import DdsNode
     from dexkit.emulators.lerobot import PORTS, LerobotPorts, Ports
 
-    chosen = PORTS if ports is None else Ports(*parse_ports(ports))
-    status = StatusLine(quiet)
+    chosen = PORTS if ports is None else Ports(*_parse_ports(ports))
+    status = StatusLine(quiet=False)
     log_to_stderr(quiet=True, status=status.on_terminal, always="dexkit.lerobot")
     with (
         stop_on_signals() as stop,
         DdsNode(domain=domain, interface=_INTERFACE) as node,
-        LerobotPorts(node, address=address, ports=chosen, camera=not no_camera) as served,
+        LerobotPorts(node, address=host, ports=chosen) as served,
     ):
         open_ports = served.ports
-        pictures = "" if no_camera else f", pictures {open_ports.camera}"
         click.echo(
-            f"ready: LeRobot's {G1.name} on {address}: commands {open_ports.commands}, states "
-            f"{open_ports.states}{pictures}; domain {domain}, {_INTERFACE}"
+            f"ready: LeRobot's {G1.name} on {host}: commands {open_ports.commands}, states "
+            f"{open_ports.states}, pictures {open_ports.camera}; domain {domain}, {_INTERFACE}"
         )
         sys.stdout.flush()
-        end = None if duration is None else time.monotonic() + duration
         states = served.counters.states
-        while served.failure is None:
-            left = _PERIOD if end is None else min(_PERIOD, end - time.monotonic())
-            if left <= 0 or stop.wait(left):
-                break
+        while served.failure is None and not stop.wait(_PERIOD):
             rate, states = (served.counters.states - states) / _PERIOD, served.counters.states
             text = f"LeRobot {served.clients} client(s), {rate:.0f} states/s"
             status.show(f"{text}; {served.counters.forwarded} commands forwarded", text)
@@ -101,7 +82,7 @@ def emulate_lerobot_g1(
     click.echo(f"stopped: {', '.join(f'{number} {what}' for what, number in counted.items())}")
 
 
-def parse_ports(text: str) -> tuple[int, int, int]:
+def _parse_ports(text: str) -> tuple[int, int, int]:
     """The three ports of an option.
 
     :raises UsageError: they are not three numbers below 65536.

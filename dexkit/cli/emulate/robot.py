@@ -19,10 +19,8 @@ from dexkit.cli.emulate.stdin import STDIN, read_faults
 from dexkit.cli.options import (
     Number,
     dds_options,
-    duration_option,
     force_option,
     json_option,
-    quiet_option,
 )
 from dexkit.cli.settings import YES_OR_NO, Setting, Settings, settings_option
 from dexkit.cli.status_line import MOST_REMARKS, StatusLine, log_to_stderr
@@ -47,12 +45,10 @@ def _command(model: RobotModel) -> click.Command:
     def emulate(
         domain: int,
         interface: str,
-        duration: float | None,
         remote: tuple[str, ...],
         settings: Settings,
         force: bool,
         as_json: bool,
-        quiet: bool,
     ) -> None:
         from dexkit.emulators import robot as emulated
         from dexkit.service.realtime import prepare_process
@@ -65,7 +61,7 @@ def _command(model: RobotModel) -> click.Command:
         peculiar = emulated.Settings(
             lenient=settings["lenient"], noise=settings["noise"], seed=settings["seed"]
         )
-        status = StatusLine(quiet)
+        status = StatusLine(quiet=False)
         log_to_stderr(quiet=True, status=status.on_terminal, always=log.name)
         robot = emulated.EmulatedRobot(
             chosen, domain=domain, interface=interface, settings=peculiar, force=force
@@ -90,7 +86,7 @@ def _command(model: RobotModel) -> click.Command:
                 f"{chosen.state_rate:g} Hz, domain {domain}, {interface}"
             )
             sys.stdout.flush()
-            _watch(robot, stop, duration, status=status, as_json=as_json)
+            _watch(robot, stop, status=status, as_json=as_json)
         if isinstance(robot.failure, TopicConflict):
             raise robot.failure
         if robot.failure is not None:
@@ -120,7 +116,7 @@ def _command(model: RobotModel) -> click.Command:
         model.name,
         cls=Command,
         exit_codes={
-            0: "stopped by Ctrl-C, SIGTERM or --duration",
+            0: "stopped by Ctrl-C or SIGTERM",
             1: "it failed while it ran, or another program publishes the same topics",
         },
     )(decorated)
@@ -130,7 +126,6 @@ def _options(model: RobotModel) -> list[Callable[[Any], Any]]:
     machine = () if model.mode_machine is None else (_mode_machine(model.mode_machine),)
     return [
         dds_options(),
-        duration_option(),
         click.option(
             "--remote",
             multiple=True,
@@ -141,7 +136,6 @@ def _options(model: RobotModel) -> list[Callable[[Any], Any]]:
         settings_option((*machine, *_SETTINGS)),
         force_option(),
         json_option("Print a line of JSON each second."),
-        quiet_option(),
     ]
 
 
@@ -172,22 +166,19 @@ _SETTINGS = (
 def _watch(
     robot: EmulatedRobot,
     stop: StopRequest,
-    duration: float | None,
     *,
     status: StatusLine,
     as_json: bool,
 ) -> None:
-    """Print the status until asked to stop or time is up."""
+    """Print the status until asked to stop."""
     period = _JSON_PERIOD if as_json else _STATUS_PERIOD
-    end = None if duration is None else time.monotonic() + duration
     counters = robot.robot.counters
     then, states, orders = time.monotonic(), counters.states, counters.commands
     state_rate = command_rate = 0.0
     logged: set[str] = set()
     over = False
     while not over:
-        left = float("inf") if end is None else end - time.monotonic()
-        over = stop.wait(max(0.0, min(period, left))) or left <= period or bool(robot.failure)
+        over = stop.wait(period) or bool(robot.failure)
         for text in sorted(set(robot.mismatches()) - logged)[: MOST_REMARKS - len(logged)]:
             logged.add(text)
             log.warning("%s", text)

@@ -410,9 +410,9 @@ def _import(ground: Ground, top: str, number: int) -> int:
     if top == "lines":
         source /= "session.jsonl"
     out = ground.out / ("a.mcap" if number & 1 else "a")
-    options = ["--embed-pictures"] if number & 2 else []
+    options = ["--set", "embed-pictures=yes"] if number & 2 else []
     if number & 12 == 12:
-        options += [("--hand", "none"), ("--keep-sides",), ("--rate", "50")][number // 16 % 3]
+        options += ["--set", ("hand=none", "keep-sides=yes", "rate=50")[number // 16 % 3]]
     code = ground.dexkit("import", source, out, *options)
     ground.read_outputs()
     return code
@@ -547,8 +547,8 @@ class _Rewriter:
 
 
 _FORMS: tuple[tuple[str, ...], ...] = (
-    ("lerobot",), ("episodes",), ("lerobot", "--fps", "30"), ("episodes", "--fps", "1000"),
-    ("parquet",), ("csv",), ("rosbag2",), ("rosbag2", "--storage", "mcap"),
+    ("lerobot",), ("episodes",), ("lerobot", "--set", "fps=30"), ("episodes", "--set", "fps=1000"),
+    ("parquet",), ("csv",), ("rosbag2",), ("rosbag2", "--set", "storage=mcap"),
 )  # fmt: skip
 
 

@@ -203,7 +203,8 @@ class _Dex3:
             str(DOMAIN),
             "--set",
             "usb=system",
-            "--accept-guesses",
+            "--set",
+            "guesses=accept",
         )
         self.service = Serve("dex3-usb", *words)
         self.node = DdsNode(domain=DOMAIN, interface="lo")
