@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,7 @@ import numpy as np
 from dexkit.conformance.faults.registry import Call, changes, wrong_hand
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
-from dexkit.hand import RobotSubject, Subject
 from dexkit.messages import decode, message_type
-from dexkit.models import Dialect
 from dexkit.robots import ROBOTS
 from dexkit.wire.crc32 import crc32_words
 
@@ -35,10 +32,8 @@ class _OtherFamily(ReferenceRobot):
 class OtherState(_OtherFamily):
     """Publishes the other family's LowState_."""
 
-    def __init__(
-        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
-    ) -> None:
-        super().__init__(dialect, sides, touch)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.state_type = self.others[1]
 
     def state_with_crc(self) -> bytes:
@@ -50,10 +45,8 @@ class OtherState(_OtherFamily):
 class OtherCommands(_OtherFamily):
     """Subscribes to the other family's LowCmd_."""
 
-    def __init__(
-        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
-    ) -> None:
-        super().__init__(dialect, sides, touch)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.command_type = self.others[0]
 
 
@@ -164,10 +157,8 @@ def CountsStates(self: Any, ticks: Call) -> Any:
 class TurnedOnce(ReferenceRobot):
     """Publishes one joint a full turn off."""
 
-    def __init__(
-        self, dialect: Dialect, sides: Iterable[RobotSubject], touch: Mapping[Subject, float]
-    ) -> None:
-        super().__init__(dialect, sides, touch)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         slot = self.robot.slot("right_knee")
         for values in (self.q, self.low, self.high):
             values[slot] += 2 * math.pi

@@ -72,16 +72,12 @@ def NoAnswers(self: Any, answer: Call) -> None:
     """Answers nothing."""
 
 
-@wrong_hand("DEX3USB-XCHG-01")
-class DropsAnswers(ReferenceDevice):
+@changes(ReferenceDevice, "answer", "DEX3USB-XCHG-01")
+def DropsAnswers(self: Any, answer: Call) -> None:
     """Does not answer every 25th command."""
-
-    count = 0
-
-    def answer(self) -> None:
-        self.count += 1
-        if self.count % 25:
-            super().answer()
+    self.memory["count"] = count = self.memory.get("count", 0) + 1
+    if count % 25:
+        answer()
 
 
 @changes(ReferenceDevice, "answer", "DEX3USB-XCHG-02")
@@ -125,16 +121,12 @@ class Slow(ReferenceDevice):
     latency = 0.0015
 
 
-@wrong_hand("DEX3USB-RATE-02")
-class LateAnswers(ReferenceDevice):
+@changes(ReferenceDevice, "answer", "DEX3USB-RATE-02")
+def LateAnswers(self: Any, answer: Call) -> None:
     """Needs 4 ms for every 20th answer."""
-
-    count = 0
-
-    def answer(self) -> None:
-        self.count += 1
-        self.latency = 0.004 if self.count % 20 == 0 else 0.0004
-        super().answer()
+    self.memory["count"] = count = self.memory.get("count", 0) + 1
+    self.latency = 0.004 if count % 20 == 0 else 0.0004
+    answer()
 
 
 # ------------------------------------------------------------------------------------ frames
@@ -166,16 +158,12 @@ def OtherHead(self: Any, frame: Call) -> Any:
     return b"\xfe\xfd" + frame()[2:]
 
 
-@wrong_hand("DEX3USB-CRC-01")
-class StaleCrc(ReferenceDevice):
+@changes(ReferenceDevice, "frame", "DEX3USB-CRC-01")
+def StaleCrc(self: Any, usual: Call) -> Any:
     """Changes some frames after their CRC was computed."""
-
-    count = 0
-
-    def frame(self) -> bytes:
-        self.count += 1
-        frame = super().frame()
-        return frame if self.count % 50 else frame[:-20] + b"\1" + frame[-19:]
+    self.memory["count"] = count = self.memory.get("count", 0) + 1
+    frame = usual()
+    return frame if count % 50 else frame[:-20] + b"\1" + frame[-19:]
 
 
 @changes(ReferenceDevice, "motor_packet", "DEX3USB-CRC-02")
@@ -198,15 +186,11 @@ def UndefinedTrailingBytes(self: Any, wrap: Call, buses: list[bytes]) -> Any:
     return wrap([*buses[:2], buses[2] + b"\xaa\x55", *buses[3:]])
 
 
-@wrong_hand("DEX3USB-PACK-02")
-class SixMotors(ReferenceDevice):
+@changes(ReferenceDevice, "motor_packet", "DEX3USB-PACK-02")
+def SixMotors(self: Any, motor_packet: Call, joint: int) -> Any:
     """Leaves a motor out of some states."""
-
-    count = 0
-
-    def motor_packet(self, joint: int) -> bytes:
-        self.count += joint == 6
-        return b"" if joint == 6 and self.count % 40 == 0 else super().motor_packet(joint)
+    self.memory["count"] = count = self.memory.get("count", 0) + (joint == 6)
+    return b"" if joint == 6 and count % 40 == 0 else motor_packet(joint)
 
 
 @wrong_hand("DEX3USB-PACK-04")
