@@ -24,13 +24,14 @@ selection, reports and the pages of the site.
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from dexkit.conformance.behaviours import AREAS, BEHAVIOURS
 from dexkit.conformance.hands import BUILT_IN, under_test
@@ -39,6 +40,7 @@ from dexkit.conformance.plots import Plot
 from dexkit.documents import parse_toml, read_text, read_toml
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.models import DIALECTS, HandModel, model, model_plugins
+from dexkit.records import to_record
 from dexkit.robots import RobotModel, robot
 
 __all__ = [
@@ -57,6 +59,8 @@ __all__ = [
 
 CONFIDENCE = ("vendor document", "vendor code", "measured", "inferred")
 """Confidence of a requirement's source, from best to least."""
+
+_NEEDS = "^(nothing|endpoints|state|commands|session|motion|(other-)?phase:.+)$"
 
 CAPABILITIES: Mapping[str, str] = {
     "force": "tau_est shows the force that the hand applies",
@@ -79,71 +83,6 @@ PREFIXES: Mapping[str, tuple[str, str]] = {
 }
 """Model and layer of dexkit's own ids, by their prefix; those like ``DEX1-CLIENT-01`` are of the
 layer ``client``."""
-_ID = re.compile(r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")
-_NEEDS = ("nothing", "endpoints", "state", "commands", "session", "motion")
-_PHASES = ("phase:", "other-phase:")
-_KEYS = {
-    "id",
-    "area",
-    "level",
-    "negative",
-    "title",
-    "sentence",
-    "rationale",
-    "source",
-    "confidence",
-    "needs",
-    "after",
-    "dialects",
-    "tolerances",
-    "advice",
-    "realtime",
-    "capability",
-    "cause",
-    "expected",
-    "repeat",
-    "plots",
-    "like",
-    "spoils",
-    "kind",
-    "original",
-}
-_OPTIONAL = {
-    "like",
-    "kind",
-    "original",
-    "negative",
-    "after",
-    "dialects",
-    "tolerances",
-    "realtime",
-    "capability",
-    "cause",
-    "expected",
-    "repeat",
-    "plots",
-    "spoils",
-}
-
-
-_TYPES: Mapping[str, type] = {
-    "after": list,
-    "dialects": list,
-    "plots": list,
-    "spoils": list,
-    "tolerances": dict,
-    "realtime": bool,
-    "negative": bool,
-    "repeat": int,
-}
-"""Types of values that are not texts."""
-_TYPE_NAMES: Mapping[type, str] = {
-    str: "a text",
-    list: "a list of texts",
-    dict: "a table",
-    bool: "true or false",
-    int: "a whole number",
-}
 
 
 class Level(str, Enum):
@@ -270,8 +209,55 @@ class Requirement:
             raise ConformanceError(f"{self.id} has no tolerance {name!r}") from None
 
 
+class _Entry(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """A requirement as it is written, with all that it takes from others."""
+
+    id: Annotated[str, msgspec.Meta(pattern=r"^[A-Z0-9]+(-[A-Z]+)+-\d\d$")]
+    area: str
+    level: Level
+    title: str
+    sentence: str
+    rationale: str
+    source: str
+    confidence: Annotated[str, msgspec.Meta(pattern=f"^({'|'.join(CONFIDENCE)})$")]
+    needs: Annotated[str, msgspec.Meta(pattern=_NEEDS)]
+    advice: str
+    after: tuple[str, ...] = ()
+    dialects: tuple[str, ...] = ()
+    tolerances: Mapping[str, float | str] = {}
+    realtime: bool = False
+    cause: str = ""
+    expected: str = ""
+    capability: Annotated[str, msgspec.Meta(pattern=f"^({'|'.join(CAPABILITIES)})?$")] = ""
+    negative: bool = False
+    repeat: Annotated[int, msgspec.Meta(ge=1, lt=100)] = 1
+    like: str = ""
+    plots: tuple[Plot, ...] | None = None
+    spoils: tuple[str, ...] = ()
+    kind: Kind = Kind.DROP_IN
+    original: str = ""
+
+
+_Part = msgspec.defstruct(
+    "_Part",
+    [
+        (f.name, Any if f.name == "plots" else f.type | msgspec.UnsetType, msgspec.UNSET)
+        for f in msgspec.structs.fields(_Entry)
+    ],
+    forbid_unknown_fields=True,
+)
+"""Some keys of an entry."""
+_AS_WRITTEN = {f.name for f in fields(Requirement)} & set(_Entry.__struct_fields__) - {
+    *("dialects", "tolerances", "sentence", "expected", "plots")
+}
+"""What a requirement takes from its entry as it is."""
+
+
 def _resolve(
-    value: Any, hand: HandModel | RobotModel, before: Mapping[str, Requirement], where: str
+    value: float | str,
+    hand: HandModel | RobotModel,
+    before: Mapping[str, Requirement],
+    where: str,
 ) -> float:
     """A tolerance: a number, a figure of the model, or a tolerance of a requirement before it."""
     if isinstance(value, str) and (name := value.partition(":")[0]) in before:
@@ -281,7 +267,7 @@ def _resolve(
         if isinstance(fact, int | float):
             return float(fact)
         raise UsageError(f"{where}: {hand.name} has no figure {value!r}")
-    if isinstance(value, int | float) and not isinstance(value, bool):
+    if not isinstance(value, str):
         return float(value)
     raise UsageError(f"{where}: a tolerance is a number, 'model:NAME' or 'ID:NAME', not {value!r}")
 
@@ -334,21 +320,6 @@ def _lineage(entry: Mapping[str, Any], others: Mapping[str, Any]) -> tuple[str, 
     return tuple(found)
 
 
-def _check_types(entry: Any, origin: str) -> None:
-    """Check that each value has the type of its key.
-
-    :raises UsageError: naming the one that is not.
-    """
-    if not isinstance(entry, dict):
-        raise UsageError(f"{origin}: requirements are [[requirement]] tables")
-    for key, value in entry.items():
-        kind = _TYPES.get(key, str)
-        texts = kind is not list or (isinstance(value, list) and all(type(v) is str for v in value))
-        if type(value) is not kind or not texts:
-            name = _TYPE_NAMES[kind]
-            raise UsageError(f"{origin}: {entry.get('id', 'a requirement')}: {key} is {name}")
-
-
 def _filled(text: str, tolerances: Mapping[str, float], where: str) -> str:
     """``text`` with the tolerances that it names.
 
@@ -360,32 +331,20 @@ def _filled(text: str, tolerances: Mapping[str, float], where: str) -> str:
         raise UsageError(f"{where}: {text!r} cannot be filled in: {error}") from error
 
 
-def _plots(names: Iterable[str], where: str) -> tuple[Plot, ...]:
-    try:
-        return tuple(Plot.parse(name) for name in names)
-    except UsageError as error:
-        raise UsageError(f"{where}: {error.message}", hint=error.hint) from error
+def _check_kind(entry: _Entry, where: str) -> None:
+    """A safety requirement also says what the original does; another one does not.
 
-
-def _kind(entry: Mapping[str, Any], where: str) -> Kind:
-    """The kind of an entry; a safety requirement also says what the original does.
-
-    :raises UsageError: there is no such kind, or ``original`` is missing or has no place.
+    :raises UsageError: it is otherwise.
     """
-    name = entry.get("kind", str(Kind.DROP_IN))
-    if name not in {str(kind) for kind in Kind}:
-        raise UsageError(f"{where}: kind is one of {', '.join(map(str, Kind))}")
-    kind = Kind(name)
-    if kind is Kind.SAFETY and not entry.get("original"):
+    if entry.kind is Kind.SAFETY and not entry.original:
         raise UsageError(
             f"{where}: a safety requirement needs the key original: what the original does"
         )
-    if kind is Kind.DROP_IN and entry.get("original"):
+    if entry.kind is Kind.DROP_IN and entry.original:
         raise UsageError(
             f"{where}: only safety requirements have the key original: the original "
             "meets the others"
         )
-    return kind
 
 
 def parse(
@@ -414,7 +373,8 @@ def _of_document(
         raise UsageError(f"{origin}: requirements are [[requirement]] tables")
     by_layer: dict[str, list[Mapping[str, Any]]] = {}
     for entry in entries:
-        _check_types(entry, origin)
+        name = entry.get("id", entry.get("like")) if isinstance(entry, dict) else "a requirement"
+        to_record(entry, _Part, f"{origin}: {name}")
         complete = _taken(entry, prefix, others, origin) if "like" in entry else entry
         layer_name = _owner(entry["like"])[1] if "like" in entry else "dds"
         by_layer.setdefault(layer_name, []).append(complete)
@@ -438,68 +398,36 @@ def _parse(
         (hand.name,) if isinstance(hand, RobotModel) else tuple(d.name for d in hand.dialects)
     )
     found: dict[str, Requirement] = {}
-    for entry in entries:
-        where = f"{origin}: {entry.get('id', 'a requirement without id')}"
-        unknown = set(entry) - _KEYS
-        missing = _KEYS - _OPTIONAL - set(entry)
-        if unknown or missing:
-            raise UsageError(f"{where}: unknown keys {sorted(unknown)}, missing {sorted(missing)}")
-        if not _ID.match(entry["id"]) or entry["id"] in found:
-            raise UsageError(f"{where}: an id is like DEX1-RATE-01 and occurs once")
-        if entry["confidence"] not in CONFIDENCE:
-            raise UsageError(f"{where}: confidence is one of {', '.join(CONFIDENCE)}")
-        if entry["level"] not in Level.__members__:
-            raise UsageError(f"{where}: level is one of {', '.join(Level.__members__)}")
-        if entry["needs"] not in _NEEDS and not entry["needs"].startswith(_PHASES):
-            raise UsageError(f"{where}: needs is one of {', '.join(_NEEDS)} or phase:NAME")
-        if entry.get("capability", "") not in ("", *CAPABILITIES):
-            raise UsageError(f"{where}: capability is one of {', '.join(CAPABILITIES)}")
-        if entry.get("repeat", 1) not in range(1, 100):
-            raise UsageError(f"{where}: repeat is a number from 1 on")
-        kind = _kind(entry, where)
-        for before in entry.get("after", []):
+    for written in entries:
+        where = f"{origin}: {written.get('id', 'a requirement without id')}"
+        entry = to_record(written, _Entry, where)
+        if entry.id in found:
+            raise UsageError(f"{where}: an id occurs once")
+        _check_kind(entry, where)
+        for before in entry.after:
             if before not in found:
                 raise UsageError(f"{where}: {before} does not come before it")
-            if kind is Kind.DROP_IN and found[before].kind is Kind.SAFETY:
+            if entry.kind is Kind.DROP_IN and found[before].kind is Kind.SAFETY:
                 raise UsageError(f"{where}: is drop-in, and cannot come after {before}: safety")
-        if "spoils" in entry and layer_name != "client":
+        if entry.spoils and layer_name != "client":
             raise UsageError(f"{where}: only a requirement about the client spoils others")
-        for name in entry.get("dialects", []):
+        for name in entry.dialects:
             if name not in DIALECTS:
                 raise UsageError(f"{where}: no dialect {name!r}")
         tolerances = {
-            name: _resolve(value, hand, found, where)
-            for name, value in entry.get("tolerances", {}).items()
+            name: _resolve(value, hand, found, where) for name, value in entry.tolerances.items()
         }
-        found[entry["id"]] = Requirement(
-            id=entry["id"],
+        own_dialects = tuple(d for d in entry.dialects if d in dialect_names)
+        found[entry.id] = Requirement(
+            **{name: getattr(entry, name) for name in _AS_WRITTEN},
             model=hand.name,
-            area=entry["area"],
-            level=Level[entry["level"]],
-            title=entry["title"],
-            sentence=_filled(entry["sentence"], tolerances, where),
-            rationale=entry["rationale"],
-            source=entry["source"],
-            confidence=entry["confidence"],
-            needs=entry["needs"],
-            advice=entry["advice"],
-            after=tuple(entry.get("after", ())),
-            dialects=tuple(d for d in entry.get("dialects", ()) if d in dialect_names)
-            or dialect_names,
-            tolerances=tolerances,
-            realtime=bool(entry.get("realtime", False)),
             layer=layer_name,
-            cause=entry.get("cause", ""),
-            expected=_filled(entry.get("expected", entry["sentence"]), tolerances, where),
-            capability=entry.get("capability", ""),
-            negative=bool(entry.get("negative", False)),
-            repeat=entry.get("repeat", 1),
-            like=entry.get("like", ""),
-            lineage=_lineage(entry, others),
-            plots=_plots(entry["plots"], where) if "plots" in entry else default_plots,
-            spoils=tuple(entry.get("spoils", ())),
-            kind=kind,
-            original=entry.get("original", ""),
+            dialects=own_dialects or dialect_names,
+            tolerances=tolerances,
+            sentence=_filled(entry.sentence, tolerances, where),
+            expected=_filled(entry.expected or entry.sentence, tolerances, where),
+            lineage=_lineage(written, others),
+            plots=default_plots if entry.plots is None else entry.plots,
         )
     return tuple(found.values())
 
@@ -538,7 +466,7 @@ def _of_table(table: Mapping[str, Any], origin: str) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for prefix, (name, _, like) in ids.items():
         own = table.get(prefix, {})
-        _check_types({**common, **own, "id": name}, origin)
+        to_record({**common, **own, "id": name}, _Part, f"{origin}: {name}")
         if prefix not in PREFIXES:
             raise UsageError(f"{origin}: {name} is of no known model")
         if like:
