@@ -45,10 +45,8 @@ BEHAVIOURS = (
 )
 """The behaviours, in the order in which requirements of one area are listed."""
 
-_USB = ("usb_descriptors", "usb_exchange", "usb_frames", "damaged_frames")
-CHECKS = tuple(f"{__name__}.{name}" for name in BEHAVIOURS if name not in _USB)
-"""The modules with their checks, one beside each file; the checks of frames on USB are in
-:mod:`dexkit.conformance.usb.checks`."""
+CHECKS = tuple(f"{__name__}.{name}" for name in BEHAVIOURS)
+"""The modules with their checks, one beside each file."""
 
 AREAS = (
     "Discovery",

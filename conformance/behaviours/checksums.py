@@ -6,6 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
+from dexkit.conformance.usb.context import UsbContext, all_frames
 
 
 @check("H1-CRC-01")
@@ -17,3 +18,29 @@ def state_crc(ctx: RobotContext) -> Outcome:
     crc = ctx.low["crc"]
     outcome = wrong_rows(ctx, ~intact, f"{int((~intact).sum())} wrong", "the CRC is wrong")
     return outcome.because("The field is never set.") if not np.any(crc > 0) else outcome
+
+
+# ---------------------------------------------------------------------------------------- USB
+
+
+@check("DEX3USB-CRC-01")
+def _frame_crc(c: UsbContext) -> Outcome:
+    return all_frames(c, lambda a: a.reading.crc_right, "a wrong CRC")
+
+
+@check("DEX3USB-CRC-02")
+def _motor_crc(c: UsbContext) -> Outcome:
+    if not any(a.reading.motors for a in c.hand.answers):
+        return c.skipped("no motor packet came")
+    return all_frames(
+        c, lambda a: all(m.intact for m in a.reading.motors), "a damaged motor packet"
+    )
+
+
+@check("DEX3USB-CRC-03")
+def _sensor_crc(c: UsbContext) -> Outcome:
+    if not any(a.reading.sensors for a in c.hand.answers):
+        return c.skipped("no sensor packet came")
+    return all_frames(
+        c, lambda a: all(s.intact for s in a.reading.sensors), "a damaged sensor packet"
+    )

@@ -14,6 +14,7 @@ from dexkit.conformance.checks.robot import RobotContext, joint_of
 from dexkit.conformance.checks.silences import mode_bytes, roles_of
 from dexkit.conformance.checks.steps import not_driven, own_speed, steps_of
 from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.usb.context import UsbContext, quiet_motors
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte
 
@@ -280,3 +281,29 @@ def reported_mode(ctx: RobotContext) -> Outcome:
                 ctx.at(ctx.states.topic, begin, end),
             ).about(joint)
     return ctx.passed("reported")
+
+
+# ---------------------------------------------------------------------------------------- USB
+
+
+@check("DEX3USB-MODE-01")
+def _usb_mode(c: UsbContext) -> Outcome:
+    judged = 0
+    for phase in c.hand.record.phases:
+        answers = c.hand.answers_in(phase)
+        if "status" not in phase.params or not answers:
+            continue
+        judged += 1
+        wanted = phase.params["status"]
+        last = answers[-1]
+        odd = {f"{m.bus}.{m.id}": m.status for m in last.reading.motors if m.status != wanted}
+        if odd:
+            figure = ", ".join(f"motor {who} reports {status}" for who, status in odd.items())
+            observed = f"commanded status {wanted}, {figure}"
+            return c.failed(f"not {wanted}", observed, c.at(last.t))
+    return c.passed("0 and 1") if judged else c.skipped("no answer to judge by")
+
+
+@check("DEX3USB-MODE-02")
+def _usb_lock(c: UsbContext) -> Outcome:
+    return quiet_motors(c, c.phases(), lambda phase: "although it was to lock")

@@ -17,6 +17,7 @@ from dexkit.conformance.checks.robot import RobotContext, joint_of, no_state
 from dexkit.conformance.checks.steps import DISOBEYS, Step, rests_before, speed_of, steps, steps_of
 from dexkit.conformance.stimuli.robot import STEP
 from dexkit.conformance.sums import mean
+from dexkit.conformance.usb.context import UsbContext, moves, named_joints, part_of_way, travel_of
 from dexkit.hand import Floats
 
 
@@ -462,3 +463,66 @@ def robot_independent(ctx: RobotContext) -> Figures:
         joint = int(np.argmax(moved))
         text = f"moves by {moved[joint]:.3f} rad with {ctx.joints[mine].name}"
         yield Figure(float(moved[joint]), begin, end, joint, text)
+
+
+# ---------------------------------------------------------------------------------------- USB
+
+
+_USB_MOVE_S = 0.2
+"""Seconds that each motor has to move (``conformance/stimuli/usb.py``, phase "move")."""
+
+
+@check("DEX3USB-MOVE-01")
+def _usb_follows(c: UsbContext) -> Outcome:
+    parts: dict[int, float] = {}
+    wrong = []
+    late = []
+    least = c.tolerance("min_part")
+    for phase, joint, begin, target in moves(c):
+        part = parts[joint] = part_of_way(c.hand, phase, joint, begin, target)
+        # overshooting by the same distance is not following either
+        if not least <= part <= 2 - least:
+            wrong.append((joint, phase))
+            # no delay sends a joint the wrong way or too far
+            late.append((least - part) * _USB_MOVE_S if -0.1 < part < least else math.inf)
+    figure = f"{min(parts.values()):.0%} .. {max(parts.values()):.0%}"
+    if not wrong:
+        return c.passed(figure, f"of the way in 0.2 s: {figure}")
+    text = ", ".join(f"{named_joints(c, [joint])} {parts[joint]:.0%}" for joint, _ in wrong)
+    outcome = c.failed(figure, f"part of the way: {text}", *(c.over(p) for _, p in wrong))
+    return outcome.about(*(joint for joint, _ in wrong)).if_late(*late)
+
+
+@check("DEX3USB-MOVE-02")
+def _usb_others(c: UsbContext) -> Outcome:
+    most = 0.0
+    earlier: set[int] = set()
+    for phase, joint, _, _ in moves(c):
+        travel = travel_of(c.hand, phase)
+        # the joint that moved before may still be moving
+        travel[[joint, *earlier]] = 0.0
+        earlier.add(joint)
+        most = max(most, float(travel.max()))
+        if travel.max() > c.tolerance("max_q"):
+            other = int(travel.argmax())
+            moved, commanded = (named_joints(c, [i]) for i in (other, joint))
+            observed = f"{moved} moved by {travel.max():.2f} rad when {commanded} was commanded to"
+            outcome = c.failed(f"{travel.max():.2f} rad", observed, c.over(phase))
+            return outcome.about(other, joint)
+    return c.passed(f"{most:.3f} rad", moved=most)
+
+
+@check("DEX3USB-MOVE-03")
+def _usb_limits(c: UsbContext) -> Outcome:
+    margin = c.tolerance("margin")
+    beyond = 0.0
+    for answer in c.hand.answers:
+        for i, (joint, q) in enumerate(zip(c.hand.joints, c.hand.q(answer), strict=True)):
+            over = max(joint.q_min - q, q - joint.q_max)
+            beyond = max(beyond, over)  # a comparison with NaN is false
+            if over > margin:
+                span = f"{joint.q_min:.2f} .. {joint.q_max:.2f}"
+                return c.failed(
+                    f"{q:.2f} rad", f"{joint.name} at {q:.2f} rad of {span}", c.at(answer.t)
+                ).about(i)
+    return c.passed(f"{beyond:.3f} rad beyond")

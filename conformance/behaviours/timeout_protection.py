@@ -8,6 +8,9 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.checks.silences import mode_bytes, roles_of, silences_of, stops_moving
 from dexkit.conformance.checks.steps import not_driven
+from dexkit.conformance.stimuli.usb import DRIVEN, FREE
+from dexkit.conformance.usb.context import UsbContext, named_joints, part_of_way
+from dexkit.conformance.usb.recording import Answer
 
 
 @check("DEX3-GUARD-01")
@@ -61,3 +64,138 @@ def latches(ctx: Context) -> Outcome:
 def clears(ctx: Context) -> Outcome:
     """The step after the protection was cleared."""
     return arrival(ctx, "commanded without bit 7 after the protection had tripped")
+
+
+# ---------------------------------------------------------------------------------------- USB
+
+
+def _usb_flags(c: UsbContext, answer: Answer) -> dict[int, bool]:
+    """The time-out flag by joint."""
+    motors = [c.hand.motor(answer, joint) for joint in range(len(c.hand.joints))]
+    return {i: m.tripped for i, m in enumerate(motors) if m is not None}
+
+
+@check("DEX3USB-PROT-01")
+def _usb_trips(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer after the silence")
+    flags = _usb_flags(c, answers[0])
+    silent = [i for i, tripped in flags.items() if not tripped and i != FREE]
+    if not silent:
+        return c.passed(f"{sum(flags.values())} tripped")
+    observed = f"after 1.5 s without a command {named_joints(c, silent)} show no time-out"
+    return c.failed(f"{len(silent)} not", observed, c.at(answers[0].t)).about(*silent)
+
+
+def _usb_driven(c: UsbContext, joint: int) -> float | None:
+    """Seconds for which a joint driven at a steady speed went on after the last command.
+
+    :returns: None when it had no such speed before, so that its stop cannot be detected.
+    """
+    silences, drives = c.hand.phases("silence"), c.hand.phases("drive")
+    after = [a for s in silences for a in c.hand.answers if a.transfer.submitted_ns >= s.end_ns]
+    if not drives or not after:
+        return None
+    t, q = c.hand.positions(drives[0])
+    late = t > t[-1] - 0.15 if len(t) else t > 0
+    if late.sum() < 3:
+        return None
+    speed = float(np.polyfit(t[late], q[late, joint], 1)[0])
+    if not abs(speed) >= c.tolerance("min_dq"):
+        return None
+    return float(c.hand.q(after[0])[joint] - q[-1, joint]) / speed
+
+
+_USB_NO_SPEED = "the motor was not driven before the silence, so its stop proves nothing"
+
+
+@check("DEX3USB-PROT-02")
+def _usb_stops(c: UsbContext) -> Outcome:
+    (silence,) = c.phases()
+    driven = _usb_driven(c, DRIVEN)
+    if driven is None:
+        return c.skipped(_USB_NO_SPEED)
+    figure = f"{driven:.2f} s"
+    if driven <= c.tolerance("max_s"):
+        return c.passed(figure, driven_s=driven)
+    observed = f"without commands it went as far as in {figure} of driving"
+    # a busy machine delays the answers that the speed is measured by
+    places = [c.over(phase) for phase in (silence, *c.hand.phases("drive"))]
+    outcome = c.failed(figure, observed, *places, driven_s=driven).about(DRIVEN)
+    return outcome.if_late(driven - c.tolerance("max_s"))
+
+
+@check("DEX3USB-PROT-03")
+def _usb_stays(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if len(answers) < 2:
+        return c.skipped("too few answers after the silence")
+    for answer in answers[1:]:
+        cleared = [i for i, tripped in _usb_flags(c, answer).items() if not tripped and i != FREE]
+        if cleared:
+            observed = f"{named_joints(c, cleared)} cleared the flag while bit 7 was set"
+            return c.failed("cleared", observed, c.at(answer.t)).about(*cleared)
+    moved = abs(float(c.hand.q(answers[-1])[DRIVEN]) - phase.params["begin"][DRIVEN])
+    if moved <= c.tolerance("max_q"):
+        return c.passed(f"{moved:.3f} rad", moved=moved)
+    observed = f"it followed a position command by {moved:.2f} rad while tripped"
+    outcome = c.failed(f"{moved:.2f} rad", observed, c.over(phase), moved=moved)
+    return outcome.about(DRIVEN)
+
+
+@check("DEX3USB-PROT-04")
+def _usb_cleared(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer to a command with bit 7 = 0")
+    tripped = [i for i, flag in _usb_flags(c, answers[-1]).items() if flag]
+    if tripped:
+        observed = (
+            f"{named_joints(c, tripped)} still tripped after 0.25 s of commands with bit 7 = 0"
+        )
+        return c.failed(f"{len(tripped)} tripped", observed, c.over(phase)).about(*tripped)
+    part = part_of_way(c.hand, phase, DRIVEN, phase.params["begin"], phase.params["target"])
+    figure = f"{part:.0%} of the way"
+    if part >= c.tolerance("min_part"):
+        return c.passed(figure)
+    return c.failed(figure, f"after clearing it went {figure}", c.over(phase)).about(DRIVEN)
+
+
+@check("DEX3USB-PROT-05")
+def _usb_disabled(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer after the silence")
+    if any(_usb_flags(c, a).get(FREE) for a in answers):
+        observed = f"{named_joints(c, [FREE])} reports a time-out although its protection was off"
+        return c.failed("tripped", observed, c.over(phase)).about(FREE)
+    driven = _usb_driven(c, FREE)
+    if driven is None:
+        return c.skipped(_USB_NO_SPEED)
+    if driven < c.tolerance("min_s"):
+        observed = f"{named_joints(c, [FREE])} stopped {driven:.2f} s into the silence"
+        return c.failed(f"{driven:.2f} s", observed, c.over(phase), driven_s=driven).about(FREE)
+    begin, target = (phase.params[name][FREE] for name in ("begin", "targets"))
+    part = part_of_way(c.hand, phase, FREE, begin, target)
+    figure = f"{part:.0%} of the way"
+    if part >= c.tolerance("min_part"):
+        return c.passed(figure)
+    return c.failed(figure, f"after the pause it went {figure}", c.over(phase)).about(FREE)
+
+
+@check("DEX3USB-PROT-06")
+def _usb_early(c: UsbContext) -> Outcome:
+    (phase,) = c.phases()
+    answers = c.hand.answers_in(phase)
+    if not answers:
+        return c.skipped("no answer after the pause")
+    tripped = [i for i, flag in _usb_flags(c, answers[0]).items() if flag]
+    if not tripped:
+        return c.passed("none")
+    observed = f"{named_joints(c, tripped)} tripped within {phase.params['seconds']:g} s"
+    return c.failed(f"{len(tripped)} tripped", observed, c.over(phase)).about(*tripped)

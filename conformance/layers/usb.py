@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from dexkit.conformance.behaviours import CHECKS
 from dexkit.conformance.layers import Layer
 from dexkit.conformance.layers.preconditions import claimed, not_blocked
 from dexkit.conformance.plots import Plot, PlotKind
@@ -14,7 +15,7 @@ from dexkit.lazy import Lazy
 if TYPE_CHECKING:
     from dexkit.conformance.recording import TraceLike
     from dexkit.conformance.results import Result
-    from dexkit.conformance.usb.checks import UsbContext
+    from dexkit.conformance.usb.context import UsbContext
     from dexkit.conformance.usb.recording import UsbRecording, UsbSide
     from dexkit.conformance.verdicts import Judgement
 
@@ -46,11 +47,11 @@ def _stimulus_applied(judgement: Judgement, context: UsbContext) -> Result | Non
 
 LAYER: Layer[UsbRecording, UsbSide, UsbContext] = Layer(
     name="usb",
-    checks=("dexkit.conformance.usb.checks",),
+    checks=CHECKS,
     plots=(Plot(PlotKind.ANSWERS), Plot(PlotKind.BYTES)),
     decode=_decode,
     subjects=lambda recording: recording.sides.items(),
-    context=Lazy("dexkit.conformance.usb.checks:UsbContext"),
+    context=Lazy("dexkit.conformance.usb.context:UsbContext"),
     # not_blocked comes first: the script ends where a device no longer answers, and the first
     # failure is the reason of missing phases
     preconditions=(claimed, not_blocked, _stimulus_applied),

@@ -54,7 +54,7 @@ SPLIT = (
     "dexkit.conformance.checks",
     "dexkit.conformance.faults",
     "dexkit.conformance.recording",
-    "dexkit.conformance.usb.checks",
+    "dexkit.conformance.usb.context",
 )
 """Modules of many independent parts; see :mod:`tools.pins.sources`."""
 JUDGES_ONLY: Mapping[str, str] = {
