@@ -332,16 +332,20 @@ def Hunts(hand: Any, torque: Call) -> float:
     return float(torque() + shake)
 
 
-@changes(ReferenceHand, "motor_torque", "DEX1-MOVE-04")
-def Slow(hand: Any, torque: Call) -> float:
+@wrong_hand("DEX1-MOVE-04")
+class Slow(ReferenceHand):
     """Moves at 2.6 rad/s at most."""
-    goal, top = hand.goal, 2.6
-    if goal is None or goal.kp <= 0:
-        return float(torque())
-    # a velocity loop below the position loop
-    wanted = min(max(12.0 * (goal.q - hand.q), -top), top)
-    tau = min(max(0.5 * (wanted - hand.dq) + hand.viscous * wanted, -2.0), 2.0)
-    return float(tau * (not hand.braking))
+
+    top = 2.6
+
+    def motor_torque(self) -> float:
+        goal = self.goal
+        if goal is None or goal.kp <= 0:
+            return super().motor_torque()
+        # a velocity loop below the position loop
+        wanted = min(max(12.0 * (goal.q - self.q), -self.top), self.top)
+        tau = min(max(0.5 * (wanted - self.dq) + self.viscous * wanted, -2.0), 2.0)
+        return tau * (not self.braking)
 
 
 @wrong_hand("DEX1-MOVE-05")
