@@ -64,9 +64,8 @@ def test_a_failure_in_safety_is_in_every_report() -> None:
     result = judged()
     assert badge_text(result)[1].endswith(" pass, 2 not applicable (simulated)")
     assert badge_text(result, Kind.SAFETY)[1].startswith("fail, 2 of 10 not met")
-    assert badges(Kind.DROP_IN, result) == tuple(Kind)
-    assert badges(Kind.SAFETY, result) == (Kind.SAFETY,)
-    both = render_badge(result, Kind.DROP_IN)
+    assert badges(result) == tuple(Kind)
+    both = render_badge(result)
     assert "Dex1-1 safety: fail" in both
     assert "#14734a" in both
     assert "#b3261e" in both

@@ -11,6 +11,7 @@ import click
 import pytest
 
 from dexkit.cli import cli
+from dexkit.cli.lazy_group import LazyGroup
 from dexkit.errors import DdsSetupError
 from tests.docs_commands import ROOT, shown_commands
 
@@ -58,6 +59,19 @@ def test_every_dexkit_command_in_the_documents_is_accepted(
             wrong.append(f"{command}\n    {error.format_message()}")
     assert len(shown) > 80
     assert not wrong, "\n".join(wrong)
+
+
+def test_the_command_page_has_the_sections_of_the_help_and_every_command() -> None:
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    headings = re.findall(r"(?m)^## (.*)$", page)
+    assert isinstance(cli, LazyGroup)
+    assert headings[: len(cli.sections)] == list(cli.sections)
+    missing = [
+        name
+        for name in cli.list_commands(click.Context(cli))
+        if not re.search(rf"`(sudo )?(dexkit )?{name}\b", page)
+    ]
+    assert not missing
 
 
 def test_every_make_target_and_module_in_the_documents_exists() -> None:

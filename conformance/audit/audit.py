@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from dexkit.conformance.audit.examine import LABELS, Task, examine, settings_key
+from dexkit.conformance.audit.examine import Task, examine, settings_key
 from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.audit.journal import Entry, Journal
 from dexkit.conformance.audit.result_tables import write_tables
@@ -123,7 +123,6 @@ class Audit:
 
     :param locations: files, folders and URLs.
     :param folder: where journal, tables and page are kept; it is created.
-    :param fresh: forget the journal of an audit before.
     :param parquet: whether the tables are Parquet; None where pyarrow decides.
     :param working_folder: what relative paths are relative to; None for the process' own.
     :raises UsageError: a URL of a kind that is not installed; another audit is running there.
@@ -134,17 +133,14 @@ class Audit:
         locations: Sequence[str],
         folder: Path,
         *,
-        labels: Sequence[str] = LABELS,
         limits: Limits = Limits(),
-        fresh: bool = False,
         parquet: bool | None = None,
         working_folder: Path | None = None,
     ) -> None:
         self.folder = folder
         self.locations = tuple(locations)
         self._working_folder = working_folder
-        self._labels = tuple(dict.fromkeys(label.lower() for label in labels))
-        self._limits, self._fresh, self._parquet = limits, fresh, parquet
+        self._limits, self._parquet = limits, parquet
         self._before: dict[str, Entry] = {}  # of changed files, which may be the same inside
 
     def run(
@@ -166,7 +162,7 @@ class Audit:
                 else:
                     problems[found.name] = found
         self.folder.mkdir(parents=True, exist_ok=True)
-        with Journal(self.folder / "journal.jsonl", fresh=self._fresh) as journal:
+        with Journal(self.folder / "journal.jsonl") as journal:
             names = sorted({*sessions, *problems})
             outcome.total, outcome.problems = len(names), len(problems)
             for record in problems.values():
@@ -189,7 +185,7 @@ class Audit:
         self, journal: Journal, sessions: dict[str, SessionFile], outcome: AuditProgress
     ) -> list[Task]:
         """The files to be examined, largest first; counts those that need not be."""
-        settings = settings_key(self._labels)
+        settings = settings_key()
         tasks = []
         for name, session in sessions.items():
             entry = journal.entries.get(name)
@@ -200,7 +196,7 @@ class Audit:
                     continue
                 known, self._before[name] = entry.sha256, entry
             journal.entries.pop(name, None)  # whatever it says, it may no longer be true
-            tasks.append(Task(session, known, self._labels, self._limits.max_size))
+            tasks.append(Task(session, known, self._limits.max_size))
         return sorted(tasks, key=lambda t: (-t.session.size, t.session.name))
 
     def _record(self, journal: Journal, task: Task, result: FileRecord | WorkerLost) -> FileRecord:

@@ -102,7 +102,7 @@ class Cluster:
                     if task is None:
                         exhausted = True
                         break
-                    settings = settings_key(task.labels)
+                    settings = settings_key()
                     reference = self._examine.remote(
                         task, settings, self._limits.seconds, self._limits.memory
                     )
@@ -165,7 +165,7 @@ def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileReco
 
     :param settings: those of the audit; a node with another dexkit would judge differently.
     """
-    mine = settings_key(task.labels)
+    mine = settings_key()
     if mine != settings:
         raise RuntimeError(
             f"its dexkit or catalogue differs from the audit's ({mine}, not {settings})"

@@ -27,9 +27,9 @@ from dexkit.redaction import redact
 from dexkit.traces import Trace, open_trace
 from dexkit.traces.container import OpenFile
 
-__all__ = ["LABELS", "Task", "examine", "settings_key"]
+__all__ = ["Task", "examine", "settings_key"]
 
-LABELS = ("robot", "operator", "task", "site")
+_LABELS = ("robot", "operator", "task", "site")
 """Keys of a recording's metadata, in any of its records, by which an audit groups sessions."""
 _SOME = 5  # of a file's warnings are kept
 _TEXT = 500  # characters of each
@@ -40,19 +40,17 @@ class Task:
     """A file to be examined.
 
     :param known: the SHA-256 that it had when it was examined the last time, or empty.
-    :param labels: keys of its metadata that are kept.
     :param max_size: bytes of an object that are copied; larger ones are read by ranges.
     """
 
     session: SessionFile
     known: str = ""
-    labels: tuple[str, ...] = LABELS
     max_size: int = 2**33
 
 
-def settings_key(labels: Sequence[str]) -> str:
+def settings_key() -> str:
     """Key of the settings; records are reused only if it is equal."""
-    return ",".join([__version__, catalogue_digest(), *labels])
+    return ",".join([__version__, catalogue_digest(), *_LABELS])
 
 
 def examine(task: Task) -> FileRecord:
@@ -67,7 +65,7 @@ def examine(task: Task) -> FileRecord:
     try:
         with opened(session, task.max_size) as (path, open_file, digest):
             if digest != task.known:
-                record = _judged(path, open_file, session.name, task.labels)
+                record = _judged(path, open_file, session.name)
             else:
                 record = FileRecord(session.name, state=State.JUDGED)
     except (DexkitError, OSError, MemoryError) as error:
@@ -81,7 +79,7 @@ def examine(task: Task) -> FileRecord:
             record.error = f"{_where()}: {record.error}"
             record.hint = "please report this, with the file if you can"
     record.size, record.tag, record.sha256 = session.size, session.tag, digest
-    record.settings = settings_key(task.labels)
+    record.settings = settings_key()
     record.dexkit, record.catalogue = __version__, catalogue_digest()
     record.facts["cpu_s"] = round(time.process_time() - begin, 4)
     return record
@@ -95,11 +93,11 @@ def _where() -> str:
     return "?" if trace is None else f"{trace.tb_frame.f_code.co_name}:{trace.tb_lineno}"
 
 
-def _judged(path: Path, open_file: OpenFile | None, name: str, labels: Sequence[str]) -> FileRecord:
+def _judged(path: Path, open_file: OpenFile | None, name: str) -> FileRecord:
     facts: dict[str, Any] = {}
     try:
         trace = open_trace(path, open_file)
-        facts = _facts_of_trace(trace, labels)
+        facts = _facts_of_trace(trace)
         view = recording_of(trace, None, ())
         facts |= _facts_of_recording(view)
         result = judge(view, claims=recorded_claims(view.run))
@@ -138,7 +136,7 @@ def _some(texts: Sequence[str]) -> list[str]:
     return [one_line(text, _TEXT) for text in texts[:_SOME]]
 
 
-def _facts_of_trace(trace: Trace, labels: Sequence[str]) -> dict[str, Any]:
+def _facts_of_trace(trace: Trace) -> dict[str, Any]:
     start = datetime.fromtimestamp(trace.first_ns / 1e9, timezone.utc)
     return {
         "recorded_at": start.isoformat(timespec="seconds") if trace.first_ns else "",
@@ -148,7 +146,7 @@ def _facts_of_trace(trace: Trace, labels: Sequence[str]) -> dict[str, Any]:
         "truncated": trace.truncated,
         "damage": _some(trace.damage),
         "warnings": _some(trace.warnings),
-        "labels": _labels(trace.metadata, labels),
+        "labels": _labels(trace.metadata),
         "topics": [
             {
                 "topic": one_line(c.topic),
@@ -161,11 +159,11 @@ def _facts_of_trace(trace: Trace, labels: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _labels(metadata: Mapping[str, Mapping[str, str]], names: Sequence[str]) -> dict[str, str]:
+def _labels(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
     found: dict[str, str] = {}
     for record in metadata.values():
         for key, value in record.items():
-            if key.lower() in names and value:
+            if key.lower() in _LABELS and value:
                 found.setdefault(key.lower(), one_line(redact(value), 100))
     return found
 

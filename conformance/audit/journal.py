@@ -37,13 +37,12 @@ class Journal:
     """The records of an audit; a context manager.
 
     :param path: the file; created if it is not there.
-    :param fresh: forget what is in it.
     :ivar entries: the newest record of each file, by name.
     :raises UsageError: it is something else, or another audit writes to it.
     :raises OutputError: it cannot be written.
     """
 
-    def __init__(self, path: Path, *, fresh: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: dict[str, Entry] = {}
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
@@ -52,12 +51,12 @@ class Journal:
         except OSError as error:
             raise output_error(path, error) from error
         try:
-            self._begin(fresh)
+            self._begin()
         except BaseException:
             self._file.close()
             raise
 
-    def _begin(self, fresh: bool) -> None:
+    def _begin(self) -> None:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -73,7 +72,7 @@ class Journal:
                 f"{self.path} is not the journal of an audit of this version",
                 hint="choose another folder with --out, or delete it",
             )
-        if not fresh and first == _FIRST:
+        if first == _FIRST:
             self._load()
         else:
             self._truncate(0)

@@ -50,18 +50,9 @@ def badge_text(result: RunResult, kind: Kind = Kind.DROP_IN) -> tuple[str, str]:
     return f"{name} {kind}", (f"{text} ({real})" if real else text)
 
 
-def badges(kind: Kind | None, result: RunResult) -> tuple[Kind, ...]:
-    """The grades that an image shows.
-
-    :param kind: the one that was asked for; None for both. The badge as a drop-in never stands
-        alone where the grade in safety has failed.
-    """
-    if result.client_only:
-        return (Kind.DROP_IN,)
-    failed = result.grade(Kind.SAFETY).overall is Overall.FAIL
-    if kind is None or (kind is Kind.DROP_IN and failed):
-        return tuple(Kind)
-    return (kind,)
+def badges(result: RunResult) -> tuple[Kind, ...]:
+    """The grades that an image shows."""
+    return (Kind.DROP_IN,) if result.client_only else tuple(Kind)
 
 
 def _width(text: str) -> int:
@@ -69,13 +60,10 @@ def _width(text: str) -> int:
     return round(sum(4.2 if c in _NARROW else 9.6 if c in _WIDE else 6.9 for c in text))
 
 
-def render_badge(result: RunResult, kind: Kind | None = None) -> str:
-    """Return the badges as one SVG, side by side; its title also says what a run catches.
-
-    :param kind: as for :func:`badges`.
-    """
+def render_badge(result: RunResult) -> str:
+    """Return the badges as one SVG, side by side; its title also says what a run catches."""
     x, titles, drawn = 0, [], []
-    for number, grade in enumerate(badges(kind, result)):
+    for number, grade in enumerate(badges(result)):
         left, right = badge_text(result, grade)
         titles.append(f"{left}: {right}")
         width, content = _badge(left, right, _colour(result, grade), x, number)

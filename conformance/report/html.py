@@ -69,28 +69,22 @@ def write_html(
     path: Path,
     *,
     recording: Path | None = None,
-    catalogue: str = "",
 ) -> None:
     """Write the page.
 
     :param view: the recording that was judged, or None: no plots then.
     :param recording: its file, which the page links to; None for the name that the result has.
-    :param catalogue: address of the requirements' pages, as :func:`render` takes it.
     """
     link = result.subject.get("recording", "")
     if recording is not None:
         link = Path(os.path.relpath(recording.absolute(), path.absolute().parent)).as_posix()
-    write_file(path, render(result, view, link=link, catalogue=catalogue))
+    write_file(path, render(result, view, link=link))
 
 
-def render(
-    result: RunResult, view: Recording | None = None, *, link: str = "", catalogue: str = ""
-) -> str:
+def render(result: RunResult, view: Recording | None = None, *, link: str = "") -> str:
     """Return the page as text.
 
     :param link: where the recording is, relative to the page; empty where it is not kept.
-    :param catalogue: address of the folder with a page for each requirement (``make docs-site``
-        makes them), which the page links to; empty for no links.
     """
     answer = ANSWERS[result.overall]
     answers = ", ".join(f"{k} {answer_of(result.grade(k)).text.lower()}" for k in Kind)
@@ -141,7 +135,6 @@ def render(
         # every requirement
         link=link,
         file=Path(link).name,
-        catalogue=catalogue.rstrip("/"),
         clients=grouped(result.client),
         client_sentence=_capital(result.client_sentence()),
         made_with=[

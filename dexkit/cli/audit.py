@@ -96,7 +96,6 @@ def command(
     """
     from dexkit.conformance.audit.audit import FAIL_ON, Audit, Limits
     from dexkit.conformance.audit.cluster import Cluster
-    from dexkit.conformance.audit.examine import LABELS
     from dexkit.conformance.audit.sessions import is_url
 
     assert _FAIL_ON == FAIL_ON
@@ -108,7 +107,6 @@ def command(
     audit = Audit(
         locations,
         out.absolute(),
-        labels=LABELS,
         limits=limits,
         parquet=None if table_format == "auto" else table_format == "parquet",
         working_folder=Path.cwd(),

@@ -37,5 +37,5 @@ def command(result: Path, output: Path) -> None:
     found = read_json(result)
     write_text(output, render_badge(found))
     if str(output) != "-":
-        for drawn in badges(None, found):
+        for drawn in badges(found):
             click.echo(f"{output}: {' | '.join(badge_text(found, drawn))}")

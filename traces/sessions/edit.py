@@ -155,7 +155,6 @@ def merge(
     out: str | os.PathLike[str],
     *,
     shifts: Sequence[float] | None = None,
-    keep_duplicates: bool = False,
     overwrite: bool = False,
 ) -> Merged:
     """Write several recordings as one, in order of log time.
@@ -202,7 +201,7 @@ def merge(
         duplicates = 0
         sources = [_shifted(t, s) for t, s in zip(traces, moved, strict=True)]
         for time_ns, m in heapq.merge(*sources, key=lambda entry: entry[0]):
-            if m.publish_time_ns and not keep_duplicates:
+            if m.publish_time_ns:
                 while recent and recent[0][0] < time_ns - _WINDOW:
                     seen.discard(recent.popleft()[1])
                 identity = _identity(m)
