@@ -13,6 +13,7 @@ from dexkit.conformance.checks.contacts import contacts
 from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.generated import parse
+from dexkit.conformance.hands import under_test
 from dexkit.conformance.requirements import catalogue, select
 from dexkit.conformance.results import Result, Verdict
 from dexkit.conformance.selection import length
@@ -20,7 +21,7 @@ from dexkit.conformance.stimuli import CommandSession, phases_for
 from dexkit.conformance.virtual import Sample, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
-from dexkit.models import BUILT_IN, MODELS
+from dexkit.models import BUILT_IN
 
 
 def judged(service: type[Service], *ids: str) -> list[Result]:
@@ -128,7 +129,7 @@ def test_a_servo_that_stays_where_it_was_a_moment_ago_does_not_park() -> None:
 def test_a_default_run_of_hands_is_short_enough(name: str) -> None:
     """90 s, less 4 s for start and judgement, and 9 s in which the slowest hand arrives."""
     stimuli = length(name, phases_for(catalogue(name)))
-    session = CommandSession.default(name).duration if MODELS[name].session else 0.0
+    session = CommandSession.default(name).duration if under_test(name).session else 0.0
     assert stimuli + session <= 77.0
 
 
