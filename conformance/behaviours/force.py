@@ -1,7 +1,7 @@
 """tau_est, or a current, shows the force that a joint applies.
 
-Such a hand has no gains, and no source says how much force a goal beyond the object makes. So a
-grip is recognised by position, and its force is compared with that of other grips of the run.
+Position servos have no gains, and no source says how much force a goal beyond the object makes. So
+their grip is recognised by position, and its force compared with that of other grips of the run.
 """
 
 from __future__ import annotations

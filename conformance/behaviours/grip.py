@@ -44,8 +44,9 @@ from dexkit.conformance.row_selection import Rows
 from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats
 
-_HELD_BY_GRIPPER = 0.2
-"""Quantile of tau_est that counts as held: a chattering limit lets go half of the time."""
+_HELD = 0.2
+"""Quantile of tau_est that counts as held, and from above as reached: a chattering limit lets go
+half of the time."""
 
 
 def _felt(
@@ -60,7 +61,7 @@ def _felt(
         tau = np.abs(ctx.tau(float(at), float(at) + window)[:, 0])
         tau = np.sort(tau[np.isfinite(tau)])
         if len(tau) >= 3:
-            found.append((float(at), median(tau), float(tau[int(_HELD_BY_GRIPPER * len(tau))])))
+            found.append((float(at), median(tau), float(tau[int(_HELD * len(tau))])))
     return found
 
 
@@ -285,12 +286,8 @@ def joints_as_commanded(ctx: Context) -> Figures:
                 )
 
 
-_FORCE_S, _HELD_LATER = (
-    0.3,
-    0.2,
-)  # s over which a force is taken, and the part of it that is below it
-
-
+_FORCE_S = 0.3
+"""Seconds over which a force is taken."""
 _STANDS_IN_GRIP = 0.03  # part of the range: a joint that moves by less meanwhile stands
 
 
@@ -339,7 +336,7 @@ def keeps_gripping(ctx: Context) -> Figures:
             tau = ctx.tau(a, b)
             if not len(tau):
                 continue
-            held = np.quantile(np.abs(tau), _HELD_LATER, axis=0)
+            held = np.quantile(np.abs(tau), _HELD, axis=0)
             for joint in (j for j in pressing if a >= since[j] - 1e-9):
                 then, now = float(first[joint]), float(held[joint])
                 text = f"tau_est of {then:.2f} N m at first, and of {now:.2f} N m later"
@@ -538,10 +535,6 @@ _FEW = 20
 
 _PRESSED_S = 0.3
 """Seconds at the end of a squeeze in which the joints stand."""
-
-
-_HELD = 0.2
-"""Quantile of tau_est that counts as held, and from above as reached."""
 
 
 _STANDS = 0.01

@@ -1,10 +1,7 @@
 """Joints stay where they are without a new command.
 
-Such a hand has no gains, and the force of its currents is not documented. So a grip is recognised
-by position: the joints stand at the object while their goals lie beyond it.
-
-Both checks use the whole run, not only the ends of steps. Stretches that other requirements judge
-(bad commands, missing commands, commands without a position gain) are left out.
+The whole run counts, not only the ends of steps. Stretches that other requirements judge (bad
+commands, missing commands, commands without a position gain) are left out.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ object. The checks compare the members of the state in windows, so that a fault 
 detected like a permanent one. Allowed are measurements up to 20 ms old, prediction between them,
 coarse encoders, a constant factor on dq (DEX1-FIELD-16 reports it), and torque in contact only.
 
-:mod:`~dexkit.conformance.checks.consistency` compares integrals in windows with motion. It misses a
-dq that alternates between twice the speed and 0, and one that is stuck while the joint stands.
+Integrals in windows with motion miss a dq that alternates between twice the speed and 0, and one
+that is stuck while the joint stands: these are compared from one state to the next, and at rest.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""The checks: each judges a recording for one requirement and one side.
+"""What a check is, and what the checks of several behaviours measure with.
 
-A check is a function of a :class:`Context` that returns an :class:`Outcome`. It never passes
-without evidence, and takes every limit from its requirement's tolerances, so that hand models can
-share it. Modules, by subject: :mod:`~dexkit.conformance.checks.discovery`,
-:mod:`~.timing`, :mod:`~.fields`, :mod:`~.members`, :mod:`~.consistency`, :mod:`~.velocity`,
-:mod:`~.motion`, :mod:`~.force`, :mod:`~.drive`, :mod:`~.firmness`, :mod:`~.grip`, :mod:`~.safety`,
-:mod:`~.after_disturbances`, :mod:`~.uncommanded`, :mod:`~.lifecycle`, :mod:`~.tracking`,
-:mod:`~.fingers`, :mod:`~.each_joint` and :mod:`~.pressure` for hands of several joints,
-:mod:`~.touch` for a topic of tactile areas, :mod:`~.servos` and :mod:`~.servo_force` for position
-servos, and :mod:`~.client` for the client that drives them.
+A check is a function of a :class:`Context` that judges a recording for one requirement and one side
+and returns an :class:`Outcome`. It never passes without evidence, and takes every limit from its
+requirement's tolerances, so that hand models can share it. It is beside its requirement, in
+:mod:`dexkit.conformance.behaviours`. Most checks yield figures: :mod:`~.figures`.
+
+Here are steps of joints (:mod:`~.steps`), and whether a hand obeys (:mod:`~.obedience`); gaps and
+rates (:mod:`~.timing`), goals (:mod:`~.goals`), silences (:mod:`~.silences`); members of a state
+(:mod:`~.members`), and its velocities (:mod:`~.speeds`); contacts of grippers (:mod:`~.contacts`),
+soft grips (:mod:`~.soft_grips`), torque pulses (:mod:`~.nudges`), the law of torque
+(:mod:`~.torque_law`), and stands of position servos (:mod:`~.stands`); robots (:mod:`~.robot`).
 """
 
 from __future__ import annotations
