@@ -18,10 +18,10 @@ from dexkit.dds import (
     Endpoint,
     Qos,
     Reader,
-    _cyclone,
     interfaces,
     type_hash,
 )
+from dexkit.dds.cyclone import library
 from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError, WireError
 from dexkit.interface_filter import interface_address
 from dexkit.messages import message_type
@@ -55,7 +55,7 @@ def test_sample_arrives_unchanged_with_its_timestamp(dds_node: DdsNode) -> None:
 
 def test_a_writer_keeps_its_one_instance(dds_node: DdsNode) -> None:
     """Otherwise CycloneDDS makes and frees it with each sample."""
-    lookup = _cyclone().layer.ddspy_lookup_instance
+    lookup = library().layer.ddspy_lookup_instance
     messages = [MotorCmds_([MotorCmd_(q=q)]) for q in (1.0, 2.0, 3.0)]
     handles = set()
     with dds_node.writer("rt/instance", CMDS) as writer:
@@ -324,10 +324,11 @@ def test_domain_configured_by_other_code_is_used_and_kept() -> None:
     script = f"""
 import logging
 from cyclonedds.domain import Domain, DomainParticipant
-from dexkit.dds import DdsNode, _config
+from dexkit.dds import DdsNode
+from dexkit.dds.domain import config
 records = []
 logging.getLogger("dexkit.dds").warning = lambda *args: records.append(args)
-foreign = Domain({free_domain()}, _config("lo"))
+foreign = Domain({free_domain()}, config("lo"))
 for _ in range(2):
     with DdsNode(foreign._id) as node, DdsNode(foreign._id) as other:
         writer = node.writer("rt/x", "{CMDS}")
@@ -369,7 +370,7 @@ old = make_idl_struct(
 )
 annotations.final(old)
 annotations.autoid("sequential")(old)
-dds.cyclone_type = lambda name: old
+dds.node.cyclone_type = lambda name: old
 with dds.DdsNode({dds_node.domain}) as node:
     writer = node.writer("rt/t13", "{name}")
     print("up", flush=True)
@@ -468,7 +469,7 @@ import threading
 from dexkit import dds
 
 logging.basicConfig()
-dds._EXIT_PATIENCE = 0.2
+dds.node._EXIT_PATIENCE = 0.2
 node, other = dds.DdsNode(int(sys.argv[1])), dds.DdsNode(int(sys.argv[1]))
 inside = threading.Event()
 

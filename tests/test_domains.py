@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
-from dexkit import dds, domains
+from dexkit import domains
 from dexkit.dds import DdsNode
+from dexkit.dds.domain import MAX_PARTICIPANT_INDEX
 from dexkit.domains import AUTOMATIC_DOMAINS, ReservedDomain, reserve_free_domain
 from dexkit.errors import DexkitError
 from tests.dds_helpers import free_domain
@@ -59,5 +60,5 @@ def test_a_domain_with_a_participant_is_not_taken(monkeypatch: pytest.MonkeyPatc
 
 
 def test_no_participant_of_ours_uses_the_reserved_port() -> None:
-    assert domains._PORT > 10 + 2 * dds._MAX_PARTICIPANT_INDEX
+    assert domains._PORT > 10 + 2 * MAX_PARTICIPANT_INDEX
     assert 7400 + 250 * AUTOMATIC_DOMAINS[-1] + domains._PORT < 65536

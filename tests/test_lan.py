@@ -670,7 +670,8 @@ _SERVERS = re.compile(r"(TCP|UDP|HTTP)Server$")
 _CALLED = re.compile(rf"\b({'|'.join(_OPENING)}|\w*(TCP|UDP|HTTP)Server)\b")
 # where something listens, each tested above
 _KNOWN = {
-    "dexkit/dds.py": {"Domain", "DomainParticipant"},
+    "dexkit/dds/domain.py": {"Domain"},
+    "dexkit/dds/node.py": {"DomainParticipant"},
     "dexkit/domains.py": {"bind"},  # reserves a port of DDS and reads nothing from it
     "dexkit/doctor/dds.py": {"bind"},
     "dexkit/doctor/link.py": {"bind"},  # echoes and refused connections, from one address

@@ -110,10 +110,10 @@ def test_nothing_imports_a_package_by_its_bare_name(folder: str) -> None:
 
 
 @each("folder", ["dexkit", "benchmarks", *PACKAGES])
-def test_only_the_dds_module_touches_cyclonedds(folder: str) -> None:
+def test_only_the_dds_package_touches_cyclonedds(folder: str) -> None:
     for path in files(folder):
         touches = any(name.split(".")[0] == "cyclonedds" for name in imported(path))
-        assert not touches or path == ROOT / "dexkit" / "dds.py", path.relative_to(ROOT)
+        assert not touches or path == ROOT / "dexkit" / "dds" / "cyclone.py", path.relative_to(ROOT)
 
 
 def module_name(path: Path) -> str:

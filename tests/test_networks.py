@@ -18,7 +18,7 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli import cli
-from dexkit.dds import _config
+from dexkit.dds.domain import config
 from dexkit.errors import DdsSetupError, UsageError
 from dexkit.interface_names import (
     PEERS,
@@ -91,8 +91,8 @@ def test_interface_that_is_not_there(text: str, error: type[Exception], said: st
 
 def test_participants_are_announced_twice_a_second_on_a_network() -> None:
     """After a link was down for longer than the lease, the first announcement ends that."""
-    assert "<SPDPInterval>500ms</SPDPInterval>" in _config("net0")
-    assert "SPDPInterval" not in _config("lo")
+    assert "<SPDPInterval>500ms</SPDPInterval>" in config("net0")
+    assert "SPDPInterval" not in config("lo")
 
 
 def test_peer_that_is_not_known() -> None:

@@ -171,7 +171,7 @@ EDITS = [
     # neither
     ("dexkit/conformance/report/html.py", "import html", "import html, math", False, False),
     ("dexkit/conformance/faults/robot.py", "class ", "class X", False, False),
-    ("dexkit/dds.py", "import threading", "import threading, math", False, False),
+    ("dexkit/dds/node.py", "import threading", "import threading, math", False, False),
 ]
 
 
