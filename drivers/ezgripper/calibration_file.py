@@ -24,13 +24,13 @@ are kept.
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import platformdirs
 
 from dexkit import documents
@@ -38,6 +38,7 @@ from dexkit.drivers.ezgripper.force import ForceTable
 from dexkit.drivers.ezgripper.scaling import STROKES
 from dexkit.errors import UsageError
 from dexkit.hand import Side
+from dexkit.records import to_record
 from dexkit.wire import mx64
 
 _HINT = "correct it, or remove it and calibrate again"
@@ -89,6 +90,33 @@ class GripperRecord:
     force_unit_known: bool = True
     mirrored: bool | None = None
     stroke: int | None = None
+
+
+_Speed = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class _Speeds(msgspec.Struct):
+    opening: _Speed | None = None
+    closing: _Speed | None = None
+
+
+class _Entries(msgspec.Struct):
+    """The entries of one gripper, by the section of the file."""
+
+    calibration: Annotated[int, msgspec.Meta(ge=-mx64.POSITION_SPAN, le=mx64.POSITION_SPAN)] | None
+    movement_speed: _Speed | _Speeds | None
+    direction_speeds: _Speed | _Speeds | None
+    force_lookup: dict[str, float] | None
+    force_lookup_unit: str | None
+    mirrored: bool | None
+    stroke: Annotated[int, msgspec.Meta(ge=STROKES[0], le=STROKES[1])] | None
+
+
+def _pair(speeds: float | _Speeds | None) -> tuple[float | None, float | None]:
+    """The speeds of opening and closing."""
+    if isinstance(speeds, _Speeds):
+        return speeds.opening, speeds.closing
+    return speeds, speeds
 
 
 class Store:
@@ -172,64 +200,29 @@ class Store:
         :raises UsageError: the file cannot be read, or this gripper's entries are invalid.
         """
         content = self._load()
-        where = f"{self.path}: {key}"
-        zero = self._get_section(content, _ZERO).get(key)
-        if zero is not None and (
-            isinstance(zero, bool) or not isinstance(zero, int) or abs(zero) > mx64.POSITION_SPAN
-        ):
-            raise UsageError(f"{where}: zero {zero!r} is not a position in ticks")
-        opening, closing = self._parse_speeds(where, self._get_section(content, _SPEED).get(key))
-        pair = self._get_section(content, _DIRECTIONS).get(key)
-        if pair is not None:
-            directions = self._parse_speeds(where, pair)
-            known = [speed for speed in directions if speed is not None]
-            if opening == closing and known and min(known) == opening:
-                opening, closing = directions
-        unit = self._get_section(content, _UNIT).get(key)
-        if unit not in (None, CURRENT_UNIT):
+        entries = {n: self._get_section(content, n).get(key) for n in _Entries.__struct_fields__}
+        found = to_record(entries, _Entries, f"{self.path}: {key}", hint=_HINT)
+        if found.force_lookup_unit not in (None, CURRENT_UNIT):
             raise UsageError(
-                f"{where}: the force table is in {unit!r}, not in {CURRENT_UNIT!r}",
+                f"{self.path}: {key}: the force table is in {found.force_lookup_unit!r}, not in "
+                f"{CURRENT_UNIT!r}",
                 hint="measure it: dexkit calibrate ezgripper --measure force",
             )
-        table = self._get_section(content, _FORCE).get(key)
-        if table is not None and not isinstance(table, dict):
-            raise UsageError(f"{where}: the force table must be an object")
-        mirrored = self._get_section(content, _MIRRORED).get(key)
-        if mirrored is not None and not isinstance(mirrored, bool):
-            raise UsageError(f"{where}: mirrored is true or false, not {mirrored!r}")
-        stroke = self._get_section(content, _STROKE).get(key)
-        if stroke is not None and (
-            isinstance(stroke, bool)
-            or not isinstance(stroke, int)
-            or not STROKES[0] <= stroke <= STROKES[1]
-        ):
-            raise UsageError(f"{where}: a stroke is {STROKES[0]} to {STROKES[1]} ticks")
+        opening, closing = _pair(found.movement_speed)
+        directions = _pair(found.direction_speeds)
+        known = [speed for speed in directions if speed is not None]
+        if opening == closing and known and min(known) == opening:
+            opening, closing = directions
+        zero, table = found.calibration, found.force_lookup
         return GripperRecord(
             zero=None if zero is None else zero % mx64.TICKS_PER_TURN,
             opening=opening,
             closing=closing,
             force_table=None if table is None else ForceTable.from_mapping(table),
-            force_unit_known=table is None or unit is not None,
-            mirrored=mirrored,
-            stroke=stroke,
+            force_unit_known=table is None or found.force_lookup_unit is not None,
+            mirrored=found.mirrored,
+            stroke=found.stroke,
         )
-
-    @staticmethod
-    def _parse_speeds(where: str, value: object) -> tuple[float | None, float | None]:
-        if value is None:
-            return None, None
-        pair = value if isinstance(value, dict) else {"opening": value, "closing": value}
-        speeds = []
-        for direction in ("opening", "closing"):
-            speed = pair.get(direction)
-            if speed is not None and (
-                isinstance(speed, bool)
-                or not isinstance(speed, int | float)
-                or not 0 < speed < math.inf
-            ):
-                raise UsageError(f"{where}: {direction} speed {speed!r} is not a positive number")
-            speeds.append(None if speed is None else float(speed))
-        return speeds[0], speeds[1]
 
     def write(self, key: str, record: GripperRecord) -> None:
         """Store the known values of ``record``; the file keeps its values for the others.
