@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import math
 
-from dexkit.conformance.selection import RunKind
-
 __all__ = ["CATCH_RATES", "wilson"]
 
-CATCH_RATES: dict[str, dict[RunKind, tuple[int, int]]] = {
-    "dex1-1": {RunKind.QUICK: (2, 8), RunKind.DEFAULT: (7, 8)},
-    "dex3-1": {RunKind.QUICK: (2, 4), RunKind.DEFAULT: (4, 4)},
-    "dex5-1": {RunKind.QUICK: (3, 3), RunKind.DEFAULT: (3, 3)},
-    "brainco-revo2": {RunKind.QUICK: (1, 2), RunKind.DEFAULT: (2, 2)},
-    "inspire-dfx": {RunKind.QUICK: (2, 3), RunKind.DEFAULT: (3, 3)},
-    "inspire-ftp": {RunKind.QUICK: (2, 3), RunKind.DEFAULT: (3, 3)},
+CATCH_RATES: dict[str, dict[str, tuple[int, int]]] = {
+    "dex1-1": {"quick": (2, 8), "default": (7, 8)},
+    "dex3-1": {"quick": (2, 4), "default": (4, 4)},
+    "dex5-1": {"quick": (3, 3), "default": (3, 3)},
+    "brainco-revo2": {"quick": (1, 2), "default": (2, 2)},
+    "inspire-dfx": {"quick": (2, 3), "default": (3, 3)},
+    "inspire-ftp": {"quick": (2, 3), "default": (3, 3)},
 }
 """Of generated wrong hands that break a MUST: how many were caught, and how many were tried."""
 

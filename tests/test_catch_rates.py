@@ -20,7 +20,6 @@ from dexkit.conformance.report.labels import catch_sentence
 from dexkit.conformance.report.markdown import plain, render_markdown
 from dexkit.conformance.report.terminal import print_result
 from dexkit.conformance.results import RunResult
-from dexkit.conformance.selection import RunKind
 from dexkit.escaping import html
 from dexkit.models import HandModel
 from tests.report_helpers import result_of_every_kind
@@ -31,11 +30,11 @@ def test_every_hand_of_dexkit_is_measured_in_quick_and_default_runs() -> None:
         h.model.name for h in hands.BUILT_IN if isinstance(h.model, HandModel)
     }
     for rates in CATCH_RATES.values():
-        assert set(rates) >= {RunKind.QUICK, RunKind.DEFAULT}
+        assert set(rates) >= {"quick", "default"}
 
 
 def test_sentence_has_the_number_of_each_kind_of_run_with_its_interval() -> None:
-    caught, tried = CATCH_RATES["dex1-1"][RunKind.DEFAULT]
+    caught, tried = CATCH_RATES["dex1-1"]["default"]
     low, high = wilson(caught, tried)
     sentence = catch_sentence(result_of_every_kind())
     assert (
