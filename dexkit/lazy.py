@@ -1,7 +1,7 @@
 """References to objects that are imported on first use.
 
-A profile names code that must not be loaded with it, such as an emulator or the conformance kit,
-as ``package.module:attribute``.
+A record of a hand or a driver names code that must not be loaded with it, such as a dialect's codec
+or a bring-up, as ``package.module:attribute``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Every hand model: those of dexkit, and those of other packages.
 
-A profile (:class:`HandModel`) is all that dexkit knows of a hand. The built-in ones are
-the modules beside this one. A package adds its own under the entry-point group
+A profile (:class:`HandModel`) holds the facts of a hand. The built-in ones are the modules beside
+this one. A package adds its own under the entry-point group
 ``dexkit.models``::
 
     [project.entry-points."dexkit.models"]
