@@ -15,7 +15,7 @@ from dexkit.cli.lazy_group import LazyGroup
 from dexkit.errors import DdsSetupError
 from tests.docs_commands import ROOT, shown_commands
 
-_OWN = {"my", "my-hand-1"}
+_OWN = {"myhand", "myhand-1"}
 """The model that docs/other-hands.md shows how to add."""
 
 
