@@ -666,7 +666,10 @@ def test_calibration_on_the_command_line(monkeypatch: pytest.MonkeyPatch) -> Non
     ("arguments", "expected"),
     [
         (["dex1-serial"], "no hand is given"),
-        (["dex1-serial", "--side", "left", "--speed"], "--speed does not apply to dex1-serial"),
+        (
+            ["dex1-serial", "--side", "left", "--measure", "speed"],
+            "--measure does not apply to dex1-serial",
+        ),
         (
             ["ezgripper", "--side", "left", "--device", "x"],
             "--side cannot be combined with --device",

@@ -158,7 +158,7 @@ def test_small_terminal_without_colours_is_resized_and_interrupted(tmp_path: Pat
 def test_monitor_reacts_to_keys_and_records(tmp_path: Path) -> None:
     domain = free_domain()
     with DdsNode(domain) as node, Session(
-        "--domain", domain, "--log", "a.mcap", columns=100, lines=30, folder=tmp_path,
+        "--domain", domain, "--record", "a.mcap", columns=100, lines=30, folder=tmp_path,
         LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0",
     ) as session:  # fmt: skip
         hand = Hand(node)
@@ -183,7 +183,7 @@ def test_monitor_reacts_to_keys_and_records(tmp_path: Path) -> None:
 def test_recording_is_whole_when_the_connection_goes(tmp_path: Path) -> None:
     domain = free_domain()
     with DdsNode(domain) as node, Session(
-        "--domain", domain, "--log", "a.mcap", columns=80, lines=24, folder=tmp_path
+        "--domain", domain, "--record", "a.mcap", columns=80, lines=24, folder=tmp_path
     ) as session:  # fmt: skip
         hand = Hand(node)
         session.until(lambda: "thumb_0" in session.text, hand)

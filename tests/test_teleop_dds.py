@@ -106,7 +106,7 @@ def test_hint_is_printed_once_after_five_seconds(capsys: pytest.CaptureFixture[s
 
 
 def test_profiles_are_listed_without_a_hand() -> None:
-    result = teleop("--list")
+    result = teleop()
     assert result.exit_code == 0
     for name in ("full-stroke", "pick-place", "startle", "pinch", "fist"):
         assert f"  {name} " in result.stdout
