@@ -131,6 +131,33 @@ class _Scene:
         moved = np.ptp(filled, axis=0) / np.array([j.stroke for j in joints])
         return [int(i) for i in np.argsort(-moved, kind="stable")[:most]]
 
+    def chart(
+        self,
+        what: str,
+        lines: Sequence[Line],
+        unit: str,
+        span: tuple[float, float] | None = None,
+        *,
+        bands: Sequence[Band] | None = None,
+        levels: Sequence[Level] = (),
+    ) -> str:
+        """A low chart of the hand, with 0 in it.
+
+        :param span: by default the whole run.
+        :param bands: by default where the kit's machine was busy, and the places.
+        """
+        span = span or (0.0, max(self.view.duration, 0.1))
+        return chart(
+            f"{whose(self.hand.side)}: {what}",
+            lines,
+            y_unit=unit,
+            span=span,
+            bands=_busy(self.view, span) + self.alarms if bands is None else bands,
+            levels=levels,
+            include=(0.0,),
+            height=150,
+        )
+
 
 def _drawn(scene: _Scene, plot: Plot) -> str:
     """One plot; empty if the recording holds nothing to draw."""
@@ -380,17 +407,9 @@ def _intervals(scene: _Scene, span: tuple[float, float] | None) -> str:
     t, steps = _milliseconds(scene)
     if not len(t):
         return ""
-    shown = span or (0.0, max(scene.view.duration, 0.1))
-    return chart(
-        f"{whose(scene.hand.side)}: time from each state to the next",
-        [Line("each state", "state", t, steps, "stems" if span else "dots")],
-        y_unit="ms",
-        span=shown,
-        bands=_busy(scene.view, shown) + scene.alarms,
-        levels=_interval_levels(scene.need),
-        include=(0.0,),
-        height=150,
-    )
+    lines = [Line("each state", "state", t, steps, "stems" if span else "dots")]
+    levels = _interval_levels(scene.need)
+    return scene.chart("time from each state to the next", lines, "ms", span, levels=levels)
 
 
 def _command_intervals(scene: _Scene) -> str:
@@ -398,17 +417,9 @@ def _command_intervals(scene: _Scene) -> str:
     t = scene.hand.commands.t
     if len(t) < 2:
         return ""
-    span = (0.0, max(scene.view.duration, 0.1))
-    return chart(
-        f"{whose(scene.hand.side)}: time from each command to the next",
-        [Line("each command", "cmd", t[1:], np.diff(t) * 1e3, "dots")],
-        y_unit="ms",
-        span=span,
-        bands=_busy(scene.view, span) + scene.alarms,
-        levels=_interval_levels(scene.need),
-        include=(0.0,),
-        height=150,
-    )
+    lines = [Line("each command", "cmd", t[1:], np.diff(t) * 1e3, "dots")]
+    levels = _interval_levels(scene.need)
+    return scene.chart("time from each command to the next", lines, "ms", levels=levels)
 
 
 def _interval_histogram(scene: _Scene) -> str:
@@ -439,15 +450,7 @@ def _rates(scene: _Scene) -> str:
         for n, text in (("min_rate_hz", "at least"), ("max_rate_hz", "at most"))
         if n in limits
     ]
-    return chart(
-        f"{whose(scene.hand.side)}: rate of the state over time",
-        [line],
-        y_unit="Hz",
-        span=(0.0, max(scene.view.duration, 0.1)),
-        levels=levels,
-        include=(0.0,),
-        height=150,
-    )
+    return scene.chart("rate of the state over time", [line], "Hz", bands=(), levels=levels)
 
 
 def _samples(scene: _Scene) -> str:
@@ -482,19 +485,12 @@ def _torque(scene: _Scene) -> str:
         if name in ("min_tau_nm", "max_tau_nm")
         for sign in (1, -1)
     ]
-    return chart(
-        f"{whose(hand.side)}: torque (tau_est)",
-        [
-            Line("tau_est", "force", hand.states.t, hand.states.tau[:, j])
-            for j in scene.joints(span)
-        ],
-        y_unit=scene.view.model.torque_unit,
-        span=span,
-        bands=phase_bands(scene.view, hand.side) + scene.alarms,
-        levels=levels,
-        include=(0.0,),
-        height=150,
-    )
+    lines = [
+        Line("tau_est", "force", hand.states.t, hand.states.tau[:, j]) for j in scene.joints(span)
+    ]
+    bands = phase_bands(scene.view, hand.side) + scene.alarms
+    unit = scene.view.model.torque_unit
+    return scene.chart("torque (tau_est)", lines, unit, span, bands=bands, levels=levels)
 
 
 def _torque_by_position(scene: _Scene) -> str:
@@ -539,15 +535,9 @@ def _member(scene: _Scene, member: str) -> str:
     if values is None:
         return ""
     table = values.reshape(len(values), -1)[:, :_MOST_ELEMENTS]
-    return chart(
-        f"{whose(scene.hand.side)}: {member}",
-        [Line(member, "force", states.t, column) for column in table.T],
-        y_unit=_FIELDS.get(member, "").replace("rad", scene.view.unit),
-        span=span,
-        bands=_busy(scene.view, span) + scene.alarms,
-        include=(0.0,),
-        height=150,
-    )
+    lines = [Line(member, "force", states.t, column) for column in table.T]
+    unit = _FIELDS.get(member, "").replace("rad", scene.view.unit)
+    return scene.chart(member, lines, unit, span)
 
 
 def _pressure(scene: _Scene) -> str:
@@ -564,16 +554,9 @@ def _pressure(scene: _Scene) -> str:
         lines.append(Line("each packet", "force", hand.states.t, change.sum(axis=1)))
     if not lines:
         return ""
-    return chart(
-        f"{whose(hand.side)}: change of pressure since rest, summed over each of {count} sensor "
-        "packets",
-        lines,
-        y_unit="",
-        span=span,
-        bands=phase_bands(scene.view, hand.side) + scene.alarms,
-        include=(0.0,),
-        height=150,
-    )
+    what = f"change of pressure since rest, summed over each of {count} sensor packets"
+    bands = phase_bands(scene.view, hand.side) + scene.alarms
+    return scene.chart(what, lines, "", span, bands=bands)
 
 
 def _column(scene: _Scene, path: str) -> Floats | None:
