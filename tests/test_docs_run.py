@@ -48,7 +48,7 @@ ELSEWHERE = (
     (r"ids[= ]1,2", "two servos on a line: tests/test_ezgripper_pair.py"),
     (r"^serve (dex1-serial|dex3-usb) --side (left|both)$", "looks for a device of this machine"),
     (r"^bringup (?!.*--dry-run)", "a person holds a key: tests/test_bringup_cli.py"),
-    (r"--to (rerun|foxglove)", "other viewers: tests/test_view_forward.py"),
+    (r"--rerun|--foxglove", "other viewers: tests/test_view_forward.py"),
     (r"--require DEX3USB", "a recording with USB: tests/test_conformance_usb.py"),
 )
 """Patterns of what is not run here, and why."""
