@@ -29,13 +29,14 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def _small(folder: Path) -> None:
-    """A file system of 64 KiB.
+    """A file system of 64 KiB with room for one page.
 
     :raises Skip: mounting is not permitted.
     """
     folder.mkdir()
     if _libc.mount(b"tmpfs", str(folder).encode(), b"tmpfs", 0, b"size=64k"):
         raise Skip("small file systems cannot be mounted here")
+    (folder / "filler").write_bytes(bytes(60_000))
 
 
 def _release(folder: Path) -> None:
@@ -93,7 +94,6 @@ class WriteCase(Case):
         if way == "folder":
             return str(folder), []
         _small(folder / "small")
-        (folder / "small" / "filler").write_bytes(bytes(60_000))
         return str(folder / "small" / "file"), []
 
 
@@ -122,7 +122,7 @@ class RecordCase(Case):
         path = batch.scratch / f"{way}.mcap"
         limits: list[tuple[int, int]] = []
         if way == "limit":
-            limits = [(resource.RLIMIT_FSIZE, 30_000)]
+            limits = [(resource.RLIMIT_FSIZE, 4_000)]
         elif way == "small":
             _small(batch.scratch / "small")
             path = batch.scratch / "small" / "x.mcap"
