@@ -49,6 +49,8 @@ class Setting:
             return self.help
         if isinstance(default, bool):
             default = "yes" if default else "no"
+        elif isinstance(default, tuple):
+            default = ",".join(map(str, default))
         return f"{self.help}  [default: {default}]"
 
 
