@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 
 from dexkit.conformance.catch_rates import CATCH_RATES, wilson
-from dexkit.conformance.known_backends import ROBOT_EMULATORS, SIMULATED
 from dexkit.conformance.requirements import Kind
 from dexkit.conformance.results import Grade, Overall, RunResult, Verdict, worst
 from dexkit.hand import ROBOT
@@ -175,7 +174,7 @@ def device_kind(result: RunResult) -> str:
     name = result.subject.get("backend", "")
     if result.subject.get("device") == "emulated":
         return "emulated"
-    if name in (*SIMULATED, *ROBOT_EMULATORS) or result.subject.get("device") == "virtual":
+    if name.startswith("sim-") or result.subject.get("device") == "virtual":
         return "simulated"
     return "" if name else "recorded"
 
