@@ -55,7 +55,7 @@ def emulate_dex1_motor(
     from dexkit.emulators.m4010 import Dex1Motors, Firmware, Wiring
 
     on_line = line_arguments(settings, faults)
-    firmware = Firmware(baudrate=on_line.pop("baudrate"), answer_time=on_line.pop("answer_time"))
+    firmware = Firmware(baudrate=on_line.pop("baudrate"))
     seed = settings["wiring"]
     return Dex1Motors(
         sides,

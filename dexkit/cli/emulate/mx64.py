@@ -20,6 +20,7 @@ from dexkit.cli.emulate.serving import (
     latency_timer,
     object_setting,
     one_link,
+    real_time_setting,
     seed_setting,
     start_setting,
     wiring_setting,
@@ -102,6 +103,7 @@ class _Ids(click.ParamType):  # type: ignore[type-arg]
         ),
         Setting("backup", "yes|no", YES_OR_NO, "Firmware with Control Table Backup.", False),
         Setting("protocol-1", "yes|no", YES_OR_NO, "Old firmware with Protocol 1.0 only.", False),
+        real_time_setting(False),
     ),
     faults="overload@3s, drop:p=0.05, unplug@5s:for=2s",
 )

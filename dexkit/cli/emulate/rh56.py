@@ -69,7 +69,7 @@ def emulate_rh56(
         port=_port(link),
         tactile=settings["tactile"],
         **pose,
-        **{name: on_line[name] for name in ("answer_time", "faults", "seed")},
+        **{name: on_line[name] for name in ("faults", "seed")},
     )
 
 

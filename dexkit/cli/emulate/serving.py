@@ -126,13 +126,6 @@ def line_settings(device: str, *, baudrate: int, most: int) -> tuple[Setting, ..
             "baudrate", "B", click.IntRange(9600, most), f"Baud rate of the {device}.", baudrate
         ),
         LINE_TIME,
-        Setting(
-            "answer-time",
-            "MS",
-            Number(0, 1000),
-            f"Time from a request to its answer; that of the real {device} is not known.",
-            0.0,
-        ),
         latency_timer(0.0),
         seed_setting(),
         ANY_BAUDRATE,
@@ -143,7 +136,6 @@ def line_arguments(settings: Settings, faults: Sequence[str]) -> dict[str, Any]:
     """Arguments of an emulated device of its :func:`line_settings`, in seconds."""
     return {
         "baudrate": settings["baudrate"],
-        "answer_time": settings["answer-time"] * 1e-3,
         "line_time": settings["line-time"],
         "latency_timer": settings["latency-timer"] * 1e-3,
         "faults": faults,
@@ -185,7 +177,7 @@ def device_command(
             specs = [spec for spec in faults if spec != STDIN]
             with (
                 # before any thread of the device is started, which inherits it
-                real_time() if settings["real-time"] else nullcontext(True) as granted,
+                real_time() if settings.get("real-time") else nullcontext(True) as granted,
                 stop_on_signals() as request,
                 make(settings=settings, faults=specs, **given) as device,
             ):
@@ -208,7 +200,7 @@ def device_command(
                 metavar="PATH",
                 help=link if default_link is None else f"{link}  [default: {default_link}]",
             ),
-            settings_option((*settings, real_time_setting(False))),
+            settings_option(settings),
             click.option(
                 "--fault",
                 "faults",
