@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dexkit.conformance.hands import BUILT_IN
 from dexkit.conformance.stimuli import CommandSession
-from dexkit.models import BUILT_IN
 from dexkit.traces import sample_path
 
 SAMPLE = sample_path("dex3_pinch")
 
 
-@pytest.mark.parametrize("name", [m.name for m in BUILT_IN if m.session])
+@pytest.mark.parametrize("name", [each.model.name for each in BUILT_IN if each.session])
 def test_the_session_of_a_model_moves_soon(name: str) -> None:
     """A session that begins at rest would use up the time of its replay."""
     session = CommandSession.default(name)
