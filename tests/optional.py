@@ -99,6 +99,7 @@ OPTIONAL = (
     Optional("the package far-unitree-sdk", _package("unitree_interface"), ("robot_sdk",)),
     Optional("the package rerun-sdk", _package("rerun"), ("view_forward",)),
     Optional("the package foxglove-sdk", _package("foxglove"), ("view_forward",)),
+    Optional("bash", lambda: shutil.which("bash") is not None, ("cli_options",)),
     Optional("systemd-analyze", lambda: shutil.which("systemd-analyze"), ("install_service",)),
     Optional("access times of files", access_times, ("campaign_fuzzers",)),
     Optional("root", lambda: os.geteuid() == 0, ("files", "install_service")),

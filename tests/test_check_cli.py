@@ -142,12 +142,8 @@ _UNUSED = (
     # np.unique of numpy 2.4 needs it
     *(("numpy.ma",) if _NUMPY < (2, 4) else ()),
     *("dexkit.teleop", "dexkit.drivers", "dexkit.emulators", "dexkit.backends"),
-    *("dexkit.conformance.faults", "dexkit.conformance.stimuli", "dexkit.conformance.live"),
-    *(
-        "dexkit.conformance.usb.recording",
-        "dexkit.conformance.report.html",
-        "dexkit.traces.recorder",
-    ),
+    *("dexkit.conformance.faults", "dexkit.conformance.live", "dexkit.conformance.usb.run"),
+    *("dexkit.conformance.report.html", "dexkit.traces.recorder"),
     *("dexkit.messages.unitree_go", "dexkit.messages.unitree_hg"),
 )
 

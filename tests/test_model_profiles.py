@@ -65,7 +65,8 @@ CONSTANTS = {
     "G1",
 }
 NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
-HOMES = ("dexkit/models/", "dexkit/robots.py")
+# what was measured is stated a model each
+HOMES = ("dexkit/models/", "dexkit/robots.py", "conformance/catch_rates.py")
 # wrong hands are declared for the models on which they are tried
 WRONG_HANDS = "conformance/faults/"
 # names of subcommands, with the module or the arguments of each

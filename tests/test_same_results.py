@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.conformance.checks import timing
+from dexkit.conformance.behaviours import freshness
 from dexkit.conformance.median import median, medians, percentile
 from dexkit.conformance.row_selection import finite_rows
 
@@ -48,7 +48,7 @@ def test_medians_of_rows() -> None:
     random = np.random.default_rng(2)
     for width in (1, 2, 4, 5):
         rows = random.integers(0, 9, (2000, width)) / 7
-        assert np.array_equal(timing._medians(rows), np.median(rows, axis=1)), width
+        assert np.array_equal(freshness._medians(rows), np.median(rows, axis=1)), width
 
 
 def test_rows_without_a_number_are_left_out() -> None:

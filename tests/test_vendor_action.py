@@ -128,10 +128,9 @@ def test_inputs_reach_the_shell_as_variables_only() -> None:
     assert set(used) == set(ACTION["inputs"])
 
 
-def test_every_input_is_in_the_document() -> None:
-    document = (ROOT / "docs" / "ci.md").read_text()
-    for name in (*ACTION["inputs"], *ACTION["outputs"]):
-        assert f"`{name}`" in document
+def test_every_input_and_output_is_described() -> None:
+    for each_of in (*ACTION["inputs"].values(), *ACTION["outputs"].values()):
+        assert len(each_of["description"]) > 10
 
 
 # -------------------------------------------------- its arguments and exit codes, on stand-ins
