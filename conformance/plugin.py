@@ -30,7 +30,7 @@ WHY_KEY: pytest.StashKey[str] = pytest.StashKey()
 _MARK = "conformance"
 _TRACE = "--dexkit-trace"
 _FILES = {
-    "json": "result",
+    "result": "result",
     "report": "report",
     "markdown": "summary",
     "recording": "recording",
@@ -131,7 +131,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     add("level", choices=texts.LEVELS, help=_as_in_pytest(texts.LEVEL))
     add("grade", choices=texts.GRADES, help=_as_in_pytest(texts.GRADE))
-    add("json", metavar="FILE", help=_as_in_pytest(texts.RESULT))
+    add("result", metavar="FILE", help=_as_in_pytest(texts.RESULT))
     add("report", metavar="FILE.html", help=_as_in_pytest(texts.PAGE))
     add(
         "markdown",

@@ -268,7 +268,7 @@ def parse_result(data: Any, path: object) -> RunResult:
     if about.get("format") != FORMAT:
         raise UsageError(
             f"{path} is not a result file of dexkit",
-            hint="'dexkit check --result FILE' and the suite's '--json FILE' write them",
+            hint="the options --result FILE of 'dexkit check' and of the suite write them",
         )
     if about.get("version") != VERSION:
         version = one_line(about.get("version"), 40)

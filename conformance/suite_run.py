@@ -76,7 +76,7 @@ class SuiteOptions:
     requirements: tuple[Requirement, ...]
     claims: Claims = field(default_factory=Claims)
     thorough: bool = False
-    json: Path | None = None
+    result: Path | None = None
     report: Path | None = None
     markdown: Path | None = None
     recording: Path | None = None
@@ -112,7 +112,7 @@ class SuiteOptions:
             quick=get("quick"),
             thorough=get("thorough"),
             capabilities=path("capabilities"),
-            json=path("json"),
+            result=path("result"),
             report=path("report"),
             markdown=path("markdown"),
             recording=path("recording"),
@@ -137,7 +137,7 @@ class SuiteOptions:
         quick: bool = False,
         thorough: bool = False,
         capabilities: Path | None = None,
-        json: Path | None = None,
+        result: Path | None = None,
         report: Path | None = None,
         markdown: Path | None = None,
         recording: Path | None = None,
@@ -190,7 +190,7 @@ class SuiteOptions:
             raise UsageError(f"a DDS domain is 0 to 230, not {domain}")
         if trace is not None and not trace.exists():
             raise UsageError(f"no such file: {trace}")
-        for file in (json, report, markdown, recording):
+        for file in (result, report, markdown, recording):
             if file is not None and not file.absolute().parent.is_dir():
                 raise UsageError(f"cannot write {file}: there is no such directory")
             if file is not None and file.is_dir():
@@ -219,7 +219,7 @@ class SuiteOptions:
             requirements=requirements,
             claims=claims,
             thorough=thorough,
-            json=json,
+            result=result,
             report=report,
             markdown=markdown,
             recording=recording,
@@ -428,8 +428,8 @@ def judge_recording(options: SuiteOptions, view: Recording) -> RunResult:
         if options.recording.is_file():
             subject["recording_sha256"] = sha256_of_file(options.recording)
     result = judge(view, requirements=options.requirements, claims=options.claims, subject=subject)
-    if options.json:
-        write_json(result, options.json)
+    if options.result:
+        write_json(result, options.result)
     if options.report:
         from dexkit.conformance.report.html import write_html
 

@@ -229,7 +229,7 @@ def test_unwritable_output_is_reported_before_the_run(
         SuiteOptions.make(backend="sim-dex1", report=tmp_path)
     monkeypatch.setattr("os.access", lambda path, mode: False)
     with pytest.raises(UsageError, match="its directory is read-only"):
-        SuiteOptions.make(backend="sim-dex1", json=tmp_path / "r.json")
+        SuiteOptions.make(backend="sim-dex1", result=tmp_path / "r.json")
 
 
 def test_invalid_catalogue_is_refused_by_name() -> None:

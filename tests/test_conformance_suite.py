@@ -86,7 +86,7 @@ def test_without_backend_tests_are_skipped_with_hint_and_exit_code() -> None:
     [
         (("--side", "left"), "--side without --backend"),
         (("--backend", "sim-dex1", "--trace", "missing.mcap"), "no such file: missing.mcap"),
-        (("--backend", "sim-dex1", "--json", "/no/such/r.json"), "cannot write /no/such/r.json"),
+        (("--backend", "sim-dex1", "--result", "/no/such/r.json"), "cannot write /no/such/r.json"),
     ],
 )
 def test_invalid_options_are_usage_errors(arguments: tuple[str, ...], expected: str) -> None:
@@ -426,7 +426,7 @@ def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None
             file.unlink(missing_ok=True)
         run = suite(
             "conformance/", "--backend", "ezgripper", "--side", "right", *wanted,
-            "--trace", sample_path("dex1_pick_place"), "--json", files[0], "--report", files[1],
+            "--trace", sample_path("dex1_pick_place"), "--result", files[0], "--report", files[1],
             "--recording", files[2], "--junitxml", files[3],
         )  # fmt: skip
         # inconclusive: the gripper's process stood still, and commands were too old for it

@@ -93,7 +93,7 @@ def files(host: Host, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert not robot.stop()
     shutil.copy(folder / "walk.mcap", folder / "robot.mcap")
     run(*suite, "--backend", "sim-dex1", "--quick", "--recording", "run.mcap",
-        "--json", "result.json", "--report", "report.html")  # fmt: skip
+        "--result", "result.json", "--report", "report.html")  # fmt: skip
     for name in ("before", "after", "v1.0", "v1.1", "a", "b", "c"):
         shutil.copy(folder / "result.json", folder / f"{name}.json")
     (folder / "capabilities.toml").write_text("[claims]\nforce = true\n")

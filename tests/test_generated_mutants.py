@@ -285,7 +285,7 @@ def test_a_campaign_is_resumed_and_not_done_again(tmp_path: Path) -> None:
 @pytest.mark.soak
 def test_command_tries_a_generated_hand(tmp_path: Path) -> None:
     path = tmp_path / "score.json"
-    run = CliRunner().invoke(command, ["--hand", HAND, "--jobs", "1", "--json", str(path)])
+    run = CliRunner().invoke(command, ["--hand", HAND, "--jobs", "1", "--result", str(path)])
     assert run.exit_code == 0, run.output
     assert "1 good hands: 0 fail a MUST, 0 are warned" in run.output
     assert json.loads(path.read_text())["run"] == "default"
@@ -351,7 +351,7 @@ def test_the_documented_example_is_loaded(tmp_path: Path) -> None:
 def test_the_documented_example_is_tried(tmp_path: Path) -> None:
     (tmp_path / "grippers.py").write_text(documented_example())
     path = tmp_path / "verdicts.json"
-    arguments = ["--from", str(tmp_path / "grippers.py"), "--json", str(path), "--jobs", "1"]
+    arguments = ["--from", str(tmp_path / "grippers.py"), "--result", str(path), "--jobs", "1"]
     run = CliRunner().invoke(command, arguments)
     assert run.exit_code == 0, run.output
     found = {h["name"]: h for h in json.loads(path.read_text())["hands"]}
@@ -414,7 +414,7 @@ def test_a_hand_that_fails_leaves_the_others(tmp_path: Path) -> None:
         + f"@hand('must-breaking', dialects='unitree_go')\nclass B(ReferenceService):\n{mute}"
     )
     out = tmp_path / "verdicts.json"
-    run = CliRunner().invoke(command, ["--from", str(path), "--json", str(out), "--jobs", "1"])
+    run = CliRunner().invoke(command, ["--from", str(path), "--result", str(out), "--jobs", "1"])
     assert run.exit_code == 1, run.output
     failed, found = json.loads(out.read_text())["hands"]
     assert failed["problem"].startswith("A failed: RuntimeError: mine")

@@ -148,7 +148,7 @@ def test_selection_by_model_includes_usb_and_topics() -> None:
 
 def test_command_prints_and_writes_the_score(tmp_path: Path) -> None:
     path = tmp_path / "score.json"
-    arguments = ["--require", "DEX3USB-DESC-0", "--json", str(path), "--jobs", "1", "-v"]
+    arguments = ["--require", "DEX3USB-DESC-0", "--result", str(path), "--jobs", "1", "-v"]
     run = CliRunner().invoke(command, arguments)
     assert run.exit_code == 0, run.output
     assert "6 of 6 requirements proven" in run.output
@@ -167,5 +167,5 @@ def test_list_names_hands_and_tries_none() -> None:
     good = CliRunner().invoke(command, ["--generated", "3", "--good", "--list"])
     assert good.exit_code == 0, good.output
     assert good.output.count("good   ") == 3
-    refused = CliRunner().invoke(command, ["--list", "--json", "x.json"])
+    refused = CliRunner().invoke(command, ["--list", "--result", "x.json"])
     assert isinstance(refused.exception, UsageError)

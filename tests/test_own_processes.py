@@ -65,7 +65,7 @@ def test_programs_import_nothing_from_the_working_directory(hostile_folder: Path
 
 @pytest.mark.soak
 def test_workers_import_nothing_from_the_working_directory(hostile_folder: Path) -> None:
-    arguments = ("--require", "DEX1-RATE-03", "--jobs", "1", "--json", "out")
+    arguments = ("--require", "DEX1-RATE-03", "--jobs", "1", "--result", "out")
     command = module_line("dexkit.conformance.faults", *arguments)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr

@@ -175,7 +175,7 @@ def test_every_input_becomes_an_option(pretended: Runner) -> None:
         "--backend external --device 'left=/dev/a b' --device right=/dev/c --side both",
         "--dialect unitree_hg --domain 3 --object right=37 --capabilities 'my capabilities.toml'",
         "--level must --require DEX1-RATE --require DEX1-MOVE-02 --quick --set 'force=12 N'",
-        "--json dexkit-report/result.json --report dexkit-report/report.html",
+        "--result dexkit-report/result.json --report dexkit-report/report.html",
         "--junitxml dexkit-report/junit.xml",
     ):
         assert part in given
@@ -247,9 +247,9 @@ def test_success_without_a_result_file_fails(pretended: Runner) -> None:
 def test_the_files_are_where_the_outputs_say_whatever_the_arguments_name(
     pretended: Runner,
 ) -> None:
-    assert pretended("Judge the hand", backend="acme", arguments="--json m.json").returncode == 0
+    assert pretended("Judge the hand", backend="acme", arguments="--result m.json").returncode == 0
     arguments = (pretended.home / "arguments").read_text().splitlines()
-    names = [b for a, b in pairwise(arguments) if a == "--json"]
+    names = [b for a, b in pairwise(arguments) if a == "--result"]
     assert names == ["m.json", "dexkit-report/result.json"]  # the last one counts
 
 

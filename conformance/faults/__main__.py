@@ -131,7 +131,7 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
 )
 @list_option("Only list the hands, with model, requirement and sides.")
 @click.option(
-    "--json", "json_path", type=OUTPUT_FILE, metavar="FILE", help="Write the score as JSON."
+    "--result", "json_path", type=OUTPUT_FILE, metavar="FILE", help="Write the score as JSON."
 )
 @jobs_option()
 @verbose_option("Print the fault of every wrong hand.")

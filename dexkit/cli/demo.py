@@ -56,7 +56,7 @@ def command(out: Path, backend: str, view: bool) -> None:
     out.mkdir(parents=True, exist_ok=True)
     options = SuiteOptions.make(
         backend=backend,
-        json=out / "result.json",
+        result=out / "result.json",
         report=out / "report.html",
         recording=out / "recording.mcap",
         view=view,

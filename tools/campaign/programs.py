@@ -366,7 +366,7 @@ def specs() -> list[Spec]:
              _talk, ready="", codes=ends, works=_output_grows),
         Spec("conformance",
              "pytest conformance/ --backend sim-dex1 --quick --side left -p no:cacheprovider "
-             "--domain {domain} --json {scratch}/result.json",
+             "--domain {domain} --result {scratch}/result.json",
              _nothing, ready="", codes=(*ends, 2), works=_output_grows),
     ]  # fmt: skip
 
