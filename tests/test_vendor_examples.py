@@ -154,7 +154,7 @@ def test_the_gripper_of_the_guide_meets_what_its_maker_claims(
                 *("--backend", "acme_gripper.hand:make", "--domain", str(free_domain())),
                 *("--device", f"left={left}", "--device", f"right={right}"),
                 *("--object", "right=37", "--capabilities", str(ACME / "capabilities.toml")),
-                *("--json", str(result), *(["--quick"] if quick else [])),
+                *("--result", str(result), *(["--quick"] if quick else [])),
             ],
             cwd=tmp_path,
             capture_output=True,
@@ -200,7 +200,7 @@ def judged(domain: int, folder: Path, *arguments: str) -> dict[str, str]:
         [
             *(*SUITE, "-q"),
             *("--pyargs", "dexkit.conformance", "--backend", "external", "--side", "left"),
-            *("--domain", str(domain), "--json", str(result), *arguments),
+            *("--domain", str(domain), "--result", str(result), *arguments),
         ],
         cwd=folder,
         capture_output=True,
