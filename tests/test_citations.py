@@ -84,6 +84,18 @@ def test_every_citation_resolves_to_a_section() -> None:
     assert seen > 300
 
 
+def test_pages_that_code_names_are_there() -> None:
+    """Messages and docstrings send readers to pages of docs/."""
+    named = {
+        (name, match.group())
+        for name, text in texts().items()
+        if name.endswith(".py") and not name.startswith("tests/")
+        for _, match in places(re.compile(r"(?<![\w/])docs/[\w./-]+\.md\b"), text)
+    }
+    assert len(named) > 100
+    assert not {(name, page) for name, page in named if not (ROOT / page).is_file()}
+
+
 def test_no_citation_names_an_internal_document() -> None:
     found = []
     for name, text in texts().items():

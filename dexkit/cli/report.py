@@ -57,7 +57,7 @@ def command(
     """Write the reports of a result file.
 
     A result file comes from 'dexkit check --result FILE' or from the conformance suite with
-    '--json FILE'. Without an option the result is printed as a table.
+    '--result FILE'. Without an option the result is printed as a table.
     """
     from dexkit.conformance.report.html import write_html
     from dexkit.conformance.report.junit import write_junit

@@ -806,7 +806,7 @@ def _stands(
         return None
     causes = [
         "the hand is not powered, or in an error: see the log of its service",
-        "its gains are too small to move it (Unitree's client: docs/clients.md)",
+        "its gains are too small to move it (what its client sends: docs/teleop.md)",
         "something holds the fingers",
     ]
     if command.q_span >= _COMMANDED and state.q_span < _STANDS * command.q_span:
