@@ -17,8 +17,8 @@ from typing import NamedTuple
 from benchmarks import Result
 from dexkit.conformance.hands.dex1 import DEX1_1
 from dexkit.conformance.hands.dex3 import DEX3_1
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
 from dexkit.traces import Recorder, open_trace, sample_path
 
 _TARGET = 200.0

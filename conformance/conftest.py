@@ -8,9 +8,9 @@ from typing import NoReturn
 import pytest
 from _pytest.outcomes import Exit
 
-from dexkit.conformance.plugin import OPTIONS_KEY, RESULT_KEY, WHY_KEY
-from dexkit.conformance.results import RunResult
-from dexkit.conformance.suite_run import run_suite
+from dexkit.conformance.kit.plugin import OPTIONS_KEY, RESULT_KEY, WHY_KEY
+from dexkit.conformance.kit.results import RunResult
+from dexkit.conformance.kit.suite_run import run_suite
 from dexkit.errors import DexkitError
 from dexkit.stop_signals import stop_on_signals
 

@@ -6,10 +6,10 @@ import warnings
 
 import pytest
 
-from dexkit.conformance.known_backends import SIMULATED
-from dexkit.conformance.plugin import OPTIONS_KEY, REPORTED_KEY
-from dexkit.conformance.requirements import Level, catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.known_backends import SIMULATED
+from dexkit.conformance.kit.plugin import OPTIONS_KEY, REPORTED_KEY
+from dexkit.conformance.kit.requirements import Level, catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.hand import Side
 
 pytestmark = pytest.mark.conformance

@@ -8,10 +8,10 @@ from dataclasses import replace
 from functools import cache
 
 from dexkit.conformance.faults import plan_for
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.results import Load, Result, RunResult, Verdict
+from dexkit.conformance.kit.stimulus_record import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.layers import layer
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Load, Result, RunResult, Verdict
-from dexkit.conformance.stimulus_record import RECORD, Beats, Stall, Stimulus
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService

@@ -176,16 +176,16 @@ def judged_result(folder: Path) -> tuple[dict[str, Any], Path]:
     """The document of a result with a dozen requirements, and the recording that was judged."""
     import json
 
-    from dexkit.conformance.judge import judge
-    from dexkit.conformance.recording import Recording
-    from dexkit.conformance.requirements import catalogue, select
+    from dexkit.conformance.kit.judge import judge
+    from dexkit.conformance.kit.recording import Recording
+    from dexkit.conformance.kit.requirements import catalogue, select
     from dexkit.traces import open_trace, sample_path
 
     path = sample_path("dex1_hand_dropout")
     recording = Recording.decode(open_trace(path))
     few = select(catalogue(recording.model.name), prefixes=("DEX1-RATE", "DEX1-TRACK"))
     found = judge(recording, requirements=few, subject={"recording": path.name})
-    from dexkit.conformance.result_file import write_json
+    from dexkit.conformance.kit.result_file import write_json
 
     write_json(found, folder / "good.json")
     return json.loads((folder / "good.json").read_text()), path
@@ -196,6 +196,7 @@ def render_all(path: Path, folder: Path, view: Any = None) -> None:
 
     :raises DexkitError: it is refused.
     """
+    from dexkit.conformance.kit.result_file import read_json
     from dexkit.conformance.report.badge import badge_text, render_badge
     from dexkit.conformance.report.compare import (
         Comparison,
@@ -206,7 +207,6 @@ def render_all(path: Path, folder: Path, view: Any = None) -> None:
     from dexkit.conformance.report.junit import write_junit
     from dexkit.conformance.report.markdown import render_markdown
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.result_file import read_json
     from dexkit.console import Console
 
     found = read_json(path)

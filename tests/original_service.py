@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.conformance.virtual.service import Sample
 from dexkit.errors import WireError

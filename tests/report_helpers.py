@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Evidence, Result, RunResult, Stage, Verdict
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Evidence, Result, RunResult, Stage, Verdict
 
 HOSTILE = "<script>alert('x')</script> | `@everyone` [a](http://evil.example) & \"q\" \x00\x1b[31m"
 

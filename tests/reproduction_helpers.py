@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.requirements import CAPABILITIES, catalogue
-from dexkit.conformance.run_record import RECORD, run_record
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.requirements import CAPABILITIES, catalogue
+from dexkit.conformance.kit.run_record import RECORD, run_record
 from dexkit.conformance.usb.record import RECORD as USB_RECORD
 from dexkit.conformance.usb.record import SCHEMA, SCHEMA_NAME, UsbRecord, topic
 from dexkit.conformance.usb.recording import UsbSide

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from dexkit.conformance import live
+from dexkit.conformance.kit import live
 
 live.DISCOVERY_TIMEOUT = 0.3

@@ -21,9 +21,9 @@ from dexkit.conformance.audit.result_tables import FILE, FINDINGS, have_parquet
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.workers import Pool, WorkerLost
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.results import Verdict
 from dexkit.errors import DexkitError, OutputError, UsageError
 from dexkit.records import to_record
 from dexkit.traces import open_trace, sample_path

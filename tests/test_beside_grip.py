@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from dexkit.conformance.faults.trials import plan_for, run_mutant
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Result, Verdict
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.virtual.inspire import InspireService
 from dexkit.hand import Floats, Side

@@ -17,7 +17,7 @@ from dexkit.conformance.behaviours.stillness import _repeats, _turns
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import StatesSwapped, Vibrates
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.brainco import BrainCoService
 from dexkit.conformance.virtual.fingers import FingerHand
 from dexkit.doctor.motion_direction import Course, moves_against, swapped

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dexkit.conformance.calibration import Loopback
-from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
+from dexkit.conformance.kit.calibration import Loopback
+from dexkit.conformance.kit.stimulus_record import CALIBRATION_TOPIC
 from dexkit.dds import DdsNode
 from dexkit.topics import HAND_TOPICS
 from tests.dds_helpers import free_domain

@@ -12,14 +12,14 @@ import pytest
 from rich.console import Console
 
 from dexkit.conformance import hands
-from dexkit.conformance.catch_rates import CATCH_RATES, wilson
+from dexkit.conformance.kit.catch_rates import CATCH_RATES, wilson
+from dexkit.conformance.kit.results import RunResult
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import catch_sentence
 from dexkit.conformance.report.markdown import plain, render_markdown
 from dexkit.conformance.report.terminal import print_result
-from dexkit.conformance.results import RunResult
 from dexkit.escaping import html
 from dexkit.models import HandModel
 from tests.report_helpers import result_of_every_kind

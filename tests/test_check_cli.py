@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dexkit.cli import main
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.traces import sample_path
 
 
@@ -142,7 +142,7 @@ _UNUSED = (
     # np.unique of numpy 2.4 needs it
     *(("numpy.ma",) if _NUMPY < (2, 4) else ()),
     *("dexkit.teleop", "dexkit.drivers", "dexkit.emulators", "dexkit.backends"),
-    *("dexkit.conformance.faults", "dexkit.conformance.live", "dexkit.conformance.usb.run"),
+    *("dexkit.conformance.faults", "dexkit.conformance.kit.live", "dexkit.conformance.usb.run"),
     *("dexkit.conformance.report.html", "dexkit.traces.recorder"),
     *("dexkit.messages.unitree_go", "dexkit.messages.unitree_hg"),
 )

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
 
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from tests.each import each
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -135,7 +135,7 @@ def test_number_without_bounds_has_no_range_in_the_help() -> None:
 def test_plugin_shares_the_texts_of_its_options() -> None:
     """The option of ``pytest`` and that of ``dexkit check`` say the same."""
     from dexkit import option_texts
-    from dexkit.conformance import plugin
+    from dexkit.conformance.kit import plugin
 
     said: dict[str, str] = {}
 

@@ -8,8 +8,8 @@ import pytest
 from dexkit.conformance.checks.causes import of_positions, of_scale, of_type
 from dexkit.conformance.faults import mutants, run_mutant
 from dexkit.conformance.faults.trials import topic_plan
-from dexkit.conformance.recording import joints_of
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.recording import joints_of
+from dexkit.conformance.kit.results import Verdict
 from dexkit.hand import Side
 from dexkit.models import dialect
 from tests.conformance_helpers import result_of
@@ -89,8 +89,8 @@ def test_cause_names_mistake_of_wrong_hand(mutant: str, requirement: str, expect
 
 
 def test_passed_result_has_no_cause() -> None:
-    from dexkit.conformance.judge import judge
-    from dexkit.conformance.recording import Recording
+    from dexkit.conformance.kit.judge import judge
+    from dexkit.conformance.kit.recording import Recording
     from tests.conformance_helpers import short_run
 
     assert result_of(judge(Recording.decode(short_run())), "DEX1-RATE-01").cause == ""

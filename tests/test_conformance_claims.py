@@ -10,13 +10,13 @@ import pytest
 
 import dexkit.conformance
 from dexkit.conformance.checks import Outcome
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import CAPABILITIES, Level, Requirement, catalogue
+from dexkit.conformance.kit.results import Result, Verdict
+from dexkit.conformance.kit.verdicts import Excuse, Judgement
 from dexkit.conformance.report.labels import hand_name
-from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement, catalogue
-from dexkit.conformance.results import Result, Verdict
-from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from tests.conformance_helpers import result_of, short_run
@@ -56,7 +56,7 @@ def test_claims_file_for_other_model_is_error(tmp_path: Path) -> None:
 
 def test_example_and_documentation_list_every_unit() -> None:
     assert dexkit.conformance.__file__ is not None
-    example = Path(dexkit.conformance.__file__).parent / "capabilities.example.toml"
+    example = Path(dexkit.conformance.__file__).parent / "kit" / "capabilities.example.toml"
     claims = Claims.load(example, "dex1-1")
     assert claims.units is not None
     text, documented = example.read_text(), DOCS.read_text()

@@ -20,20 +20,20 @@ from hypothesis import strategies as st
 from dexkit.cli.check import command
 from dexkit.conformance.behaviours.client import returns, sessions, slow_stretches
 from dexkit.conformance.checks import Context, Outcome, check_of
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import Mutant, mutants
 from dexkit.conformance.faults.matrix import WrongHandResult as Trial
 from dexkit.conformance.faults.matrix import try_one
-from dexkit.conformance.judge import judge
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.recording import Commands, Recording, SideView, States, joints_of
+from dexkit.conformance.kit.requirements import Level, catalogue, parse
+from dexkit.conformance.kit.result_file import as_document, read_json
+from dexkit.conformance.kit.results import Overall, Result, RunResult, Verdict
 from dexkit.conformance.layers import layer
-from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.recording import Commands, Recording, SideView, States, joints_of
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import render_markdown
-from dexkit.conformance.requirements import Level, catalogue, parse
-from dexkit.conformance.result_file import as_document, read_json
-from dexkit.conformance.results import Overall, Result, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.conformance.virtual.client import ReferenceClient, run_client
 from dexkit.errors import UsageError

@@ -10,13 +10,13 @@ import pytest
 
 from dexkit.conformance.checks import Context
 from dexkit.conformance.checks.contacts import contacts
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.generated import parse
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Result, Verdict
-from dexkit.conformance.selection import length
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.requirements import catalogue, select
+from dexkit.conformance.kit.results import Result, Verdict
+from dexkit.conformance.kit.selection import length
 from dexkit.conformance.stimuli import CommandSession, phases_for
 from dexkit.conformance.virtual import Sample, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.behaviours.bad_commands import fastest
 from dexkit.conformance.checks.steps import Step
-from dexkit.conformance.claims import Claims
 from dexkit.conformance.faults import any_model, gripper, plan_for
 from dexkit.conformance.faults.registry import mix
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Load, Overall, RunResult, Verdict
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.results import Load, Overall, RunResult, Verdict
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.fingers import Dex3Service, FingerHand
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService

@@ -11,12 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks import REGISTRY
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording, detect_dialect, sides_of
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.result_file import as_document, read_json, write_json
-from dexkit.conformance.results import Overall, RunResult, Verdict, worst
-from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording, detect_dialect, sides_of
+from dexkit.conformance.kit.requirements import catalogue, select
+from dexkit.conformance.kit.result_file import as_document, read_json, write_json
+from dexkit.conformance.kit.results import Overall, RunResult, Verdict, worst
+from dexkit.conformance.kit.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import ConformanceError, TraceUnsupported, UsageError
 from dexkit.hand import Side

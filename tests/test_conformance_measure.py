@@ -10,17 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks import Outcome, rate_measure
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.judge import judge
-from dexkit.conformance.measurement_error import Measure, Quantity, weigh
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.measurement_error import Measure, Quantity, weigh
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.result_file import MeasureRecord, as_document, read_json, write_json
+from dexkit.conformance.kit.results import Evidence, Result, RunResult, Verdict
+from dexkit.conformance.kit.stimulus_record import RECORD, Calibration, Stimulus
+from dexkit.conformance.kit.verdicts import Excuse, Judgement
 from dexkit.conformance.report.card import Card, near_limits
 from dexkit.conformance.report.html import render
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.result_file import MeasureRecord, as_document, read_json, write_json
-from dexkit.conformance.results import Evidence, Result, RunResult, Verdict
-from dexkit.conformance.stimulus_record import RECORD, Calibration, Stimulus
-from dexkit.conformance.verdicts import Excuse, Judgement
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side

@@ -7,15 +7,15 @@ from functools import cache
 
 import numpy as np
 
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
-from dexkit.conformance.judge import judge
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.requirements import Kind, Level, catalogue
+from dexkit.conformance.kit.result_file import as_document
+from dexkit.conformance.kit.results import Overall, RunResult, Verdict
 from dexkit.conformance.report.badge import badge_text, badges, render_badge
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.markdown import render_markdown
-from dexkit.conformance.requirements import Kind, Level, catalogue
-from dexkit.conformance.result_file import as_document
-from dexkit.conformance.results import Overall, RunResult, Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side

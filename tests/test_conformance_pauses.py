@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.checks import Context
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.generated import parse
-from dexkit.conformance.judge import judge
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.memory_trace import MemoryTrace

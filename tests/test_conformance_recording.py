@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.trials import plan_for
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.layers import layer_of_model
-from dexkit.conformance.recording import Recording
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.hand import ROBOT, Side, Subject
 from tests.conformance_helpers import copy_of

@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 
 from dexkit.conformance.faults import gripper, mutants, plan_for
 from dexkit.conformance.faults import usb as wrong_usb
-from dexkit.conformance.judge import judge, judge_layer
+from dexkit.conformance.kit.judge import judge, judge_layer
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.recording import Recording
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.labels import VERDICTS
 from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.report.svg_charts import MAX_GAPS, Line, chart, nice_ticks, pieces, thin
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.report.compare import Comparison, render_comparison
 from dexkit.conformance.report.html import render
 from dexkit.traces import open_trace, sample_path

@@ -14,13 +14,18 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from dexkit.cli import cli
-from dexkit.conformance.claims import Claims
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.robot import NoCrc
 from dexkit.conformance.faults.usb import StaleCrc
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import Kind
+from dexkit.conformance.kit.result_file import read_json, write_json
+from dexkit.conformance.kit.results import RunResult, Verdict
+from dexkit.conformance.kit.run_record import RECORD, run_record
+from dexkit.conformance.kit.suite_run import SuiteOptions, judge_recording
 from dexkit.conformance.report.badge import badge_text, render_badge
 from dexkit.conformance.report.compare import (
     Comparison,
@@ -32,11 +37,6 @@ from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import VERDICTS, catch_sentence
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
 from dexkit.conformance.report.terminal import MARKS, print_result
-from dexkit.conformance.requirements import Kind
-from dexkit.conformance.result_file import read_json, write_json
-from dexkit.conformance.results import RunResult, Verdict
-from dexkit.conformance.run_record import RECORD, run_record
-from dexkit.conformance.suite_run import SuiteOptions, judge_recording
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.conformance import requirements
 from dexkit.conformance.checks import REGISTRY, check_of
 from dexkit.conformance.faults import mutants
 from dexkit.conformance.hands import under_test
+from dexkit.conformance.kit import requirements
+from dexkit.conformance.kit.requirements import Level, catalogue, models, parse, select
+from dexkit.conformance.kit.selection import quick
+from dexkit.conformance.kit.suite_run import SuiteOptions
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.requirements import Level, catalogue, models, parse, select
-from dexkit.conformance.selection import quick
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.conformance.stimuli.script import default_objects
-from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.documents import parse_toml
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side

@@ -14,27 +14,27 @@ import pytest
 from click.testing import CliRunner
 
 from dexkit.cli.check import command
-from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.checks import check_of
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import Mutant, mutants, plan_for, run_mutant
 from dexkit.conformance.faults.matrix import WrongHandResult, try_one
 from dexkit.conformance.faults.robot import CdrCrc, NoCrc, WaitsForCommands
-from dexkit.conformance.judge import judge
-from dexkit.conformance.live import LiveOptions, record_run
-from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.requirements import Level, catalogue, select
-from dexkit.conformance.results import Overall, RunResult, Stage, Verdict
-from dexkit.conformance.robot import (
+from dexkit.conformance.kit.backend_processes import RigOptions
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.live import LiveOptions, record_run
+from dexkit.conformance.kit.motor_messages import Motor
+from dexkit.conformance.kit.requirements import Level, catalogue, select
+from dexkit.conformance.kit.results import Overall, RunResult, Stage, Verdict
+from dexkit.conformance.kit.robot import (
     WRONG_CRCS,
     RobotMotorCodec,
     robot_dialect,
     robot_in,
     robot_recording,
 )
+from dexkit.conformance.kit.stimulus_record import Beats, Stimulus
+from dexkit.conformance.kit.suite_run import SuiteOptions
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
-from dexkit.conformance.stimulus_record import Beats, Stimulus
-from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.conformance.virtual import MemoryTrace, Sample, run_virtual
 from dexkit.conformance.virtual.robot import Orders, ReferenceRobot
 from dexkit.errors import ConformanceError, UsageError

@@ -8,12 +8,11 @@ from typing import Any, get_args
 
 import pytest
 
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.judge import judge
-from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import CONFIDENCE
-from dexkit.conformance.result_file import (
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import CONFIDENCE
+from dexkit.conformance.kit.result_file import (
     Confidence,
     LayerName,
     ResultFile,
@@ -21,6 +20,7 @@ from dexkit.conformance.result_file import (
     as_document,
     write_json,
 )
+from dexkit.conformance.layers import LAYERS
 from dexkit.hand import ROBOT, Side
 from dexkit.records import json_schema, to_record
 from dexkit.traces import open_trace, sample_path

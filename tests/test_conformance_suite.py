@@ -13,21 +13,21 @@ from types import SimpleNamespace
 
 import pytest
 
-from dexkit.conformance import suite_run
-from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.faults import any_model, plan_for
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.judge import judge
-from dexkit.conformance.known_backends import EXTERNAL
-from dexkit.conformance.live import LiveOptions, record_run
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import Level, select
-from dexkit.conformance.requirements import catalogue as requirements
-from dexkit.conformance.results import Overall, RunResult
-from dexkit.conformance.selection import length, quick
+from dexkit.conformance.kit import suite_run
+from dexkit.conformance.kit.backend_processes import RigOptions
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.known_backends import EXTERNAL
+from dexkit.conformance.kit.live import LiveOptions, record_run
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import Level, select
+from dexkit.conformance.kit.requirements import catalogue as requirements
+from dexkit.conformance.kit.results import Overall, RunResult
+from dexkit.conformance.kit.selection import length, quick
+from dexkit.conformance.kit.suite_run import SuiteOptions
 from dexkit.conformance.stimuli import phases_for
-from dexkit.conformance.suite_run import SuiteOptions
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.on_dds import ServiceOnDds
@@ -228,7 +228,7 @@ def test_a_repeated_run_says_what_was_open(monkeypatch: pytest.MonkeyPatch) -> N
     good = Recording.decode(trace)
     trace.rows[key] = [r for r in trace.rows[key] if not begin <= r[0] < begin + 200_000_000]
     recordings = [with_beats(trace, [begin]), good]
-    monkeypatch.setattr("dexkit.conformance.live.record_run", lambda *args, **kwargs: True)
+    monkeypatch.setattr("dexkit.conformance.kit.live.record_run", lambda *args, **kwargs: True)
     monkeypatch.setattr("dexkit.traces.open_trace", lambda path: SimpleNamespace(damage=()))
     monkeypatch.setattr(suite_run, "recording_of", lambda *args: recordings.pop(0))
     said: list[str] = []
@@ -283,7 +283,7 @@ def test_hand_that_requests_transient_local_fails_on_dds(tmp_path: Path) -> None
 
 
 def test_missing_hand_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dexkit.conformance.live.DISCOVERY_TIMEOUT", 0.3)  # there is no hand
+    monkeypatch.setattr("dexkit.conformance.kit.live.DISCOVERY_TIMEOUT", 0.3)  # there is no hand
     rig = RigOptions(EXTERNAL, (Side.LEFT,), dialect("unitree_go"), free_domain())
     with pytest.raises(ConformanceError, match="publishes rt/dex1/left/state") as caught:
         record_run(LiveOptions(rig, frozenset({"step"})), tmp_path / "run.mcap")

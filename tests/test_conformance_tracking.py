@@ -9,8 +9,8 @@ from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.any_model import WaitsForRest
 from dexkit.conformance.faults.gripper import Slow
 from dexkit.conformance.faults.registry import mix
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
 from tests.each import each

@@ -15,16 +15,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.conformance.backend_processes import Tool
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.faults import mutants
 from dexkit.conformance.faults.matrix import WrongHandResult, try_one
 from dexkit.conformance.faults.trials import judge_usb, play_usb
-from dexkit.conformance.judge import judge_layer
+from dexkit.conformance.kit.backend_processes import Tool
+from dexkit.conformance.kit.judge import judge_layer
+from dexkit.conformance.kit.requirements import Requirement, catalogue
+from dexkit.conformance.kit.results import Load, Verdict
+from dexkit.conformance.kit.run_queue import Watched
 from dexkit.conformance.layers.usb import LAYER as USB
-from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import Load, Verdict
-from dexkit.conformance.run_queue import Watched
 from dexkit.conformance.stimuli.usb import BUSES, DAMAGES
 from dexkit.conformance.usb import frames
 from dexkit.conformance.usb.access import bulk_pair, open_device
@@ -211,7 +211,7 @@ def test_failure_has_evidence_in_the_recording() -> None:
 
 
 def test_slow_rate_on_overloaded_machine_is_blocked() -> None:
-    from dexkit.conformance.stimulus_record import Beats
+    from dexkit.conformance.kit.stimulus_record import Beats
 
     recording = usb_run(BY_NAME["Slow"].made(Side.LEFT))
     hand = recording.sides[Side.LEFT]

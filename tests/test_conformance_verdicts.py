@@ -13,18 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks import Outcome
-from dexkit.conformance.claims import Claims
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.operator import LateState
-from dexkit.conformance.heartbeat import Heartbeat
-from dexkit.conformance.judge import judge
-from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import Evidence, Load, Result, Verdict
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.heartbeat import Heartbeat
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.lateness import Lateness
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import Requirement, catalogue
+from dexkit.conformance.kit.results import Evidence, Load, Result, Verdict
+from dexkit.conformance.kit.stimulus_record import Beats
+from dexkit.conformance.kit.verdicts import MOST_PLACES, Excuse, Judgement, excuse
 from dexkit.conformance.stimuli.operator import OPERATOR
-from dexkit.conformance.stimulus_record import Beats
-from dexkit.conformance.verdicts import MOST_PLACES, Excuse, Judgement, excuse
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side, Subject
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
@@ -288,7 +288,7 @@ def test_pause_of_the_kit_between_two_beats_counts(monkeypatch: pytest.MonkeyPat
             resumed.wait(0.06)
         return 0.0
 
-    monkeypatch.setattr("dexkit.conformance.heartbeat._waited", waited)
+    monkeypatch.setattr("dexkit.conformance.kit.heartbeat._waited", waited)
     with Heartbeat() as heart:
         wait_until(lambda: len(heart.beats.t_us) > 5)
     assert max(heart.beats.late_us) >= 45_000

@@ -17,19 +17,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.conformance import run_queue
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.gripper import Inverted, NanVelocity, Percent
-from dexkit.conformance.judge import judge
-from dexkit.conformance.lateness import IDLE, Lateness
-from dexkit.conformance.processor_waits import ProcessWaits, Starvation, Waits
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Evidence, Load, RunResult, Verdict
-from dexkit.conformance.run_queue import MOST_FILES, RunQueue, Watched
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
-from dexkit.conformance.verdicts import BEFORE, excuse
+from dexkit.conformance.kit import run_queue
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.lateness import IDLE, Lateness
+from dexkit.conformance.kit.processor_waits import ProcessWaits, Starvation, Waits
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Evidence, Load, RunResult, Verdict
+from dexkit.conformance.kit.run_queue import MOST_FILES, RunQueue, Watched
+from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.kit.verdicts import BEFORE, excuse
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.errors import TraceUnsupported

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.checks.timing import Positions
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.results import Result, Verdict
-from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.motor_messages import MotorCodec
+from dexkit.conformance.kit.results import Result, Verdict
+from dexkit.conformance.kit.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.hand import Side
 from dexkit.models import dialect

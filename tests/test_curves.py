@@ -11,11 +11,11 @@ from click.testing import CliRunner
 
 from dexkit.cli import cli
 from dexkit.cli.info_plot import plot_lines
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.requirements import catalogue, select
+from dexkit.conformance.kit.result_file import write_json
 from dexkit.conformance.report.curves import page, recorded
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.result_file import write_json
 from dexkit.digests import sha256_of_file
 from dexkit.messages import message_type
 from dexkit.sparkline import ASCII, resampled, sparkline

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from dexkit.cli import main
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.results import Overall, RunResult, Verdict
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.results import Overall, RunResult, Verdict
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import DIALECTS, Dialect, dialect

@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Overall, Verdict
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.results import Overall, Verdict
 from dexkit.emulators.sim_dex5 import SimDex5
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, Side

@@ -17,9 +17,9 @@ import pytest
 from dexkit import digests, documents
 from dexkit.backends import BackendOptions, backend
 from dexkit.cli.emulate.mx64 import _EepromFile
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.result_file import read_json, write_json
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.result_file import read_json, write_json
+from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.doctor.environment import uri_problem
 from dexkit.drivers.ezgripper.calibration_file import Store

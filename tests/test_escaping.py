@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dexkit.cli.status_line import log_to_stderr
-from dexkit.conformance.result_file import write_json
+from dexkit.conformance.kit.result_file import write_json
 from dexkit.console import Console, markup
 from dexkit.errors import DdsUnavailable, OutputError, UsageError
 from dexkit.escaping import Guard, guarded, html, one_line, visible

@@ -12,8 +12,8 @@ from dexkit.backends import BackendOptions, backend, simulators
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
 from dexkit.conformance.faults import plan_for, run_mutant
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.emulators.simulated_hand import SimulatedHand
 from dexkit.errors import HandLost, UsageError
 from dexkit.hand import Floats, Hand, HandCommand, HandState, JointMode, Side

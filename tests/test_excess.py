@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.behaviours.tracking import _best_delay
-from dexkit.conformance.excess import Course, Excess
-from dexkit.conformance.row_selection import SomeTimes, Times
+from dexkit.conformance.kit.excess import Course, Excess
+from dexkit.conformance.kit.row_selection import SomeTimes, Times
 from dexkit.hand import Floats
 
 LAG, PART, LONGEST = 0.04, 0.15, 0.02

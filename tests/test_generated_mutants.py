@@ -21,8 +21,8 @@ from dexkit.conformance.faults.generated.rig import Part, What, compose
 from dexkit.conformance.faults.generated.stimulus import play_order, random_segments
 from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.selection import RunKind
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.virtual import Service
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.hand import Side

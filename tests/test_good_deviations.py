@@ -14,7 +14,7 @@ from dexkit.conformance.faults.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.faults.generated.rig import Faulty, Part, Report, What, compose
 from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.virtual import Sample
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side

@@ -16,13 +16,13 @@ from dexkit.backends import BackendOptions
 from dexkit.cli import cli
 from dexkit.cli.emulate.all import _for_xr
 from dexkit.clock import ManualClock
-from dexkit.conformance.backend_processes import RigOptions
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import ReversedScale
-from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.backend_processes import RigOptions
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.fingers import Ints
 from dexkit.conformance.virtual.inspire import InspireHand, InspireService
 from dexkit.doctor import Observations, diagnose

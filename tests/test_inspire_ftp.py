@@ -17,8 +17,8 @@ from dexkit.clock import ManualClock
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import ReversedScale
-from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpHand, FtpService
 from dexkit.emulators.sim_inspire import SimInspireFtp, sim_inspire_ftp
 from dexkit.errors import EncodeError, OversizeError, TruncatedError

@@ -15,9 +15,9 @@ from dexkit.clock import ManualClock
 from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.touch import CountsFromTheThumb, NoPalm, NoTouch
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpService
 from dexkit.conformance.virtual.topic_run import run_virtual
 from dexkit.doctor.observations import DomainView, Endpoint, Observations, Participant, Stream

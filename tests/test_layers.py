@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 from dexkit.conformance.checks import REGISTRY, check_of
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.layers import LAYERS, layer
-from dexkit.conformance.requirements import catalogue
 from dexkit.models import BUILT_IN
 from dexkit.robots import ROBOTS
 
@@ -40,7 +40,7 @@ def test_requirements_are_read_without_checks() -> None:
     """What lists requirements starts without decoders, checks, scripts and references."""
     text = (
         "import sys\n"
-        "from dexkit.conformance.requirements import catalogue\n"
+        "from dexkit.conformance.kit.requirements import catalogue\n"
         "assert catalogue(None, None)\n"
         "print(*(m for m in sys.modules if m.startswith('dexkit.conformance.')))\n"
     )

@@ -15,9 +15,9 @@ import pytest
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Overall, RunResult, Verdict
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.results import Overall, RunResult, Verdict
 from dexkit.hand import Side
 from dexkit.models import dialect
 from dexkit.traces import Recorder, open_trace, sample_path

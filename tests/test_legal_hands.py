@@ -15,15 +15,15 @@ from typing import Any
 import pytest
 
 from dexkit.conformance.checks import Outcome
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.generated import Fault, Generated
 from dexkit.conformance.faults.trials import plan_for
-from dexkit.conformance.judge import judge
-from dexkit.conformance.motor_messages import Motor, state_member
-from dexkit.conformance.requirements import CAPABILITIES, catalogue
-from dexkit.conformance.results import Result, RunResult, Verdict
-from dexkit.conformance.verdicts import Excuse, Judgement
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.motor_messages import Motor, state_member
+from dexkit.conformance.kit.requirements import CAPABILITIES, catalogue
+from dexkit.conformance.kit.results import Result, RunResult, Verdict
+from dexkit.conformance.kit.verdicts import Excuse, Judgement
 from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
 from dexkit.conformance.virtual.dex5 import Dex5Hand, Dex5Service
 from dexkit.conformance.virtual.fingers import Dex3Hand, Dex3Service, FingerHand

@@ -24,8 +24,8 @@ from dexkit.conformance.faults import mutants, plan_for, run_mutant
 from dexkit.conformance.faults.matrix import chosen, cost, try_one
 from dexkit.conformance.hands import BUILT_IN as UNDER_TEST
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Overall
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Overall
 from dexkit.dds import DdsNode
 from dexkit.errors import ModelBroken, UsageError
 from dexkit.hand import Side
@@ -66,7 +66,7 @@ CONSTANTS = {
 }
 NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
 # what was measured is stated a model each
-HOMES = ("dexkit/models/", "dexkit/robots.py", "conformance/catch_rates.py")
+HOMES = ("dexkit/models/", "dexkit/robots.py", "conformance/kit/catch_rates.py")
 # wrong hands are declared for the models on which they are tried
 WRONG_HANDS = "conformance/faults/"
 # names of subcommands, with the module or the arguments of each
@@ -182,8 +182,8 @@ class Packages:
 def forget() -> None:
     """What was found out about installed packages."""
     from dexkit import lazy
-    from dexkit.conformance import requirements
     from dexkit.conformance.faults import registry
+    from dexkit.conformance.kit import requirements
 
     importlib.invalidate_caches()
     dexkit.models._plugins = None

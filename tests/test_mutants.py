@@ -19,9 +19,9 @@ from dexkit.conformance.faults.matrix import (
     try_one,
 )
 from dexkit.conformance.faults.trials import cost
+from dexkit.conformance.kit.requirements import Level, catalogue, select
+from dexkit.conformance.kit.results import Overall, Verdict
 from dexkit.conformance.layers import layer
-from dexkit.conformance.requirements import Level, catalogue, select
-from dexkit.conformance.results import Overall, Verdict
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from tests.each import each

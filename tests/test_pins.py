@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from dexkit.conformance import judge as judge_module
 from dexkit.conformance.checks import Check, Outcome, check_of
 from dexkit.conformance.faults import Mutant, mutants
 from dexkit.conformance.faults.trials import cost, run_of
-from dexkit.conformance.judge import judge_layer
+from dexkit.conformance.kit import judge as judge_module
+from dexkit.conformance.kit.judge import judge_layer
+from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
-from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.hand import Side
 from tests.each import each
 from tools.pins.__main__ import main
@@ -146,7 +146,7 @@ EDITS = [
     ("dexkit/conformance/virtual/service.py", "self.now += dt", "self.now += 2 * dt", True, None),
     ("dexkit/models/dex3.py", "1.5", "1.6", True, True),
     (
-        "dexkit/conformance/motor_messages.py",
+        "dexkit/conformance/kit/motor_messages.py",
         "class MotorCodec:",
         "class MotorCodec(object):",
         True,
@@ -162,11 +162,11 @@ EDITS = [
         None,
     ),
     ("dexkit/conformance/checks/__init__.py", "ROUNDING = 1e-3", "ROUNDING = 2e-3", False, None),
-    ("dexkit/conformance/verdicts.py", "LARGER = 4.0", "LARGER = 5.0", False, True),
-    ("dexkit/conformance/judge.py", "1e6", "1e7", False, True),
-    ("dexkit/conformance/recording.py", "_SOME = 50", "_SOME = 51", False, True),
+    ("dexkit/conformance/kit/verdicts.py", "LARGER = 4.0", "LARGER = 5.0", False, True),
+    ("dexkit/conformance/kit/judge.py", "1e6", "1e7", False, True),
+    ("dexkit/conformance/kit/recording.py", "_SOME = 50", "_SOME = 51", False, True),
     ("dexkit/conformance/layers/hand.py", "_SILENT = 0.5", "_SILENT = 0.6", False, True),
-    ("dexkit/conformance/measurement_error.py", "class Measure", "class Measure_", False, True),
+    ("dexkit/conformance/kit/measurement_error.py", "class Measure", "class Measure_", False, True),
     ("dexkit/traces/reader.py", "1024", "1025", None, True),
     # neither
     ("dexkit/conformance/report/html.py", "import html", "import html, math", False, False),

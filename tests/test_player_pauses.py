@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.kit.motor_messages import MotorCodec
 from dexkit.conformance.stimuli import Action, CommandSession, Observation, Plan, Send, script_for
 from dexkit.hand import Side
 from dexkit.models import DEX1_1

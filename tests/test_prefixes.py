@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 from dexkit.child_processes import Tool, command_line
 from dexkit.cli import cli
-from dexkit.conformance.decoding import recording_of
+from dexkit.conformance.kit.decoding import recording_of
 from dexkit.doctor import diagnose, readiness, verdict
 from dexkit.doctor.observations import DomainView
 from dexkit.errors import UsageError

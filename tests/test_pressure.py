@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from dexkit.conformance.faults import plan_for, run_mutant
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.requirements import catalogue, select
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.stimuli import phases_for, script_class
 from dexkit.conformance.virtual.fingers import Dex3Service, FingerHand
 from dexkit.dds import DdsNode

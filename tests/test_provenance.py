@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.provenance import TIMES, Provenance
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.provenance import TIMES, Provenance
+from dexkit.conformance.kit.results import Verdict
 from dexkit.models import MODELS
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.names import CUT, RECORDER

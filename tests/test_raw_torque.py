@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import mutants
 from dexkit.conformance.faults.matrix import try_one
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Result, Verdict
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.results import Result, Verdict
 from dexkit.conformance.virtual.fingers import Dex3Service
 from dexkit.traces import open_trace, sample_path
 from tests.each import each

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 
-from dexkit.conformance.requirements import Level, catalogue
+from dexkit.conformance.kit.requirements import Level, catalogue
 from tests.test_citations import ROOT, unresolved
 from tools.generate import real_hands_page
 from tools.generate.real_hands_page import BASES, VERDICTS, basis, read, verdicts

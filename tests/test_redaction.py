@@ -292,7 +292,7 @@ def test_command_lines_of_other_programs_are_redacted(monkeypatch: pytest.Monkey
 
 
 def test_the_device_of_a_result_is_redacted() -> None:
-    from dexkit.conformance.backend_processes import RigOptions
+    from dexkit.conformance.kit.backend_processes import RigOptions
 
     about: Callable[..., dict[str, str]] = RigOptions.subject.fget  # type: ignore[attr-defined]
     stand_in = type("Options", (), {"backend": "x", "devices": {"left": URL}, "objects": {}})

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from dexkit.cli.rehearse import command
 from dexkit.command_age import PAUSE, SETTLE
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.errors import SessionError, UsageError
 from dexkit.hand import MotorError, Side

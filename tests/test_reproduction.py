@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.result_file import as_document, read_json
-from dexkit.conformance.run_record import (
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.result_file import as_document, read_json
+from dexkit.conformance.kit.run_record import (
     RECORD,
     catalogue_digest,
     recorded_claims,

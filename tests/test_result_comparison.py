@@ -10,17 +10,17 @@ from typing import Any
 
 import pytest
 
-from dexkit.conformance import rejudge
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.rejudge import Comparison, compare_with_recording
-from dexkit.conformance.requirements import CAPABILITIES, Kind, catalogue
-from dexkit.conformance.result_file import as_document, parse_result
-from dexkit.conformance.results import Evidence, Overall, Verdict
-from dexkit.conformance.robot import robot_dialect
-from dexkit.conformance.run_record import RECORD, run_record
-from dexkit.conformance.selection import RunKind
+from dexkit.conformance.kit import rejudge
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.rejudge import Comparison, compare_with_recording
+from dexkit.conformance.kit.requirements import CAPABILITIES, Kind, catalogue
+from dexkit.conformance.kit.result_file import as_document, parse_result
+from dexkit.conformance.kit.results import Evidence, Overall, Verdict
+from dexkit.conformance.kit.robot import robot_dialect
+from dexkit.conformance.kit.run_record import RECORD, run_record
+from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.robot import ReferenceRobot
@@ -138,7 +138,7 @@ def test_live_run_and_check_of_its_recording_write_the_same(tmp_path: Path) -> N
 
 def test_run_record_without_a_device_gives_no_subject(of_run: Document) -> None:
     assert of_run["subject"]["backend"] == "virtual"  # of this dexkit
-    from dexkit.conformance.run_record import recorded_subject
+    from dexkit.conformance.kit.run_record import recorded_subject
 
     assert recorded_subject({"backend": "ezgripper"}) == {}  # it may have been emulated
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from dexkit.conformance.row_selection import SomeTimes, Times, extremes
-from dexkit.conformance.sums import total
+from dexkit.conformance.kit.row_selection import SomeTimes, Times, extremes
+from dexkit.conformance.kit.sums import total
 
 SHIFTS = [(s, side) for s in (-0.3, -0.01, 0.0, 0.004, 0.04, 5.0) for side in ("left", "right")]
 

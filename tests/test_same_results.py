@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.conformance.behaviours import freshness
-from dexkit.conformance.median import median, medians, percentile
-from dexkit.conformance.row_selection import finite_rows
+from dexkit.conformance.kit.median import median, medians, percentile
+from dexkit.conformance.kit.row_selection import finite_rows
 
 _COLUMNS = st.lists(st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 1e-300, math.nan]))
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults import plan_for
-from dexkit.conformance.judge import judge
-from dexkit.conformance.requirements import catalogue, select
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.requirements import catalogue, select
+from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.brainco import BrainCoHand, BrainCoService
 from dexkit.conformance.virtual.inspire import FtpHand, FtpService

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.cli import cli
-from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
+from dexkit.conformance.kit.stimulus_record import RECORD, Phase, Stimulus
 from dexkit.errors import DexkitError, TraceError, TraceUnsupported, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from dexkit.cli import cli
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.recording import Recording
 from dexkit.errors import SessionError
 from dexkit.hand import Side
 from dexkit.messages import message_type

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from tools.site import hooks
 
 ROOT = Path(__file__).parent.parent

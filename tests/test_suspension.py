@@ -14,11 +14,11 @@ from dexkit.cli.consent import Consent
 from dexkit.cli.stop_keys import Keys
 from dexkit.clock import ManualClock, RealClock
 from dexkit.command_age import LONG_PAUSE, PauseWatch
+from dexkit.conformance.kit.suspension import sleep_awake
 from dexkit.conformance.selftest import supervision
 from dexkit.conformance.selftest.joint_motion import Setup
 from dexkit.conformance.selftest.live import run
 from dexkit.conformance.selftest.procedure import Procedure
-from dexkit.conformance.suspension import sleep_awake
 from dexkit.dds import DdsNode
 from dexkit.emulators.sim_dex1 import SimHand
 from dexkit.errors import ConformanceError

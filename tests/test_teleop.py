@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.recording import Recording
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import BUILT_IN, DEX3_1, DIALECTS, MODELS
@@ -433,7 +433,7 @@ def test_the_recorded_dex1_commands_are_encoded_alike() -> None:
 
 @each("name", list(DIALECTS))
 def test_positions_are_decoded(name: str) -> None:
-    from dexkit.conformance.motor_messages import MotorCodec
+    from dexkit.conformance.kit.motor_messages import MotorCodec
 
     spoken = DIALECTS[name]
     joints = len(MODELS[spoken.model].joints[LEFT])

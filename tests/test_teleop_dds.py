@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.command_age import PAUSE
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.recording import Recording
 from dexkit.dds import DdsNode, Sample
 from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side

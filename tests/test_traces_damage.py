@@ -19,8 +19,8 @@ from mcap.writer import CompressionType
 from dexkit.cli import main
 from dexkit.cli.info import _print as print_info
 from dexkit.cli.info import summary
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.messages import message_type

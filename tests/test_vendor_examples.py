@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from dexkit.backends import BackendOptions
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.suite_run import SuiteOptions
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.suite_run import SuiteOptions
 from dexkit.errors import HandLost, HandNotFound, HandRefused, UsageError
 from dexkit.hand import Hand, HandCommand, Side
 from tests.conformance_helpers import SUITE
@@ -245,7 +245,7 @@ def test_a_hand_class_needs_no_name_to_be_judged() -> None:
 
 def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
     (tmp_path / "spoilt.py").write_text(
-        "import dexkit.conformance.suite_run as session\n"
+        "import dexkit.conformance.kit.suite_run as session\n"
         "def run_suite(*args): raise IndexError('a bug of the kit')\n"
         "session.run_suite = run_suite\n"
     )
@@ -268,9 +268,9 @@ def test_internal_error_of_the_kit_is_reported_once(tmp_path: Path) -> None:
 
 def test_each_failure_is_printed_once_before_the_verdict(tmp_path: Path) -> None:
     (tmp_path / "canned.py").write_text(
-        "import dexkit.conformance.suite_run as session\n"
-        "from dexkit.conformance.judge import judge\n"
-        "from dexkit.conformance.recording import Recording\n"
+        "import dexkit.conformance.kit.suite_run as session\n"
+        "from dexkit.conformance.kit.judge import judge\n"
+        "from dexkit.conformance.kit.recording import Recording\n"
         "from dexkit.traces import open_trace, sample_path\n"
         "view = Recording.decode(open_trace(sample_path('dex1_hand_dropout')))\n"
         "def run_suite(options, *args): return judge(view, requirements=options.requirements)\n"

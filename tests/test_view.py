@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.cli.view import _skeletons
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.recording_marks import phase_marks, verdict_marks
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.recording_marks import phase_marks, verdict_marks
 from dexkit.errors import ExtraMissing, UsageError
 from dexkit.hand import MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go, unitree_hg

@@ -16,7 +16,7 @@ from dexkit.conformance.audit.result_tables import write_tables
 from dexkit.conformance.audit.sessions import SessionFile, find
 from dexkit.conformance.audit.summary_page import Summary, render
 from dexkit.conformance.audit.workers import Pool, WorkerLost
-from dexkit.conformance.results import Verdict
+from dexkit.conformance.kit.results import Verdict
 from dexkit.documents import write_file
 from dexkit.redaction import redact
 

@@ -15,11 +15,11 @@ import numpy as np
 from dexkit import __version__
 from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.sessions import SessionFile, opened, problem_of
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.results import Overall, RunResult, overall_of
-from dexkit.conformance.run_record import catalogue_digest, recorded_claims
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.results import Overall, RunResult, overall_of
+from dexkit.conformance.kit.run_record import catalogue_digest, recorded_claims
 from dexkit.errors import DexkitError
 from dexkit.escaping import one_line
 from dexkit.hand import Floats

@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
-from dexkit.conformance.requirements import Kind, Level
-from dexkit.conformance.results import Overall, Result, Verdict, worst
+from dexkit.conformance.kit.requirements import Kind, Level
+from dexkit.conformance.kit.results import Overall, Result, Verdict, worst
 from dexkit.errors import UsageError
 from dexkit.records import as_plain, to_record
 

@@ -14,13 +14,13 @@ from markupsafe import Markup
 
 from dexkit import __version__
 from dexkit.conformance.audit.file_records import FileRecord, State
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.results import Overall, Verdict
+from dexkit.conformance.kit.run_record import catalogue_digest
 from dexkit.conformance.layers import LAYERS
 from dexkit.conformance.report.labels import ANSWERS
 from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.svg_charts import Line, chart
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.results import Overall, Verdict
-from dexkit.conformance.run_record import catalogue_digest
 
 __all__ = ["Group", "Summary", "render"]
 

@@ -1,6 +1,6 @@
 """What hands, robots and their clients must do: one file for each behaviour, for all models.
 
-:mod:`dexkit.conformance.requirements` reads them and explains their keys.
+:mod:`dexkit.conformance.kit.requirements` reads them and explains their keys.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.members import all_finite
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
-from dexkit.conformance.sums import mean
+from dexkit.conformance.kit.sums import mean
 from dexkit.hand import Floats
 
 _IMU = [f"imu_state.{name}" for name in ("quaternion", "gyroscope", "accelerometer", "rpy")]

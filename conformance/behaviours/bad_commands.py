@@ -13,8 +13,8 @@ from dexkit.conformance.checks.obedience import sags, silent, stays, unharmed
 from dexkit.conformance.checks.robot import LATE_S, RobotContext, no_state
 from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.checks.timing import gaps
-from dexkit.conformance.measurement_error import Measure
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.unseen import UNSEEN_S
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.robot import RobotContext
-from dexkit.conformance.provenance import STATES, TIMES
-from dexkit.conformance.results import Evidence
-from dexkit.conformance.sums import total
+from dexkit.conformance.kit.provenance import STATES, TIMES
+from dexkit.conformance.kit.results import Evidence
+from dexkit.conformance.kit.sums import total
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte, model
 from dexkit.other_interfaces import TWO_FINGERS, is_two_fingers

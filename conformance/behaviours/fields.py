@@ -18,8 +18,8 @@ from dexkit.conformance.checks.members import (
     values_of,
 )
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
-from dexkit.conformance.motor_messages import sequence_of
-from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.conformance.kit.motor_messages import sequence_of
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.messages import message_type
 
 

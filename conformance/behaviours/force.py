@@ -30,8 +30,8 @@ from dexkit.conformance.checks.stands import (
 )
 from dexkit.conformance.checks.steps import Step, steps_of
 from dexkit.conformance.checks.torque_law import torque_factors
-from dexkit.conformance.median import median, medians
-from dexkit.conformance.results import Evidence
+from dexkit.conformance.kit.median import median, medians
+from dexkit.conformance.kit.results import Evidence
 from dexkit.hand import Floats
 
 Ranges: TypeAlias = NDArray[np.intp]

@@ -12,8 +12,8 @@ from dexkit.conformance.checks import Context, Late, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.speeds import FEW, FOUGHT_OVER, fastest_speed
 from dexkit.conformance.checks.timing import Positions, encoder_step
-from dexkit.conformance.median import median, percentile
-from dexkit.conformance.provenance import TIMES
+from dexkit.conformance.kit.median import median, percentile
+from dexkit.conformance.kit.provenance import TIMES
 from dexkit.hand import Floats
 
 _EXPLAINED = 1.5

@@ -32,9 +32,9 @@ from dexkit.conformance.checks.steps import (
     steps_of,
 )
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.measurement_error import Measure, Quantity
-from dexkit.conformance.median import median
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.measurement_error import Measure, Quantity
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.stimulus_record import Phase
 
 _GROWS = 0.25
 """Part of the growth of the error by which the way may grow where a soft start limits it."""

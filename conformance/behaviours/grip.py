@@ -38,10 +38,10 @@ from dexkit.conformance.checks.torque_law import (
     torque_factors,
     torque_scales,
 )
-from dexkit.conformance.measurement_error import Measure, Quantity
-from dexkit.conformance.median import median
-from dexkit.conformance.row_selection import Rows
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.measurement_error import Measure, Quantity
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.row_selection import Rows
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.hand import Floats
 
 _HELD = 0.2

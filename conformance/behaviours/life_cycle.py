@@ -9,8 +9,8 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import arrival, away_first
-from dexkit.conformance.measurement_error import Measure
-from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.motor_messages import MotorCodec
 from dexkit.hand import JointMode
 
 

@@ -13,7 +13,7 @@ from dexkit.conformance.checks.obedience import stays
 from dexkit.conformance.checks.robot import RobotContext, joint_of
 from dexkit.conformance.checks.silences import mode_bytes, roles_of
 from dexkit.conformance.checks.steps import not_driven, own_speed, steps_of
-from dexkit.conformance.motor_messages import MotorCodec
+from dexkit.conformance.kit.motor_messages import MotorCodec
 from dexkit.conformance.usb.context import UsbContext, quiet_motors
 from dexkit.hand import Floats, JointMode
 from dexkit.models import ModeByte

@@ -15,8 +15,8 @@ from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.goals import OWN_RULE, Goals, goals_of
 from dexkit.conformance.checks.robot import RobotContext, joint_of, no_state
 from dexkit.conformance.checks.steps import DISOBEYS, Step, rests_before, speed_of, steps, steps_of
+from dexkit.conformance.kit.sums import mean
 from dexkit.conformance.stimuli.robot import STEP
-from dexkit.conformance.sums import mean
 from dexkit.conformance.usb.context import UsbContext, moves, named_joints, part_of_way, travel_of
 from dexkit.hand import Floats
 

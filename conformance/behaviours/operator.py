@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.hand import Side
 from dexkit.teleop import client_for

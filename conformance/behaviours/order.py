@@ -6,7 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.obedience import arrival
-from dexkit.conformance.provenance import TIMES
+from dexkit.conformance.kit.provenance import TIMES
 
 
 @check("DEX1-ORDER-01", "DEX3-ORDER-01", "H1-ORDER-01", rests_on=(TIMES,))

@@ -12,9 +12,9 @@ from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.checks.speeds import FEW, by_times, fastest_speed, filled, q_and_dq
-from dexkit.conformance.provenance import TIMES
-from dexkit.conformance.recording import joints_of
-from dexkit.conformance.row_selection import Rows, Times
+from dexkit.conformance.kit.provenance import TIMES
+from dexkit.conformance.kit.recording import joints_of
+from dexkit.conformance.kit.row_selection import Rows, Times
 from dexkit.hand import Floats
 
 _STAND_S = 0.1  # seconds without motion after which a joint counts as standing

@@ -21,7 +21,7 @@ from dexkit.conformance.checks.members import (
     span_text,
 )
 from dexkit.conformance.checks.steps import steps_of
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.hand import Floats, Subject
 from dexkit.models import HandModel
 from dexkit.pressure import NO_VALUE, known

@@ -24,9 +24,9 @@ from dexkit.conformance.checks.timing import (
     survived,
     too_slow,
 )
-from dexkit.conformance.median import median, percentile
-from dexkit.conformance.provenance import TIMES
-from dexkit.conformance.sums import total
+from dexkit.conformance.kit.median import median, percentile
+from dexkit.conformance.kit.provenance import TIMES
+from dexkit.conformance.kit.sums import total
 from dexkit.hand import Floats
 
 # stimuli with separate requirements for the state's rate

@@ -11,9 +11,9 @@ from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, rests_before, steps_of
-from dexkit.conformance.measurement_error import Measure, Quantity
-from dexkit.conformance.median import median
-from dexkit.conformance.sums import mean
+from dexkit.conformance.kit.measurement_error import Measure, Quantity
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.sums import mean
 
 _NEARLY, _CLEAR_WAY = 0.9, 0.3
 """Part of its whole way after which the time of a step is taken, and the least part of the step

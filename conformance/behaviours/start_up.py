@@ -6,7 +6,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
-from dexkit.conformance.median import median
+from dexkit.conformance.kit.median import median
 from dexkit.hand import Floats
 
 

@@ -8,7 +8,7 @@ from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measur
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.stands import FEW_STANDS, stands
 from dexkit.conformance.checks.timing import gap_beside_states
-from dexkit.conformance.touch import Touch
+from dexkit.conformance.kit.touch import Touch
 from dexkit.hand import Floats
 
 _WINDOW_S = 1.0

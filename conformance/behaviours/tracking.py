@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dexkit.conformance.checks import STROKE_S, Context, Late, Outcome, check
 from dexkit.conformance.checks.figures import Figure, judged
 from dexkit.conformance.checks.steps import own_speed, speed_of, steps_of
-from dexkit.conformance.row_selection import Selected, finite_rows
-from dexkit.conformance.sums import mean
+from dexkit.conformance.kit.row_selection import Selected, finite_rows
+from dexkit.conformance.kit.sums import mean
 from dexkit.hand import Floats
 
 _GRID = 0.005  # seconds; clients send commands at 200 Hz

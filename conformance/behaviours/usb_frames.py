@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
+from dexkit.conformance.kit.sums import total
 from dexkit.conformance.stimuli.usb import BUSES
-from dexkit.conformance.sums import total
 from dexkit.conformance.usb.context import (
     UsbContext,
     all_frames,

@@ -23,17 +23,17 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dexkit.conformance import sums
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.robot import RobotContext, joint_of
 from dexkit.conformance.checks.speeds import FEW, FOUGHT_OVER, by_times, filled, q_and_dq
 from dexkit.conformance.checks.timing import encoder_step
-from dexkit.conformance.excess import Course
-from dexkit.conformance.median import median
-from dexkit.conformance.provenance import TIMES
-from dexkit.conformance.row_selection import Rows, Selected, SomeTimes, Times
-from dexkit.conformance.sums import mean, total
+from dexkit.conformance.kit import sums
+from dexkit.conformance.kit.excess import Course
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.provenance import TIMES
+from dexkit.conformance.kit.row_selection import Rows, Selected, SomeTimes, Times
+from dexkit.conformance.kit.sums import mean, total
 from dexkit.hand import Floats
 from dexkit.unseen import UNSEEN_S
 

@@ -15,8 +15,8 @@ from dexkit.conformance.checks.silences import roles_of, stops_moving
 from dexkit.conformance.checks.steps import obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gaps, survived
 from dexkit.conformance.checks.torque_law import torque_scales
-from dexkit.conformance.measurement_error import Measure, Quantity
-from dexkit.conformance.median import median
+from dexkit.conformance.kit.measurement_error import Measure, Quantity
+from dexkit.conformance.kit.median import median
 from dexkit.hand import Floats
 
 

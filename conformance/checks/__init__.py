@@ -22,14 +22,14 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.kit.measurement_error import Measure, Quantity
+from dexkit.conformance.kit.plots import Plot, PlotKind
+from dexkit.conformance.kit.recording import Commands, Recording, SideView, States
+from dexkit.conformance.kit.requirements import Requirement
+from dexkit.conformance.kit.results import Evidence
+from dexkit.conformance.kit.row_selection import Selected, finite_rows
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.layers import layer
-from dexkit.conformance.measurement_error import Measure, Quantity
-from dexkit.conformance.plots import Plot, PlotKind
-from dexkit.conformance.recording import Commands, Recording, SideView, States
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Evidence
-from dexkit.conformance.row_selection import Selected, finite_rows
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.unseen import UNSEEN_S
 
@@ -405,7 +405,7 @@ def check(*requirement_ids: str, rests_on: Sequence[str] = ()) -> Callable[[Chec
     """Register the decorated function as the check of these requirements, of any layer.
 
     :param rests_on: what it judges beside positions: members of a motor, and
-        :data:`~dexkit.conformance.provenance.TIMES`.
+        :data:`~dexkit.conformance.kit.provenance.TIMES`.
     """
 
     def register(function: CheckT) -> CheckT:

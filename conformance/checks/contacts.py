@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.conformance.checks import Context
-from dexkit.conformance.median import median
-from dexkit.conformance.row_selection import Rows
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.row_selection import Rows
 from dexkit.hand import Floats
 from dexkit.models import model
 

@@ -25,7 +25,7 @@ from functools import wraps
 from typing import TypeAlias, TypeVar
 
 from dexkit.conformance.checks import STROKE_S, Context, Late, Outcome
-from dexkit.conformance.measurement_error import Measure, Quantity
+from dexkit.conformance.kit.measurement_error import Measure, Quantity
 
 __all__ = ["Figure", "Figures", "judged", "with_object", "worst"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome
-from dexkit.conformance.plots import Plot, PlotKind
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.hand import Floats
 
 

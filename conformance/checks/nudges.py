@@ -9,8 +9,8 @@ import numpy as np
 
 from dexkit.conformance.checks import Context
 from dexkit.conformance.checks.steps import noise_at_rest
-from dexkit.conformance.median import median
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.stimulus_record import Phase
 
 STIFFNESS = "stiffness"
 """The phase of the pushes that are repeated throughout a run."""

@@ -11,8 +11,8 @@ from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.checks.figures import Figure, Figures, judged
 from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gap_measures, gaps, longest_gap
-from dexkit.conformance.measurement_error import Measure
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.hand import Floats
 
 

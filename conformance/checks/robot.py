@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.checks.figures import Figure, Figures
-from dexkit.conformance.robot import RobotRecording
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.robot import RobotRecording
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.messages import Columns
 
 LATE_S = 1.0  # s by which a state may be late on a busy machine

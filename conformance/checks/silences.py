@@ -12,8 +12,8 @@ from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.checks.figures import Figure, judged
 from dexkit.conformance.checks.obedience import stopped
 from dexkit.conformance.hands import JointRoles, under_test
-from dexkit.conformance.median import medians
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.median import medians
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.hand import Floats
 from dexkit.models import ModeByte
 

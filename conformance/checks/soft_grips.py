@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.conformance.checks import Context
-from dexkit.conformance.median import median
+from dexkit.conformance.kit.median import median
 from dexkit.models import HandModel
 
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from dexkit.conformance.checks import Context
-from dexkit.conformance.row_selection import finite_rows
+from dexkit.conformance.kit.row_selection import finite_rows
 from dexkit.hand import Floats
 
 FEW = 10

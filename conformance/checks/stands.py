@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome
-from dexkit.conformance.motor_messages import state_member
+from dexkit.conformance.kit.motor_messages import state_member
 from dexkit.hand import Floats
 from dexkit.models import model
 

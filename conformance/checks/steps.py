@@ -10,8 +10,8 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.checks.figures import Figure, judged
-from dexkit.conformance.median import median
-from dexkit.conformance.stimulus_record import Phase
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.hand import Floats
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome
-from dexkit.conformance.measurement_error import Measure
-from dexkit.conformance.median import median, percentile
+from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.median import median, percentile
 from dexkit.hand import Floats
 
 COARSEST = 0.02

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context
-from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.row_selection import Rows
+from dexkit.conformance.kit.motor_messages import MotorCodec
+from dexkit.conformance.kit.row_selection import Rows
 from dexkit.hand import Floats, JointMode
 
 _FREE = ("joint", "step", "fingerprint", "stiff")

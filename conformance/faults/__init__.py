@@ -25,7 +25,7 @@ from dexkit.conformance.faults import (
 from dexkit.conformance.faults.registry import Mutant, expand, wrong_hand
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import models
+from dexkit.conformance.kit.requirements import models
 
 __all__ = ["MODULES", "Mutant", "mutants", "plan_for", "run_mutant", "wrong_hand"]
 

@@ -191,7 +191,7 @@ def command(
     if generated is not None or names:
         from dexkit.conformance.faults.generated import dialects, parse, sample, sample_good
         from dexkit.conformance.faults.generated.campaign import Campaign
-        from dexkit.conformance.selection import RunKind
+        from dexkit.conformance.kit.selection import RunKind
 
         if model in ROBOTS:
             raise UsageError(f"{model} is a robot; only hands are generated")

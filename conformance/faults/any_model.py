@@ -17,8 +17,8 @@ from dexkit.conformance.faults.registry import (
     takes_floats,
     wrong_hand,
 )
-from dexkit.conformance.motor_messages import Motor, sequence_of
-from dexkit.conformance.recording import joints_of
+from dexkit.conformance.kit.motor_messages import Motor, sequence_of
+from dexkit.conformance.kit.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.hand import JointSpec, Side
 from dexkit.messages import message_type

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 from dexkit.conformance.faults.registry import Call, changes, takes_floats, wrong_hand
-from dexkit.conformance.motor_messages import LIMP, Motor
-from dexkit.conformance.recording import joints_of
+from dexkit.conformance.kit.motor_messages import LIMP, Motor
+from dexkit.conformance.kit.recording import joints_of
 from dexkit.conformance.virtual.client import ReferenceClient
 from dexkit.hand import Side
 from dexkit.models import ModeByte

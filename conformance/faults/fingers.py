@@ -24,7 +24,7 @@ from dexkit.conformance.faults.registry import (
     reports,
     wrong_hand,
 )
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual import Sample
 from dexkit.conformance.virtual.fingers import (
     Dex3Hand,

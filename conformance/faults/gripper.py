@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from dexkit.conformance.faults.registry import BOTH, LEFT, Call, changes, reports, wrong_hand
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual import TopicDevice
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from dexkit.conformance.faults import Mutant, mutants
 from dexkit.conformance.faults.trials import blamed, cost
-from dexkit.conformance.requirements import Level, Requirement, catalogue, select
+from dexkit.conformance.kit.requirements import Level, Requirement, catalogue, select
 from dexkit.console import Console
 from dexkit.documents import write_file
 

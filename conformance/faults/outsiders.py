@@ -25,8 +25,8 @@ from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import Level, catalogue
-from dexkit.conformance.results import RunResult, Verdict
+from dexkit.conformance.kit.requirements import Level, catalogue
+from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.virtual import Service
 from dexkit.console import Console
 from dexkit.documents import write_file

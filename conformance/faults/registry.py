@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+from dexkit.conformance.kit.motor_messages import Motor
+from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
-from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.virtual.dex5 import Dex5Hand, Dex5Service
 from dexkit.conformance.virtual.fingers import (
     Dex3Hand,

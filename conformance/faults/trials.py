@@ -15,16 +15,16 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.registry import Mutant
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.judge import deciding, judge, judge_layer, results_of
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import deciding, judge, judge_layer, results_of
+from dexkit.conformance.kit.recording import TraceLike
+from dexkit.conformance.kit.requirements import Requirement, catalogue, select
+from dexkit.conformance.kit.results import Result, RunResult, Verdict
+from dexkit.conformance.kit.robot import robot_dialect
+from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.layers import layer
-from dexkit.conformance.recording import TraceLike
-from dexkit.conformance.requirements import Requirement, catalogue, select
-from dexkit.conformance.results import Result, RunResult, Verdict
-from dexkit.conformance.robot import robot_dialect
-from dexkit.conformance.selection import RunKind
 from dexkit.conformance.stimuli import CommandSession, Plan, phases_for, script_class
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects

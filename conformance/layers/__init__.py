@@ -1,7 +1,7 @@
 """The layers of judging: a hand's DDS topics, a robot's DDS topics, a hand's USB, and the client.
 
 A :class:`Layer` is the data by which the kit goes from a device to verdicts: how a recording is
-decoded, what is judged by which checks (:mod:`dexkit.conformance.judge`), and which script is
+decoded, what is judged by which checks (:mod:`dexkit.conformance.kit.judge`), and which script is
 played to which reference. Each layer is in a module of its own:
 
 * :mod:`~dexkit.conformance.layers.hand`: ``dds``, the DDS topics of hands;
@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from dexkit.conformance.plots import Plot
+from dexkit.conformance.kit.plots import Plot
 from dexkit.hand import Subject
 from dexkit.lazy import Lazy
 from dexkit.robots import ROBOTS
@@ -49,7 +49,7 @@ class Layer(Generic[RecordingT, ViewT, ContextT]):
     """The data by which one layer is judged.
 
     :param name: one of :data:`LAYERS`; it selects the catalogue
-        (:func:`dexkit.conformance.requirements.catalogue`).
+        (:func:`dexkit.conformance.kit.requirements.catalogue`).
     :param checks: the modules that register its checks.
     :param plots: what shows a failure where neither the catalogue nor the check names a plot.
     :param decode: a recording's part that is about the layer; None where there is none. It takes

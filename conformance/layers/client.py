@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.conformance.layers import Layer, hand
 from dexkit.conformance.layers.preconditions import not_blocked
-from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks import Context
-    from dexkit.conformance.recording import Recording, SideView
+    from dexkit.conformance.kit.recording import Recording, SideView
 
 __all__ = ["LAYER"]
 

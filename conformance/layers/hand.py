@@ -10,18 +10,18 @@ import numpy as np
 
 from dexkit.conformance.behaviours import CHECKS
 from dexkit.conformance.hands import under_test
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.conformance.layers import Layer
 from dexkit.conformance.layers.preconditions import claimed, not_blocked, not_spoiled
-from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import Side, Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks import Context, Outcome
-    from dexkit.conformance.recording import Recording, SideView, TraceLike
-    from dexkit.conformance.results import Result
-    from dexkit.conformance.verdicts import Judgement
+    from dexkit.conformance.kit.recording import Recording, SideView, TraceLike
+    from dexkit.conformance.kit.results import Result
+    from dexkit.conformance.kit.verdicts import Judgement
 
 __all__ = [
     "LAYER",
@@ -47,7 +47,7 @@ _REMEDY = {
 
 
 def _decode(trace: TraceLike, dialect_name: str | None, sides: Sequence[Subject]) -> Recording:
-    from dexkit.conformance.recording import Recording
+    from dexkit.conformance.kit.recording import Recording
 
     hands = tuple(s for s in sides if isinstance(s, Side))
     if len(hands) < len(sides):
@@ -160,7 +160,7 @@ def _missing(context: Context) -> str:
 def carried(judgement: Judgement, context: Context) -> Result | None:
     """A precondition: the source of the recording carries what the check rests on."""
     from dexkit.conformance.checks import rests_on
-    from dexkit.conformance.provenance import STATES
+    from dexkit.conformance.kit.provenance import STATES
 
     requirement, recording = context.requirement, context.recording
     wanted, states = rests_on(requirement), context.states.topic

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks import BaseContext
-    from dexkit.conformance.results import Result
-    from dexkit.conformance.verdicts import Judgement
+    from dexkit.conformance.kit.results import Result
+    from dexkit.conformance.kit.verdicts import Judgement
 
 __all__ = ["claimed", "not_blocked", "not_spoiled"]
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from dexkit.conformance.behaviours import CHECKS
 from dexkit.conformance.hands import under_test
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.conformance.layers import Layer, hand
 from dexkit.conformance.layers.preconditions import claimed, not_blocked
-from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.errors import UsageError
 from dexkit.hand import ROBOT, Subject
 from dexkit.lazy import Lazy
@@ -17,14 +17,14 @@ from dexkit.robots import H1
 
 if TYPE_CHECKING:
     from dexkit.conformance.checks.robot import RobotContext
-    from dexkit.conformance.recording import SideView, TraceLike
-    from dexkit.conformance.robot import RobotRecording
+    from dexkit.conformance.kit.recording import SideView, TraceLike
+    from dexkit.conformance.kit.robot import RobotRecording
 
 __all__ = ["LAYER"]
 
 
 def _decode(trace: TraceLike, name: str | None, sides: Sequence[Subject]) -> RobotRecording:
-    from dexkit.conformance.robot import robot_in, robot_recording
+    from dexkit.conformance.kit.robot import robot_in, robot_recording
 
     if sides not in ((), (ROBOT,)):
         raise UsageError("a robot has no sides", hint="leave --side out")

@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from dexkit.conformance.behaviours import CHECKS
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.conformance.layers import Layer
 from dexkit.conformance.layers.preconditions import claimed, not_blocked
-from dexkit.conformance.plots import Plot, PlotKind
 from dexkit.hand import Subject
 from dexkit.lazy import Lazy
 
 if TYPE_CHECKING:
-    from dexkit.conformance.recording import TraceLike
-    from dexkit.conformance.results import Result
+    from dexkit.conformance.kit.recording import TraceLike
+    from dexkit.conformance.kit.results import Result
+    from dexkit.conformance.kit.verdicts import Judgement
     from dexkit.conformance.usb.context import UsbContext
     from dexkit.conformance.usb.recording import UsbRecording, UsbSide
-    from dexkit.conformance.verdicts import Judgement
 
 __all__ = ["LAYER"]
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dexkit.conformance.kit.requirements import Kind
+from dexkit.conformance.kit.results import Overall, RunResult
 from dexkit.conformance.report.labels import (
     catch_sentence,
     count_verdicts,
     device_kind,
     model_title,
 )
-from dexkit.conformance.requirements import Kind
-from dexkit.conformance.results import Overall, RunResult
 from dexkit.escaping import html as escape
 
 __all__ = ["badge_text", "badges", "render_badge"]

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from dexkit.conformance.requirements import Kind, Requirement
-from dexkit.conformance.results import Evidence, Result, RunResult, Verdict, grouped, worst
+from dexkit.conformance.kit.requirements import Kind, Requirement
+from dexkit.conformance.kit.results import Evidence, Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
 __all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards", "near_limits"]

@@ -8,6 +8,8 @@ from itertools import pairwise
 
 from markupsafe import Markup
 
+from dexkit.conformance.kit.requirements import Requirement
+from dexkit.conformance.kit.results import Result, RunResult, Verdict, worst
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -18,8 +20,6 @@ from dexkit.conformance.report.labels import (
 )
 from dexkit.conformance.report.markdown import code, plain, table
 from dexkit.conformance.report.pages import fill
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Result, RunResult, Verdict, worst
 from dexkit.errors import UsageError
 
 __all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]

@@ -13,7 +13,20 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import CAPABILITIES, Kind
+from dexkit.conformance.kit.results import (
+    SEVERITY,
+    Grade,
+    Overall,
+    Result,
+    RunResult,
+    Stage,
+    Verdict,
+    grouped,
+    overall_of,
+    worst,
+)
 from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits
 from dexkit.conformance.report.labels import (
     ANSWERS,
@@ -33,19 +46,6 @@ from dexkit.conformance.report.labels import (
 from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.report.run_plots import run_plots
-from dexkit.conformance.requirements import CAPABILITIES, Kind
-from dexkit.conformance.results import (
-    SEVERITY,
-    Grade,
-    Overall,
-    Result,
-    RunResult,
-    Stage,
-    Verdict,
-    grouped,
-    overall_of,
-    worst,
-)
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.documents import write_file
 

@@ -6,9 +6,9 @@ import io
 from pathlib import Path
 from xml.etree import ElementTree
 
+from dexkit.conformance.kit.requirements import Kind
+from dexkit.conformance.kit.results import Result, RunResult, Verdict
 from dexkit.conformance.report.labels import catch_sentence, hand_name
-from dexkit.conformance.requirements import Kind
-from dexkit.conformance.results import Result, RunResult, Verdict
 from dexkit.documents import write_file
 from dexkit.escaping import visible
 

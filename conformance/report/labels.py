@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
-from dexkit.conformance.catch_rates import CATCH_RATES, wilson
-from dexkit.conformance.requirements import Kind
-from dexkit.conformance.results import Grade, Overall, RunResult, Verdict, worst
+from dexkit.conformance.kit.catch_rates import CATCH_RATES, wilson
+from dexkit.conformance.kit.requirements import Kind
+from dexkit.conformance.kit.results import Grade, Overall, RunResult, Verdict, worst
 from dexkit.hand import ROBOT
 from dexkit.models import MODELS
 from dexkit.robots import ROBOTS

@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from dexkit.conformance.kit.requirements import Kind
+from dexkit.conformance.kit.results import Result, RunResult, Verdict, grouped, worst
 from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards, near_limits
 from dexkit.conformance.report.labels import (
     ANSWERS,
@@ -21,8 +23,6 @@ from dexkit.conformance.report.labels import (
     part,
     whose,
 )
-from dexkit.conformance.requirements import Kind
-from dexkit.conformance.results import Result, RunResult, Verdict, grouped, worst
 from dexkit.escaping import REMARK, one_line
 
 __all__ = ["code", "plain", "render_markdown", "table"]

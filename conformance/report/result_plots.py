@@ -1,4 +1,4 @@
-"""Draw the plots that a result names (:mod:`dexkit.conformance.plots`) from its recording."""
+"""Draw the plots that a result names (:mod:`dexkit.conformance.kit.plots`) from its recording."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.conformance.plots import Plot, PlotKind
-from dexkit.conformance.recording import Recording, SideView
+from dexkit.conformance.kit.plots import Plot, PlotKind
+from dexkit.conformance.kit.recording import Recording, SideView
+from dexkit.conformance.kit.requirements import Requirement
+from dexkit.conformance.kit.results import Result
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.report.labels import whose
 from dexkit.conformance.report.svg_charts import Band, Level, Line, Range, chart, histogram
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.results import Result
 from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.conformance.usb.record import Transfer
 from dexkit.conformance.usb.recording import UsbRecording, UsbSide
 from dexkit.errors import UsageError

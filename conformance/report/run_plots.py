@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from dexkit.conformance.recording import Recording, SideView
+from dexkit.conformance.kit.recording import Recording, SideView
+from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.report.labels import subject, whose
 from dexkit.conformance.report.result_plots import command_and_state, operated, phase_bands
 from dexkit.conformance.report.svg_charts import Band, Level, Line, chart, histogram
-from dexkit.conformance.results import RunResult, Verdict
 from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.escaping import html as escape
 from dexkit.hand import JointSpec

@@ -9,10 +9,10 @@ import rich.markup
 from rich.table import Table
 from rich.text import Text
 
+from dexkit.conformance.kit.requirements import Kind
+from dexkit.conformance.kit.results import Overall, Result, RunResult, Verdict, grouped, worst
 from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits
 from dexkit.conformance.report.labels import about_harness, catch_sentence
-from dexkit.conformance.requirements import Kind
-from dexkit.conformance.results import Overall, Result, RunResult, Verdict, grouped, worst
 from dexkit.console import Console
 from dexkit.console import markup as escape
 from dexkit.escaping import REMARK, one_line

@@ -1,5 +1,5 @@
 """The stimuli for hands and robots on DDS topics, as scripts (see
-:mod:`dexkit.conformance.phased_script`).
+:mod:`dexkit.conformance.kit.phased_script`).
 
 Grippers have :mod:`~.stimuli.gripper`, hands of several joints :mod:`~.stimuli.fingers`; both
 share :mod:`~.stimuli.hand`. Robots have :mod:`~.stimuli.robot`.
@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer_of_model
-from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimuli.script import (
     Action,

@@ -77,10 +77,10 @@ from dataclasses import replace
 from functools import partial
 
 from dexkit.conformance.hands import JointRoles, under_test
-from dexkit.conformance.motor_messages import Motor, Motors
+from dexkit.conformance.kit.motor_messages import Motor, Motors
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Part, Payloads, Pose, Steps
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointMode, Side
 
 __all__ = ["FingerScript"]

@@ -63,7 +63,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-from dexkit.conformance.motor_messages import Motor, Motors
+from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.stimuli.hand import ASIDE, ASIDE_SECONDS, BETWEEN, HandScript
 from dexkit.conformance.stimuli.script import NOT_FINITE, Part, Payloads, Plan, Pose, Steps
 from dexkit.hand import Side

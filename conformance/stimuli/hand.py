@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from dexkit.command_age import PAUSE
-from dexkit.conformance.motor_messages import MotorCodec, Motors
-from dexkit.conformance.recording import joints_of
+from dexkit.conformance.kit.motor_messages import MotorCodec, Motors
+from dexkit.conformance.kit.recording import joints_of
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.operator import OPERATOR, operate
 from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.conformance.stimuli.script import (
@@ -30,7 +31,6 @@ from dexkit.conformance.stimuli.script import (
     StopService,
 )
 from dexkit.conformance.stimuli.standing import Standing
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import HandModel, model
 

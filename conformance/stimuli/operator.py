@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from dexkit.conformance.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.script import Plan, Script, Send, Steps
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, client_for, profile

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.recording import Commands, Recording
+from dexkit.conformance.kit.motor_messages import Motor, Motors
+from dexkit.conformance.kit.recording import Commands, Recording
 from dexkit.errors import ConformanceError, TraceError
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, Dialect, model

@@ -34,8 +34,9 @@ from dataclasses import replace
 from functools import partial
 
 from dexkit.command_age import PAUSE
-from dexkit.conformance.motor_messages import Motor, Motors
-from dexkit.conformance.robot import WRONG_CRCS, RobotMotorCodec
+from dexkit.conformance.kit.motor_messages import Motor, Motors
+from dexkit.conformance.kit.robot import WRONG_CRCS, RobotMotorCodec
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
@@ -47,7 +48,6 @@ from dexkit.conformance.stimuli.script import (
     Send,
     Steps,
 )
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import ROBOT, RobotSubject
 from dexkit.robots import robot
 

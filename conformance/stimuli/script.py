@@ -11,9 +11,9 @@ from enum import Enum
 from typing import Generic, TypeVar
 
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.phased_script import PhasedScript, play
+from dexkit.conformance.kit.phased_script import PhasedScript, play
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.recorded_session import CommandSession
-from dexkit.conformance.stimulus_record import Phase
 from dexkit.hand import JointSpec, Side, Subject
 from dexkit.models import Dialect
 

@@ -1,4 +1,4 @@
-"""The stimulus for one hand on USB, as a script; see :mod:`dexkit.conformance.phased_script`.
+"""The stimulus for one hand on USB, as a script; see :mod:`dexkit.conformance.kit.phased_script`.
 
 Order of the phases: what may disturb a hand comes after what needs it undisturbed. Commands that
 move something enable the time-out protection, except where its absence is tested. A player that
@@ -30,7 +30,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dexkit.conformance.phased_script import PhasedScript
+from dexkit.conformance.kit.phased_script import PhasedScript
 from dexkit.conformance.usb.frames import (
     Motor,
     Scale,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dexkit.conformance.checks import BaseContext, Outcome
-from dexkit.conformance.results import Evidence
+from dexkit.conformance.kit.results import Evidence
 from dexkit.conformance.usb.record import UsbPhase, topic
 from dexkit.conformance.usb.recording import Answer, Exchange, Floats, UsbRecording, UsbSide
 

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from dexkit.conformance.processor_waits import Time, Waits
-from dexkit.conformance.stimulus_record import Beats, Stall, from_metadata, to_metadata
+from dexkit.conformance.kit.processor_waits import Time, Waits
+from dexkit.conformance.kit.stimulus_record import Beats, Stall, from_metadata, to_metadata
 from dexkit.conformance.usb import RECORD
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side

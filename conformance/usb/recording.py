@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.processor_waits import Starvation, Waits
-from dexkit.conformance.stimulus_record import Beats, Stall
+from dexkit.conformance.kit.lateness import Lateness
+from dexkit.conformance.kit.processor_waits import Starvation, Waits
+from dexkit.conformance.kit.stimulus_record import Beats, Stall
 from dexkit.conformance.usb.frames import MotorReading, Scale, StateReading, read_state
 from dexkit.conformance.usb.record import (
     RECORD,

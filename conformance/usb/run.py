@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 from dexkit.clock import RealClock
-from dexkit.conformance.heartbeat import Heartbeat
+from dexkit.conformance.kit.heartbeat import Heartbeat
+from dexkit.conformance.kit.phased_script import play
+from dexkit.conformance.kit.run_queue import RunQueue, Watched
+from dexkit.conformance.kit.suspension import sleep_awake
 from dexkit.conformance.layers import layer
-from dexkit.conformance.phased_script import play
-from dexkit.conformance.run_queue import RunQueue, Watched
 from dexkit.conformance.stimuli.usb import (
     Action,
     Alone,
@@ -23,7 +24,6 @@ from dexkit.conformance.stimuli.usb import (
     UsbScript,
     Wait,
 )
-from dexkit.conformance.suspension import sleep_awake
 from dexkit.conformance.usb.access import UsbHost, bulk_pair, open_device
 from dexkit.conformance.usb.record import (
     RECORD,

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
 from dexkit.conformance.layers import layer
-from dexkit.conformance.motor_messages import Motor, MotorCodec
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.conformance.virtual.service import Service
 from dexkit.conformance.virtual.topic_run import log_time_ns

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.service import Service, TopicDevice
 from dexkit.hand import Side, Subject

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dexkit.conformance.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
 from dexkit.conformance.stimuli.script import Pose
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.errors import WireError

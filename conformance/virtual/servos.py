@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual.fingers import GO_MOTOR, FingerHand, FingerService, Flags, Ints
 from dexkit.hand import Floats, JointMode, Side, Subject
 from dexkit.messages import message_type

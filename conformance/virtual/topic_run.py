@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.phased_script import play
-from dexkit.conformance.robot import codec_for
+from dexkit.conformance.kit.motor_messages import MotorCodec
+from dexkit.conformance.kit.phased_script import play
+from dexkit.conformance.kit.robot import codec_for
+from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.stimuli import (
     Action,
     Join,
@@ -21,7 +22,6 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 from dexkit.conformance.virtual.service import Sample, TopicDevice
 from dexkit.hand import Subject

@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Mapping
 from functools import cache
 
+from dexkit.conformance.kit.phased_script import play
 from dexkit.conformance.layers import layer
-from dexkit.conformance.phased_script import play
 from dexkit.conformance.stimuli.usb import BUSES as MAP
 from dexkit.conformance.stimuli.usb import (
     Action,

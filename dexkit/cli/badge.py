@@ -30,8 +30,8 @@ def command(result: Path, output: Path) -> None:
     A badge says if the hand was emulated, simulated or only recorded, and how many requirements
     could not be judged.
     """
+    from dexkit.conformance.kit.result_file import read_json
     from dexkit.conformance.report.badge import badge_text, badges, render_badge
-    from dexkit.conformance.result_file import read_json
 
     check_output_paths([output], [result])
     found = read_json(result)

@@ -111,13 +111,13 @@ def command(
     if against is not None:
         _compare(recording, against)
         return
-    from dexkit.conformance.claims import Claims
-    from dexkit.conformance.decoding import recording_of
-    from dexkit.conformance.judge import judge
+    from dexkit.conformance.kit.claims import Claims
+    from dexkit.conformance.kit.decoding import recording_of
+    from dexkit.conformance.kit.judge import judge
+    from dexkit.conformance.kit.requirements import Kind, catalogue, select
+    from dexkit.conformance.kit.robot import robot_in
+    from dexkit.conformance.kit.run_record import recorded_claims
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.requirements import Kind, catalogue, select
-    from dexkit.conformance.robot import robot_in
-    from dexkit.conformance.run_record import recorded_claims
     from dexkit.digests import sha256_of_file
     from dexkit.traces.sessions.judgeable import judgeable
 
@@ -152,7 +152,7 @@ def command(
     if not requirements:
         raise ConformanceError("no requirement is left by --require and --level together")
     if list_only:
-        from dexkit.conformance.selection import print_selection
+        from dexkit.conformance.kit.selection import print_selection
 
         print_selection(requirements)
         return
@@ -167,7 +167,7 @@ def command(
     if also:
         console.print(also)
     if result_path:
-        from dexkit.conformance.result_file import write_json
+        from dexkit.conformance.kit.result_file import write_json
 
         write_json(result, result_path)
     if junit_path:
@@ -203,9 +203,9 @@ def _compare(recording: Path | None, result: Path) -> None:
     :raises click.exceptions.Exit: something does.
     """
     from dexkit import __version__, documents
-    from dexkit.conformance.rejudge import compare_with_recording
-    from dexkit.conformance.requirements import Kind
-    from dexkit.conformance.result_file import parse_result
+    from dexkit.conformance.kit.rejudge import compare_with_recording
+    from dexkit.conformance.kit.requirements import Kind
+    from dexkit.conformance.kit.result_file import parse_result
     from dexkit.digests import sha256_of_file
 
     context = click.get_current_context()

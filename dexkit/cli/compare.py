@@ -45,12 +45,12 @@ def command(results: tuple[Path, ...], html_path: Path | None) -> None:
     time; a worse verdict is listed as a regression. The page also shows the curves of their
     recordings side by side, if these are in the folders of the results.
     """
+    from dexkit.conformance.kit.result_file import read_json
     from dexkit.conformance.report.compare import (
         Comparison,
         render_comparison,
         render_comparison_markdown,
     )
-    from dexkit.conformance.result_file import read_json
 
     if other := [path for path in results if path.suffix in (".mcap", ".bag", ".db3")]:
         raise UsageError(

@@ -113,7 +113,7 @@ def _spans(
     phases: tuple[str, ...],
 ) -> tuple[list[Span], Metadata]:
     """The times to keep, and the metadata without phases that are not whole in them."""
-    from dexkit.conformance.stimulus_record import RECORD, Stimulus
+    from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
     from dexkit.traces.sessions.edit import Span
 
     # the last message belongs to the recording

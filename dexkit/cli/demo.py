@@ -49,8 +49,8 @@ def command(out: Path, backend: str, view: bool) -> None:
 
     Traffic stays on this machine, on a DDS domain of its own.
     """
+    from dexkit.conformance.kit.suite_run import SuiteOptions, run_suite
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.suite_run import SuiteOptions, run_suite
 
     console = Console()
     out.mkdir(parents=True, exist_ok=True)

@@ -20,8 +20,8 @@ from dexkit.documents import check_output_paths, write_file
 from dexkit.errors import UsageError
 
 if TYPE_CHECKING:
-    from dexkit.conformance.recording import Recording
-    from dexkit.conformance.results import RunResult
+    from dexkit.conformance.kit.recording import Recording
+    from dexkit.conformance.kit.results import RunResult
 
 
 def write_text(path: Path, text: str) -> None:
@@ -59,11 +59,11 @@ def command(
     A result file comes from 'dexkit check --result FILE' or from the conformance suite with
     '--result FILE'. Without an option the result is printed as a table.
     """
+    from dexkit.conformance.kit.result_file import read_json
     from dexkit.conformance.report.html import write_html
     from dexkit.conformance.report.junit import write_junit
     from dexkit.conformance.report.markdown import render_markdown
     from dexkit.conformance.report.terminal import print_result
-    from dexkit.conformance.result_file import read_json
     from dexkit.console import Console
 
     found = read_json(result)
@@ -99,7 +99,7 @@ def _matching_recording(path: Path, result: RunResult, *, given: bool) -> Record
 
     :raises UsageError: the recording that the user gave is not the one that was judged.
     """
-    from dexkit.conformance.decoding import recording_of
+    from dexkit.conformance.kit.decoding import recording_of
     from dexkit.conformance.report.labels import utc_date
     from dexkit.traces import open_trace
 

@@ -198,7 +198,7 @@ def _ask(name: str | None, yes: bool, side: Side) -> None:
 
     :raises UsageError: there is no terminal to ask at.
     """
-    from dexkit.conformance.known_backends import SIMULATED
+    from dexkit.conformance.kit.known_backends import SIMULATED
 
     if yes or name in SIMULATED:
         return

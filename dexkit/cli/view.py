@@ -224,10 +224,10 @@ def recorded(path: Path, judge: bool) -> Source:
 
 def _marks(trace: Trace, judge: bool) -> list[Mark]:
     """Phases and verdicts; a recording that cannot be judged is shown all the same."""
-    from dexkit.conformance.decoding import recording_of
-    from dexkit.conformance.judge import judge as verdict_on
-    from dexkit.conformance.recording_marks import phase_marks, verdict_marks
-    from dexkit.conformance.run_record import recorded_claims
+    from dexkit.conformance.kit.decoding import recording_of
+    from dexkit.conformance.kit.judge import judge as verdict_on
+    from dexkit.conformance.kit.recording_marks import phase_marks, verdict_marks
+    from dexkit.conformance.kit.run_record import recorded_claims
 
     try:
         marks = phase_marks(trace)

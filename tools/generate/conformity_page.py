@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 from dexkit import documents
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.errors import UsageError
 from tools.generate import ROOT
 from tools.generate.requirement_pages import REQUIREMENT

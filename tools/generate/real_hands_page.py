@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 from dexkit import documents
-from dexkit.conformance.requirements import Level, Requirement, catalogue
+from dexkit.conformance.kit.requirements import Level, Requirement, catalogue
 from dexkit.errors import UsageError
 from tools.generate import DOCS
 

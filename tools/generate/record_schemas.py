@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from dexkit.conformance.result_file import ResultFile
+from dexkit.conformance.kit.result_file import ResultFile
 from dexkit.conformance.selftest.result_file import SelfTestFile
 from dexkit.records import json_schema
 

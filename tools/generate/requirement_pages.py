@@ -10,8 +10,8 @@ import re
 from collections.abc import Iterable
 
 from dexkit.conformance.faults import mutants
+from dexkit.conformance.kit.requirements import Kind, Level, Requirement, catalogue, renamed
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.requirements import Kind, Level, Requirement, catalogue, renamed
 from dexkit.models import BUILT_IN
 
 __all__ = ["REQUIREMENT", "area_table", "pages"]

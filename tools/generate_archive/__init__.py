@@ -18,7 +18,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from dexkit.conformance.requirements import catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.models import HandModel, model

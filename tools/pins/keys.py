@@ -31,9 +31,9 @@ from dexkit.conformance import layers
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.faults import Mutant, trials
 from dexkit.conformance.faults.trials import run_of
-from dexkit.conformance.judge import deciding
+from dexkit.conformance.kit.judge import deciding
+from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
-from dexkit.conformance.requirements import Requirement, catalogue
 from tools.pins.sources import WHOLE, Place, Sources
 
 __all__ = [
@@ -53,15 +53,15 @@ SPLIT = (
     "dexkit.conformance.behaviours",
     "dexkit.conformance.checks",
     "dexkit.conformance.faults",
-    "dexkit.conformance.recording",
+    "dexkit.conformance.kit.recording",
     "dexkit.conformance.usb.context",
 )
 """Modules of many independent parts; see :mod:`tools.pins.sources`."""
 JUDGES_ONLY: Mapping[str, str] = {
     "dexkit.conformance.layers": "names script and reference, both of which are in the key",
-    "dexkit.conformance.recording:Recording": "has read the session, which is in the key by value",
-    "dexkit.conformance.recording:TopicDecoder": "reads recordings; a robot has no session",
-    "dexkit.conformance.requirements": "has chosen the phases, which are in the key by value",
+    "dexkit.conformance.kit.recording:Recording": "has read the session: a value in the key",
+    "dexkit.conformance.kit.recording:TopicDecoder": "reads recordings; a robot has no session",
+    "dexkit.conformance.kit.requirements": "has chosen the phases, which are in the key by value",
 }
 """What the code that plays names, but does not need while it plays, with the reason. Only the first
 is called at all while a run is played."""

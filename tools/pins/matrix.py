@@ -9,7 +9,7 @@ from pathlib import Path
 from dexkit.conformance.faults import mutants
 from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.trials import cost
-from dexkit.conformance.recording import detect_dialect
+from dexkit.conformance.kit.recording import detect_dialect
 from dexkit.errors import UsageError
 from dexkit.traces import open_trace
 from dexkit.traces.samples import SAMPLES, sample_path

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dexkit.conformance.faults.matrix import with_key
 from dexkit.conformance.faults.trials import run_of
-from dexkit.conformance.results import Result
+from dexkit.conformance.kit.results import Result
 from dexkit.traces.samples import sample_path
 from tools.pins.recordings import pack
 from tools.pins.store import Store

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import results_of
-from dexkit.conformance.results import Result
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import results_of
+from dexkit.conformance.kit.results import Result
 from dexkit.traces import open_trace
 
 __all__ = ["Verdicts", "judge_sample", "verdicts_of"]

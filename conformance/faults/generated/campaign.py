@@ -17,15 +17,15 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from dexkit.conformance.catch_rates import wilson
 from dexkit.conformance.faults.generated import Generated, parse
 from dexkit.conformance.faults.generated.oracle import Opinion, Severity, examine, shortest
 from dexkit.conformance.faults.generated.rig import Faulty
 from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.outsiders import blame
 from dexkit.conformance.faults.trials import plan_for, run_mutant
-from dexkit.conformance.requirements import catalogue
-from dexkit.conformance.selection import RunKind
+from dexkit.conformance.kit.catch_rates import wilson
+from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.stimuli import Plan
 from dexkit.console import Console
 from dexkit.documents import parse_json, read_text, write_file

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from dexkit.conformance.faults.generated.rig import Motors, Report, What
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual import Sample
 from dexkit.hand import Side
 

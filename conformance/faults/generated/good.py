@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 
 from dexkit.conformance.faults.generated.rig import Faulty, Motors, Report, What
-from dexkit.conformance.motor_messages import Motor
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual import Sample
 from dexkit.hand import Side
 

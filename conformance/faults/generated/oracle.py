@@ -17,7 +17,6 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.faults.generated import Generated
 from dexkit.conformance.faults.generated.rig import Faulty, compose
 from dexkit.conformance.faults.generated.stimulus import (
@@ -30,7 +29,8 @@ from dexkit.conformance.faults.generated.stimulus import (
 )
 from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.recording import States
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.recording import States
 from dexkit.conformance.stimuli import Plan
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.conformance.virtual.topic_run import log_time_ns

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from dexkit.conformance.motor_messages import Motor
-from dexkit.conformance.recording import joints_of
+from dexkit.conformance.kit.motor_messages import Motor
+from dexkit.conformance.kit.recording import joints_of
 from dexkit.conformance.virtual import Sample, Service
 from dexkit.conformance.virtual.fingers import FingerHand, FingerService
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService

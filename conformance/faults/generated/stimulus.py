@@ -9,10 +9,10 @@ from functools import cache
 
 from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.motor_messages import Motor, MotorCodec
-from dexkit.conformance.recording import joints_of
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
+from dexkit.conformance.kit.recording import joints_of
+from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.stimuli import Plan
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.virtual import Service, run_virtual
 from dexkit.conformance.virtual.topic_run import ORIGIN_NS
 from dexkit.hand import Side

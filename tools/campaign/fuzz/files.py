@@ -17,9 +17,11 @@ import numpy as np
 import zstandard
 
 from dexkit.backends import BackendOptions
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.result_file import as_document, read_json
+from dexkit.conformance.kit.stimulus_record import Stimulus
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.compare import (
     Comparison,
@@ -30,8 +32,6 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.markdown import render_markdown
 from dexkit.conformance.report.terminal import print_result
-from dexkit.conformance.result_file import as_document, read_json
-from dexkit.conformance.stimulus_record import Stimulus
 from dexkit.conformance.usb.record import UsbRecord
 from dexkit.console import Console
 from dexkit.doctor.environment import uri_problem

@@ -9,7 +9,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from dexkit.clock import RealClock
-from dexkit.conformance.stimulus_record import Beats, Stall
+from dexkit.conformance.kit.stimulus_record import Beats, Stall
 from dexkit.threads import Worker
 
 __all__ = ["Heartbeat"]
@@ -28,8 +28,8 @@ class Heartbeat:
     The first, :attr:`beats`, is a measured delay of a program on this machine. The second also uses
     Linux' pressure stall information: the time for which some task could have run but had no
     processor. It does not show which task waited, or for how long: two programs in the background
-    can fill it without delaying the hand. :mod:`~dexkit.conformance.verdicts` decides what each of
-    them excuses.
+    can fill it without delaying the hand. :mod:`~dexkit.conformance.kit.verdicts` decides what each
+    of them excuses.
 
     :ivar stalls: when programs waited for most of the time, or this thread was woken late.
     """

@@ -1,9 +1,9 @@
 """Make a verdict of a requirement and its check's outcome; the same for DDS and USB.
 
 **Machine or hand?** A machine that is short of processor time makes a correct hand look late. One
-rule decides. Where the kit's own timer (:mod:`~dexkit.conformance.heartbeat`) or the hand's own
-processes (:mod:`~dexkit.conformance.run_queue`: of all waits the part of which other programs are
-the cause) waited for a processor at the place of a failure, and :data:`LARGER` times that is as
+rule decides. Where the kit's own timer (:mod:`~dexkit.conformance.kit.heartbeat`) or the hand's own
+processes (:mod:`~dexkit.conformance.kit.run_queue`: of all waits the part of which other programs
+are the cause) waited for a processor at the place of a failure, and :data:`LARGER` times that is as
 long as the failure is large, it is *blocked*, and the run is done again. Else it is the hand's.
 
 A failure is as large as the delay that would make a correct hand fail in the same way
@@ -14,7 +14,7 @@ each of its places. A failure that the machine explains in part says so, and the
 more; the second run counts.
 
 Apart from load, a MUST that fails by less than the kit's measurement error
-(:mod:`~dexkit.conformance.measurement_error`) is *blocked* as well: its figure is nearer to the
+(:mod:`~dexkit.conformance.kit.measurement_error`) is *blocked* as well: its figure is nearer to the
 limit than the kit can tell. A pass by less than that remains a pass, and says so.
 """
 
@@ -26,12 +26,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dexkit.conformance.checks import Late, Outcome
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.measurement_error import Measure
-from dexkit.conformance.processor_waits import Starvation
-from dexkit.conformance.requirements import Level, Requirement
-from dexkit.conformance.results import UNDISTURBED, Disturbance, Load, Result, Verdict
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.lateness import Lateness
+from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.processor_waits import Starvation
+from dexkit.conformance.kit.requirements import Level, Requirement
+from dexkit.conformance.kit.results import UNDISTURBED, Disturbance, Load, Result, Verdict
 from dexkit.hand import Subject
 
 __all__ = ["Excuse", "Judgement", "Machine", "excuse"]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dexkit.clock import RealClock
-from dexkit.conformance.processor_waits import ProcessWaits, Waits
+from dexkit.conformance.kit.processor_waits import ProcessWaits, Waits
 from dexkit.hand import Subject
 from dexkit.threads import Worker
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from dexkit.conformance.results import Result, RunResult
-    from dexkit.conformance.suite_run import SuiteOptions
+    from dexkit.conformance.kit.results import Result, RunResult
+    from dexkit.conformance.kit.suite_run import SuiteOptions
     from dexkit.errors import DexkitError
 
 __all__ = ["OPTIONS_KEY", "REPORTED_KEY", "RESULT_KEY", "WHY_KEY"]
@@ -168,7 +168,7 @@ def pytest_configure(config: pytest.Config) -> None:
             text = f"{', '.join(given)} without --backend: which hand is to be judged?"
             raise pytest.UsageError(text)
         return
-    from dexkit.conformance.suite_run import SuiteOptions
+    from dexkit.conformance.kit.suite_run import SuiteOptions
     from dexkit.errors import DexkitError
 
     try:
@@ -186,8 +186,8 @@ def pytest_cmdline_main(config: pytest.Config) -> int | None:
     """``--list``: no hand is needed."""
     if not config.getoption("dexkit_list"):
         return None
-    from dexkit.conformance.selection import print_selection
-    from dexkit.conformance.suite_run import selection
+    from dexkit.conformance.kit.selection import print_selection
+    from dexkit.conformance.kit.suite_run import selection
     from dexkit.errors import DexkitError
 
     try:
@@ -219,8 +219,8 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
         return
     if not _items(session) and config.stash[OPTIONS_KEY] is None:
         return  # a pytest run without the suite
-    from dexkit.conformance.requirements import Kind
-    from dexkit.conformance.results import Grade, Overall, overall_of
+    from dexkit.conformance.kit.requirements import Kind
+    from dexkit.conformance.kit.results import Grade, Overall, overall_of
 
     reported: list[Result] = config.stash[REPORTED_KEY]
     grade = config.getoption("dexkit_grade")

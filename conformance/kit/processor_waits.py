@@ -1,7 +1,8 @@
 """How long the hand's processes waited for a processor in a run, as data of its recording.
 
-:mod:`~dexkit.conformance.run_queue` measures it. A process that waits could have run: it is late by
-that time through no fault of its own. A process that computes does not wait, however long it takes.
+:mod:`~dexkit.conformance.kit.run_queue` measures it. A process that waits could have run: it is
+late by that time through no fault of its own. A process that computes does not wait, however long
+it takes.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.row_selection import Rows
-from dexkit.conformance.sums import total
+from dexkit.conformance.kit.lateness import Lateness
+from dexkit.conformance.kit.row_selection import Rows
+from dexkit.conformance.kit.sums import total
 from dexkit.hand import Floats, Subject
 
 __all__ = ["ProcessWaits", "Starvation", "SubjectName", "Time", "Waits", "Worst"]

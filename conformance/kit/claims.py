@@ -1,7 +1,7 @@
 """Read a vendor's capability claims from ``capabilities.toml``.
 
-Not every hand has every unit (:data:`~dexkit.conformance.requirements.CAPABILITIES`). A file says
-which this one has::
+Not every hand has every unit (:data:`~dexkit.conformance.kit.requirements.CAPABILITIES`). A file
+says which this one has::
 
     [hand]
     name = "Example gripper"
@@ -28,7 +28,7 @@ from typing import Annotated, Any
 import msgspec
 
 from dexkit import documents
-from dexkit.conformance.requirements import CAPABILITIES, Level, Requirement
+from dexkit.conformance.kit.requirements import CAPABILITIES, Level, Requirement
 from dexkit.errors import UsageError
 from dexkit.models import model
 from dexkit.records import as_plain, to_record

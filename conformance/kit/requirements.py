@@ -35,8 +35,8 @@ import msgspec
 
 from dexkit.conformance.behaviours import AREAS, BEHAVIOURS
 from dexkit.conformance.hands import BUILT_IN, under_test
+from dexkit.conformance.kit.plots import Plot
 from dexkit.conformance.layers import layer
-from dexkit.conformance.plots import Plot
 from dexkit.documents import parse_toml, read_text, read_toml
 from dexkit.errors import ConformanceError, ModelBroken, UsageError
 from dexkit.models import DIALECTS, HandModel, model, model_plugins
@@ -74,7 +74,7 @@ CAPABILITIES: Mapping[str, str] = {
     "timeout": "motors that ask for it brake when commands end (bit 7 of the mode byte)",
 }
 """Optional units of a hand, and what a claim of each means; see
-:mod:`dexkit.conformance.claims`."""
+:mod:`dexkit.conformance.kit.claims`."""
 
 PREFIXES: Mapping[str, tuple[str, str]] = {
     prefix: (each.model.name, layer_name)
@@ -445,7 +445,7 @@ def _written() -> Mapping[str, Mapping[str, Any]]:
     """The complete entries of dexkit's own requirements by id, by area and behaviour."""
     found: dict[str, dict[str, Any]] = {}
     for name in BEHAVIOURS:
-        path = Path(__file__).parent / "behaviours" / f"{name}.toml"
+        path = Path(__file__).parent.parent / "behaviours" / f"{name}.toml"
         head = dict(read_toml(path))
         for table in head.pop("requirement"):
             for entry in _of_table({**head, **table}, path.name):

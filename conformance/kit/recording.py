@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.lateness import Lateness
+from dexkit.conformance.kit.lateness import Lateness
+from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.motor_messages import MotorCodec
+from dexkit.conformance.kit.processor_waits import Starvation
+from dexkit.conformance.kit.provenance import Provenance
+from dexkit.conformance.kit.run_record import RECORD as RUN
+from dexkit.conformance.kit.stimulus_record import RECORD, Phase, Stimulus
+from dexkit.conformance.kit.touch import Touch
 from dexkit.conformance.layers import layer
-from dexkit.conformance.median import median
-from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.processor_waits import Starvation
-from dexkit.conformance.provenance import Provenance
-from dexkit.conformance.run_record import RECORD as RUN
-from dexkit.conformance.stimulus_record import RECORD, Phase, Stimulus
-from dexkit.conformance.touch import Touch
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.messages.columns import Columns

@@ -20,14 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.decoding import recording_of
-from dexkit.conformance.judge import judge
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.result_file import as_document, parse_result
-from dexkit.conformance.results import SEVERITY, Result, RunResult, Verdict, grouped, worst
-from dexkit.conformance.run_record import recorded_claims
-from dexkit.conformance.selection import RunKind
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.result_file import as_document, parse_result
+from dexkit.conformance.kit.results import SEVERITY, Result, RunResult, Verdict, grouped, worst
+from dexkit.conformance.kit.run_record import recorded_claims
+from dexkit.conformance.kit.selection import RunKind
 from dexkit.digests import sha256_of_file
 from dexkit.escaping import one_line
 from dexkit.traces import open_trace

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 
 from dexkit.clock import RealClock
-from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC, Calibration
+from dexkit.conformance.kit.stimulus_record import CALIBRATION_TOPIC, Calibration
 from dexkit.dds import DdsNode, Qos, Sample
 from dexkit.errors import DdsError
 from dexkit.messages import message_type

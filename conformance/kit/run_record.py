@@ -17,9 +17,9 @@ from importlib import metadata
 from pathlib import Path
 
 from dexkit import __version__
-from dexkit.conformance.claims import Claims
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import LAYERS
-from dexkit.conformance.requirements import Requirement, catalogue
 from dexkit.errors import DexkitError
 from dexkit.hand import ROBOT, Side, Subject
 from dexkit.models import DIALECTS

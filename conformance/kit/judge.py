@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check_of
-from dexkit.conformance.claims import Claims
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.measurement_error import Measure, weigh
+from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import Requirement, catalogue
+from dexkit.conformance.kit.results import Result, RunResult, Stage
+from dexkit.conformance.kit.run_record import recorded_subject
+from dexkit.conformance.kit.stimulus_record import CALIBRATION_TOPIC
+from dexkit.conformance.kit.verdicts import Judgement, excuse
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
-from dexkit.conformance.measurement_error import Measure, weigh
-from dexkit.conformance.recording import Recording
-from dexkit.conformance.requirements import Requirement, catalogue
-from dexkit.conformance.results import Result, RunResult, Stage
-from dexkit.conformance.run_record import recorded_subject
-from dexkit.conformance.stimulus_record import CALIBRATION_TOPIC
-from dexkit.conformance.verdicts import Judgement, excuse
 from dexkit.hand import Side, Subject
 
 __all__ = ["deciding", "judge", "judge_layer", "results_of"]

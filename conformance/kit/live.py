@@ -17,18 +17,20 @@ from pathlib import Path
 
 from dexkit.clock import RealClock
 from dexkit.command_age import PauseWatch
-from dexkit.conformance.backend_processes import Rig, RigOptions
-from dexkit.conformance.calibration import POLL, Loopback
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.heartbeat import Heartbeat
-from dexkit.conformance.known_backends import EXTERNAL
-from dexkit.conformance.motor_messages import MotorCodec
-from dexkit.conformance.phased_script import play
-from dexkit.conformance.requirements import Requirement
-from dexkit.conformance.robot import codec_for
-from dexkit.conformance.run_queue import RunQueue, Watched
-from dexkit.conformance.run_record import RECORD as RUN
-from dexkit.conformance.run_record import run_record
+from dexkit.conformance.kit.backend_processes import Rig, RigOptions
+from dexkit.conformance.kit.calibration import POLL, Loopback
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.heartbeat import Heartbeat
+from dexkit.conformance.kit.known_backends import EXTERNAL
+from dexkit.conformance.kit.motor_messages import MotorCodec
+from dexkit.conformance.kit.phased_script import play
+from dexkit.conformance.kit.requirements import Requirement
+from dexkit.conformance.kit.robot import codec_for
+from dexkit.conformance.kit.run_queue import RunQueue, Watched
+from dexkit.conformance.kit.run_record import RECORD as RUN
+from dexkit.conformance.kit.run_record import run_record
+from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.kit.suspension import sleep_awake
 from dexkit.conformance.stimuli import (
     Action,
     CommandSession,
@@ -45,8 +47,6 @@ from dexkit.conformance.stimuli import (
     script_for,
 )
 from dexkit.conformance.stimuli.script import Pose, object_places
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
-from dexkit.conformance.suspension import sleep_awake
 from dexkit.dds import DdsNode, Qos, Reader, Writer
 from dexkit.errors import ConformanceError, WireError
 from dexkit.hand import Side, Subject

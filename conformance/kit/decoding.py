@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dexkit.conformance import run_record
+from dexkit.conformance.kit import run_record
+from dexkit.conformance.kit.recording import Recording, TraceLike
+from dexkit.conformance.kit.robot import robot_in
+from dexkit.conformance.kit.unprefixed import Unprefixed, choose_prefix
 from dexkit.conformance.layers import layer_of_model
-from dexkit.conformance.recording import Recording, TraceLike
-from dexkit.conformance.robot import robot_in
-from dexkit.conformance.unprefixed import Unprefixed, choose_prefix
 from dexkit.hand import Subject
 from dexkit.topics import HAND_TOPICS, prefixes_of
 

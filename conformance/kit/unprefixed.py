@@ -10,7 +10,7 @@ from dexkit.errors import UsageError
 from dexkit.topics import HAND_TOPICS, prefixes_of, split_prefix
 
 if TYPE_CHECKING:
-    from dexkit.conformance.recording import TraceLike
+    from dexkit.conformance.kit.recording import TraceLike
     from dexkit.traces.reader import ChannelInfo, SampleArray, TraceEndpoint
 
 __all__ = ["Unprefixed", "choose_prefix"]
@@ -42,7 +42,7 @@ def choose_prefix(topics: Iterable[str], wanted: str = "") -> str:
 class Unprefixed:
     """The part of a recording under a prefix; what is no hand's stays as it is.
 
-    A :class:`~dexkit.conformance.recording.TraceLike`.
+    A :class:`~dexkit.conformance.kit.recording.TraceLike`.
     """
 
     def __init__(self, trace: TraceLike, prefix: str) -> None:

@@ -16,10 +16,10 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 
 from dexkit import documents
-from dexkit.conformance.measurement_error import Quantity
-from dexkit.conformance.plots import Plot
-from dexkit.conformance.requirements import Kind, Level
-from dexkit.conformance.results import (
+from dexkit.conformance.kit.measurement_error import Quantity
+from dexkit.conformance.kit.plots import Plot
+from dexkit.conformance.kit.requirements import Kind, Level
+from dexkit.conformance.kit.results import (
     Disturbance,
     Evidence,
     Overall,
@@ -65,7 +65,7 @@ class _Record(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class RequirementRecord(_Record):
-    """A requirement, as :class:`~dexkit.conformance.requirements.Requirement`.
+    """A requirement, as :class:`~dexkit.conformance.kit.requirements.Requirement`.
 
     A claimed SHOULD is a MUST here.
     """
@@ -98,7 +98,7 @@ class RequirementRecord(_Record):
 
 class MeasureRecord(_Record):
     """The figure with a limit that a verdict rests on, as
-    :class:`~dexkit.conformance.measurement_error.Measure`.
+    :class:`~dexkit.conformance.kit.measurement_error.Measure`.
 
     :param margin: distance to the limit, positive on the side that passes.
     :param error: the kit's own error of such a figure at that place; null if it is not known.
@@ -116,7 +116,7 @@ class MeasureRecord(_Record):
 
 
 class ResultRecord(_Record):
-    """The result of a requirement on one side, as :class:`~dexkit.conformance.results.Result`.
+    """The result of a requirement on one side, as :class:`~dexkit.conformance.kit.results.Result`.
 
     :param expected: what would have been right, in a few words.
     """
@@ -159,7 +159,7 @@ class ClientRecord(_Record):
 
 
 class ResultFile(_Record):
-    """A result of a dexkit conformance run, as :class:`~dexkit.conformance.results.RunResult`.
+    """A result of a dexkit conformance run, as :class:`~dexkit.conformance.kit.results.RunResult`.
 
     :param overall: fail: a MUST is not met; inconclusive: a MUST could not be judged, or nothing
         was.

@@ -10,25 +10,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dexkit.conformance.backend_processes import RigOptions
-from dexkit.conformance.claims import Claims
-from dexkit.conformance.decoding import recording_of
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.judge import judge
-from dexkit.conformance.known_backends import (
+from dexkit.conformance.kit.backend_processes import RigOptions
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.decoding import recording_of
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.known_backends import (
     EXTERNAL,
     ROBOT_EMULATORS,
     SIMULATED,
     emulator_of,
     has_usb_requirements,
 )
-from dexkit.conformance.recording import Recording, sides_of
-from dexkit.conformance.requirements import Requirement, catalogue, select
-from dexkit.conformance.result_file import write_json
-from dexkit.conformance.results import RunResult, grouped
-from dexkit.conformance.robot import robot_dialect
-from dexkit.conformance.run_queue import MOST_FILES
-from dexkit.conformance.selection import RunKind
+from dexkit.conformance.kit.recording import Recording, sides_of
+from dexkit.conformance.kit.requirements import Requirement, catalogue, select
+from dexkit.conformance.kit.result_file import write_json
+from dexkit.conformance.kit.results import RunResult, grouped
+from dexkit.conformance.kit.robot import robot_dialect
+from dexkit.conformance.kit.run_queue import MOST_FILES
+from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.stimuli import phases_for
 from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.digests import sha256_of_file
@@ -45,7 +45,7 @@ from dexkit.view.viewer_process import viewer
 if TYPE_CHECKING:
     import pytest
 
-    from dexkit.conformance.live import LiveOptions
+    from dexkit.conformance.kit.live import LiveOptions
 
 __all__ = ["SuiteOptions", "judge_recording", "live_options", "run_suite", "selection"]
 
@@ -341,7 +341,7 @@ def live_options(options: SuiteOptions, domain: int) -> LiveOptions:
 
     :raises TraceError: the session to be replayed cannot be read.
     """
-    from dexkit.conformance.live import LiveOptions
+    from dexkit.conformance.kit.live import LiveOptions
 
     phases = phases_for(r for r in options.requirements if r.layer != "usb")
     session = None
@@ -379,7 +379,7 @@ def run_suite(
     :raises TopicConflict: somebody else commands it.
     :raises DdsError: DDS cannot be used here.
     """
-    from dexkit.conformance.live import record_run
+    from dexkit.conformance.kit.live import record_run
     from dexkit.domains import reserve_free_domain
     from dexkit.traces import open_trace
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from dexkit import child_processes
 from dexkit.backends import Emulator
 from dexkit.backends import backend as find_backend
-from dexkit.conformance.known_backends import EXTERNAL, ROBOT_EMULATORS, SIMULATED, emulator_of
-from dexkit.conformance.run_queue import Watched
+from dexkit.conformance.kit.known_backends import EXTERNAL, ROBOT_EMULATORS, SIMULATED, emulator_of
+from dexkit.conformance.kit.run_queue import Watched
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.hand import Side, Subject
 from dexkit.models import Dialect

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dexkit.conformance.sums import mean, total
+from dexkit.conformance.kit.sums import mean, total
 from dexkit.hand import Floats
 
 __all__ = ["IDLE", "Lateness"]

@@ -14,8 +14,8 @@ from typing import Literal, TypeVar
 import msgspec
 import numpy as np
 
-from dexkit.conformance.lateness import Lateness
-from dexkit.conformance.processor_waits import SubjectName, Time, Waits
+from dexkit.conformance.kit.lateness import Lateness
+from dexkit.conformance.kit.processor_waits import SubjectName, Time, Waits
 from dexkit.documents import parse_json
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import ROBOT, Floats, Side, Subject

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from dexkit.conformance.results import Result, RunResult, Verdict
-from dexkit.conformance.stimulus_record import RECORD, Stimulus
+from dexkit.conformance.kit.results import Result, RunResult, Verdict
+from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
 from dexkit.traces import Trace
 from dexkit.watch.marks import Mark
 

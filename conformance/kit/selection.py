@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from enum import Enum
 
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.requirements import Level, Requirement
-from dexkit.conformance.robot import robot_dialect
+from dexkit.conformance.kit.requirements import Level, Requirement
+from dexkit.conformance.kit.robot import robot_dialect
 from dexkit.conformance.stimuli import Plan, phases_for, script_class
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.hand import ROBOT, Side

@@ -1,6 +1,6 @@
 """The result of a run: one object, from which every report is rendered.
 
-:mod:`dexkit.conformance.result_file` writes and reads it.
+:mod:`dexkit.conformance.kit.result_file` writes and reads it.
 
 Verdicts (h2spec and Autobahn grade theirs likewise; a plain pass or fail hides too much):
 
@@ -27,9 +27,9 @@ from typing import Annotated
 import msgspec
 
 from dexkit import __version__
-from dexkit.conformance.measurement_error import Measure
-from dexkit.conformance.plots import Plot
-from dexkit.conformance.requirements import Kind, Level, Requirement
+from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.plots import Plot
+from dexkit.conformance.kit.requirements import Kind, Level, Requirement
 from dexkit.hand import Side
 
 __all__ = [

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dexkit.conformance.row_selection import Rows, SomeTimes, extremes
+from dexkit.conformance.kit.row_selection import Rows, SomeTimes, extremes
 from dexkit.hand import Floats
 
 __all__ = ["Course", "Excess"]

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.motor_messages import Motor, MotorCodec, Motors
-from dexkit.conformance.recording import Recording, TopicDecoder, TraceLike
+from dexkit.conformance.kit.motor_messages import Motor, MotorCodec, Motors
+from dexkit.conformance.kit.recording import Recording, TopicDecoder, TraceLike
 from dexkit.errors import WireError
 from dexkit.hand import ROBOT, Floats, Subject
 from dexkit.messages import Columns, MessageType, message_type
