@@ -50,7 +50,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test mutants soak pins platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
+.PHONY: help setup demo test test-all mutants soak pins platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -67,6 +67,9 @@ $(COLLECTED): $(STAMP) $(wildcard tests/*.py)
 	@touch $@
 
 test: $(STAMP) $(COLLECTED) ## the tests, six workers for two cores (ARGS="-k name" is passed on)
+	$(RUN) pytest -n auto --dist worksteal -m "not soak and not slow" $(ARGS)
+
+test-all: $(STAMP) $(COLLECTED) ## the tests with those marked slow, as CI runs them (ARGS as for make test)
 	$(RUN) pytest -n auto --dist worksteal -m "not soak" $(ARGS)
 
 mutants: $(STAMP) ## the conformance checks on deliberately wrong hands (ARGS="--model h1"; docs/mutants.md)
