@@ -50,7 +50,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test test-all mutants soak pins platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
+.PHONY: help setup demo test test-all mutants soak pins coverage platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -112,6 +112,9 @@ format: $(STAMP) ## put the code in ruff's format
 
 docs: $(STAMP) ## write the generated files, and into build/docs the pages of requirements and models (ARGS=--check compares)
 	$(RUN) python -m tools.generate $(ARGS)
+
+coverage: $(STAMP) ## what each requirement reads and what is sent to it, as grids with their holes: build/coverage.md
+	$(RUN) python -m tools.coverage
 
 docs-site: $(STAMP) ## the documentation as a site in build/site, with search, requirements and API; checks every link
 	$(UV) run --frozen --python .venv/bin/python --group site python -m mkdocs build --quiet -f tools/site/mkdocs.yml $(ARGS)
