@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,16 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.cli.check import command
-from dexkit.conformance.behaviours.client import returns, sessions, slow_stretches
+from dexkit.conformance.behaviours.client import slow_stretches
 from dexkit.conformance.checks import Context, Outcome, check_of
-from dexkit.conformance.faults import Mutant, mutants
-from dexkit.conformance.faults.matrix import WrongHandResult as Trial
-from dexkit.conformance.faults.matrix import try_one
 from dexkit.conformance.kit.decoding import recording_of
 from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
 from dexkit.conformance.kit.recording import Commands, Recording, SideView, States, joints_of
-from dexkit.conformance.kit.requirements import Level, catalogue, parse
+from dexkit.conformance.kit.requirements import catalogue, parse
 from dexkit.conformance.kit.result_file import as_document, read_json
 from dexkit.conformance.kit.results import Overall, Result, RunResult, Verdict
 from dexkit.conformance.layers import layer
@@ -40,11 +36,9 @@ from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import DIALECTS, dialect, model
 from dexkit.traces import Recorder, open_trace, sample_path
-from dexkit.traces.samples import SAMPLES
 from tests.conformance_helpers import failed, result_of, short_run
 from tests.each import each
 
-GOOD = {Verdict.PASS, Verdict.NOT_APPLICABLE}
 BAD = {Verdict.FAIL, Verdict.WARN, Verdict.ERROR}
 BY_ID = {r.id: r for r in catalogue(None, "client")}
 GO = dialect("unitree_go")
@@ -64,14 +58,6 @@ def test_every_prefix_of_spoils_names_requirements_of_the_hand() -> None:
             assert any(name.startswith(prefix) for name in of_hand), (requirement.id, prefix)
 
 
-def test_every_must_of_the_client_spoils_what_follows_its_commands() -> None:
-    for requirement in BY_ID.values():
-        prefix = requirement.id.partition("-")[0]
-        tracks = any(r.id.startswith(f"{prefix}-TRACK") for r in catalogue(requirement.model))
-        if requirement.level is Level.MUST and tracks:
-            assert f"{prefix}-TRACK" in requirement.spoils, requirement.id
-
-
 def test_only_requirements_about_the_client_spoil_others() -> None:
     text = (
         'model = "dex1-1"\n[[requirement]]\nid = "DEX1-RATE-01"\narea = "a"\nlevel = "MUST"\n'
@@ -86,14 +72,6 @@ def test_only_requirements_about_the_client_spoil_others() -> None:
 
 
 # ---------------------------------------------------------------- genuine clients, and good ones
-
-
-@each("name", SAMPLES)
-def test_clients_of_the_samples_meet_every_requirement(name: str) -> None:
-    result = judge(recording_of(open_trace(sample_path(name)), None, ()))
-    assert {r.verdict for r in result.client} <= GOOD, bad(result.client)
-    passed = {r.requirement.id[-9:] for r in result.client if r.verdict is Verdict.PASS}
-    assert len(passed) >= min(10, len({r.requirement.id for r in result.client}))
 
 
 @each("name", [n for n, d in DIALECTS.items() if d.is_gripper])
@@ -114,16 +92,6 @@ def test_run_of_the_kit_has_no_results_about_the_client() -> None:
     assert result.client == []
     assert result.client_sentence() == ""
     assert as_document(result)["client"] is None
-
-
-def one_of_each_check() -> list[Mutant]:
-    found = {check_of(BY_ID[m.kills]): m for m in reversed(mutants("client"))}
-    return [m for m in found.values() if m.model == "dex1-1"]
-
-
-@pytest.mark.parametrize("given_client", one_of_each_check(), ids=lambda m: m.name)
-def test_wrong_client_fails_its_requirement_and_no_hand(given_client: Mutant) -> None:
-    assert try_one(given_client) == Trial(given_client), given_client.summary
 
 
 # ------------------------------------------- genuine hands with clients that send something wrong
@@ -198,27 +166,6 @@ def test_fault_of_the_client_fails_no_hand(change: Change, requirement: str, tol
     assert result_of(result, "DEX1-TRACK-01", "right").verdict is Verdict.PASS
     assert result.overall is Overall.INCONCLUSIVE
     assert f"because of the client ({requirement})" in result.sentence()
-
-
-def test_percent_and_degrees_are_named_as_the_cause() -> None:
-    def degrees(number: int, motors: tuple[Motor, ...]) -> list[Motor]:
-        return [replace(m, q=math.degrees(m.q)) for m in motors]
-
-    for change, unit in ((in_percent, "percent or degrees"), (degrees, "degrees")):
-        result = judge(Recording.decode(spoiled(change)))
-        (guilty,) = (r for r in result.client if r.requirement.id == "DEX1-CLIENT-03" and r.cause)
-        assert guilty.cause == f"q is in {unit}, not in radians."
-
-
-def test_rate_that_falls_in_the_middle_is_found_with_its_second() -> None:
-    def slows(number: int, motors: tuple[Motor, ...]) -> list[Motor] | None:
-        return list(motors) if number < 2000 or number % 20 == 0 else None
-
-    result = judge(Recording.decode(spoiled(slows)))
-    slow = next(r for r in result.client if r.requirement.id == "DEX1-CLIENT-05")
-    assert slow.verdict is Verdict.FAIL
-    begin = genuine().rows["rt/dex1/left/cmd", GO.cmd_type][1999][0]
-    assert slow.evidence[0].log_time_ns == pytest.approx(begin, abs=110e6)
 
 
 def test_only_the_client_is_selected() -> None:
@@ -331,122 +278,12 @@ def test_steady_client_passes_from_the_limit_on(rate: float, limit: float, windo
     assert least == pytest.approx(rate, rel=1e-6)
 
 
-@given(pause=st.floats(0.01, 0.9), at=st.integers(100, 700))
-def test_stretch_of_few_commands_is_found_where_it_is(pause: float, at: int) -> None:
-    t = np.arange(1000) / 200.0
-    t[at:] += pause
-    _, found = slow_stretches(t, 25.0, 0.5)
-    # 12 intervals in 0.48 s: 11 of 5 ms beside the pause
-    assert bool(found) is (pause + 12 * 0.005 > 0.48 + 1e-6)
-    for begin, end in found:
-        assert begin <= t[at - 1] < t[at] <= end
-
-
-@given(pause=st.floats(0.02, 0.95))
-def test_interval_is_a_gap_from_a_tenth_of_a_second_on(pause: float) -> None:
-    t, q = still(400)
-    t[200:] += pause - 0.005
-    assert judged(context("DEX1-CLIENT-07", t, q)).met is (pause <= 0.1)
-
-
-@each(
-    ("run", "pause", "count"),
-    [(200, 0.9, 1), (200, 1.1, 2), (5, 1.1, 1), (1, 2.0, 1)],
-)
-def test_longer_pause_separates_sessions_of_some_length(run: int, pause: float, count: int) -> None:
-    t, q = still(400)
-    late = np.arange(400) // run * pause if run < 20 else (np.arange(400) >= run) * pause
-    found = sessions(context("DEX1-CLIENT-07", t + late, q))
-    assert len(found) == count
-    assert found[0].start == 0
-    assert found[-1].stop == 400
-
-
-@given(st.data())
-def test_any_value_that_is_not_finite_is_found(data: st.DataObject) -> None:
-    t, q = still(50, joints=7)
-    column = data.draw(st.sampled_from(["q", "dq", "tau", "kp", "kd"]))
-    row, joint = data.draw(st.integers(0, 49)), data.draw(st.integers(0, 6))
-    values = np.ones((50, 7))
-    assert judged(
-        context("DEX3-CLIENT-02", t, q, **({column: values} if column != "q" else {}))
-    ).met
-    values[row, joint] = data.draw(st.sampled_from([math.nan, math.inf, -math.inf]))
-    ctx = (
-        context("DEX3-CLIENT-02", t, values)
-        if column == "q"
-        else context("DEX3-CLIENT-02", t, q, **{column: values})
-    )
-    outcome = judged(ctx)
-    assert outcome.met is False
-    assert outcome.joints == (joint,)
-    assert outcome.evidence[0].time_s == pytest.approx(t[row], abs=1e-4)
-
-
-@given(st.integers(-1, 40))
-def test_only_the_dialects_length_passes(length: int) -> None:
-    t, q = still(50, joints=7)
-    ctx = context("DEX3-CLIENT-01", t, q, length=np.full(50, float(length)))
-    assert judged(ctx).met is (length == 7)
-
-
-@given(q=st.floats(-10.0, 400.0), driven=st.booleans())
-def test_driven_q_is_within_stroke_and_margin(q: float, driven: bool) -> None:
-    t, zero = still(50)
-    gains = {} if driven else {"kp": zero, "kd": zero}
-    outcome = judged(context("DEX1-CLIENT-03", t, zero + q, **gains))
-    assert outcome.met is (not driven or -0.25 <= q <= 5.65)
-
-
-@given(st.floats(-1.0, 1.0))
-def test_step_from_the_states_is_at_most_a_fifth_of_a_radian(step: float) -> None:
-    t, q = still(200)
-    q = q + 2.0
-    q[0] += 0.01  # a hand that never moves says nothing of its client
-    ctx = context("DEX1-CLIENT-08", t, q)
-    goal = ctx.commands.q.copy()
-    goal[100] += step
-    ahead = replace(ctx.hand, commands=replace(ctx.commands, q=goal))
-    outcome = judged(replace(ctx, hand=ahead))
-    assert outcome.met is (abs(step) <= 0.0371 * 5.4)
-
-
-@given(st.floats(0.01, 100.0))
-def test_gains_are_within_the_factor(factor: float) -> None:
-    t, q = still(100, joints=7)
-    ctx = context("DEX3-CLIENT-09", t, q, kp=np.full((100, 7), 1.5 * factor))
-    assert judged(ctx).met is (0.25 * (1 - 1e-6) <= factor <= 4.0 * (1 + 1e-6))
-
-
 def test_zero_gains_stop_a_joint_at_the_end_and_nowhere_else() -> None:
     t, q = still(100)
     for rows, met in ((slice(90, 100), True), (slice(0, 10), True), (slice(40, 50), False)):
         kp, kd = np.full((100, 1), 5.0), np.full((100, 1), 0.05)
         kp[rows], kd[rows] = 0.0, 0.0
         assert judged(context("DEX1-CLIENT-09", t, q, kp=kp, kd=kd)).met is met
-
-
-@given(st.integers(0, 255), st.integers(0, 6))
-def test_mode_byte_of_a_driven_motor_is_its_index_and_status_1(byte: int, joint: int) -> None:
-    t, q = still(60, joints=7)
-    mode = np.tile(0x10 | np.arange(7.0).astype(int), (60, 1)).astype(np.float64)
-    assert judged(context("DEX3-CLIENT-10", t, q, mode=mode)).met
-    mode[30, joint] = byte
-    outcome = judged(context("DEX3-CLIENT-10", t, q, mode=mode))
-    assert outcome.met is (byte & 0x7F == 0x10 | joint)
-
-
-@given(
-    distance=st.floats(0.2, 3.0),
-    first=st.integers(1, 3),
-    second=st.integers(1, 3),
-)
-def test_two_clients_at_any_two_rates_are_noticed(distance: float, first: int, second: int) -> None:
-    t = np.arange(400) / 200.0
-    by_second = np.arange(400) % (first + second) >= first
-    q = np.where(by_second, distance, 0.0) + np.linspace(1.0, 2.0, 400)
-    assert returns(q, 0.108).any()
-    assert judged(context("DEX1-CLIENT-11", t, q[:, None])).met is False
 
 
 @given(speed=st.floats(-10.0, 10.0), hold=st.integers(1, 10))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,6 @@ from xml.etree import ElementTree
 
 import pytest
 from click.testing import CliRunner, Result
-from rich.console import Console
 
 from dexkit.cli import cli
 from dexkit.conformance.faults import plan_for
@@ -21,7 +19,6 @@ from dexkit.conformance.hands import under_test
 from dexkit.conformance.kit.claims import Claims
 from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.recording import Recording
-from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.result_file import read_json, write_json
 from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.kit.run_record import RECORD, run_record
@@ -36,7 +33,7 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import VERDICTS, catch_sentence
 from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
-from dexkit.conformance.report.terminal import MARKS, print_result
+from dexkit.conformance.report.terminal import MARKS
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb
@@ -369,27 +366,6 @@ def test_terminal_shows_table_and_summary(judged: Path) -> None:
     assert "FAIL: a MUST is not met" in table.output
     assert "stage reached: left" in table.output
     assert run("report", judged / "result.json", "--markdown", "-").output.startswith("## ❌ Fail")
-
-
-def test_terminal_prints_facts_of_both_hands_once() -> None:
-    result = result_of_every_kind("a word " * 30)
-    out = io.StringIO()
-    print_result(result, Console(file=out, width=80), verbose=True)
-    lines = [line.rstrip() for line in out.getvalue().splitlines()]
-    assert max(map(len, lines[:-4])) <= 80
-    assert lines[-3:-1] == [result.grade(kind).sentence() for kind in Kind]
-    assert lines[-1] == result.sentence()
-    failed = next(r.requirement for r in result.results if r.verdict is Verdict.FAIL)
-    begin = lines.index(f"{failed.id} ({failed.level}) left and right: fail")
-    card = lines[begin + 1 : lines.index("", begin)]
-    labels = [line[:11].strip() for line in card if line[:11].strip()]
-    sides = ["observed:", "where:"] * 2
-    assert [label for label in labels if label != "expected:"] == (
-        ["required:", *sides, "cause:", "cause:", "try:", "source:"]
-    )
-    assert all(line.startswith(" " * 12) for line in card if not line[:11].strip())
-    unjudged = next(r.requirement for r in result.results if r.verdict is Verdict.NOT_APPLICABLE)
-    assert sum(line.startswith(f"  {unjudged.id} left and right: ") for line in lines) == 1
 
 
 def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) -> None:

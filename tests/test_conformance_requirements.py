@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from dexkit.conformance.checks import REGISTRY, check_of
-from dexkit.conformance.faults import mutants
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.kit import requirements
 from dexkit.conformance.kit.requirements import Level, catalogue, models, parse, select
@@ -73,97 +72,6 @@ def test_error_names_the_mistake_in_a_requirement(old: str, new: str, expected: 
         parse(GOOD.replace(old, new))
 
 
-LIKE = """
-model = "dex5-1"
-prefix = "DEX5"
-[[requirement]]
-like = "DEX1-X-01"
-"""
-
-
-def test_like_entry_inherits_missing_keys() -> None:
-    theirs = {
-        "id": "DEX1-X-01",
-        "area": "A",
-        "level": "MUST",
-        "title": "t",
-        "sentence": "From {low:g} to {high:g} on rt/dex1/SIDE/state.",
-        "rationale": "see DEX1-Y-01",
-        "source": "s",
-        "confidence": "measured",
-        "needs": "state",
-        "advice": "a",
-        "tolerances": {"low": 1, "high": 2},
-    }
-    others = {"DEX1-X-01": theirs}
-    (alike,) = parse(LIKE, others=others)
-    assert (alike.id, alike.like, alike.model) == ("DEX5-X-01", "DEX1-X-01", "dex5-1")
-    assert alike.sentence == "From 1 to 2 on rt/dex5/SIDE/state."
-    assert alike.rationale == "see DEX5-Y-01"
-    # evidence for another model is none for this hand
-    assert (alike.source, alike.confidence) == ("as DEX1-X-01: s", "inferred")
-    own = LIKE + 'level = "INFO"\nconfidence = "measured"\ntolerances = { high = 3 }\n'
-    (other,) = parse(own, others=others)
-    assert (str(other.level), other.confidence) == ("INFO", "measured")
-    assert other.tolerances == {"low": 1, "high": 3}
-    with pytest.raises(UsageError, match="no requirement 'DEX1-X-01' to be like"):
-        parse(LIKE)
-
-
-def test_entry_is_of_the_layer_of_the_requirement_that_it_is_like() -> None:
-    found = parse(LIKE.replace("X-01", "TOPIC-01") + '[[requirement]]\nlike = "FTP-CLIENT-01"\n')
-    assert [r.layer for r in found] == ["dds", "client"]
-
-
-TABLE = """
-ids = ["DEX1-X-02", "DEX3-X-01", "DEX5-X-01 as DEX3", "DFX-X-01 as DEX5"]
-area = "Rate"
-level = "MUST"
-title = "t"
-sentence = "From {low:g} to {high:g} on rt/dex1/SIDE/state."
-rationale = "see DEX1-Y-01"
-source = "s"
-confidence = "measured"
-needs = "state"
-advice = "a"
-tolerances = { low = 1, high = 2 }
-[DEX3]
-advice = "b"
-tolerances = { high = 3 }
-[DEX5]
-title = "u"
-"""
-
-
-def test_one_table_is_about_several_models() -> None:
-    one, three, five, dfx = requirements._of_table(parse_toml(TABLE, "t"), "t")
-    assert one["id"] == "DEX1-X-02"
-    assert (one["advice"], one["tolerances"]) == ("a", {"low": 1, "high": 2})
-    assert three["id"] == "DEX3-X-01"
-    assert (three["rationale"], three["confidence"]) == ("see DEX3-Y-01", "measured")
-    assert three["sentence"].endswith("rt/dex3/SIDE/state.")
-    assert (three["advice"], three["tolerances"]) == ("b", {"low": 1, "high": 3})
-    assert (five["like"], five["source"]) == ("DEX3-X-01", "as DEX3-X-01: s")
-    assert (five["title"], five["advice"], five["confidence"]) == ("u", "b", "inferred")
-    assert (dfx["like"], dfx["title"], dfx["source"]) == ("DEX5-X-01", "u", "as DEX3-X-01: s")
-
-
-def test_error_names_the_mistake_in_a_table_of_several_models() -> None:
-    for old, new, expected in (
-        ("DFX-X", "NO-X", "NO-X-01 is of no known model"),
-        ('title = "u"', "title = 1", "title: Expected str, got int"),
-    ):
-        with pytest.raises(UsageError, match=expected):
-            requirements._of_table(parse_toml(TABLE.replace(old, new), "t"), "t")
-
-
-def test_expected_is_the_sentence_unless_given() -> None:
-    (requirement,) = parse(GOOD)
-    assert requirement.expected == requirement.sentence
-    (short,) = parse(GOOD + 'expected = "{limit:g} s"\ncause = "c"\nrepeat = 3\n')
-    assert (short.expected, short.cause, short.repeat) == ("1 s", "c", 3)
-
-
 def test_every_must_and_should_has_a_likely_cause() -> None:
     assert [r.id for r in catalogue(None, None) if r.level is not Level.INFO and not r.cause] == []
 
@@ -178,10 +86,6 @@ def test_every_requirement_has_one_check_and_every_check_a_requirement() -> None
     every = catalogue(None, None)
     assert all(check_of(r) for r in every)
     assert set(REGISTRY) <= {r.id for r in every}
-
-
-def test_every_requirement_has_a_wrong_hand() -> None:
-    assert {m.kills for m in mutants("dds")} == {r.id for r in catalogue()}
 
 
 @each("name", models())

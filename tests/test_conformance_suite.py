@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +47,7 @@ from tests.conformance_helpers import (
     with_beats,
 )
 from tests.dds_helpers import DdsNode, free_domain
+from tests.each import each
 from tests.reproduction_helpers import checked
 from tests.slow_hand import SLOW
 
@@ -73,90 +75,104 @@ def suite(*arguments: object, timeout: float = 120) -> subprocess.CompletedProce
 
 # --------------------------------------------------------------------------------- options
 
-
-def test_without_backend_tests_are_skipped_with_hint_and_exit_code() -> None:
-    run = suite("conformance/", "-k", "DEX1-RATE", "-rs")
-    assert run.returncode == 2
-    assert "Nothing was judged, which is not a pass" in run.stdout
-    assert "--backend ezgripper" in run.stdout
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("--side", "left"), "--side without --backend"),
-        (("--backend", "sim-dex1", "--trace", "missing.mcap"), "no such file: missing.mcap"),
-        (("--backend", "sim-dex1", "--result", "/no/such/r.json"), "cannot write /no/such/r.json"),
-    ],
-)
-def test_invalid_options_are_usage_errors(arguments: tuple[str, ...], expected: str) -> None:
-    run = suite("conformance/", *arguments)
-    assert run.returncode == 4
-    assert expected in run.stderr
-
-
-def test_requirements_are_the_test_ids() -> None:
-    run = suite(
-        "conformance/", "--backend", "sim-dex1", "--side", "left", "--require", "DEX1-RATE",
-        "--collect-only",
-    )  # fmt: skip
-    ids = [line.partition("::")[2] for line in run.stdout.splitlines() if "::" in line]
-    assert ids == [f"test_requirement[DEX1-RATE-0{i}-left]" for i in range(1, 6)]
-
-
-def test_empty_selection_is_not_success() -> None:
-    run = suite("conformance/", "--backend", "sim-dex1", "-k", "nothing-is-called-so")
-    assert run.returncode == 2, run.stdout
-    assert "Nothing was judged, which is not a pass. No requirement was left" in run.stdout
-
-
-def test_suite_hidden_by_pytest_settings_is_reported() -> None:
-    run = suite("conformance/", "--backend", "sim-dex1", "-o", "python_files=check_*.py")
-    assert run.returncode == 2, run.stdout
-    assert "pytest found none of the suite's tests" in run.stdout
-    assert "add -c /dev/null" in run.stdout
-
-
-def test_unreachable_hand_is_not_success() -> None:
-    run = suite(
-        "conformance/", "-p", "tests.short_discovery", "--backend", "external", "--quick",
-        "--domain", str(free_domain()), "--side", "left",
-    )  # fmt: skip
-    assert run.returncode == 2, run.stdout
-    assert "publishes rt/dex1/left/state" in run.stdout
-    assert "passed" not in run.stdout
+IN_ONE_PROCESS = """
+import contextlib, io, json, sys
+import pytest
+ran = []
+for arguments in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = pytest.main(arguments)
+    ran.append((int(code), out.getvalue(), err.getvalue()))
+print(json.dumps(ran))
+"""
+SIM = ("--backend", "sim-dex1")
+ENDS = [
+    # arguments, exit code, and what standard output and standard error say
+    (("-k", "DEX1-RATE", "-rs"), 2, ["which is not a pass", "--backend ezgripper"], ""),
+    (("--side", "left"), 4, [], "--side without --backend"),
+    ((*SIM, "--trace", "missing.mcap"), 4, [], "no such file: missing.mcap"),
+    ((*SIM, "--result", "/no/such/r.json"), 4, [], "cannot write /no/such/r.json"),
+    ((*SIM, "-n", "2"), 4, [], "pytest-xdist's -n cannot divide it"),
+    (
+        (*SIM, "-k", "nothing-is-called-so"),
+        2,
+        ["Nothing was judged, which is not a pass. No requirement was left"],
+        "",
+    ),
+    (
+        (*SIM, "-o", "python_files=check_*.py"),
+        2,
+        ["pytest found none of the suite's tests", "add -c /dev/null"],
+        "",
+    ),
+    (
+        (*SIM, "--side", "left", "--require", "DEX1-RATE", "--collect-only"),
+        0,
+        [f"test_requirement[DEX1-RATE-0{i}-left]" for i in range(1, 6)],
+        "",
+    ),
+    (("--list", "--capabilities", "wrong.toml"), 4, [], "Object contains unknown field speed"),
+    (("--list", "--capabilities", "right.toml", "--require", "DEX1-FIELD"), 0, [], ""),
+    # the last one: its plug-in shortens discovery in the whole process
+    (
+        (
+            *("-p", "tests.short_discovery", "--backend", "external", "--quick"),
+            *("--side", "left", "--domain", "DOMAIN"),
+        ),
+        2,
+        ["publishes rt/dex1/left/state"],
+        "",
+    ),
+]
 
 
-def test_all_requirements_of_a_hand_use_one_run() -> None:
-    run = suite("conformance/", "--backend", "sim-dex1", "-n", "2")
-    assert run.returncode == 4
-    assert "pytest-xdist's -n cannot divide it" in run.stderr
+@pytest.fixture(scope="module")
+def ends(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str, str]]:
+    """Exit code and output of each of these; one process saves ten starts of the suite."""
+    folder = tmp_path_factory.mktemp("claims")
+    (folder / "right.toml").write_text("[claims]\nvelocity = true\n")
+    (folder / "wrong.toml").write_text("[claims]\nspeed = true\n")
+    told = {"DOMAIN": str(free_domain())} | {f.name: str(f) for f in folder.iterdir()}
+    ran = [[*SUITE[3:], "-q", "conformance/", *(told.get(w, w) for w in r[0])] for r in ENDS]
+    done = subprocess.run(
+        [sys.executable, "-c", IN_ONE_PROCESS, json.dumps(ran)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    found: list[tuple[int, str, str]] = json.loads(done.stdout)
+    return found
 
 
-def listed(*arguments: object) -> list[list[str]]:
-    run = suite("conformance/", "--list", *arguments)
-    assert run.returncode == 0, run.stdout + run.stderr
-    rows = [line for line in run.stdout.splitlines() if line.startswith("DEX")]
-    assert run.stdout.splitlines()[-1] == f"{len(rows)} requirements"
-    return [line.split("  ") for line in rows]
+@each("number", range(len(ENDS)))
+def test_what_judges_nothing_has_a_reason_and_an_exit_code(
+    number: int, ends: list[tuple[int, str, str]]
+) -> None:
+    _, code, printed, error = ENDS[number]
+    found, out, err = ends[number]
+    assert found == code, out + err
+    assert all(text in out for text in printed), out
+    assert error in err
+    assert "passed" not in out
 
 
-def test_selection_is_listed_without_hand(tmp_path: Path) -> None:
-    claims = tmp_path / "capabilities.toml"
-    claims.write_text("[claims]\nvelocity = true\n")
-    rows = listed("--require", "DEX1-FIELD", "--capabilities", claims)
+def test_selection_is_listed_without_hand(ends: list[tuple[int, str, str]]) -> None:
+    (out,) = (e[1] for e, r in zip(ends, ENDS, strict=True) if "right.toml" in r[0])
+    lines = out.splitlines()
+    rows = [line.split("  ") for line in lines if line.startswith("DEX")]
     expected = [r for r in requirements() if r.id.startswith("DEX1-FIELD")]
     assert [row[0] for row in rows] == [r.id for r in expected]
+    assert lines[-1] == f"{len(rows)} requirements"
     by_id = {row[0]: " ".join(filter(None, row)).split() for row in rows}
     assert by_id["DEX1-FIELD-04"][1] == "MUST"
     assert by_id["DEX1-FIELD-04"][-1] == "velocity"
     for r in expected:
         assert r.confidence in " ".join(by_id[r.id])
         assert r.needs in by_id[r.id]
-    claims.write_text("[claims]\nspeed = true\n")
-    run = suite("conformance/", "--list", "--capabilities", claims)
-    assert run.returncode == 4
-    assert "claims: Object contains unknown field speed" in run.stderr
 
 
 @pytest.mark.parametrize("name", [*(m.name for m in BUILT_IN), *ROBOTS])

@@ -22,12 +22,12 @@ from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.gripper import Inverted, NanVelocity, Percent
 from dexkit.conformance.kit import run_queue
 from dexkit.conformance.kit.judge import judge
-from dexkit.conformance.kit.lateness import IDLE, Lateness
+from dexkit.conformance.kit.lateness import Lateness
 from dexkit.conformance.kit.processor_waits import ProcessWaits, Starvation, Waits
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.requirements import catalogue
-from dexkit.conformance.kit.results import Evidence, Load, RunResult, Verdict
-from dexkit.conformance.kit.run_queue import MOST_FILES, RunQueue, Watched
+from dexkit.conformance.kit.results import Evidence, RunResult, Verdict
+from dexkit.conformance.kit.run_queue import RunQueue, Watched
 from dexkit.conformance.kit.stimulus_record import RECORD, Stimulus
 from dexkit.conformance.kit.verdicts import BEFORE, excuse
 from dexkit.conformance.virtual import MemoryTrace, run_virtual
@@ -134,58 +134,6 @@ def test_hand_that_keeps_the_processors_busy_itself_is_not_excused() -> None:
     assert MANY_SHORT.others(0, 10**9) == 1.0  # not known
 
 
-@each(
-    ("own", "busy", "part"),
-    [
-        (0.68, 0.68, 0.0),  # alone
-        (0.98, 1.0, 0.0),  # it keeps all busy itself
-        (0.68, 1.0, 0.957),  # others took what it left
-        (0.1, 1.0, 0.998),
-        (0.9, 1.0, 0.816),
-        (0.6, 0.7, 0.357),  # they left some of it
-        (0.5, 0.4, 0.0),  # counted in another way
-        (0.0, 0.0, 0.0),
-    ],
-)
-def test_part_of_the_waits_that_other_programs_cause(own: float, busy: float, part: float) -> None:
-    found = msgspec.structs.replace(
-        MANY_SHORT,
-        busy_us=[round(2 * busy * SAMPLE_US)] * 200,
-        own_us=[round(2 * own * SAMPLE_US)] * 200,
-        processors=2,
-    )
-    assert found.others(0, 10**9) == pytest.approx(part, abs=2e-3)
-
-
-@given(own=st.floats(0, 1), others=st.floats(0, 1), more=st.floats(0, 1))
-def test_more_work_of_others_causes_more_of_the_waits(
-    own: float, others: float, more: float
-) -> None:
-    def part(work: float) -> float:
-        return msgspec.structs.replace(
-            MANY_SHORT,
-            busy_us=[round((own + work) * SAMPLE_US)] * 200,
-            own_us=[round(own * SAMPLE_US)] * 200,
-            processors=2,
-        ).others(0, 10**9)
-
-    assert 0.0 <= part(others) <= part(others + more) + 1e-9 <= 1.0 + 1e-9
-
-
-def test_excuse_says_what_happened_and_what_to_do() -> None:
-    found = excuse(Machine(ONE_LONG), GAP, failure(1.1, 1.3).if_late(0.1), Side.LEFT)
-    assert found.text == (
-        "the machine was too busy to tell: the service (pid 42) waited for a processor for 11% of "
-        "the time there, up to 150 ms at once, so a good hand may have been 100 ms late; close "
-        "other programs or use another machine"
-    )
-    assert found.disturbance.load is Load.TOO_BUSY
-    assert found.disturbance.late_s == pytest.approx(0.15 - IDLE)
-    found = excuse(Machine(ONE_LONG), GAP, failure(1.1, 1.3).if_late(0.8), Side.LEFT)
-    assert "which explains at most 596 ms of 800 ms" in found.text
-    assert found.disturbance.load is Load.BUSY
-
-
 @given(
     waited=st.lists(st.integers(0, 300_000), min_size=1, max_size=60),
     more=st.integers(0, 100_000),
@@ -200,16 +148,6 @@ def test_longer_waits_excuse_more_and_larger_failures_are_excused_less(
         return excuse(machine, GAP, failure(0.0, 1.0).if_late(late), Side.LEFT).excused
 
     assert excused(size, more) >= excused(size, 0) >= excused(size + larger, 0)
-
-
-@given(waited=st.lists(st.integers(0, 300_000), max_size=30), begin=st.floats(0, 1))
-def test_delay_is_at_most_the_time_that_passed(waited: list[int], begin: float) -> None:
-    """Threads that wait side by side do not wait longer than the clock runs."""
-    found = waits(*(5 * x for x in waited), longest=SAMPLE_US)
-    two = msgspec.structs.replace(found, processes=found.processes * 2)
-    delays = two.delays(Side.LEFT, round(begin * 1e9), round(begin * 1e9) + 10**8)
-    assert len(delays) <= 12
-    assert (delays <= SAMPLE_US / 1e6).all()
 
 
 # ------------------------------------------------------------------------------- recordings
@@ -306,83 +244,6 @@ def test_damaged_waits_are_refused(change: dict[str, object]) -> None:
 # ------------------------------------------------------------------------------ measurement
 
 
-def proc(folder: Path, pid: int, threads: dict[int, int], ran: int = 777) -> None:
-    """Files of a process whose threads have waited so many nanoseconds, and run."""
-    for thread, ns in threads.items():
-        path = folder / str(pid) / "task" / str(thread)
-        path.mkdir(parents=True, exist_ok=True)
-        (path / "schedstat").write_text(f"{ran} {ns} 5\n")
-
-
-def test_waits_of_all_threads_are_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_queue, "_PROC", tmp_path)
-    proc(tmp_path, 7, {7: 5_000_000, 8: 1_000})
-    threads = run_queue._Threads(7, 2)
-    threads.search(MOST_FILES)
-    assert threads.sample() == 0  # what was before is not of this time
-    proc(tmp_path, 7, {7: 8_000_000, 8: 1_001_000}, ran=1777)
-    assert threads.sample() == 2000
-    proc(tmp_path, 7, {9: 50_000})
-    threads.search(MOST_FILES)
-    threads.sample()
-    proc(tmp_path, 7, {9: 56_000})
-    threads.sample()
-    threads.close()
-    assert threads.seen
-    # the last thread has begun since the first search
-    assert threads.waited_us == [0, 0, 0, 4000, 50, 6]
-    assert threads.longest_us == [0, 0, 0, 3000, 50, 6]
-
-
-def test_work_of_the_usable_processors_is_read_now_and_then(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run_queue, "_PROC", tmp_path)
-    monkeypatch.setattr(run_queue, "_TICKS", 100)
-    processors = run_queue._Processors({0, 2})
-    assert processors.worked() == 0  # no such file
-    stat = tmp_path / "stat"
-
-    def work(*rows: str) -> None:
-        names = ("cpu ", "cpu0", "cpu1", "cpu2", "intr")
-        stat.write_text("".join(f"{n} {r}\n" for n, r in zip(names, rows, strict=True)))
-
-    work("0 0 0 0 0 0 0 0", "9 20 30 4000 500 1 2 3 7 7", "0 0 0 0", "1 0 0 0 0 0 0 0 0 0", "5 1")
-    assert [processors.worked() for _ in range(10)] == [0] * 10
-    # the one that is not usable has worked most
-    work("9 9 9 9 9 9 9 9", "10 20 33 9000 900 1 2 4 9 9", "800 0", "2 0 0 50 0 0 0 0 0 0", "9 9")
-    assert [processors.worked() for _ in range(10)] == [0] * 9 + [60_000]
-
-
-def test_number_of_files_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_queue, "_PROC", tmp_path)
-    proc(tmp_path, 7, dict.fromkeys(range(20), 0))
-    threads = run_queue._Threads(7, 0)
-    threads.search(5)
-    threads.search(-1)
-    threads.search(20)
-    assert threads.files == 5
-    threads.close()
-
-
-def test_kernel_workers_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_queue, "_PROC", tmp_path)
-    for pid, name in enumerate(["kworker/u8:1-events_unbound", "kworker/0:1", "python"]):
-        (tmp_path / str(pid)).mkdir()
-        (tmp_path / str(pid) / "comm").write_text(f"{name}\n")
-        (tmp_path / str(pid) / "schedstat").write_text("1 2 3\n")
-    (tmp_path / "self").mkdir()
-    workers = run_queue._KernelWorkers(0, 0)
-    workers.search(MOST_FILES)
-    assert workers.files == 1
-    workers.sample()
-    for ns in (5_000_003, 35_000_003):  # a short wait may be for other work
-        (tmp_path / "0" / "schedstat").write_text(f"1 {ns} 3\n")
-        workers.sample()
-    workers.close()
-    assert workers.waited_us == workers.longest_us == [0, 0, 30_000]
-
-
 def test_nothing_is_measured_without_proc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_queue, "_PROC", tmp_path / "none")
     watched = [Watched("a", 1, (Side.LEFT,)), Watched("b", 0, (Side.LEFT,))]
@@ -406,6 +267,10 @@ def burner(processor: int) -> Iterator[int]:
             process.kill()
 
 
+def waited_ns(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+
+
 @pytest.mark.skipif(
     not Path("/proc/self/schedstat").exists(), reason="this kernel does not count waits"
 )
@@ -416,10 +281,11 @@ def test_two_that_share_a_processor_wait_and_a_stopped_one_does_not() -> None:
         wait_until(lambda: Path(f"/proc/{stopped}/stat").read_text().split()[2] == "T")
         watched = [Watched(str(pid), pid, (Side.LEFT,)) for pid in (one, two, stopped)]
         with RunQueue(lambda: watched) as queue:
-
-            def waited() -> dict[str, int]:
-                found = queue.waits
-                return {p.name: sum(p.waited_us) for p in found.processes} if found else {}
-
-            wait_until(lambda: min(waited().get(str(p), 0) for p in (one, two)) > 20_000)
-    assert waited()[str(stopped)] == 0
+            enough = {pid: waited_ns(pid) + 300_000_000 for pid in (one, two)}
+            wait_until(lambda: all(waited_ns(pid) > ns for pid, ns in enough.items()))
+    found = queue.waits
+    assert found is not None
+    waited = [sum(p.waited_us) for p in found.processes]
+    assert min(waited[:2]) > 20_000
+    assert waited[2] == 0
+    assert sum(found.busy_us) > 0

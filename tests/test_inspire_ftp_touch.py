@@ -12,17 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.conformance.checks.timing import gap_beside_states
-from dexkit.conformance.faults import plan_for, run_mutant
-from dexkit.conformance.faults.touch import CountsFromTheThumb, NoPalm, NoTouch
+from dexkit.conformance.faults import plan_for
 from dexkit.conformance.kit.recording import Recording
-from dexkit.conformance.kit.requirements import catalogue
-from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpService
 from dexkit.conformance.virtual.topic_run import run_virtual
 from dexkit.doctor.observations import DomainView, Endpoint, Observations, Participant, Stream
 from dexkit.doctor.rules import diagnose
-from dexkit.doctor.topic_spelling import is_hand_topic
 from dexkit.emulators.sim_inspire import SimInspireFtp
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, Side
@@ -35,7 +30,6 @@ from dexkit.monitor.json_lines import json_line
 from dexkit.monitor.screen import hand_lines
 from dexkit.service import HandService
 from dexkit.service.dialects import StateView, dialect_map
-from dexkit.topics import roles
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.sessions.streams import _streams
 from dexkit.traces.watched import feed
@@ -53,14 +47,6 @@ N = 6
 FULL_SPEED = INSPIRE_FTP.joints[LEFT][0].dq_max
 
 # ------------------------------------------------------------------------------------ on the wire
-
-
-def test_areas_are_those_of_the_message() -> None:
-    assert {f.name: f.most for f in TOUCH.layout.fields} == LENGTHS
-    assert sum(LENGTHS.values()) == 1062
-    assert FTP.areas[-2].place == "thumb palm"
-    (role,) = roles("rt/inspire_hand/touch/r")
-    assert (role.kind, role.sides, role.type_name) == ("touch", (RIGHT,), TOUCH.name)
 
 
 @given(st.lists(st.integers(-32768, 32767), min_size=1062, max_size=1062))
@@ -127,12 +113,6 @@ def test_hand_without_contact_reports_no_pressure_at_its_ends() -> None:
         assert felt(hand, state) == {}
 
 
-def test_state_without_pressure_gives_no_touch_message() -> None:
-    mapping = dialect_map(FTP, {LEFT: INSPIRE_FTP.spec(LEFT, io_rate=100.0)})
-    view = StateView(HandState.from_values([0.5] * N, stamp=0.0), (0,) * N)
-    assert mapping.encode_touch({LEFT: view}) is None
-
-
 # -------------------------------------------------------------------------------------- the service
 
 
@@ -156,47 +136,6 @@ def test_service_of_a_hand_without_areas_has_no_touch_topic() -> None:
 
 
 # ---------------------------------------------------------------------------------- the conformance
-
-PHASES = frozenset(["listen", "touch"])
-
-
-def verdicts(service: type[FtpService], phases: frozenset[str] = PHASES) -> dict[str, str]:
-    plan = replace(plan_for("inspire_ftp", sides=(RIGHT,)), phases=phases)
-    wanted = tuple(
-        r for r in catalogue("inspire-ftp") if r.id.startswith(("FTP-TOUCH", "FTP-SENS"))
-    )
-    return {r.requirement.id: str(r.verdict) for r in run_mutant(service, plan, wanted).results}
-
-
-def test_touch_is_judged_by_its_topic() -> None:
-    good = verdicts(FtpService)
-    assert {i for i, v in good.items() if v == "pass"} == {
-        *(f"FTP-TOUCH-0{i}" for i in range(1, 5)),
-        "FTP-SENS-04",
-    }
-    other_order = verdicts(CountsFromTheThumb)
-    assert [i for i, v in other_order.items() if v == "fail"] == ["FTP-SENS-04"]
-    short = verdicts(NoPalm, frozenset(["listen"]))
-    assert short["FTP-TOUCH-02"] == "fail"
-    assert short["FTP-SENS-04"] in ("blocked", "not applicable")
-    absent = verdicts(NoTouch, frozenset(["listen"]))
-    assert [i for i, v in absent.items() if v == "warn"] == ["FTP-TOUCH-01"]
-    assert Verdict.PASS not in absent.values()
-
-
-@each(
-    ("touch", "states", "gap"),
-    [
-        ([0.0, 0.1, 0.2], [0.0, 0.05, 0.1, 0.15, 0.2], 0.05),
-        ([0.0, 0.1, 0.9], [0.01 * i for i in range(91)], 0.79),
-        ([0.0, 0.1, 0.9], [0.0, 0.1, 0.9], 0.0),  # both were silent
-        ([0.0], [0.01 * i for i in range(101)], 0.99),
-    ],
-)
-def test_gap_of_touch_is_one_while_there_are_states(
-    touch: list[float], states: list[float], gap: float
-) -> None:
-    assert gap_beside_states(np.array(touch), np.array(states))[0] == pytest.approx(gap)
 
 
 def test_touch_in_a_recording_is_no_stream_of_joints() -> None:
@@ -346,8 +285,3 @@ def test_doctor_sees_swapped_sides_and_a_reversed_scale(
         )
     found = found_in(*every, streams=tuple(streams))
     assert set(found) & {"DDS-REVERSED", "DDS-SIDES-SWAPPED"} == expected
-
-
-def test_doctor_does_not_look_for_motors_in_touch() -> None:
-    assert not is_hand_topic(FTP.touch_topic_of(LEFT), FTP.touch_type)
-    assert is_hand_topic(FTP.topics(LEFT)[1], FTP.state_type)

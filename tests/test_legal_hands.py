@@ -7,7 +7,6 @@ less of what is optional. Makers claim what such a hand has, and nothing else.
 from __future__ import annotations
 
 import math
-import re
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +19,7 @@ from dexkit.conformance.faults.trials import plan_for
 from dexkit.conformance.kit.claims import Claims
 from dexkit.conformance.kit.decoding import recording_of
 from dexkit.conformance.kit.judge import judge
-from dexkit.conformance.kit.motor_messages import Motor, state_member
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.kit.requirements import CAPABILITIES, catalogue
 from dexkit.conformance.kit.results import Result, RunResult, Verdict
 from dexkit.conformance.kit.verdicts import Excuse, Judgement
@@ -359,27 +358,6 @@ def test_a_dex3_may_lose_its_state_for_a_second(seconds: float, verdict: Verdict
 
 
 # ------------------------------------------------------------------------------------ sources
-
-
-def test_no_source_calls_the_states_of_the_samples_genuine() -> None:
-    """The recordings have a genuine client in them, and simulated hands."""
-    every = catalogue(None, None)
-    assert not [r.id for r in every if "recordings of the genuine hand" in r.source]
-    named = [r for r in every if "traces/samples" in r.source]
-    assert named
-    assert not [r.id for r in named if "simulated" not in r.source]
-
-
-def test_texts_of_an_ftp_hand_use_its_own_words() -> None:
-    words = re.compile(r"tau_est|\bcurrents?\b|\bgains\b|N m\b")
-    texts = {
-        f"{r.id} {name}": getattr(r, name)
-        for r in catalogue("inspire-ftp")
-        for name in ("title", "sentence", "expected", "rationale", "cause", "advice")
-    }
-    assert not [where for where, text in texts.items() if words.search(text)]
-    assert state_member("inspire::inspire_hand_state", "tau_est") == "force_act"
-    assert state_member("unitree_go::msg::dds_::MotorStates_", "tau_est") == "tau_est"
 
 
 def pressed_softly(grams: int) -> MemoryTrace:

@@ -23,7 +23,6 @@ from dexkit.conformance.kit import judge as judge_module
 from dexkit.conformance.kit.judge import judge_layer
 from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
-from dexkit.hand import Side
 from tests.each import each
 from tools.pins.__main__ import main
 from tools.pins.keys import (
@@ -41,7 +40,7 @@ from tools.pins.keys import (
 from tools.pins.matrix import tasks
 from tools.pins.pinned import Pins
 from tools.pins.recordings import Broken, pack, unpack
-from tools.pins.sources import WHOLE, Place, Sources
+from tools.pins.sources import Place, Sources
 from tools.pins.store import Store
 from tools.pins.trial import Task, known, same_again, work
 from tools.pins.verdicts import verdicts_of
@@ -125,14 +124,6 @@ def test_a_digest_has_what_is_named_and_nothing_else(
         assert place == ("kit.parts.one", name)
         found += name * (before.digest([place]) != after.digest([place]))
     assert found == changed
-
-
-def test_a_module_that_is_left_out_is_not_entered(tmp_path: Path) -> None:
-    for name, text in TREE.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    found = Sources(tmp_path, ("kit",)).reached([("kit.judge", WHOLE)], ["kit.whole"])
-    assert found == {("kit", WHOLE), ("kit.judge", WHOLE)}
 
 
 # ------------------------------------------------------------------------------------- keys
@@ -365,17 +356,6 @@ def test_a_real_run_stays_in_the_code_of_its_keys() -> None:
     assert done.stdout.split() == runs
 
 
-def test_a_run_outside_of_its_keys_is_found() -> None:
-    watched = Watched()
-    with watched:
-        data_of(catalogue("dex3-1")[0])
-        cheapest("usb", "dex3-1").made(Side.LEFT).frame()
-    here = ROOT / "dexkit/conformance/virtual/usb.py"
-    files = {file for file, _ in watched.outside({here: None})}
-    assert str(ROOT / "dexkit/conformance/usb/frames.py") in files
-    assert str(here) not in files
-
-
 # ------------------------------------------------------------------------------ what is kept
 
 
@@ -452,16 +432,6 @@ def test_the_oldest_files_are_removed_first(tmp_path: Path) -> None:
     assert store.tidy(250) == (200, 100)
     assert store.packed("bb2") is None
     assert store.packed("cc3") == bytes(100)
-
-
-def test_files_that_were_never_finished_are_removed(tmp_path: Path) -> None:
-    (tmp_path / "aa").mkdir()
-    old, new = tmp_path / "aa" / ".dexkit-1", tmp_path / "aa" / ".dexkit-2"
-    old.write_bytes(b"x")
-    os.utime(old, (1e9, 1e9))
-    new.write_bytes(b"y")
-    assert Store(tmp_path).tidy(1e9) == (1, 1)
-    assert new.exists()
 
 
 # -------------------------------------------------------------------------------- the command

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from functools import cache
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -191,22 +190,6 @@ def check_load(name: str, seed: int, joints: Sequence[int] | None = None) -> Non
     assert (lost > 0) <= bool(after.spoiled)
     spoiled = [n for j in after.joints for n in j.notes if "spoiled by pauses" in n]
     assert len(spoiled) == after.spoiled
-
-
-class Hopeless(ManualClock):
-    """A clock of a machine that comes back late in the middle of every measurement."""
-
-    def sleep_until(self, deadline: float) -> None:
-        super().sleep_until(deadline + (0.3 if int(deadline) > int(self.now()) else 0.0))
-
-
-def test_what_pauses_have_spoiled_is_named() -> None:
-    result = result_of(examined("dex1", clock=Hopeless(7.0))[0], {})
-    assert result.verdict is Verdict.INCOMPLETE
-    (joint,) = result.joints
-    assert result.spoiled == len(joint.notes) > 0
-    assert all(note.endswith(": spoiled by pauses of this machine") for note in joint.notes)
-    assert escape(joint.notes[0]) in render_selftest(result)
 
 
 def test_no_motor_gives_more_than_its_lead_allows() -> None:
