@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -17,8 +16,6 @@ import pytest
 pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds 0.10: dexkit setup-dds")
 
 from tools.campaign.case import ROOT, Finding
-from tools.campaign.mutate import mutator
-from tools.campaign.process import traceback_in
 from tools.campaign.run import Findings
 from tools.campaign.soak import WatchedProcess, slope
 
@@ -127,22 +124,6 @@ def test_a_finding_is_kept_once_with_its_input(tmp_path: Path) -> None:
     assert (tmp_path / f"{one.id}.bin").read_bytes() == b"\x00\xff"
     assert json.loads((tmp_path / f"{one.id}.json").read_text())["detail"] == "first"
     assert findings.times[one.id] == 2
-
-
-def test_a_seed_gives_the_same_inputs_again() -> None:
-    corpus = [bytes(range(40)), b"head" * 5]
-    both = [[mutator(corpus, random.Random("s 3"))() for _ in range(500)] for _ in range(2)]
-    assert both[0] == both[1]
-    assert len(set(both[0])) > 0
-
-
-def test_a_traceback_is_seen_in_a_log_and_a_message_is_not() -> None:
-    text = 'INFO ok\nERROR it died\nTraceback (most recent call last):\n  File "/x/y.py", line 3, '
-    assert traceback_in(text + "in run\n    f()\nValueError: bad\n") == (
-        "y.py:run",
-        "ValueError: bad",
-    )
-    assert traceback_in("error: no such file\n  give another\n") is None
 
 
 def test_growth_of_memory_and_descriptors_is_distinguished_from_noise() -> None:

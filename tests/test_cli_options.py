@@ -17,7 +17,6 @@ from click.testing import CliRunner
 
 from dexkit.cli import cli
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import Number
 
 COMMANDS = Path(__file__).parent.parent / "dexkit" / "cli"
 MOST = 250
@@ -122,32 +121,3 @@ def test_bash_completes_commands_options_and_values(tmp_path: Path) -> None:
     )
     assert [set(line.split()) for line in done.stdout.splitlines()] == [*COMPLETED.values()]
     assert done.stderr == ""
-
-
-def test_number_without_bounds_has_no_range_in_the_help() -> None:
-    assert repr(Number()) == "<Number >"
-    assert repr(Number(min=0)) == "<Number x>=0>"
-    assert repr(Number(max=1)) == "<Number x<=1>"
-    for command in ("cut", "diff"):
-        assert "None" not in CliRunner().invoke(cli, [command, "--help"]).output
-
-
-def test_plugin_shares_the_texts_of_its_options() -> None:
-    """The option of ``pytest`` and that of ``dexkit check`` say the same."""
-    from dexkit import option_texts
-    from dexkit.conformance.kit import plugin
-
-    said: dict[str, str] = {}
-
-    class Parser:
-        def getgroup(self, *_: str) -> Parser:
-            return self
-
-        def addoption(self, name: str, *_: str, **attributes: object) -> None:
-            said[name] = str(attributes["help"])
-
-    plugin.pytest_addoption(Parser())  # type: ignore[arg-type]
-    for name in ("capabilities", "grade", "level", "list", "require"):
-        text = getattr(option_texts, name.upper()).removesuffix(".")
-        assert text[1:] in said[f"--{name}"], name
-    assert said["--level"] == "only requirements at least this binding"

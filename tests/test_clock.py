@@ -13,23 +13,6 @@ from dexkit.errors import UsageError
 from tests.each import each
 
 
-class TestManualClock:
-    def test_manual_clock_advances_only_on_request(self) -> None:
-        clock = ManualClock(10.0)
-        assert clock.advance(0.5) == clock.now() == 10.5
-
-    def test_sleep_on_a_manual_clock_advances_it(self) -> None:
-        clock = ManualClock(10.0)
-        clock.sleep_until(12.0)
-        assert clock.now() == 12.0
-        clock.sleep_until(11.0)
-        assert clock.now() == 12.0
-
-    def test_manual_clock_refuses_negative_steps(self) -> None:
-        with pytest.raises(UsageError, match="cannot go back"):
-            ManualClock().advance(-1.0)
-
-
 class TestRate:
     @given(st.lists(st.floats(0.0, 0.0099), min_size=1, max_size=200))
     def test_work_shorter_than_a_period_never_shifts_a_deadline(self, work: list[float]) -> None:

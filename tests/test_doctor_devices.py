@@ -7,7 +7,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,17 +14,17 @@ import pytest
 
 from dexkit.cli import doctor_devices
 from dexkit.clock import RealClock
-from dexkit.doctor import Observations, diagnose, proc_files
+from dexkit.doctor import Observations, diagnose
 from dexkit.doctor import usb as doctor_usb
-from dexkit.doctor.environment import environment, uri_problem
-from dexkit.doctor.network import dds_sockets, interfaces
+from dexkit.doctor.environment import uri_problem
+from dexkit.doctor.network import dds_sockets
 from dexkit.doctor.observations import SerialPort, UsbDevice
-from dexkit.doctor.proc_files import command_line, holders, start_time
+from dexkit.doctor.proc_files import command_line, holders
 from dexkit.doctor.rtps import unicast_port
 from dexkit.emulators.dex3_mcu.hands import emulated_dex3
 from dexkit.emulators.mx64 import Bus, Port, Servo
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
-from dexkit.errors import DdsSetupError, UsageError
+from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import PRODUCT_ID, VENDOR_ID
 from tests.process_helpers import started
@@ -47,13 +46,6 @@ def _line(
         yield port.path
 
 
-def test_healthy_servo_has_no_finding() -> None:
-    with _line(1_000_000) as path:
-        port = doctor_devices.inspect_port(path)
-    assert [(s.id, s.baudrate, s.protocol) for s in port.servos] == [(1, 1_000_000, 2)]
-    assert _ids(port) == set()
-
-
 def test_servo_at_another_baud_rate_is_reported() -> None:
     with _line(57_600) as path:
         port = doctor_devices.inspect_port(path)
@@ -65,14 +57,6 @@ def test_servo_of_protocol_1_is_reported() -> None:
     with _line(old=(Protocol1Servo(1, baudrate=57_600),)) as path:
         port = doctor_devices.inspect_port(path)
     assert _ids(port) == {"SERIAL-PROTOCOL-1"}
-
-
-def test_silent_port_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    # every baud rate takes half a second in vain
-    monkeypatch.setattr(doctor_devices, "SCAN_BAUD_RATES", (1_000_000, 57_600))
-    with _line(57_600, servo_id=200) as path:  # none of the ids that are asked for
-        port = doctor_devices.inspect_port(path, thorough=False)
-    assert _ids(port) == {"SERIAL-NO-ANSWER"}
 
 
 def test_port_in_use_is_not_opened() -> None:
@@ -177,30 +161,6 @@ def test_readable_cyclonedds_uri_has_no_finding(tmp_path: Path) -> None:
         assert "cannot" in uri_problem(odd) or "not XML" in uri_problem(odd), odd
 
 
-def test_python_environment_is_described_and_diagnosed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", "file:///nowhere.xml")
-    env = environment()
-    assert env.python.split(".")[:2] == [str(n) for n in sys.version_info[:2]]
-    if env.cyclonedds:
-        assert env.cyclonedds.startswith("0.10.")
-        assert env.cyclonedds_error == ""
-    names = {f.id for f in diagnose(Observations(environment=env))}
-    assert "ENV-URI" in names
-    if env.sdk:  # the package on PyPI does not import
-        assert env.sdk_error.startswith("ImportError")
-        assert "ENV-SDK" in names
-
-
-def test_this_machines_interfaces() -> None:
-    (lo,) = [i for i in interfaces() if i.loopback]
-    assert lo.up
-    assert lo.addresses[:1] == ("127.0.0.1",)
-    from dexkit.doctor.network import address_of
-
-    with pytest.raises(DdsSetupError, match="no network interface"):
-        address_of("nosuch0")
-
-
 def test_a_process_that_listens_to_a_domain_is_named() -> None:
     """Without DDS: a socket on the port of a participant is enough."""
     for domain in range(40, 90):
@@ -214,28 +174,3 @@ def test_a_process_that_listens_to_a_domain_is_named() -> None:
             assert found.command == command_line(os.getpid())
             return
     pytest.fail("no port is free")
-
-
-def test_command_line_and_start_time_of_a_process_are_read() -> None:
-    assert "pytest" in command_line(os.getpid()) or "-c" in command_line(os.getpid())
-    before = time.time()
-    with started([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        began = start_time(process.pid)
-        process.communicate("\n")
-    assert began is not None
-    # the kernel counts from the whole second before
-    assert before <= began + 1.02
-    assert began <= time.time()
-    assert command_line(2**22 + 1) == ""
-    assert start_time(2**22 + 1) is None
-
-
-def test_file_of_the_same_name_in_another_mount_namespace_is_not_this_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "theirs").touch()
-    ours = tmp_path / "ours"
-    ours.touch()
-    links = [(1, tmp_path / "theirs", str(ours)), (2, ours, str(ours))]
-    monkeypatch.setattr(proc_files, "_descriptors", lambda: iter(links))
-    assert proc_files.holders(str(ours)) == [2]

@@ -6,8 +6,6 @@ import dataclasses
 import io
 import json
 import math
-import threading
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -18,7 +16,6 @@ from dexkit.doctor import (
     Scope,
     Severity,
     diagnose,
-    link,
     readiness,
     verdict,
 )
@@ -40,12 +37,11 @@ from dexkit.doctor.observations import (
 )
 from dexkit.doctor.report import as_data, print_report
 from dexkit.doctor.rtps import Data, EndpointData, parse_message, parse_participant
-from dexkit.doctor.topic_spelling import closest_topic, is_driven
+from dexkit.doctor.topic_spelling import closest_topic
 from dexkit.doctor.type_hashes import TYPE_HASHES
 from dexkit.messages import message_type
 from dexkit.messages import unitree_hg as hg
 from dexkit.messages.earlier import EARLIER
-from dexkit.models import DIALECTS
 from tests.doctor_packets import FAST_PARTICIPANT
 from tests.each import each
 
@@ -274,14 +270,6 @@ FINE: dict[str, tuple[dict[str, object], dict[str, object]]] = {
 def test_hand_that_moves_or_is_not_asked_to_is_healthy(name: str) -> None:
     state, command = FINE[name]
     assert diagnose(_seen(_driven(state, command))) == []
-
-
-@each(("model", "kp"), [("dex1", "kp 5,"), ("dex3", "kp 1.5,")])
-def test_advice_on_gains_is_of_the_hand(model: str, kp: str) -> None:
-    limp: dict[str, object] = {"q_span": 1.0, "limp_span": 1.0, "drives": False, "asks": False}
-    (found, _) = diagnose(_seen(_driven({}, limp, model)))
-    assert kp in found.fix
-    assert ("EZGripper" in found.fix) == (model == "dex1")
 
 
 def test_mode_byte_that_moves_a_hand_is_a_warning() -> None:
@@ -532,45 +520,6 @@ def test_fast_dds_client_on_loopback_is_known_by_its_port() -> None:
     assert "NET-INTERFACE" in _ids(seen)
 
 
-@each(
-    ("name", "mode", "kp", "expected"),
-    [
-        ("unitree_go", 0, 5.0, True),
-        ("unitree_go", 1, 0.0, False),
-        ("unitree_hg", 0, 0.0, True),  # its commands have no gains
-        ("dex3", 0x10, 1.5, True),
-        ("dex3", 0x01, 1.5, False),  # locked
-        ("dex3", 0x11, 0.0, False),
-    ],
-)
-def test_a_command_drives_a_motor(name: str, mode: int, kp: float, expected: bool) -> None:
-    assert is_driven(SimpleNamespace(mode=mode, kp=kp), DIALECTS[name]) is expected
-
-
-def test_missing_robot_state_is_named_with_its_usual_publisher() -> None:
-    (found,) = [f for f in diagnose(_seen(_waiting())) if f.severity is Severity.ERROR]
-    assert found.id == "DDS-UNPUBLISHED"
-    assert "client.py" in found.seen
-    assert "waits for rt/lowstate (unitree_hg LowState_) on domain 0" in found.seen
-    assert "the robot itself" in found.seen
-    assert "on domain 0, on the robot's network (192.168.123.x)" in found.seen
-    assert "the client is at 10.0.0.7" in found.fix
-    assert "--network-interface" in found.fix
-    assert "'dexkit emulate g1 --domain 0'" in found.fix
-    # in the robot's network it is not the interface; on domain 1 the domain may be wrong
-    right = diagnose(_seen(_waiting(address="192.168.123.5")))[0]
-    assert "the client is at" not in right.fix
-    simulated = diagnose(_seen(_waiting(number=1)))[0]
-    assert "the client is on domain 1, the robot on 0" in simulated.fix
-    assert "'dexkit emulate g1 --domain 1'" in simulated.fix
-
-
-def test_state_of_a_robot_that_comes_is_no_finding() -> None:
-    assert all(
-        f.severity is Severity.NOTE for f in diagnose(_seen(_waiting(publisher="unitree_hg")))
-    )
-
-
 def test_state_of_another_robot_silent_or_on_another_domain() -> None:
     (found,) = [
         f for f in diagnose(_seen(_waiting(publisher="unitree_go"))) if f.severity is Severity.ERROR
@@ -583,41 +532,6 @@ def test_state_of_another_robot_silent_or_on_another_domain() -> None:
     (found,) = [f for f in diagnose(seen) if f.severity is Severity.ERROR]
     assert found.id == "DDS-OTHER-DOMAIN"
     assert "robot.py (pid" in found.seen
-
-
-@each(
-    ("topic", "kind", "expected"),
-    [
-        ("rt/inspire/state", "MotorStates_", "RH56DFX"),
-        ("rt/inspire_hand/state/l", "inspire_hand_state", "RH56DFTP"),
-        ("rt/brainco/right/state", "MotorStates_", "brainco_hand_service"),
-        ("rt/sim_state", "String_", "no robot does"),
-        ("rt/secondary_imu", "IMUState_", "torso"),
-    ],
-)
-def test_other_hands_and_simulators_are_named(topic: str, kind: str, expected: str) -> None:
-    found = [f for f in diagnose(_seen(_waiting(topic, kind))) if f.id == "DDS-UNPUBLISHED"]
-    assert expected in found[0].seen
-    assert closest_topic(topic) is None
-
-
-def test_a_requested_hand_leaves_other_states_aside() -> None:
-    asked = Scope(dialects=(DIALECTS["dex3"],))
-    assert "DDS-UNPUBLISHED" not in _ids(_seen(_waiting()), asked)
-
-
-def test_good_link_has_no_finding_and_remedies_name_the_interface() -> None:
-    devices = Scope(devices_only=True)
-    assert not [f for f in diagnose(_linked(), devices) if f.id.startswith("LINK-")]
-    (found,) = [f for f in diagnose(_linked(rtt_95=0.04), devices) if f.id == "LINK-JITTER"]
-    assert "iw dev eth0 set power_save off" in found.fix
-    (found,) = [f for f in diagnose(_linked(multicast=False), devices) if f.id == "LINK-MULTICAST"]
-    assert "DEXKIT_PEERS=robot" in found.fix
-    (found,) = [f for f in diagnose(_linked(received=80), devices) if f.id == "LINK-LOSS"]
-    assert found.severity is Severity.ERROR
-    # without commands from there their age follows from the round trips
-    (found,) = [f for f in diagnose(_linked(rtt_95=0.5), devices) if f.id == "LINK-AGE"]
-    assert "estimated" in found.seen
 
 
 def test_link_figures_follow_from_samples_and_round_trips() -> None:
@@ -646,13 +560,6 @@ def test_link_figures_follow_from_samples_and_round_trips() -> None:
     json.dumps(as_data(seen, [], verdict(seen, [], Scope()), []), allow_nan=False)
 
 
-def test_echoes_of_this_machine_come_back_by_either_method() -> None:
-    for measure in (link.measure_round_trips, link._by_tcp):
-        trips = measure("127.0.0.1", "127.0.0.1", 0.3, threading.Event())
-        assert 0 < len(trips.times) <= trips.sent
-        assert min(trips.times) > 0
-
-
 def test_restarted_hand_is_not_reported_as_late_joiner() -> None:
     """A hand younger than a client whose commands do arrive is a hand that was restarted."""
     view = _pair(hand=_who("hand", started=9.0), client=_who("client", started=5.0))
@@ -662,15 +569,6 @@ def test_restarted_hand_is_not_reported_as_late_joiner() -> None:
 def test_port_in_use_by_a_service_is_no_finding() -> None:
     (found,) = diagnose(_port(holders=("dexkit serve ezgripper (pid 5)",), asked=False))[-1:]
     assert (found.id, found.severity) == ("SERIAL-BUSY", Severity.NOTE)
-
-
-def test_device_check_reports_no_waiting_client() -> None:
-    (found,) = [
-        f
-        for f in diagnose(Observations(domains=(DomainView(0),)), Scope(devices_only=True))
-        if f.id == "DDS-NOBODY"
-    ]
-    assert found.severity is Severity.NOTE
 
 
 @each(
@@ -689,37 +587,6 @@ def test_misspelt_topic_is_recognised(topic: str, meant: str) -> None:
     found = closest_topic(topic)
     assert found is not None
     assert found[0] == meant
-
-
-@each(
-    "topic", ["rt/dex1/left/cmd", "rt/dex5/left/state", "rt/lowstate", "rt/inspire/cmd", "rosout"]
-)
-def test_unrelated_topic_name_is_no_misspelling(topic: str) -> None:
-    assert closest_topic(topic) is None
-
-
-def test_topics_take_a_line_each_in_a_narrow_terminal() -> None:
-    other = _waiting("rt/" + "x" * 90)
-    seen = _seen(_legacy(), _pair(model="dex3", number=2), other)
-    text = io.StringIO()
-    console = Console(file=text, width=80)
-    print_report(console, seen, [], verdict(seen, [], Scope()), [])
-    lines = text.getvalue().splitlines()
-    assert "…" not in text.getvalue()
-    for view in seen.domains:
-        for topic in {e.topic for e in view.endpoints}:
-            (line,) = [s for s in lines if s.startswith(f"{view.number} ") and topic in s.split()]
-            assert len(line) <= 80 or len(topic) > 60
-    assert len(lines) < 30
-    (line,) = [s for s in lines if "rt/dex3/left/state" in s]
-    hand, client = (
-        next(s for s in lines if s.endswith(f"{who}.py (pid {int(who, 36)}) (domain 2)"))
-        for who in ("hand", "client")
-    )
-    assert line.split() == [
-        *("2", "rt/dex3/left/state", "hg", "HandState_", "500"),
-        *(hand.split()[0], ">", client.split()[0]),
-    ]
 
 
 @each(

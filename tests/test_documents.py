@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import random
 import socket
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -71,20 +69,6 @@ def test_any_file_content_is_read_or_refused_with_its_name(tmp_path: Path) -> No
     assert count > 200
 
 
-def test_special_file_is_refused(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "around").symlink_to("around")
-    for name in ("pipe", "folder", "around"):
-        for read in (*JSON, *TOML):
-            assert refused(read, tmp_path / name, name), name
-    for name in ("/dev/zero", "/dev/full", "/proc/self/mem", "/proc/self", "a\0b", "x" * 5000):
-        with pytest.raises(UsageError):
-            documents.read_text(Path(name))
-    with pytest.raises(UsageError, match="No such file"):
-        documents.read_text(tmp_path / "none")
-
-
 READERS: dict[str, Callable[[Path], object]] = {
     "urdf": lambda path: read_urdf(path, DEX1_1.joints[Side.LEFT]),
     "recording": open_trace,
@@ -126,29 +110,6 @@ def test_a_configuration_of_dds_is_an_ordinary_file_without_entities(tmp_path: P
     laughs = '<!DOCTYPE x [<!ENTITY a "ha">]><CycloneDDS>&a;</CycloneDDS>'
     (tmp_path / "laughs.xml").write_text(laughs)
     assert uri_problem(f"file://{tmp_path}/laughs.xml")
-
-
-def test_unreadable_file_leaves_no_descriptor_open(tmp_path: Path) -> None:
-    before = os.listdir("/proc/self/fd")
-    with pytest.raises(UsageError, match="Is a directory"):
-        documents.read_text(tmp_path)
-    assert len(os.listdir("/proc/self/fd")) == len(before)
-
-
-def test_oversized_file_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "large"
-    with path.open("wb") as file:
-        file.truncate(documents.LARGEST + 1)
-    with pytest.raises(UsageError, match="larger than 64 MB"):
-        documents.read_text(path)
-
-
-def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
-    path = tmp_path / "x"
-    path.write_bytes(b'\xef\xbb\xbf{"a": 1}')
-    assert documents.read_json(path) == {"a": 1}
-    path.write_bytes(b"\xef\xbb\xbfa = 1")
-    assert documents.read_toml(path) == {"a": 1}
 
 
 def test_duplicate_key_and_non_finite_number_are_refused() -> None:
@@ -244,41 +205,6 @@ def test_records_in_a_recording_are_read_or_refused() -> None:
 
 def left_behind(folder: Path) -> list[str]:
     return [p.name for p in folder.iterdir() if p.name.startswith(".dexkit-")]
-
-
-def test_written_file_has_default_or_existing_permissions(tmp_path: Path) -> None:
-    before = os.umask(0o027)
-    try:
-        documents.write_file(tmp_path / "new", "手\n")
-    finally:
-        os.umask(before)
-    assert (tmp_path / "new").read_text(encoding="utf-8") == "手\n"
-    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o640
-    (tmp_path / "new").chmod(0o604)
-    (tmp_path / "link").symlink_to("new")
-    documents.write_file(tmp_path / "link", b"other")
-    assert (tmp_path / "link").is_symlink()
-    assert (tmp_path / "new").read_bytes() == b"other"
-    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o604
-
-
-@pytest.mark.parametrize("where", ["write", "fsync", "replace"])
-def test_failed_write_keeps_the_old_file(
-    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "report"
-    path.write_text("good")
-
-    def full(*arguments: object) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, where, full)
-        for target in (path, tmp_path / "new"):
-            with pytest.raises(OutputError, match=f"cannot write .*{target.name}: No space left"):
-                documents.write_file(target, "bad" * 1000)
-    assert path.read_text() == "good"
-    assert [p.name for p in tmp_path.iterdir()] == ["report"]
 
 
 def test_unwritable_paths_are_refused(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import struct
 import threading
 import tty
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import pytest
 from usb.core import USBError, USBTimeoutError
@@ -98,21 +97,6 @@ def test_servo_bus_times_out_under_a_flood(data: bytes) -> None:
                 assert isinstance(ends(lambda: bus.ping(1)), HandTimeout)
         finally:
             bus.close()
-
-
-def test_motor_line_times_out_when_reads_never_end() -> None:
-    with flooded(b"") as path:
-        line = acquire(path, 115200)
-        true = line._port
-        descriptor = os.open("/dev/zero", os.O_RDWR)
-        try:
-            line._port = SimpleNamespace(fileno=lambda: descriptor)  # type: ignore[assignment]
-            frame = m4010.MotorCmd(0, m4010.Status.BRAKE).pack()
-            assert isinstance(ends(lambda: line.exchange(frame, 0, 0.01)), HandTimeout)
-        finally:
-            line._port = true
-            line.release()
-            os.close(descriptor)
 
 
 def test_usbip_client_times_out_under_a_flood() -> None:

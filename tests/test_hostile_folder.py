@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -63,11 +62,6 @@ def test_nothing_in_the_working_folder_is_run(command: list[str], hostile: Path)
     assert not hostile.exists(), hostile.read_text()
     assert done.returncode == 0 or "No module named pip" in done.stderr, done.stderr
     assert "evil" not in done.stdout
-
-
-def test_the_folder_would_run_otherwise(hostile: Path) -> None:
-    _run([sys.executable, "-m", "venv", "--help"])
-    assert hostile.exists()
 
 
 # -- completion of the shell

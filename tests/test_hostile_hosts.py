@@ -15,14 +15,9 @@ from pathlib import Path
 import pytest
 
 from dexkit.clock import ManualClock
-from dexkit.emulators.dex3_mcu.device import Dex3Mcu
-from dexkit.emulators.dex3_mcu.usb import Dex3Usb
-from dexkit.emulators.faults import DEX3_FAULTS, MX64_FAULTS, parse_fault
 from dexkit.emulators.m4010.bus import Bus as MotorBus
 from dexkit.emulators.m4010.motor import Motor
 from dexkit.emulators.mx64 import Bus, Firmware, Port, Servo
-from dexkit.errors import UsageError
-from dexkit.hand import Side
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import m4010
 from dexkit.wire.dynamixel import Instruction
@@ -60,13 +55,6 @@ def test_oversized_fast_read_is_not_answered() -> None:
         assert ask(bus, asked) == [], asked.hex()
         assert bus.failure is None
         assert len(ask(bus, PING)) == 1
-
-
-def test_the_longest_fast_read_is_answered() -> None:
-    longest = dxl.MAX_LENGTH - 5
-    bus = fast_bus()
-    (answer,) = ask(bus, packet(254, 0x8A, b"\0\0" + longest.to_bytes(2, "little") + b"\1"))
-    assert len(answer.params) == 2 + longest  # error (no such range), id, and its place
 
 
 def test_exception_in_one_device_is_logged_and_the_line_continues(
@@ -130,25 +118,6 @@ def test_flood_is_limited_by_the_line_speed() -> None:
             assert len(bus._out) <= 6000  # answers to a chunk
         finally:
             os.close(fd)
-
-
-def test_delayed_answers_are_limited_in_number() -> None:
-    clock = ManualClock()
-    mcu = Dex3Mcu(Side.LEFT, clock=clock)
-    usb = Dex3Usb(mcu, clock)
-    mcu.inject(parse_fault("delay:ms=900000", DEX3_FAULTS))
-    clock.advance(0.01)
-    for _ in range(200):
-        usb._received(usb._out, b"no frame")
-    assert len(usb._held) <= 64
-    assert mcu.counters.unread == 200 - 64
-
-
-def test_invalid_fault_lines_are_refused() -> None:
-    for text in ("overheat:id=" + "9" * 5000, "drop:p=nan", "drop@1e400", "stuck:id=²", "\0"):
-        with pytest.raises(UsageError) as caught:
-            parse_fault(text, MX64_FAULTS)
-        assert len(str(caught.value)) < 10000
 
 
 def test_invalid_standard_input_is_reported(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,10 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from dexkit.errors import SessionError
-from dexkit.traces.sessions import lerobot_in, topic_tables
+from dexkit.traces.sessions import topic_tables
 from dexkit.traces.sessions.lerobot_format import parquet_pieces, read_parquet
 from dexkit.traces.sessions.topic_tables import import_tables
-from tests.test_sessions_import import NAMES, dataset
 
 TIMES = "log_time_ns,publish_time_ns"
 
@@ -72,48 +70,6 @@ def test_a_parquet_file_has_as_much_data_as_its_size_accounts_for(
         read_parquet(path)
 
 
-def test_columns_that_are_not_wanted_are_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.parquet"
-    pq.write_table(pa.table({"a": [1], "a.b": [2], "c": ["x"]}), path)
-    assert read_parquet(path, lambda name: name == "a").to_pydict() == {"a": [1]}
-    assert read_parquet(path).to_pydict() == {"a": [1], "a.b": [2], "c": ["x"]}
-
-
-def test_an_episode_has_a_limited_number_of_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lerobot_in, "MOST_FRAMES", 10)
-    for frames in (10, 11):
-        root = dataset(tmp_path / str(frames), "v2.1", NAMES, np.full((frames, 28), 0.1))
-        if frames == 10:
-            assert len(lerobot_in.Dataset(root).read(0).times_ns) == 10
-        else:
-            with pytest.raises(SessionError, match="more than 10 frames"):
-                lerobot_in.Dataset(root).read(0)
-
-
-@pytest.mark.parametrize(
-    ("values", "shape"),
-    [
-        (pa.array([1, 2]), (2,)),
-        (pa.array([[1.5, 2], [3, 4]]), (2, 2)),
-        (pa.array([[1], [2]], pa.list_(pa.float32(), 1)), (2, 1)),
-        (pa.array([[1.5], [3, 4]]), None),
-        (pa.array([1, None]), None),
-        (pa.array([[1, None]]), None),
-        (pa.array([[1], None]), None),
-        (pa.array(["1"]), None),
-        (pa.array([[[1]]]), None),
-        (pa.array([], pa.int64()), (0,)),
-        (pa.array([], pa.list_(pa.int64())), (0,)),
-    ],
-    ids=str,
-)
-def test_columns_of_numbers(values: Any, shape: tuple[int, ...] | None) -> None:
-    found = lerobot_in._as_numbers(pa.chunked_array([values]))
-    assert (None if found is None else found.shape) == shape
-
-
 def tables(folder: Path, content: str | bytes) -> Path:
     folder.mkdir()
     entry = {"topic": "rt/x", "type": "x", "file": "x.csv", "columns": "payload"}
@@ -149,16 +105,6 @@ def test_a_hostile_csv_is_refused(
         tracemalloc.stop()
     assert why in f"{raised.value} {raised.value.hint}"
     assert not (tmp_path / "out.mcap").exists()
-
-
-def test_tables_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(topic_tables, "_VALUES_AT_ONCE", 6)
-    rows = "".join(f"{i},{i},eA==\n" + "5\n" * (i == 3) for i in range(1, 8))
-    written, problems = import_tables(
-        tables(tmp_path / "t", f"{TIMES},payload\n{rows}"), tmp_path / "out.mcap"
-    )
-    assert written == 7
-    assert "row 5" in " ".join(problems.sentences())
 
 
 _READ_DAMAGED = """

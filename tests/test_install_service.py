@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from dexkit import sd_notify, systemd_units
+from dexkit import systemd_units
 from dexkit.child_processes import command_line
 from dexkit.cli import cli
 from dexkit.errors import OutputError, UsageError
@@ -215,18 +215,6 @@ def test_unit_of_a_plugin_path_names_the_folder_that_it_is_loaded_from(
         _install(*words)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become another user")
-def test_interpreter_that_the_services_user_cannot_read_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hidden = tmp_path / "hidden"
-    hidden.mkdir(mode=0o700)
-    (hidden / "python").symlink_to(sys.executable)
-    monkeypatch.setattr(sys, "executable", str(hidden / "python"))
-    with pytest.raises(UsageError, match=r"as the user nobody, .* cannot load sim-dex1"):
-        _install("sim-dex1", "--side", "left", "--user", "nobody", "--dry-run")
-
-
 @each(
     ("words", "said"),
     [
@@ -247,14 +235,6 @@ def test_backends_that_cannot_be_a_service_are_refused(words: tuple[str, ...], s
     with pytest.raises(Exception, match=said) as raised:
         _install(*words, "--dry-run")
     assert not isinstance(raised.value, OutputError)
-
-
-def test_a_folder_that_cannot_be_written_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dexkit.cli.install_service._UNITS", Path("/proc/1"))
-    with pytest.raises(OutputError) as raised:
-        _install("sim-dex1", "--side", "left", "--user", "root")
-    assert "sudo " in raised.value.hint
-    assert "--dry-run" in raised.value.hint
 
 
 # -- udev
@@ -290,16 +270,6 @@ def test_udev_rule_gives_an_adapter_a_stable_name(tmp_path: Path) -> None:
     assert 'ATTR{idProduct}=="1011"' in usb_rules()
 
 
-def test_a_port_that_is_not_on_usb_needs_no_rule(tmp_path: Path) -> None:
-    tty = tmp_path / "class" / "tty" / "ttyS0"
-    (tmp_path / "devices" / "serial8250").mkdir(parents=True)
-    tty.mkdir(parents=True)
-    (tty / "device").symlink_to(tmp_path / "devices" / "serial8250")
-    with pytest.raises(UsageError, match="is not on USB") as raised:
-        serial_rule(Side.LEFT, Path("/dev/ttyS0"), tmp_path)
-    assert "--no-udev" in raised.value.hint
-
-
 # -- notifications
 
 
@@ -312,41 +282,6 @@ def _systemd(tmp_path: Path) -> Iterator[socket.socket]:
         tmp_path.chmod(0o755)
         sock.settimeout(120)
         yield sock
-
-
-def test_watchdog_reports_three_times_in_its_interval(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = [100.0]
-    with _systemd(tmp_path) as sock:
-        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        monkeypatch.setenv("WATCHDOG_USEC", "3000000")
-        monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
-        alive = sd_notify.watchdog(lambda: clock[0])
-        assert alive is not None
-        for _ in range(60):  # 6 s
-            alive(0)
-            clock[0] += 0.1
-        sock.setblocking(False)
-        assert [sock.recv(100) for _ in range(6)] == [b"WATCHDOG=1"] * 6
-        with pytest.raises(BlockingIOError):
-            sock.recv(100)
-
-
-@each(
-    ("variable", "value"),
-    [("WATCHDOG_USEC", "x"), ("WATCHDOG_USEC", "0"), ("WATCHDOG_PID", "1"), ("WATCHDOG_USEC", "")],
-)
-def test_no_notification_without_systemd(variable: str, value: str) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("WATCHDOG_USEC", "1000000")
-        patch.setenv("WATCHDOG_PID", str(os.getpid()))
-        patch.setenv(variable, value)
-        assert sd_notify.watchdog(lambda: 0.0) is None
-        patch.setenv("NOTIFY_SOCKET", "relative")
-        assert not sd_notify.notify("READY=1")
-        patch.setenv("NOTIFY_SOCKET", "/nowhere/at/all")
-        assert not sd_notify.notify("READY=1")
 
 
 def _waiting(sock: socket.socket) -> bytes:

@@ -7,18 +7,16 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.cli import cli
 from dexkit.hand import MotorError
-from dexkit.monitor.bars import ASCII, UNICODE, bar
+from dexkit.monitor.bars import ASCII, bar
 from dexkit.monitor.json_lines import json_line
 from dexkit.monitor.keys import keys
-from dexkit.monitor.screen import Shown, screen, summary
-from dexkit.robots import G1
+from dexkit.monitor.screen import Shown, screen
 from dexkit.watch import Collector
 from dexkit.watch.events import Event, Events
 from tests.each import each
@@ -51,15 +49,6 @@ def test_bar_shows_a_joint_between_its_limits(q: float, target: float, expected:
     found = "".join(text for text, _ in bar(ASCII, 12, -1.0, 1.0, q, target))
     assert len(found) == 12
     assert found == expected
-
-
-@given(
-    width=st.integers(3, 60),
-    q=st.floats(allow_nan=True, allow_infinity=True),
-    target=st.floats(allow_nan=True, allow_infinity=True),
-)
-def test_a_bar_has_its_width(width: int, q: float, target: float) -> None:
-    assert sum(len(t) for t, _ in bar(UNICODE, width, -0.5, 1.5, q, target)) == width
 
 
 # -- the screen ------------------------------------------------------------------------------------
@@ -100,21 +89,6 @@ def test_screen_of_any_size_is_filled(width: int, height: int, scroll: int) -> N
 HANDS = closing_hands(0.2)
 
 
-def test_robot_fills_the_width_of_the_screen() -> None:
-    view = HANDS.picture(0.1).subjects[0]
-    joints = tuple(G1.joint(i) for i in G1.used)
-    arrays = {
-        name: np.zeros(len(joints), getattr(view, name).dtype)
-        for name in ("q", "dq", "tau", "temperature", "target", "fault", "near")
-    }
-    robot = replace(view, model=G1, joints=joints, **arrays)  # type: ignore[arg-type]
-    picture = replace(HANDS.picture(0.1), subjects=(robot,))
-    lines = [line.plain for line in screen(picture, [], SHOWN, 80, 40)]
-    # in two columns
-    assert next(line for line in lines if line.startswith("l_hip_pitch")).count("◉") == 2
-    assert "l_shoulder_pitch" in "\n".join(lines)
-
-
 def test_names_from_dds_cannot_send_escapes_to_the_terminal() -> None:
     evil = "\x1b[2J\x07\nx"
     collector = closing_hands(0.2)
@@ -123,17 +97,6 @@ def test_names_from_dds_cannot_send_escapes_to_the_terminal() -> None:
     told = [("12:00:00", Event(0.0, "bad", evil))]
     for line in screen(collector.picture(0.1), told, replace(SHOWN, title=evil), 100, 40):
         assert line.plain.isprintable()
-
-
-def test_ascii_where_the_terminal_has_no_more() -> None:
-    assert all(line.isascii() for line in text_of(HANDS, 0.1, 80, 24, unicode=False))
-
-
-def test_hand_is_summarised_in_one_line() -> None:
-    view = HANDS.picture(0.1).subjects[0]
-    assert summary(view).startswith("left Dex3-1 hand: rests; state 0 ms, cmd 0 ms; q 0.00 ")
-    late = HANDS.picture(9.0).subjects[0]
-    assert summary(late).startswith("left Dex3-1 hand: no state; state 8.8 s")
 
 
 # -- events ----------------------------------------------------------------------------------------

@@ -145,39 +145,6 @@ def test_full_or_closed_standard_output_is_an_error(
     os.close(full)
 
 
-def test_interpreter_prints_no_error_on_exit() -> None:
-    no_reader, pipe = os.pipe()
-    os.close(no_reader)
-    for place, code in ((os.open("/dev/full", os.O_WRONLY), 2), (pipe, 141)):
-        done = subprocess.run(
-            command_line("models", "--json"),
-            stdout=place,
-            stderr=subprocess.PIPE,
-            check=False,
-            timeout=60,
-        )
-        os.close(place)
-        assert done.returncode == code
-        assert done.stderr.count(b"\n") == (1 if code == 2 else 0), done.stderr
-
-
-def test_output_without_standard_streams_goes_into_no_other_file(
-    tmp_path: Path,
-) -> None:
-    _, recording = hostile.judged_result(tmp_path)
-    out = tmp_path / "result.json"
-    done = subprocess.run(
-        [
-            *("sh", "-c", 'exec "$@" >&- 2>&-', "sh"),
-            *command_line("check", str(recording), "--result", str(out), "--require", "DEX1-RATE"),
-        ],
-        check=False,
-        timeout=60,
-    )
-    assert done.returncode == 2  # the table went nowhere
-    assert out.read_text().startswith("{")
-
-
 def test_a_closed_standard_output_is_an_error_if_something_was_to_be_written(
     tmp_path: Path,
 ) -> None:
@@ -276,12 +243,3 @@ def test_no_command_overwrites_its_input_or_writes_a_file_twice(tmp_path: Path) 
     assert result.read_bytes() == before
     assert session.read_bytes() == recording.read_bytes()
     assert not new.exists()
-
-
-def test_one_device_may_take_several_outputs(tmp_path: Path) -> None:
-    hostile.judged_result(tmp_path)
-    result = str(tmp_path / "good.json")
-    found = CliRunner().invoke(
-        cli, ["report", result, "--html", "/dev/null", "--junit", "/dev/null"]
-    )
-    assert found.exit_code == 0, found.output

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import resource
 import select
-import signal
 import subprocess
 import sys
 import tempfile
@@ -15,10 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from dexkit.child_processes import END_WITH_PARENT, Tool, command_line, module_line
+from dexkit.child_processes import Tool, command_line
 from dexkit.emulators.mx64 import EmulatedProcess
-from dexkit.errors import DexkitError
-from dexkit.open_file_limit import require_open_files
 from dexkit.temporary_folder import PREFIX, TemporaryFolder, sweep
 
 _HOSTILE = """
@@ -63,42 +59,6 @@ def test_programs_import_nothing_from_the_working_directory(hostile_folder: Path
     assert not (hostile_folder / "was-run").exists()
 
 
-@pytest.mark.soak
-def test_workers_import_nothing_from_the_working_directory(hostile_folder: Path) -> None:
-    arguments = ("--require", "DEX1-RATE-03", "--jobs", "1", "--result", "out")
-    command = module_line("dexkit.conformance.faults", *arguments)
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode in (0, 1), done.stderr
-    assert (hostile_folder / "out").exists()
-    assert not (hostile_folder / "was-run").exists()
-
-
-def test_a_checkout_that_is_not_installed_is_found(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [command_line()[0], "-S", "-c", "import sys; print(sys.path)"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "site-packages" not in done.stdout
-    # -S: no site-packages, so only dexkit itself is found, and its dependencies are not
-    done = subprocess.run(
-        [sys.executable, "-S", *command_line("--version")[1:]],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
-    assert "No module named 'click'" in done.stderr
-
-
-def _ended(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
-
-
 _PARENT = """
 import os, sys, threading
 from dexkit.child_processes import Tool
@@ -129,30 +89,6 @@ def test_child_process_ends_with_its_parent(when: str, tmp_path: Path) -> None:
     assert poll.poll(20_000), "it still runs"
     os.close(child)
     assert not os.path.lexists(tmp_path / "link")
-
-
-def test_process_that_ignores_sigterm_is_killed(tmp_path: Path) -> None:
-    code = (
-        "import signal, time, dexkit.child_processes as p\n"
-        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-        "p.STOP_TIMEOUT = 0.05\n"
-        "p.end_with_parent()\n"
-        "print('up', flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    theirs, ours = os.pipe()
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        pass_fds=(theirs,),
-        env={**os.environ, END_WITH_PARENT: str(theirs)},
-        stdout=subprocess.PIPE,
-    )
-    os.close(theirs)
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"up\n"
-    os.close(ours)
-    assert process.wait(20) == -signal.SIGKILL
-    process.stdout.close()
 
 
 # -------------------------------------------------------------------------- temporary folders
@@ -203,26 +139,6 @@ def test_folders_of_killed_programs_are_removed_and_those_of_others_stay(tempora
         living.communicate("")
 
 
-def test_folder_removed_before_its_lock_is_made_again(
-    temporary: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    genuine = fcntl.flock
-    removed: list[Path] = []
-
-    def sweeping(descriptor: int, how: int) -> None:
-        if how == fcntl.LOCK_EX:  # another process removes the new folder before it is locked
-            monkeypatch.setattr(fcntl, "flock", genuine)
-            removed.extend(sweep())
-        genuine(descriptor, how)
-
-    monkeypatch.setattr(fcntl, "flock", sweeping)
-    with TemporaryFolder() as folder:
-        assert removed
-        assert folder not in removed
-        assert folder.exists()
-        assert sweep() == []
-
-
 # ------------------------------------------------------------------------------- descriptors
 
 
@@ -250,16 +166,3 @@ def test_too_few_file_descriptors_are_refused_at_start() -> None:
         assert process.returncode == 2, (arguments, process.returncode, err)
         assert printed in err
         assert "ulimit -n" in err
-
-
-def test_descriptor_limit_is_raised_where_permitted() -> None:
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    used = len(os.listdir("/proc/self/fd"))
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (used + 5, before[1]))
-        require_open_files(20, "a test")
-        assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] > used + 5
-        with pytest.raises(DexkitError, match="a test needs 100000000 more open files"):
-            require_open_files(10**8, "a test")
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, before)

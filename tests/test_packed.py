@@ -123,58 +123,6 @@ def _same(bulk: Columns, single: list[Columns], path: str) -> None:
         assert np.array_equal(bulk.table([path, path]), np.stack([column] * 2).T, equal_nan=True)
 
 
-def test_a_member_that_never_changes_is_known_to() -> None:
-    mt = message_type("unitree_hg::msg::dds_::HandState_")
-    payloads = []
-    for i in range(1500):  # more than are taken at once, and the change comes late
-        message = mt.cls()
-        message.power_v = 24.0
-        message.power_a = 1.0 if i == 1400 else 0.0
-        payloads.append(mt.encode(message))
-    columns = mt.columns(payloads)
-    assert columns.constant("power_v") == [24.0]
-    assert columns.constant("power_a") is None
-    assert np.flatnonzero(columns["power_a"]).tolist() == [1400]
-    assert columns["power_v"].tolist() == [24.0] * 1500
-
-
-def test_columns_are_right_when_a_value_begins_to_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dexkit.messages.packed, "_SEGMENT", 100)
-    mt = message_type("unitree_hg::msg::dds_::HandState_")
-    payloads = []
-    for i in range(1030):
-        message = mt.cls()
-        message.power_v = float(i >= 99)
-        message.power_a = float(i >= 100)
-        message.system_v = float(i >= 1029)
-        message.device_v = float(i % 7)
-        message.imu_state.temperature = i // 700
-        payloads.append(mt.encode(message))
-    columns = mt.columns(payloads)
-    rows = np.arange(1030)
-    assert columns["power_v"].tolist() == (rows >= 99).tolist()
-    assert columns["power_a"].tolist() == (rows >= 100).tolist()
-    assert columns["system_v"].tolist() == (rows >= 1029).tolist()
-    assert columns["device_v"].tolist() == (rows % 7).tolist()
-    assert columns["imu_state.temperature"].tolist() == (rows // 700).tolist()
-    assert columns.extremes("system_v") == (0.0, 1.0)
-
-
-def test_damaged_sample_does_not_affect_columns_of_the_others() -> None:
-    mt = message_type("unitree_hg::msg::dds_::HandState_")
-    payloads = []
-    for i in range(6):
-        message = mt.cls()
-        message.imu_state.temperature = i
-        payloads.append(mt.encode(message))
-    payloads[3] = damaged(payloads[3], 4, 200)  # of equal length, but it says 200 motors
-    columns = mt.columns(packed(payloads, [2], list(range(6))))
-    assert list(columns.errors) == [3]
-    seen = columns["imu_state.temperature"]
-    assert np.isnan(seen[3])
-    assert np.delete(seen, 3).tolist() == [0, 1, 2, 4, 5]
-
-
 def test_columns_of_compressed_tables_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     mt = message_type("unitree_hg::msg::dds_::HandState_")
     random = np.random.default_rng(1)

@@ -121,20 +121,6 @@ def test_suspended_service_obeys_only_later_commands(
     assert sum("was paused" in record.message for record in caplog.records) == 1
 
 
-def test_state_after_a_pause_reports_the_brake() -> None:
-    hand, node, clock = SimHand(LEFT), FakeNode(), Suspendable()
-    client = Client(node, clock)
-
-    def mode() -> int:
-        data = next(data for topic, data in reversed(node.sent) if topic == STATE)
-        return int(message_type(GO.state_type).decode(data).states[0].mode)
-
-    with HandService(hand, node=node, clock=clock):
-        client.until(lambda: node.sent and mode() == 1, 3.0)
-        clock.away += 1.0
-        wait_until(lambda: mode() == 0)
-
-
 def test_hanging_exchange_is_a_pause_of_that_hand_only() -> None:
     hands = {side: ScriptedHand(side, exchange_timeout=0.05) for side in Side}
     node, clock = FakeNode(), Suspendable()
@@ -155,24 +141,6 @@ def test_hanging_exchange_is_a_pause_of_that_hand_only() -> None:
         wait_until(lambda: cores[LEFT].counters.brakes > brakes)
         wait_until(lambda: send() or cores[LEFT].driving)  # type: ignore[func-returns-value]
         assert service.counters.pauses >= 1
-
-
-def test_slow_exchange_does_not_hide_a_pause() -> None:
-    """The exchange thread goes on first: that the publishing loop has not looked is enough."""
-    hand, node, clock = ScriptedHand(io_rate=2.0), FakeNode(), Suspendable()
-    client = Client(node, clock)
-    with HandService(hand, node=node, clock=clock) as service:  # type: ignore[arg-type]
-        core = service.cores[LEFT]
-        client.until(lambda: core.driving, 2.0)
-        service._publisher.remove(service._tick)  # it hangs
-        client.until(lambda: not core.driving, 2.0)
-
-
-def test_slow_hand_and_slow_state_are_no_pause() -> None:
-    hand, node, clock = ScriptedHand(io_rate=3.0), FakeNode(), Suspendable()
-    client = Client(node, clock)
-    with HandService(hand, node=node, state_rate=3.0, clock=clock):
-        client.until(lambda: hand.q == 2.0, 2.0)
 
 
 # -- drivers: what was stopped between a command and its bytes --------------------------------
@@ -203,17 +171,6 @@ def test_brake_after_a_pause_holds_the_present_position() -> None:
             here = servo.get(mx64.PRESENT_POSITION)
             _obeys(hand, HandCommand.brake(1))
             assert servo.get(mx64.GOAL_POSITION) >= here - 5
-
-
-def test_goal_from_before_a_pause_does_not_enable_the_mx64() -> None:
-    clock = Slow()
-    with emulated_ezgripper(start=20.0, closed_at=1510) as gripper:
-        assert isinstance(gripper, EmulatedThread)
-        with EZGripper(
-            gripper.path, LEFT, GripperSettings(zero=1510, timeout=1.0), clock=clock
-        ) as hand:
-            _refuses(hand, clock, HandCommand.position(5.0))
-            assert not gripper.servo.torque
 
 
 def test_command_from_before_a_pause_is_not_written_to_the_m4010() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dexkit.clock import ManualClock, RealClock
+from dexkit.clock import ManualClock
 from dexkit.errors import UsageError
 from dexkit.traces import Player, TraceMessage, open_trace, sample_path
 from tests.each import each
@@ -101,29 +100,6 @@ def test_loops_follow_each_other_at_the_recorded_pace(tmp_path: Path) -> None:
     assert (stats.sent, stats.passes, stats.stopped) == (7, 2, True)
 
 
-def test_nothing_is_published_after_a_stop(tmp_path: Path) -> None:
-    player = Player(open_trace(trace_of(tmp_path, [0, 60_000])))
-    sent: list[TraceMessage] = []
-    stop = threading.Event()
-    thread = threading.Thread(target=lambda: player.play(sent.append, RealClock(), stop))
-    thread.start()
-    while not sent:
-        thread.join(0.01)
-    stop.set()
-    thread.join(60)
-    assert not thread.is_alive()
-    assert len(sent) == 1
-
-
-def test_a_stop_before_the_start_publishes_nothing(tmp_path: Path) -> None:
-    stop = threading.Event()
-    stop.set()
-    sent: list[TraceMessage] = []
-    stats = Player(open_trace(trace_of(tmp_path, [0, 10]))).play(sent.append, ManualClock(), stop)
-    assert sent == []
-    assert (stats.sent, stats.stopped) == (0, True)
-
-
 def test_commands_are_played_by_default_and_topics_can_be_chosen() -> None:
     trace = open_trace(sample_path("dex1_pick_place"))
     player = Player(trace)
@@ -149,18 +125,6 @@ def test_unplayable_sessions_are_refused(tmp_path: Path) -> None:
     states = write(tmp_path / "b.mcap", mcap_bytes([r for r in rows() if r[0] == STATE]))
     with pytest.raises(UsageError, match="no command topics"):
         Player(open_trace(states))
-
-
-@pytest.mark.realtime
-def test_in_real_time_no_message_is_early() -> None:
-    """By how much it is late is a matter of benchmarks/bench_traces.py."""
-    trace = open_trace(sample_path("dex1_idle_then_startle"))
-    player = Player(trace, speed=20.0)
-    sent: list[float] = []
-    begin = time.monotonic()
-    stats = player.play(lambda message: sent.append(time.monotonic() - begin))
-    assert stats.sent == len(sent) == 7278
-    assert all(at >= due for at, due in zip(sent, player.offsets, strict=True))
 
 
 @each("suspended", [False, True], ids=["stopped", "suspended"])
@@ -204,34 +168,3 @@ def test_messages_due_during_a_pause_are_not_sent_in_a_burst(
     assert gaps == pytest.approx(recorded, abs=0.05)  # the nap that was interrupted
     assert np.delete(gaps, 2) == pytest.approx(np.delete(recorded, 2), abs=1e-6)
     assert stats.error_max < 1e-6
-
-
-def test_blocking_listener_causes_no_backlog(tmp_path: Path) -> None:
-    """Each message takes longer than its distance; none goes out much later than is said."""
-    clock = ManualClock()
-    log = Log(clock)
-
-    def publish(message: TraceMessage) -> None:
-        log(message)
-        clock.advance(0.1)
-
-    paused: list[float] = []
-    path = trace_of(tmp_path, [i * 5.0 for i in range(100)] + [1000.0 + i * 200 for i in range(5)])
-    stats = Player(open_trace(path)).play(publish, clock, paused=paused.append)
-    assert stats.error_max <= 0.25
-    assert paused == []
-    assert np.diff(log.times)[-4:] == pytest.approx([0.2] * 4)
-
-
-def test_stop_set_by_the_pause_callback_ends_the_playback(tmp_path: Path) -> None:
-    clock = ManualClock()
-    log = Log(clock)
-    stop = threading.Event()
-
-    def publish(message: TraceMessage) -> None:
-        log(message)
-        clock.advance(1.0)
-
-    player = Player(open_trace(trace_of(tmp_path, [0, 10, 20])))
-    stats = player.play(publish, clock, stop, paused=lambda seconds: stop.set())
-    assert (stats.sent, stats.stopped, stats.pauses) == (1, True, 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import zipfile
 from importlib import metadata
 from pathlib import Path
 
@@ -31,27 +30,6 @@ def register(folder: Path, group: str = GROUP) -> None:
 def test_entry_point_of_an_installed_package_is_found(folder: Path) -> None:
     register(folder)
     assert [(e.name, e.value) for e in entry_points(GROUP)] == [("acme", "acme:HAND")]
-
-
-def test_group_without_registered_plugins_is_empty(folder: Path) -> None:
-    register(folder, "somebody.else")
-    assert entry_points(GROUP) == []
-
-
-def test_folder_of_the_import_path_that_does_not_exist_is_passed_over(folder: Path) -> None:
-    sys.path.insert(0, str(folder / "none"))
-    register(folder)
-    assert len(entry_points(GROUP)) == 1
-
-
-def test_entry_point_in_an_archive_is_found(folder: Path) -> None:
-    register(folder)
-    archive = folder / "acme.zip"
-    with zipfile.ZipFile(archive, "w") as file:
-        for path in folder.glob("acme-1.0.dist-info/*"):
-            file.write(path, path.relative_to(folder))
-    sys.path[:] = [str(archive)]
-    assert len(entry_points(GROUP)) == 1
 
 
 def test_entry_point_of_another_finder_is_found(

@@ -20,15 +20,11 @@ from dexkit.doctor import diagnose, readiness, verdict
 from dexkit.doctor.observations import DomainView
 from dexkit.errors import UsageError
 from dexkit.hand import Side
-from dexkit.models import DIALECTS
-from dexkit.topics import checked_prefix, split_prefix, topics_of, under_prefix
+from dexkit.topics import checked_prefix, split_prefix, under_prefix
 from dexkit.traces import open_trace
 from dexkit.traces.samples import sample_path
-from dexkit.watch.fields import parts_of
 from tests.patience import PATIENCE
 from tests.test_doctor_rules import GOOD, _seen
-
-DEX3 = "unitree_hg::msg::dds_::HandState_"
 
 
 @pytest.mark.parametrize(
@@ -50,31 +46,10 @@ def test_a_topic_is_split(topic: str, prefix: str, bare: str) -> None:
         assert under_prefix(bare, prefix) == topic
 
 
-def test_every_topic_of_every_dialect_can_have_a_prefix() -> None:
-    for dialect in DIALECTS.values():
-        plain = [topic for topic, _ in topics_of(dialect)]
-        moved = [topic for topic, _ in topics_of(dialect.under("r2"))]
-        assert moved == [under_prefix(topic, "r2") for topic in plain]
-        assert [split_prefix(topic) for topic in moved] == [("r2", topic) for topic in plain]
-
-
-@pytest.mark.parametrize("text", ["r2", "/r2", "rt/r2/"])
-def test_a_prefix_as_people_write_it(text: str) -> None:
-    assert checked_prefix(text) == "r2"
-
-
 @pytest.mark.parametrize("text", ["", "rt", "2", "a b", "r2//x", "*"])
 def test_what_cannot_be_one(text: str) -> None:
     with pytest.raises(UsageError):
         checked_prefix(text)
-
-
-def test_the_monitor_tells_robots_apart() -> None:
-    own, other = (
-        parts_of(topic, DEX3) for topic in ("rt/dex3/left/state", "rt/r2/dex3/left/state")
-    )
-    assert replace(other[0], prefix="") == own[0]
-    assert (own[0].prefix, other[0].prefix) == ("", "r2")
 
 
 # ----------------------------------------------------------------------------------- recordings

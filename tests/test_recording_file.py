@@ -14,13 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex
-from mcap.writer import Writer
 
 from dexkit.errors import TraceError, UsageError
 from dexkit.traces import Recorder, open_trace
-from dexkit.traces.recording_file import ChunkIndexes, RecordingFile
 from tests.dds_helpers import wait_until
 from tests.each import each
 from tests.trace_helpers import STATE, STATE_TYPE, T0, state
@@ -81,22 +77,6 @@ def test_without_a_message_the_old_recording_stays_for_good(tmp_path: Path) -> N
     assert os.listdir(tmp_path) == ["a.mcap"]
 
 
-def test_a_new_recording_without_a_message_leaves_nothing(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "a.mcap", keep_empty=False):
-        pass
-    assert os.listdir(tmp_path) == []
-
-
-def test_symbolic_link_to_a_recording_is_followed(tmp_path: Path) -> None:
-    target, link = tmp_path / "target.mcap", tmp_path / "link.mcap"
-    old(target)
-    link.symlink_to(target)
-    with Recorder(link, overwrite=True) as recorder:
-        put(recorder, 5, 1)
-    assert link.is_symlink()
-    assert recorded(target) == [state(5.0)]
-
-
 # -- two recorders ---------------------------------------------------------------------------------
 
 
@@ -118,35 +98,6 @@ def test_a_second_recorder_is_refused_at_every_stage(tmp_path: Path, messages: i
     with Recorder(path, overwrite=True) as again:
         put(again, 7, 1)
     assert recorded(path) == [state(7.0)]
-
-
-def test_folder_is_no_file_to_record_to(tmp_path: Path) -> None:
-    for overwrite in (False, True):
-        with pytest.raises(TraceError, match="Is a directory"):
-            RecordingFile(tmp_path, overwrite=overwrite).open()
-
-
-def test_a_new_file_is_locked_too(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with Recorder(path), pytest.raises(UsageError, match="being recorded"):
-        Recorder(path, overwrite=True).open()
-
-
-def test_the_old_file_was_deleted_and_another_began_there(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    old(path)
-    first = Recorder(path, overwrite=True)
-    first.open()
-    wait_until(lambda: part(path).stat().st_size)
-    path.unlink()
-    with pytest.raises(UsageError, match="being recorded"):
-        Recorder(path).open()  # the other will want this name
-    other = path.open("wb")  # somebody else's file
-    other.write(b"anything")
-    other.close()
-    put(first, 1, 1)
-    first.close()
-    assert recorded(path) == [state(1.0)]
 
 
 def test_only_one_of_several_simultaneous_recorders_records(tmp_path: Path) -> None:
@@ -178,28 +129,6 @@ def test_only_one_of_several_simultaneous_recorders_records(tmp_path: Path) -> N
             recorder.close()
         if not open_ones:  # each was in the other's way: told, and nothing is lost
             assert all("being recorded" in e.message for e in refused)
-    assert not part(path).exists()
-
-
-def test_recorder_that_has_not_locked_its_new_file_yet_gives_way(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between creation and lock another recorder may take the new file for an old recording."""
-    path = tmp_path / "a.mcap"
-    late, early = Recorder(path, overwrite=True), Recorder(path, overwrite=True)
-    lock = RecordingFile._lock
-
-    def late_lock(file: RecordingFile, fd: int, how: int) -> None:
-        monkeypatch.setattr(RecordingFile, "_lock", lock)
-        early.open()
-        lock(file, fd, how)
-
-    monkeypatch.setattr(RecordingFile, "_lock", late_lock)
-    with pytest.raises(UsageError, match="being recorded"):
-        late.open()
-    put(early, 1, 1)
-    early.close()
-    assert open_trace(path).message_count == 1
     assert not part(path).exists()
 
 
@@ -363,52 +292,6 @@ def test_a_full_disk_before_the_first_message_keeps_the_old_one(
     assert os.listdir(tmp_path) == ["a.mcap"]
 
 
-def test_dev_full_is_reported_as_a_full_disk() -> None:
-    recorder = Recorder("/dev/full", overwrite=True)
-    recorder.open()
-    wait_until(lambda: recorder.error)
-    with pytest.raises(TraceError, match="No space left"):
-        recorder.close()
-    assert Path("/dev/full").is_char_device()
-    assert not Path("/dev/full.part").exists()
-
-
-# -- memory ----------------------------------------------------------------------------------------
-
-
-def test_the_index_made_from_the_file_is_the_library_s(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dexkit.traces.recorder.FLUSH_INTERVAL", 0.0)
-    theirs: list[ChunkIndex] = []
-    monkeypatch.setattr(ChunkIndexes, "append", lambda self, index: theirs.append(index))
-    for compression in ("zstd", "lz4", "none"):
-        theirs.clear()
-        path = tmp_path / f"{compression}.mcap"
-        recorder = Recorder(path, compression=compression)
-        recorder.open()
-        for chunk in range(4):
-            for topic in range(chunk + 1):
-                recorder.put(f"rt/t{topic}", STATE_TYPE, state(1.0), T0 + chunk)
-            recorder.add_metadata("note", {"chunk": str(chunk)})
-            wait_until(lambda r=recorder, n=chunk: r.written == (n + 1) * (n + 2) // 2)  # type: ignore[misc]
-        recorder.close()
-        with path.open("rb") as file:
-            summary = make_reader(file).get_summary()
-        assert summary is not None
-        assert len(theirs) >= 4
-        assert summary.chunk_indexes == theirs
-
-
-def test_a_long_recording_keeps_no_index_in_memory(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "a.mcap")
-    recorder.open()
-    kept = vars(recorder._writer)["_Writer__chunk_indices"]
-    assert isinstance(kept, ChunkIndexes)
-    assert set(vars(kept)) == {"_file"}
-    recorder.close()
-
-
 # -- what others do to the file --------------------------------------------------------------------
 
 
@@ -460,18 +343,6 @@ def test_write_by_another_program_is_reported(
         recorder.close()
 
 
-def test_changed_modification_time_alone_is_accepted(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with Recorder(path) as recorder:
-        put(recorder, 0, 10)
-        wait_until(lambda: recorder.written)
-        os.utime(path, ns=(0, 0))
-    trace = open_trace(path)
-    assert not trace.damage
-    assert not trace.truncated
-    assert trace.message_count == 10
-
-
 # -- what others have put there --------------------------------------------------------------------
 
 
@@ -500,33 +371,6 @@ def test_part_path_that_is_no_file_is_refused(tmp_path: Path, make: Callable[[Pa
     assert path.read_bytes() == before
 
 
-@each("content", [b"V", b"short", b"a longer text"])
-def test_other_file_in_place_of_the_partial_file_is_kept(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.mcap"
-    old(path)
-    part(path).write_bytes(content)
-    with pytest.raises(UsageError, match="or is no recording"), Recorder(path, overwrite=True):
-        pass
-    assert part(path).read_bytes() == content
-
-
-def test_partial_file_with_unchunked_messages_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    old(path)
-    with part(path).open("wb") as file:
-        writer = Writer(file, use_chunking=False)
-        writer.start()
-        schema = writer.register_schema("a", "ros2msg", b"uint8 a")
-        channel = writer.register_channel("rt/a", "cdr", schema)
-        writer.add_message(channel, T0, b"\0\1\0\0\1", T0)
-        file.flush()  # killed here
-        before = part(path).read_bytes()
-    part(path).write_bytes(before)
-    with pytest.raises(UsageError, match="holds messages"), Recorder(path, overwrite=True):
-        pass
-    assert part(path).read_bytes() == before
-
-
 def test_pipe_without_a_reader_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
@@ -539,10 +383,3 @@ def test_pipe_without_a_reader_is_refused(tmp_path: Path) -> None:
         assert os.read(reader, 8) == b"\x89MCAP0\r\n"
     finally:
         os.close(reader)
-
-
-def test_the_root_folder_is_no_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir("/")
-    for name in ("", "/", "."):
-        with pytest.raises(UsageError, match="it is a folder"):
-            RecordingFile(Path(name), overwrite=True)

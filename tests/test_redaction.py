@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import click
 import pytest
@@ -19,11 +18,8 @@ import pytest
 from dexkit.cli import cli, main
 from dexkit.conformance.audit import objects
 from dexkit.conformance.audit.audit import Audit, Limits, in_this_process
-from dexkit.conformance.audit.examine import Task
-from dexkit.conformance.audit.file_records import FileRecord
-from dexkit.conformance.audit.workers import WorkerLost
 from dexkit.errors import UsageError
-from dexkit.redaction import redact, redact_logs, url_name
+from dexkit.redaction import redact, redact_logs
 from dexkit.traces import sample_path
 from tests.each import each
 from tests.test_audit_objects import Server
@@ -65,16 +61,6 @@ def test_parts_of_a_known_url_are_left_out_alone() -> None:
     said = f"no {url}: GET /a?token=secret more refused for us:my secret (hunter2)"
     shown = redact(said, url)
     assert shown == "no http://***@host/a?***: GET /a?*** refused for *** (***)"
-
-
-def test_two_urls_with_one_look_have_two_names() -> None:
-    names = {url_name(f"http://user:secret@host/get?id={i}") for i in range(100)}
-    assert len(names) == 100
-    assert all(n.startswith("http://***@host/get?*** [") for n in names)
-    assert url_name("s3://bucket/a.mcap") == "s3://bucket/a.mcap"
-    # nobody can try passwords on the digest; the user may decide what file it is
-    one, two = (url_name(f"ftp://{user}@host/a") for user in ("anna:secret", "anna:hunter2"))
-    assert one == two != url_name("ftp://bob:secret@host/a")
 
 
 class Queried(Server):
@@ -146,25 +132,6 @@ def test_an_audit_writes_no_credentials(
         states = {row["state"] for row in rows}
         assert states == {"judged", "gone", "no permission", "unreadable"}
     check("".join(capsys.readouterr()))
-
-
-def test_a_worker_or_a_node_that_fails_says_no_credentials(tmp_path: Path) -> None:
-    from fsspec.implementations.memory import MemoryFileSystem
-
-    memory = MemoryFileSystem()
-    memory.pipe("/redacted/a?AKIA.mcap", b"x")
-
-    def lost(tasks: Any, stop: object) -> Iterator[tuple[Task, FileRecord | WorkerLost]]:
-        for task in tasks:
-            yield task, WorkerLost(f"a node cannot do it: {task.session.place} / {task!r}")
-
-    try:
-        Audit(["memory://redacted"], tmp_path, parquet=False).run(lost)
-    finally:
-        memory.rm("/redacted", recursive=True)
-    text = written(tmp_path)
-    assert "a node cannot do it" in text
-    assert "AKIA" not in text
 
 
 @each(
@@ -248,17 +215,6 @@ def test_no_error_of_a_command_shows_credentials(
         main([*arguments])
     assert ended.value.code == 2
     check("".join(capsys.readouterr()))
-
-
-def test_a_path_with_colon_and_slashes_that_is_there_is_a_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "http:").mkdir()
-    shutil.copyfile(sample_path("dex1_legacy_v1_1"), tmp_path / "http:" / "a.mcap")
-    with pytest.raises(SystemExit) as ended:
-        main(["info", "http://a.mcap"])
-    assert ended.value.code == 0, capsys.readouterr()
 
 
 def test_log_lines_of_a_storage_s_library_are_redacted(

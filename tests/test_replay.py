@@ -14,9 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.cli.rehearse import command
 from dexkit.command_age import PAUSE, SETTLE
-from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.errors import SessionError, UsageError
 from dexkit.hand import MotorError, Side
@@ -25,7 +23,7 @@ from dexkit.messages.unitree_go import MotorCmd_, MotorCmds_, MotorState_, Motor
 from dexkit.messages.unitree_hg import HandCmd_, HandState_
 from dexkit.messages.unitree_hg import MotorCmd_ as HgCmd
 from dexkit.messages.unitree_hg import MotorState_ as HgState
-from dexkit.models import DEX3_1, MODELS, ModeByte, dialect
+from dexkit.models import DEX3_1, ModeByte, dialect
 from dexkit.models import model as model_by_name
 from dexkit.teleop.client import JointCommand
 from dexkit.traces import open_trace, sample_path
@@ -213,21 +211,6 @@ def test_session_with_high_gains_and_thin_rate_is_refused_and_corrected(tmp_path
     assert (after.t[0], after.t[-1]) == (before.t[0], before.t[-1])
 
 
-def test_gains_that_are_negative_are_refused(tmp_path: Path) -> None:
-    found = prepare(session(tmp_path, gripper(slow_wave(), kp=-5.0)))
-    assert levels(found) == {"zero-gains": "refused", "high-gains": "refused"}
-    assert "kp -5 and kd 0.05" in found.findings[1].text
-
-
-def test_a_thin_rate_by_a_slow_pace_is_found(tmp_path: Path) -> None:
-    calm = session(tmp_path, gripper(slow_wave()))
-    assert prepare(calm, ReplayOptions(pace=0.5)).findings == []
-    assert levels(prepare(calm, ReplayOptions(pace=0.25))) == {"thin-rate": "refused"}
-    played = prepare(calm, ReplayOptions(pace=0.25, resample=200.0)).plan
-    assert played is not None
-    assert played.duration == pytest.approx(399 / 200 / 0.25)
-
-
 def test_faster_than_recorded_is_refused_unless_it_is_accepted(tmp_path: Path) -> None:
     calm = session(tmp_path, gripper(slow_wave()))
     assert levels(prepare(calm, ReplayOptions(pace=2.0))) == {"pace": "refused"}
@@ -266,18 +249,6 @@ def test_postures_of_real_hands_beyond_the_limits_are_played(tmp_path: Path) -> 
         assert ((limits.low <= q) & (q <= limits.high)).all()
     far = prepare(session(tmp_path, fingers(poses - 0.2)))
     assert "limits" in {f.name for f in far.refused}
-
-
-def test_the_margins_of_the_limits_are_those_of_the_kit() -> None:
-    """Judge, replay and doctor take one figure."""
-    found = set()
-    for hand in MODELS.values():
-        for requirement in catalogue(hand.name, None):
-            margin = requirement.tolerances.get("margin_rad")
-            if margin is not None and requirement.id.split("-")[1] in ("FIELD", "SAFE", "CLIENT"):
-                assert margin == hand.limit_margin, requirement.id
-                found.add(hand.name)
-    assert found == set(MODELS)
 
 
 def test_motion_tells_whether_the_fingers_of_a_session_are_exchanged(tmp_path: Path) -> None:
@@ -328,17 +299,6 @@ def test_jumps_are_refused_or_given_time(tmp_path: Path) -> None:
     assert plan.duration == pytest.approx(399 / 200 - 0.005 + 4.5 / 24.0, abs=1e-3)
     assert _fastest(track) <= 24.0 * (1 + 1e-6)
     assert np.diff(track.q[:, 0]).max() < 0.2
-
-
-def test_stretching_one_hand_keeps_both_hands_in_step(tmp_path: Path) -> None:
-    q = np.where(np.arange(400) < 200, 0.5, 5.0)
-    both = gripper(q) + gripper(slow_wave(), topic="rt/dex1/right/cmd")
-    plan = prepare(session(tmp_path, both), ReplayOptions(jumps="stretch")).plan
-    assert plan is not None
-    left, right = plan.tracks[LEFT], plan.tracks[RIGHT]
-    assert left.t[-1] == pytest.approx(right.t[-1], abs=1e-4)
-    after = right.t[np.argmin(np.abs(right.q[:, 0] - slow_wave()[300]))]
-    assert left.t[-1] - after == pytest.approx(99 / 200, abs=1e-3)
 
 
 def _fastest(track: Track) -> float:
@@ -424,17 +384,6 @@ def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> Non
         rehearse(plan)
 
 
-def test_a_goal_out_of_reach_of_joints_that_are_not_driven_is_no_endless_ramp(
-    tmp_path: Path,
-) -> None:
-    found = prepare(session(tmp_path, fingers(np.full((3, 7), 1e30), mode=0)))
-    assert {"limits", "locked"} <= {f.name for f in found.refused}
-    assert found.plan is not None
-    done = rehearse(found.plan, Guards(ramp_speed=20.0))
-    assert done.machine.end is End.DONE
-    assert done.seconds < 5.0
-
-
 def test_commands_to_a_hand_with_other_joints_are_refused(tmp_path: Path) -> None:
     six = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 50, 0.0)[:, :6]))
     found = prepare(six)
@@ -448,14 +397,6 @@ def test_another_model_is_refused(tmp_path: Path) -> None:
     found = prepare(session(tmp_path, gripper(slow_wave())), ReplayOptions(dialect="dex3"))
     assert levels(found) == {"model": "refused"}
     assert found.plan is None
-
-
-def test_a_gripper_of_another_dialect_gets_its_radians(tmp_path: Path) -> None:
-    plan = prepare(
-        session(tmp_path, gripper([0.0, 2.7, 5.4], hz=2.0)), ReplayOptions(dialect="unitree_hg")
-    )
-    assert plan.plan is not None
-    assert plan.plan.tracks[LEFT].q[:, 0] == pytest.approx([0, math.pi, 2 * math.pi], abs=1e-5)
 
 
 def test_a_session_of_states_is_refused_or_played(tmp_path: Path) -> None:
@@ -484,11 +425,6 @@ def test_sessions_without_a_hand_are_refused(tmp_path: Path) -> None:
     left = session(tmp_path, gripper(slow_wave()))
     with pytest.raises(UsageError, match="nothing to play on the right hand"):
         prepare(left, ReplayOptions(sides=(RIGHT,)))
-
-
-def test_session_without_motion_is_noted(tmp_path: Path) -> None:
-    assert levels(prepare(session(tmp_path, gripper(np.full(50, 2.0))))) == {"still": "note"}
-    assert levels(prepare(session(tmp_path, gripper([2.0])))) == {"still": "note", "single": "note"}
 
 
 @given(
@@ -779,17 +715,6 @@ def test_a_hand_with_a_fault_is_not_moved_at_all() -> None:
     assert drive.machine.end is End.FAULT
 
 
-def test_a_distance_that_passes_stops_nothing() -> None:
-    drive = Drive(plan_of(np.full(2000, 2.7)), Guards(max_distance=0.3, distance_time=1.0))
-    drive.until(Phase.PLAY)
-    drive.follows = False
-    for i in range(600):
-        drive.q = 1.0 if i % 60 < 40 else 2.7  # blocked for 0.2 s, again and again
-        drive.turn()
-    assert drive.machine.phase is Phase.PLAY
-    assert drive.machine.progress.farthest[LEFT][0] == pytest.approx(1.7)
-
-
 @settings(max_examples=20, deadline=None)
 @given(
     delays=st.lists(
@@ -884,19 +809,6 @@ def test_states_of_each_dialect_are_read() -> None:
     assert found[LEFT].problem(["gripper"]) == "gripper reports overvoltage"
 
 
-def test_both_hands_of_a_shared_message_are_always_in_it() -> None:
-    plan = prepare(read_session(sample_path("dex1_legacy_v1_1"))).plan
-    assert plan is not None
-    machine, now = ReplayMachine(plan, Guards(max_distance=9.0)), 0.0
-    for _ in range(900):
-        now = machine.wakes_at(now)
-        for side in Side:
-            machine.receive(now, side, DecodedHand((0.5,), (0.0,)))
-        commands = machine.step(now)
-        assert set(commands) in (set(), set(Side))
-    assert machine.phase is Phase.PLAY
-
-
 # -- the command
 
 
@@ -943,13 +855,6 @@ def test_every_source_that_import_knows_is_replayed(tmp_path: Path) -> None:
     assert "http" not in text.replace("http-equiv", "")
 
 
-def test_session_with_nominal_times_is_reported(tmp_path: Path) -> None:
-    made = episode(tmp_path / "e", whole(document(30, "dex3-1")))
-    code, output = dexkit("rehearse", made, "--check", "--set", "rate=100")
-    assert (code, "nominal-time" in output) == (0, True)
-    assert "30 a second" in output
-
-
 def test_a_refused_session_is_rehearsed_nevertheless(tmp_path: Path) -> None:
     session(tmp_path, gripper(slow_wave(), kp=0.0))
     page = tmp_path / "page.html"
@@ -984,11 +889,6 @@ def test_several_sessions_need_a_choice(tmp_path: Path) -> None:
     assert (code, "dexkit import" in output) == (2, True)
     code, output = dexkit("rehearse", tmp_path / "task" / "episode_0001", "--check")
     assert (code, "thin-rate" in output) == (1, True)
-
-
-def test_the_command_names_all_findings_that_can_be_accepted() -> None:
-    accept = next(p for p in command.params if p.name == "accept")
-    assert tuple(accept.type.choices) == preparation.ACCEPTABLE  # type: ignore[attr-defined]
 
 
 @each("name", ["dex1-1", "dex3-1", "dex5-1"])

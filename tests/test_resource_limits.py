@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import errno
-from pathlib import Path
 
 import pytest
 
 from dexkit.cli import info, main
 from dexkit.errors import ResourceError
-from dexkit.threads import Worker
 from dexkit.traces import sample_path
 
 
@@ -56,17 +54,6 @@ def test_lack_of_memory_or_threads_is_told(
     assert end.value.code == ResourceError.exit_code == 2
     assert err.startswith("error: ")
     assert told in err
-
-
-def test_a_thread_that_could_not_be_started_is_cleaned_up(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr(Worker, "start", lambda self: no_thread())
-    with pytest.raises(SystemExit) as end:
-        main(["emulate", "mx64", "--link", str(tmp_path / "link")])
-    assert end.value.code == 2
-    assert "no thread can be started" in capsys.readouterr().err
-    Worker("never", no_thread).join()
 
 
 @pytest.mark.parametrize("error", [RuntimeError("a bug"), ImportError("No module named 'x'")])

@@ -14,19 +14,16 @@ from hypothesis import strategies as st
 
 from dexkit.cli import cli
 from dexkit.conformance.kit.stimulus_record import RECORD, Phase, Stimulus
-from dexkit.errors import DexkitError, TraceError, TraceUnsupported, UsageError
+from dexkit.errors import DexkitError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.traces import Recorder, open_trace, sample_path
-from dexkit.traces.clock_steps import order_of, steps_between
 from dexkit.traces.names import CUT
 from dexkit.traces.sessions.align import Track, align
 from dexkit.traces.sessions.compare import compare
 from dexkit.traces.sessions.edit import Span, clock_offset, cut, merge
-from dexkit.traces.sessions.resample import gap_of, hold, interpolate
-from dexkit.traces.sessions.streams import COMMAND, streams_of
+from dexkit.traces.sessions.streams import COMMAND
 from dexkit.traces.writer import RecordingWriter, definition
-from tests.each import each
 from tests.session_helpers import document, episode, streamed
 from tests.trace_helpers import (
     CMD,
@@ -41,7 +38,6 @@ from tests.trace_helpers import (
     write,
 )
 
-STATE_KIND = "state"
 PICK = sample_path("dex1_pick_place")
 
 
@@ -113,19 +109,6 @@ def test_a_phase_is_cut_with_its_record(tmp_path: Path) -> None:
     assert (code, text) == (2, "run.mcap has no phase walk")
 
 
-def test_a_cut_beyond_the_recording_names_the_time_that_is(tmp_path: Path) -> None:
-    out = tmp_path / "out.mcap"
-    for window, time in (("100:", 100), (":-1000", -1000)):
-        code, text = dexkit("cut", PICK, out, f"--window={window}")
-        assert code == 2
-        assert text.startswith(f"{time} s: nothing is left, {PICK.name} is ")
-    assert "B must be later than A" in dexkit("cut", PICK, out, "--window", "3:3")[1]
-    for window in ("3", "a:b", "1:nan"):
-        refused = CliRunner().invoke(cli, ["cut", str(PICK), str(out), "--window", window])
-        assert refused.exit_code == 2
-        assert "--window" in refused.output
-
-
 def test_failed_cut_leaves_no_file(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     for arguments in (
@@ -145,15 +128,6 @@ def test_failed_cut_leaves_no_file(tmp_path: Path) -> None:
     assert dexkit("cut", out, out, "--overwrite")[0] == 2
 
 
-def test_a_damaged_recording_is_cut_as_far_as_it_can_be_read(tmp_path: Path) -> None:
-    data = bytearray(mcap_bytes(rows(200)))
-    data[data.index(state(0.01 * 50)) + 20] ^= 0xFF
-    source = write(tmp_path / "damaged.mcap", bytes(data))
-    code, text = dexkit("cut", source, tmp_path / "out.mcap")
-    assert code == 1, text
-    assert 0 < len(messages(tmp_path / "out.mcap")) < 300
-
-
 def test_clocks_of_two_recorders_are_compared_by_common_messages(tmp_path: Path) -> None:
     a = write(tmp_path / "a.mcap", mcap_bytes(rows(60)))
     late = [(t, log + 250_000_000, sent, data) for t, log, sent, data in rows(60)]
@@ -167,45 +141,6 @@ def test_clocks_of_two_recorders_are_compared_by_common_messages(tmp_path: Path)
     stranger = write(tmp_path / "c.mcap", mcap_bytes(rows(60, T0 + 1)))
     with pytest.raises(UsageError, match="0 messages in common"):
         clock_offset(open_trace(a), open_trace(stranger))
-
-
-def test_recordings_of_different_schemas_are_not_merged(tmp_path: Path) -> None:
-    a = write(tmp_path / "a.mcap", mcap_bytes(rows(10)))
-    b = write(tmp_path / "b.mcap", mcap_bytes(rows(10), encoding="omgidl"))
-    with pytest.raises(TraceError, match="another schema"):
-        merge([open_trace(a), open_trace(b)], tmp_path / "out.mcap")
-    assert not (tmp_path / "out.mcap").exists()
-
-
-def test_one_topic_with_two_schemas_is_refused(tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    with (tmp_path / "two.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "a test")
-        for text in (b"float32 q\n", b"float64 q\n"):
-            schema = writer.register_schema("a/msg/B", "ros2msg", text)
-            channel = writer.register_channel("/b", "cdr", schema)
-            writer.add_message(channel, 1, b"\x00\x01\x00\x00", 1)
-        writer.finish()
-    with pytest.raises(TraceUnsupported, match="two channels"):
-        cut(open_trace(tmp_path / "two.mcap"), tmp_path / "out.mcap")
-
-
-def test_streams_have_the_joints_of_the_profile() -> None:
-    found = {(s.part, s.kind): s for s in streams_of(open_trace(sample_path("dex3_pinch")))}
-    assert set(found) == {
-        (f"{s}_hand", k) for s in ("left", "right") for k in (STATE_KIND, COMMAND)
-    }
-    left = found["left_hand", STATE_KIND]
-    assert left.names[:4] == ("left_thumb_0", "left_thumb_1", "left_thumb_2", "left_middle_0")
-    assert left.pressure is not None
-    assert left.pressure.shape == (len(left), 33)
-    legacy = {(s.part, s.kind): s for s in streams_of(open_trace(sample_path("dex1_legacy_v1_1")))}
-    samples = open_trace(sample_path("dex1_legacy_v1_1")).samples("rt/unitree_actuator/state")
-    # 0 is the right gripper on that topic
-    right = legacy["right_hand", STATE_KIND].q[:, 0]
-    assert np.array_equal(right, samples.columns()["states[0].q"])
 
 
 def test_two_runs_are_aligned_and_compared(tmp_path: Path) -> None:
@@ -290,25 +225,6 @@ def test_a_shift_is_found_at_any_rate(shift: float, scale: float, rate: int, see
     assert found.correlation > 0.99
 
 
-def test_still_joints_cannot_be_aligned() -> None:
-    t = np.arange(0, 10 * 10**9, 10**7)
-    assert align([Track(t, np.zeros((len(t), 1)), t, np.ones((len(t), 1)))]) is None
-
-
-@each("method", [hold, interpolate])
-def test_nothing_is_filled_in_across_a_gap(method: object) -> None:
-    times = np.array([0, 10, 20, 30, 1030, 1040]) * 10**6
-    values = np.arange(6, dtype=float)[:, None]
-    at = np.array([-5, 0, 15, 30, 100, 500, 1035, 1041]) * 10**6
-    assert gap_of(times) == 0.1
-    got = method(times, values, at)[:, 0]  # type: ignore[operator]
-    if method is hold:
-        assert np.array_equal(got, [np.nan, 0, 1, 3, 3, np.nan, 4, 5], equal_nan=True)
-    else:
-        expected = [np.nan, 0, 1.5, 3, np.nan, np.nan, 4.5, np.nan]
-        assert np.array_equal(got, expected, equal_nan=True)
-
-
 # -- times that say nothing of each other ---------------------------------------------------------
 
 
@@ -351,16 +267,6 @@ def test_a_clock_that_steps_back_mixes_nothing(tmp_path: Path) -> None:
         assert not open_trace(out).clock_steps
     second = [(topic, log + 10**9, sent + 10**9, data) for topic, log, sent, data in pieces[1]]
     assert pieces[0] + second == messages(PICK)
-
-
-@given(st.lists(st.integers(0, 40), min_size=1, max_size=40), st.integers(1, 9))
-@settings(max_examples=30)
-def test_steps_of_a_clock_are_those_of_the_times(tenths: list[int], pieces: int) -> None:
-    """However a file is cut into chunks."""
-    times = np.array(tenths, dtype=np.uint64) * np.uint64(10**8) + np.uint64(T0)
-    whole = [(b, a) for b, a in itertools.pairwise(times.tolist()) if a < b]
-    parts = [{3: order_of(p)} for p in np.array_split(times, pieces) if len(p)]
-    assert [(s.before_ns, s.after_ns) for s in steps_between(parts)] == whole
 
 
 def test_recordings_of_two_domains_are_not_one_hand(tmp_path: Path) -> None:

@@ -7,19 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from dexkit.digests import sha256_of_file
 from dexkit.messages import message_type
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.traces import Recorder, open_trace, sample_path
 from dexkit.traces.reader import Definition
-from dexkit.traces.sessions import lerobot_out, ros_types, topic_tables
+from dexkit.traces.sessions import topic_tables
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.streams import streams_of
 from dexkit.traces.writer import RecordingWriter, definition
@@ -59,21 +57,6 @@ def test_tables_give_the_recording_back(tmp_path: Path, part: Path, form: str) -
     about = json.loads((tmp_path / "t" / "session.json").read_text())
     assert any("padding" in text for text in about["lost"])
     assert dexkit("export", part, "--to", form, "--out", tmp_path / "t")[0] == 2  # it exists
-
-
-def test_a_parquet_table_has_the_values_of_the_messages(tmp_path: Path, part: Path) -> None:
-    assert dexkit("export", part, "--to", "parquet", "--out", tmp_path / "t")[0] == 0
-    entries = json.loads((tmp_path / "t" / "session.json").read_text())["topics"]
-    for entry in entries:
-        table = pq.read_table(tmp_path / "t" / entry["file"])
-        sent = list(open_trace(part).messages([entry["topic"]]))
-        mt = message_type(entry["type"])
-        assert table["log_time_ns"].to_pylist() == [m.log_time_ns for m in sent]
-        assert table[f"{mt.motor_sequence}[2].q"].type == "float"
-        for i in (0, len(sent) - 1):
-            motors = getattr(mt.decode(sent[i].data), mt.motor_sequence)
-            for j, motor in enumerate(motors):
-                assert table[f"{mt.motor_sequence}[{j}].q"][i].as_py() == motor.q
 
 
 @settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
@@ -141,61 +124,6 @@ def test_a_bag_gives_the_payloads_back(tmp_path: Path, part: Path, storage: str)
     assert {k: back[k] for k in source} == source
 
 
-def test_several_recordings_are_exported_and_one_refused(tmp_path: Path, part: Path) -> None:
-    bad = tmp_path / "bad.mcap"
-    bad.write_bytes(b"nothing")
-    code, output = dexkit("export", part, bad, "--to", "csv", "--out", tmp_path / "all")
-    assert (code, "bad.mcap: refused" in output) == (1, True)
-    assert [p.name for p in (tmp_path / "all").iterdir()] == ["part"]
-    assert dexkit("export", bad, "--to", "csv", "--out", tmp_path / "one")[0] == 2
-
-
-@each(
-    "values",
-    [
-        pa.array([[1.0]] * 2),
-        pa.array([{"a": 1}] * 2),
-        pa.array([2**30] * 2, pa.date32()),
-        pa.array([2**62] * 2, pa.timestamp("ns")),
-        pa.array([1] * 2, pa.duration("s")),
-        pa.array([[("a", 1)]] * 2, pa.map_(pa.string(), pa.int64())),
-    ],
-    ids=lambda values: str(values.type).partition("<")[0],
-)
-def test_a_table_with_columns_of_other_types_is_refused(
-    tmp_path: Path, part: Path, values: pa.Array
-) -> None:
-    assert dexkit("export", part, "--to", "parquet", "--out", tmp_path / "t")[0] == 0
-    path = sorted((tmp_path / "t").glob("*.parquet"))[0]
-    table = pq.read_table(path).slice(0, 2)
-    name = table.column_names[-1]
-    pq.write_table(table.set_column(table.num_columns - 1, name, values), path)
-    code, output = dexkit("import", tmp_path / "t", tmp_path / "back.mcap")
-    assert (code, f"column {name}" in output, path.name in output) == (1, True, True), output
-    there = len(open_trace(tmp_path / "back.mcap").definitions)
-    assert there == len(open_trace(part).definitions) - 1
-
-
-@each("to", ["csv", "parquet", "rosbag2", "rosbag2 --set storage=mcap"])
-def test_times_after_2262_are_told(tmp_path: Path, to: str) -> None:
-    mt = message_type("unitree_hg::msg::dds_::HandState_")
-    data = mt.encode(mt.cls())
-    known = definition("rt/dex3/left/state", mt)
-    other = ros_types.STRING.definition("rt/text")
-    with RecordingWriter(tmp_path / "a.mcap") as writer:
-        for channel, payload in ((known, data), (other, ros_types.encode_string("a"))):
-            number = writer.add_channel(channel)
-            for stamp in (T0, 2**63 - 1, 2**64 - 1):
-                writer.put(number, payload, stamp, stamp)
-    code, output = dexkit(
-        "export", tmp_path / "a.mcap", "--to", *to.split(), "--out", tmp_path / "out"
-    )
-    assert (code, output.count("after the year 2262")) == (0, 2), output
-    assert dexkit("import", tmp_path / "out", tmp_path / "back.mcap")[0] == 0
-    times = [m.log_time_ns for m in open_trace(tmp_path / "back.mcap").messages()]
-    assert times == [T0] * 2 + [2**63 - 1] * 4
-
-
 @each("robot", ROBOTS.values(), ids=list(ROBOTS))
 def test_the_motors_of_a_robot_become_streams(tmp_path: Path, robot: RobotModel) -> None:
     path = tmp_path / "robot.mcap"
@@ -220,20 +148,6 @@ def test_the_motors_of_a_robot_become_streams(tmp_path: Path, robot: RobotModel)
     code, output = dexkit("export", path, "--to", "episodes", "--out", tmp_path / "e")
     assert code == 0, output
     assert dexkit("info", path, "--plot")[0] == 0
-
-
-def test_equal_values_are_distinguished(tmp_path: Path) -> None:
-    mt = message_type("unitree_go::msg::dds_::MotorCmds_")
-    motor = mt.motor_type.cls
-    values = [0.0, -0.0, np.float32(np.nan).item(), float("inf"), 1e-45, 3.4028234e38]
-    with RecordingWriter(tmp_path / "a.mcap") as writer:
-        number = writer.add_channel(definition("rt/dex1/left/cmd", mt))
-        for i, q in enumerate(values):
-            writer.put(number, mt.encode(mt.cls([motor(q=q)] * (i % 3))), T0 + i)
-    for form in ("csv", "parquet"):
-        topic_tables.export_tables(open_trace(tmp_path / "a.mcap"), tmp_path / form, form)
-        topic_tables.import_tables(tmp_path / form, tmp_path / f"{form}.mcap")
-        assert rows(tmp_path / f"{form}.mcap") == rows(tmp_path / "a.mcap")
 
 
 @pytest.fixture
@@ -278,52 +192,3 @@ def test_tables_are_the_same_in_pieces_of_any_size(
             assert pq.read_metadata(pieces / path.name).num_row_groups > 1
         else:
             assert path.read_bytes() == (pieces / path.name).read_bytes()
-
-
-def test_pieces_are_the_samples(long: Path) -> None:
-    trace = open_trace(long)
-    for topic in trace.topics:
-        whole = trace.samples(topic)
-        pieces = list(trace.pieces(topic, 11))
-        assert max(map(len, pieces)) == 11
-        assert [p for piece in pieces for p in piece.payloads] == whole.payloads
-        for name in ("log_time_ns", "publish_time_ns"):
-            found = np.concatenate([getattr(piece, name) for piece in pieces])
-            assert np.array_equal(found, getattr(whole, name))
-
-
-def test_a_recording_of_many_runs_is_hashed_once(
-    tmp_path: Path, long: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hashed: list[Path] = []
-
-    def digest(path: Path) -> str:
-        hashed.append(path)
-        return sha256_of_file(path)
-
-    monkeypatch.setattr(lerobot_out, "sha256_of_file", digest)
-    result = lerobot_out.export_dataset([open_trace(long)], tmp_path / "set")
-    assert result.episodes > 1
-    assert hashed == [long]
-
-
-def test_streams_without_samples_have_the_same_values(long: Path) -> None:
-    trace = open_trace(long)
-    whole, alone = streams_of(trace), streams_of(trace, keep_samples=False)
-    positions = streams_of(trace, positions=True)
-    assert len(whole) == len(alone) == len(positions) == 4
-    for a, b, c in zip(whole, alone, positions, strict=True):
-        assert a.samples is not None
-        assert b.samples is None
-        assert c.pressure is None
-        assert list(c.values) == ["q"]
-        assert np.array_equal(a.q, c.q, equal_nan=True)
-        assert a.values.keys() == b.values.keys()
-        for name in a.values:
-            assert np.array_equal(a.values[name], b.values[name], equal_nan=True)
-        if a.kind == "state":
-            assert a.pressure is not None
-            assert b.pressure is not None
-            first = a.samples.columns()["press_sensor_state[0].pressure[3]"]
-            assert np.array_equal(a.pressure[:, 0], first, equal_nan=True)  # as in the messages
-            assert np.array_equal(a.pressure, b.pressure, equal_nan=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +20,12 @@ from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.frames import open_source, sample
 from dexkit.traces.sessions.imported import RECORD
-from dexkit.traces.sessions.lerobot_out import statistics
-from dexkit.traces.sessions.model import REST_TOPIC, picture_topic
+from dexkit.traces.sessions.model import picture_topic
 from dexkit.traces.sessions.streams import COMMAND, STATE
-from dexkit.traces.writer import RecordingWriter, definition
+from dexkit.traces.writer import RecordingWriter
 from tests.each import each
 from tests.session_helpers import document, episode, png, streamed, whole
 from tests.test_sessions_import import dexkit, streams
-
-T0 = 1_795_251_429_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -116,14 +112,6 @@ def test_every_value_of_a_dataset_is_that_of_the_recording(tmp_path: Path, part:
     tasks = pq.read_table(tmp_path / "d/meta/tasks.parquet")
     assert tasks.to_pylist() == [{"task_index": 0, "task": "pinch"}]
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
-
-
-def test_a_task_that_is_no_text_is_escaped(tmp_path: Path, part: Path) -> None:
-    out = tmp_path / "d"
-    task = b"pick \xff".decode("utf-8", "surrogateescape")  # as the command line has it
-    assert dexkit("export", part, "--to", "lerobot", "--out", out, "--set", f"task={task}")[0] == 0
-    tasks = pq.read_table(out / "meta" / "tasks.parquet").to_pylist()
-    assert [row["task"] for row in tasks] == ["pick \\udcff"]
 
 
 def test_several_recordings_are_one_dataset(tmp_path: Path, part: Path) -> None:
@@ -226,42 +214,6 @@ def test_pictures_are_taken_over_as_they_are(tmp_path: Path, cameras: int) -> No
     )
     assert (code, "is missing" in output) == (2, True)
     assert not list(tmp_path.glob("x*"))
-
-
-def test_a_missing_library_names_its_extra(
-    tmp_path: Path, part: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    code, output = dexkit("export", part, "--to", "lerobot", "--out", tmp_path / "d")
-    assert (code, "dexkit[lerobot]" in output) == (2, True)
-
-
-@settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])
-@given(st.integers(1, 50), st.integers(1, 4), st.integers(0, 2**31))
-def test_statistics_are_those_of_numpy(frames: int, width: int, seed: int) -> None:
-    values = np.random.default_rng(seed).normal(size=(frames, width)).astype(np.float32)
-    found = statistics(values)
-    assert found["count"] == [frames]
-    for name, expected in (("min", values.min(axis=0)), ("std", values.astype(float).std(axis=0))):
-        assert np.allclose(found[name], expected)
-    assert all(len(found[k]) == width for k in found if k != "count")
-
-
-def test_an_episode_comes_back_through_lerobot(tmp_path: Path) -> None:
-    source = episode(tmp_path / "e", streamed(document(frames=40, cameras=0)))
-    assert dexkit("import", source, tmp_path / "a.mcap")[0] == 0
-    assert dexkit("export", tmp_path / "a.mcap", "--to", "lerobot", "--out", tmp_path / "d")[0] == 0
-    info, _ = read(tmp_path / "d")
-    # what the source did not have is not in the dataset
-    assert "observation.velocity" not in info["features"]
-    assert dexkit("import", tmp_path / "d", tmp_path / "b.mcap")[0] == 0
-    a, b = (streams(open_trace(tmp_path / f"{n}.mcap")) for n in "ab")
-    assert set(a) == set(b)
-    for key, s in a.items():
-        assert b[key].joints == s.joints
-        assert np.array_equal(b[key].times_ns, s.times_ns)
-        assert np.array_equal(b[key].q, s.q)
-    assert open_trace(tmp_path / "b.mcap").metadata[RECORD]["clock"] == "nominal"
 
 
 # -- episodes ------------------------------------------------------------------------------------
@@ -380,24 +332,6 @@ def test_a_recording_becomes_an_episode_that_the_importer_reads(tmp_path: Path, 
             assert np.array_equal(s.q[np.searchsorted(s.times_ns, first, side="right") - 1], q)
 
 
-def test_recordings_without_joints_are_refused(tmp_path: Path) -> None:
-    mt = message_type("unitree_hg::msg::dds_::IMUState_")
-    with RecordingWriter(tmp_path / "a.mcap") as writer:
-        number = writer.add_channel(definition("rt/secondary_imu", mt))
-        writer.put(number, mt.encode(mt.cls()), T0)
-    for form in ("lerobot", "episodes"):
-        code, output = dexkit("export", tmp_path / "a.mcap", "--to", form, "--out", tmp_path / form)
-        assert (code, "has no joints" in output) == (2, True)
-    assert not list(tmp_path.glob("lerobot*"))
-    assert dexkit("export", tmp_path / "a.mcap", "--to", "csv", "--out", tmp_path / "c")[0] == 0
-    assert (
-        dexkit(
-            "export", tmp_path / "a.mcap", "--to", "csv", "--out", tmp_path / "d", "--set", "fps=3"
-        )[0]
-        == 2
-    )
-
-
 # -- touch ---------------------------------------------------------------------------------------
 
 
@@ -457,35 +391,3 @@ def test_touch_is_in_datasets_and_episodes(tmp_path: Path) -> None:
     assert back["info"]["dexkit"]["tactile_at_rest"] == {}
     right = np.array([item["tactiles"]["right_ee"] for item in back["data"]])
     assert np.abs(right - made[:, 1062:]).max() < 0.01
-
-
-def test_export_leaves_gaps_of_touch_out_and_reports_short_lists(tmp_path: Path) -> None:
-    source = touched(tmp_path / "a.mcap", lost=range(20, 60), short=True)
-    code, output = dexkit("export", source, "--to", "lerobot", "--out", tmp_path / "d")
-    assert code == 1
-    assert "rt/inspire_hand/touch/l: 1 messages whose lists are not as long" in output
-    assert "it is written as 2 episodes" in output
-    _, table = read(tmp_path / "d")
-    assert np.isfinite(vectors(table, "observation.pressure")).all()
-
-
-@each("topic", [picture_topic("color_0"), REST_TOPIC, ""], ids=["picture", "rest", "all"])
-def test_times_after_2262_end_no_export(tmp_path: Path, topic: str) -> None:
-    found = document(frames=20)
-    found["data"][-1]["extra"] = 1  # kept beside joints and pictures
-    source = episode(tmp_path / "e", whole(found), 1, 20)
-    assert dexkit("import", source, tmp_path / "a.mcap", "--set", "embed-pictures=yes")[0] == 0
-    trace = open_trace(tmp_path / "a.mcap")
-    assert {topic} <= {*trace.topics, ""}
-    with RecordingWriter(tmp_path / "b.mcap") as writer:
-        numbers = {key: writer.add_channel(d) for key, d in trace.definitions.items()}
-        for m in trace.messages():
-            late = topic in ("", m.topic) and m.log_time_ns == trace.last_ns
-            stamp = 2**64 - 1 if late else m.log_time_ns
-            writer.put(numbers[m.topic, m.type_name], m.data, stamp, stamp)
-        writer.add_metadata(RECORD, trace.metadata[RECORD])
-    for form in ("lerobot", "episodes"):
-        for more in ([], ["--set", "fps=30"]):
-            out = tmp_path / f"{form}{len(more)}"
-            code, output = dexkit("export", tmp_path / "b.mcap", "--to", form, "--out", out, *more)
-            assert code in (0, 1, 2), output

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from dexkit.hand import Side
-from dexkit.messages import message_type
 from dexkit.models import MODELS, model
 from dexkit.traces import open_trace
-from dexkit.traces.sessions.streams import COMMAND, STATE, streams_of
 from tests.session_helpers import dexkit, document, episode, streamed
 
 pytest.importorskip("pyarrow")
@@ -74,24 +71,3 @@ def test_a_hand_comes_back_as_the_same_messages(
         )
         assert code == 0, output
         assert messages(tmp_path / f"{form}.mcap") == expected, form
-
-
-@each_hand
-def test_the_streams_of_a_hand_have_the_values_of_its_source(
-    tmp_path: Path, hand: str, sides: tuple[Side, ...]
-) -> None:
-    """Neither a hand that the source has not, nor fields that it or the message has not."""
-    source = document(frames=FRAMES, hand=hand, cameras=0)["data"]
-    dialect = model(hand).dialects[0]
-    found = {(s.part, s.kind): s for s in streams_of(open_trace(imported(tmp_path, hand, sides)))}
-    hands = {key for key in found if key[0].endswith("_hand")}
-    assert hands == {(f"{s}_hand", k) for s in sides for k in (STATE, COMMAND)}
-    for side in sides:
-        for key, kind, type_name in (
-            ("states", STATE, dialect.state_type),
-            ("actions", COMMAND, dialect.cmd_type),
-        ):
-            stream = found[f"{side}_hand", kind]
-            assert not {"dq", "tau"} & set(stream.values)
-            q = np.array([item[key][f"{side}_ee"]["qpos"] for item in source])
-            assert np.array_equal(stream.q, message_type(type_name).motor_values_sent("q", q))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import runpy
 import shutil
 import signal
 import struct
@@ -21,7 +20,6 @@ from typing import Any
 import pytest
 
 from dexkit.cli import main
-from dexkit.dds_library import loaded_libraries
 from dexkit.errors import (
     DdsBuildFailed,
     DdsInstallError,
@@ -29,7 +27,7 @@ from dexkit.errors import (
     DexkitError,
     InterpreterRefused,
 )
-from dexkit.setup_dds import advice, execute, inspect_machine, pinned_wheel, plan, probe
+from dexkit.setup_dds import execute, inspect_machine, pinned_wheel, plan, probe
 from dexkit.setup_dds.facts import Distribution, Installed, Interpreter, Library, Machine
 from dexkit.setup_dds.process_runner import Done, Interrupted, ProcessRunner
 from dexkit.stop_signals import StopRequest
@@ -117,13 +115,6 @@ def test_working_cyclonedds_is_replaced_on_request_only() -> None:
     assert not replaced.notes
 
 
-def test_working_cyclonedds_is_kept_where_nothing_may_be_installed() -> None:
-    machine = dataclasses.replace(
-        with_python(kind="system"), installed=Installed("0.10.5", "", ("/x/libddsc.so.0",))
-    )
-    assert isinstance(plan.make_plan(machine).action, plan.Keep)
-
-
 @each("problem", ["libddsc.so: cannot open shared object file", ""])
 def test_cyclonedds_that_does_not_work_is_built_again(problem: str) -> None:
     libraries = () if problem else ("/opt/ros/jazzy/lib/libddsc.so.0", "/x/libddsc.so.0.10.5")
@@ -165,12 +156,6 @@ def test_a_wheel_is_taken_where_the_index_has_one(version: tuple[int, int, int])
         assert isinstance(plan.make_plan(machine).action, kind), (version, processor)
 
 
-def test_a_source_comes_before_a_wheel() -> None:
-    options = plan.Options(source="/home/u/cyclonedds", source_version="0.10.5")
-    found = plan.make_plan(with_python(version=(3, 10, 1)), options)
-    assert found.action == plan.BuildSource("/home/u/cyclonedds", "0.10.5")
-
-
 def test_libraries_that_cannot_be_used_are_passed_over_with_their_reason() -> None:
     others = (
         dataclasses.replace(LIBRARY, origin="a", header_version="11.0.1", version="11.0.1"),
@@ -202,11 +187,6 @@ def test_a_library_in_a_folder_that_may_go_away_is_pointed_out(folder: str) -> N
     notes = " ".join(plan.make_plan(with_library(folder=folder)).notes)
     assert folder in notes
     assert ("temporary" in notes) == ("tmp" in folder)
-
-
-@each("folder", ["/usr/lib/x86_64-linux-gnu", "/opt/ros/jazzy/lib", "/env/lib"])
-def test_a_library_of_the_system_is_safe(folder: str) -> None:
-    assert not plan.make_plan(with_library(folder=folder)).notes
 
 
 def test_another_library_that_every_program_is_offered_is_pointed_out() -> None:
@@ -274,27 +254,6 @@ def test_a_source_needs_cmake() -> None:
     assert "apt install cmake" in refusal(machine, options, kind=DdsLibraryMissing)
 
 
-@each(
-    "distribution, words",
-    [
-        (("debian", "11"), "packages no CycloneDDS 0.10"),
-        (("debian", "12"), "apt install cyclonedds-dev"),
-        (("debian", ""), "apt install cyclonedds-dev"),  # testing
-        (("ubuntu", "20.04"), "--from-source cyclonedds"),
-        (("ubuntu", "22.04"), "ros-humble-cyclonedds"),
-        (("ubuntu", "24.04"), "apt install cyclonedds-dev"),
-        (("ubuntu", "26.04"), "apt install cyclonedds-dev"),
-        (("fedora", "41"), "--from-source cyclonedds"),
-    ],
-)
-def test_how_to_get_the_library_depends_on_the_release(
-    distribution: tuple[str, str], words: str
-) -> None:
-    text = advice.how_to_get_library(Distribution(*distribution, "X"))
-    assert words in text
-    assert ("cyclonedds-dev" in text) == ("cyclonedds-dev" in words)
-
-
 # --- what is found
 
 
@@ -342,17 +301,6 @@ def test_libraries_are_found_in_their_usual_places_and_in_order(tmp_path: Path) 
     assert {x.file for x in libraries} == {"libddsc.so.0"}
 
 
-def test_one_library_under_two_names_is_found_once(tmp_path: Path) -> None:
-    make_library(tmp_path / "opt/ros/jazzy")
-    (tmp_path / "also").symlink_to(tmp_path / "opt/ros/jazzy")
-    assert len(found(tmp_path, CYCLONEDDS_HOME=str(tmp_path / "also"))) == 1
-
-
-def test_nothing_is_found_in_an_empty_machine_or_below_a_wrong_home(tmp_path: Path) -> None:
-    assert found(tmp_path) == []
-    assert found(tmp_path, CYCLONEDDS_HOME=str(tmp_path / "none"), CMAKE_PREFIX_PATH=":/x:") == []
-
-
 def test_the_processor_of_a_library_is_read_from_the_file(tmp_path: Path) -> None:
     make_library(tmp_path / "usr", machine=183)
     (library,) = found(tmp_path)
@@ -386,43 +334,6 @@ def test_the_distribution_is_read(tmp_path: Path, text: str, known: tuple[str, s
     (tmp_path / "etc/os-release").write_text(text)
     distribution = inspect_machine.distribution(tmp_path)
     assert (distribution.id, distribution.release) == known
-
-
-def test_libraries_that_the_loader_is_offered_are_found(tmp_path: Path) -> None:
-    make_library(tmp_path / "ros")
-    offered = inspect_machine.offered_elsewhere(
-        {"LD_LIBRARY_PATH": f":/none:{tmp_path}/ros/lib", "LD_PRELOAD": "/a/libx.so /b/libddsc.so"}
-    )
-    assert offered == sorted(["/b/libddsc.so", f"{tmp_path}/ros/lib/libddsc.so.0.10.5"])
-    assert inspect_machine.offered_elsewhere({}) == []
-
-
-def test_the_version_of_a_source_is_read(tmp_path: Path) -> None:
-    assert inspect_machine.source_version(tmp_path) == ""
-    (tmp_path / "CMakeLists.txt").write_text("project(CycloneDDS VERSION 0.10.5 LANGUAGES C)\n")
-    assert inspect_machine.source_version(tmp_path) == "0.10.5"
-
-
-def test_this_interpreter_is_described_as_it_is() -> None:
-    here = inspect_machine.interpreter()
-    assert here.version == sys.version_info[:3]
-    assert here.kind == ("venv" if sys.prefix != sys.base_prefix else here.kind)
-    assert bool(here.not_writable) != os.access(here.packages, os.W_OK)
-
-
-def test_loaded_libraries_are_read_from_the_map_of_a_process() -> None:
-    maps = (
-        "7f00-7f01 r--p 00000000 fe:00 123   /opt/ros/humble/lib/libddsc.so.0.10.5\n"
-        "7f01-7f02 r-xp 00001000 fe:00 123   /opt/ros/humble/lib/libddsc.so.0.10.5\n"
-        "7f03-7f04 r--p 00000000 fe:00 124   /home/a b/cyclonedds.libs/libddsc-9.so.0.10.5\n"
-        "7f05-7f06 r--p 00000000 fe:00 125   /usr/lib/libc.so.6\n"
-        "7f06-7f07 r--p 00000000 fe:00 126   /usr/lib/libddscxx.so.0.10.5\n"
-        "7f07-7f08 rw-p 00000000 00:00 0 \n"
-    )
-    assert loaded_libraries(maps) == (
-        "/home/a b/cyclonedds.libs/libddsc-9.so.0.10.5",
-        "/opt/ros/humble/lib/libddsc.so.0.10.5",
-    )
 
 
 def test_a_child_that_dies_is_a_finding() -> None:
@@ -511,19 +422,6 @@ def test_the_wheel_is_tried_before_it_is_installed_and_that_is_the_last_step(
         module = packed.read("cyclonedds/__library__.py").decode()
     assert "in_wheel = True" in module
     assert "'/usr/lib/x86_64-linux-gnu/libddsc.so.0'" in module
-
-
-@each("version", [(3, 12, 1), (3, 13, 0)])
-def test_the_build_gets_the_library_and_the_flag_of_3_13(version: tuple[int, int, int]) -> None:
-    script = Script()
-    carry_out(script, with_python(version=version))
-    (number,) = [n for n, c in enumerate(script.commands) if "--no-binary" in c]
-    environment = script.environments[number]
-    assert environment["CYCLONEDDS_HOME"].startswith(environment["TMPDIR"])
-    assert "-Wl,-rpath,/usr/lib/x86_64-linux-gnu" in environment["LDFLAGS"]
-    renamed = "-D_Py_IsFinalizing=Py_IsFinalizing"
-    assert (renamed in environment["CFLAGS"]) == (version >= (3, 13))
-    assert "--no-cache-dir" in script.commands[number]
 
 
 def test_a_wheel_alone_is_made_for_an_interpreter_that_nothing_may_be_installed_into(
@@ -682,21 +580,6 @@ def test_wheel_is_rewritten_with_a_correct_record(tmp_path: Path) -> None:
 # --- children
 
 
-def test_a_command_is_stopped_with_its_children_and_the_log_has_its_output(
-    tmp_path: Path,
-) -> None:
-    stop = StopRequest()
-    with (tmp_path / "log").open("w") as log:
-        runner = ProcessRunner(log, stop)
-        assert runner.run(["sh", "-c", "echo hello; exit 3"]).code == 3
-        assert runner.run([str(tmp_path / "none")]).code == 127
-        stop.set()
-        with pytest.raises(Interrupted):
-            runner.run(["sleep", "1000"])
-    assert "hello" in (tmp_path / "log").read_text()
-    assert "exit code 3" in (tmp_path / "log").read_text()
-
-
 def test_a_request_to_stop_ends_a_running_command_but_not_the_installation(
     tmp_path: Path,
 ) -> None:
@@ -756,30 +639,6 @@ def test_a_broken_log_or_source_is_one_error(
 def test_a_wheel_alone_needs_a_place(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command("--no-install", "--dry-run") == 2
     assert "--wheel DIR" in capsys.readouterr().err
-
-
-def test_the_recipe_of_the_wheels_asks_for_what_dexkit_needs_but_the_binding() -> None:
-    path = Path(__file__).parents[1] / "packaging" / "wheels" / "backend.py"
-    recipe = runpy.run_path(str(path))
-    needed = recipe["get_requires_for_build_wheel"]()
-    assert any(word.startswith("click") for word in needed)
-    assert not any(word.startswith("cyclonedds") for word in needed)
-
-
-@each("version", ["3.12", "3.13"])
-def test_make_setup_takes_another_python(version: str) -> None:
-    if not shutil.which("make"):
-        pytest.skip("needs make")
-    root = Path(__file__).parent.parent
-    done = subprocess.run(
-        ["make", "-n", "setup", f"PYTHON_VERSION={version}", "PYENV_ROOT=/none", "HOME=/none"],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert f"sync --frozen --quiet --python {version}" in done.stdout
-    assert "dexkit setup-dds" in done.stdout
 
 
 @each("version", ["3.8", "3.9", "3.14"])

@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import stat
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,12 +15,8 @@ from click.testing import CliRunner
 
 from dexkit import staging
 from dexkit.cli import cli
-from dexkit.conformance.audit.sessions import find
 from dexkit.documents import write_file
-from dexkit.emulators.mx64 import Bus, Port, Servo
-from dexkit.emulators.sim_dex5 import SimDex5
-from dexkit.errors import DexkitError, OutputError, SessionError, TraceError, UsageError
-from dexkit.hand import Side
+from dexkit.errors import OutputError, SessionError, TraceError, UsageError
 from dexkit.messages import message_type
 from dexkit.staging import NOTE, PREFIX, Staged, whole_file, whole_folder
 from dexkit.traces import open_trace, sample_path
@@ -181,18 +176,6 @@ def test_what_is_not_certainly_left_by_a_killed_run_stays(tmp_path: Path) -> Non
     assert len(left(tmp_path)) == len(others) + 1
 
 
-def test_a_folder_of_another_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out"
-    assert killed(a_file, out, "replace")
-    before = left(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-        a_file(out, "new")
-    assert left(tmp_path) == before
-    a_file(out, "new")
-    assert left(tmp_path) == []
-
-
 def test_the_temporary_folder_is_private_and_new(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,15 +192,6 @@ def test_the_temporary_folder_is_private_and_new(
         a_file(tmp_path / "out", "new")
     assert not list(target.iterdir())
     assert link.is_symlink()
-
-
-def test_a_long_name_and_a_name_without_utf_8(tmp_path: Path) -> None:
-    for name in ("n" * 255, os.fsdecode(b"\xff\xfe")):
-        out = tmp_path / name
-        assert killed(a_file, out, "replace")
-        a_file(out, "new")
-        assert out.read_text() == "new"
-    assert left(tmp_path) == []
 
 
 def test_a_new_file_has_the_permissions_of_the_mask_and_an_old_one_its_own(tmp_path: Path) -> None:
@@ -319,22 +293,6 @@ def test_an_output_that_cannot_be_taken_is_refused_before_anything_is_written(
     assert sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
 
 
-def test_a_folder_that_comes_to_be_there_meanwhile_is_not_replaced(tmp_path: Path) -> None:
-    out = tmp_path / "ds"
-    for make in (out.mkdir, out.touch):
-
-        def write(make: Callable[[], None] = make) -> None:
-            with whole_folder(out) as root:
-                root.mkdir()
-                make()
-
-        with pytest.raises(DexkitError, match="ds exists"):
-            write()
-        assert [p.name for p in tmp_path.iterdir()] == ["ds"]
-        if out.is_dir():
-            out.rmdir()
-
-
 def test_an_edited_recording_has_its_name_when_it_is_whole(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     kind = message_type("unitree_go::msg::dds_::MotorCmds_")
@@ -360,28 +318,6 @@ def test_an_edited_recording_has_its_name_when_it_is_whole(tmp_path: Path) -> No
     assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
 
 
-def test_the_pose_and_the_link_of_an_emulator_take_nothing_that_is_there(tmp_path: Path) -> None:
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
-    link, pose = tmp_path / "tty", tmp_path / "pose.json"
-    beside = [
-        Path(f"{link}.{os.getpid()}.{threading.get_ident()}"),
-        pose.with_name("pose.json.part"),
-    ]
-    for path in beside:
-        path.symlink_to(victim)
-    with Port(Bus([Servo(1, now=0.0)], start=0.0), link=link):
-        assert link.is_symlink()
-    hand = SimDex5(Side.LEFT)
-    hand.keep_pose(pose)
-    hand.open()
-    hand.close()
-    assert isinstance(json.loads(pose.read_text()), list)
-    assert all(path.is_symlink() for path in beside)
-    assert victim.read_text() == "mine"
-    assert left(tmp_path) == []
-
-
 def test_a_name_with_a_slash_at_its_end_is_no_file(tmp_path: Path, session: Path) -> None:
     out = tmp_path / "out.html"
     for arguments in (
@@ -399,10 +335,3 @@ def test_a_name_with_a_slash_at_its_end_is_no_file(tmp_path: Path, session: Path
     )
     assert result.exit_code == 0, result.output
     assert [p.name for p in tmp_path.iterdir()] == ["ds"]
-
-
-def test_an_audit_does_not_look_into_unfinished_outputs(tmp_path: Path) -> None:
-    assert killed(a_recording, tmp_path / "a.mcap", "replace")
-    (folder,) = left(tmp_path)
-    assert (tmp_path / folder / "a.mcap").exists()
-    assert list(find(str(tmp_path))) == []

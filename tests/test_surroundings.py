@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.each import each
-from tests.optional import OPTIONAL, Optional, header
+from tests.optional import OPTIONAL, Optional
 from tests.wall_time import upper_bounds
 
 HERE = Path(__file__).parent
@@ -84,22 +83,6 @@ def test_inherited_environment_does_not_reach_a_test() -> None:
     assert not home_is_left
 
 
-def test_tests_run_in_a_fixed_environment() -> None:
-    assert os.environ["LC_ALL"] == "C.UTF-8"
-    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
-        assert signal.getsignal(number) is not signal.SIG_IGN
-
-
-def test_header_lists_missing_programs_and_skipped_tests() -> None:
-    there = Optional("here", lambda: True, ("a",))
-    assert header([there]) == "optional: everything is here, no test is skipped"
-    gone = [Optional("Chromium", lambda: None, ("b", "c")), Optional("a yak", lambda: 0, ("d",))]
-    assert header([there, *gone]) == (
-        "not on this machine, so their tests are skipped: "
-        "Chromium (tests of b, c), a yak (tests of d)"
-    )
-
-
 def test_every_file_that_may_skip_a_test_is_in_the_list() -> None:
     listed = {name for optional in OPTIONAL for name in optional.tests}
     skips = re.compile(r"pytest\.skip\(|mark\.skipif\(|pytest\.importorskip\(")
@@ -115,37 +98,6 @@ def test_every_file_that_may_skip_a_test_is_in_the_list() -> None:
 def test_the_files_in_the_list_exist(optional: Optional) -> None:
     for name in optional.tests:
         assert " " in name or (HERE / f"test_{name}.py").is_file(), name
-
-
-@each(
-    "code",
-    [
-        "assert time.monotonic() - begin < 1",
-        "took = time.perf_counter() - begin\nassert took <= 3",
-        "before = time.thread_time()\nused = time.thread_time() - before\nassert 1 > used",
-        "up = time.monotonic()\nback = newest(watch)[0] - up\nassert back < 1.0",
-        "a, b = time.time_ns(), 0\nassert (trace.last_ns - a) / 1e9 < 0.5",
-        "used = time.process_time()\nassert time.process_time() - used < 0.3 * took",
-        "t = time.monotonic()\nrate = 100 / (time.monotonic() - t)\nassert rate > 50",
-        "t = time.monotonic()\ntook = time.monotonic() - t\nassert min(took, 9) == approx(2)",
-    ],
-)
-def test_upper_bounds_of_time_are_found(code: str) -> None:
-    assert upper_bounds("begin = time.monotonic()\n" + code), code
-
-
-@each(
-    "code",
-    [
-        "deadline = time.monotonic() + 60\nassert time.monotonic() < deadline",
-        "begin = time.monotonic()\nassert time.monotonic() - begin >= 1",
-        "before = time.time_ns()\nassert before <= sample.at <= time.time_ns()",
-        "begin = clock.now()\nassert clock.now() - begin < 1",
-        "t = time.monotonic()\nassert 100 / (time.monotonic() - t) < 500",
-    ],
-)
-def test_lower_bounds_deadlines_and_virtual_time_are_no_upper_bounds(code: str) -> None:
-    assert not upper_bounds(code), code
 
 
 def test_no_test_asserts_an_upper_bound_of_time() -> None:

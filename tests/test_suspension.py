@@ -85,31 +85,6 @@ def test_without_a_terminal_the_command_ends(capsys: pytest.CaptureFixture[str])
     assert "suspended for 3600.0 s, and has no terminal" in capsys.readouterr().err
 
 
-def test_suspension_during_the_question_asks_again(capsys: pytest.CaptureFixture[str]) -> None:
-    clock = ManualClock()
-
-    class Suspending(Typed):
-        looks = 0
-
-        def __call__(self) -> bytes:
-            self.looks += 1
-            if self.looks == 2:
-                clock.suspend(100.0)
-                self.found = [b"\n", b"", b"\n"]  # the first Enter was typed meanwhile
-            return super().__call__()
-
-    assert Consent(Suspending(), StopRequest(), clock)(2.0)
-    said = capsys.readouterr().err
-    assert "suspended for 2.0 s" in said
-    assert "suspended for 100.0 s" in said
-
-
-def test_stop_ends_the_question() -> None:
-    stop = StopRequest()
-    stop.set()
-    assert not Consent(Typed(b"\n", b"\n", b"\n"), stop, ManualClock())(2.0)
-
-
 # -- replay
 
 
@@ -157,18 +132,6 @@ def test_replay_on_dds_goes_on_after_a_long_pause_only_with_leave(
     after = sent[before[0] :]
     assert min(after) < 1.7  # from where the hand is
     assert max(after) == (pytest.approx(4.0) if answer else pytest.approx(1.5, abs=0.1))
-
-
-def test_suspension_while_the_hand_is_waited_for_counts() -> None:
-    clock = Suspendable()
-    with DdsNode(free_domain()) as node:
-        live = LiveReplay(node, ReplayMachine(plan_of(WAVE)))
-        live._watch = PauseWatch(clock)
-
-        def waiting(seconds: float) -> None:
-            clock.away = 60.0
-
-        assert not live.wait_ready(threading.Event(), waiting)
 
 
 def test_recording_played_as_it_is_ends_after_a_suspension_without_a_terminal(

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import logging
-import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dexkit import threads
 from dexkit.bridge import bridge as bridge_module
-from dexkit.child_processes import Tool
 from dexkit.cli import main
 from dexkit.dds import DdsNode
 from dexkit.emulators.robot.run import EmulatedRobot
-from dexkit.emulators.serial_port import Port
 from dexkit.errors import DexkitError, HandLost
 from dexkit.service import HandService
 from dexkit.service.publisher import Publisher
@@ -24,7 +20,7 @@ from dexkit.threads import Worker
 from dexkit.traces import Recorder, open_trace
 from dexkit.traces.dds_recording import DdsRecording
 from tests.dds_helpers import free_domain, wait_until
-from tests.trace_helpers import CMD, CMD_TYPE, STATE, STATE_TYPE
+from tests.trace_helpers import CMD, CMD_TYPE, STATE
 
 
 class Injected(Exception):
@@ -70,18 +66,6 @@ def test_dexkit_error_of_a_worker_is_raised_unchanged(caplog: pytest.LogCaptureF
         worker.check()
     assert "Traceback" not in caplog.text
     threads.forget()
-
-
-def test_worker_that_returns_raises_nothing() -> None:
-    done = threading.Event()
-    threads.forget()
-    with stop_on_signals() as stop:
-        worker = Worker("test", done.set)
-        worker.start()
-        worker.join()
-        assert not stop
-    assert done.is_set()
-    threads.check()
 
 
 # -- each program ----------------------------------------------------------------------------------
@@ -156,47 +140,4 @@ def test_recording_before_the_failure_is_kept(tmp_path: Path) -> None:
             recording.stop()
         recorder.close()
     assert len(open_trace(path).samples(CMD)) == 1
-    threads.forget()
-
-
-# -- parts that others use -------------------------------------------------------------------------
-
-
-def test_a_node_whose_dispatcher_died_frees_its_waiters(monkeypatch: pytest.MonkeyPatch) -> None:
-    begin = threading.Event()
-
-    def dispatch(self: DdsNode) -> None:
-        begin.wait(20)
-        die()
-
-    monkeypatch.setattr(DdsNode, "_dispatch", dispatch)
-    with DdsNode(free_domain()) as node:
-        writer = node.writer(STATE, STATE_TYPE)
-        waits: list[Callable[[], bool]] = [
-            lambda: writer.wait_matched(),
-            lambda: node.discovery.wait(lambda endpoints: False),
-        ]
-        results: list[bool] = []
-        waiting = [threading.Thread(target=lambda w=w: results.append(w())) for w in waits]
-        for thread in waiting:
-            thread.start()
-        begin.set()
-        for thread in waiting:
-            thread.join(10)
-        assert results == [False, False]
-        assert isinstance(node.failure, Injected)
-    threads.forget()
-
-
-def test_dying_thread_of_an_emulator_or_tool_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Tool, "_listen", die)
-    dead: list[Worker] = []
-    with threads.on_death(dead.append), Tool("--version"):
-        wait_until(lambda: dead)
-    monkeypatch.setattr(Port, "run", die)
-    port = Port.__new__(Port)
-    port.error = None
-    port.start()
-    wait_until(lambda: port.error)
-    assert isinstance(port.error, Injected)
     threads.forget()

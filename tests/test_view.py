@@ -14,25 +14,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dexkit.cli.view import _skeletons
 from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.recording_marks import phase_marks, verdict_marks
 from dexkit.errors import ExtraMissing, UsageError
-from dexkit.hand import MotorError, Side
-from dexkit.messages import encode, message_type, unitree_go, unitree_hg
-from dexkit.models import DEX3_1, INSPIRE_DFX
+from dexkit.hand import MotorError
+from dexkit.messages import encode, message_type, unitree_hg
+from dexkit.models import DEX3_1
 from dexkit.traces import open_trace, sample_path
-from dexkit.view.curve_points import common_times, thin
 from dexkit.view.html_tables import hand_table, time_strip, topics_table
 from dexkit.view.sources import Recorded
 from dexkit.view.transport import Transport
-from dexkit.view.viewer_process import viewer
 from dexkit.watch import Collector, Mark
-from dexkit.watch.number_format import seconds
 from tests.cli_helpers import running
 from tests.dds_helpers import dds_domain, wait_until
 from tests.patience import PATIENCE
@@ -42,8 +37,6 @@ if TYPE_CHECKING:
     from dexkit.view.browser_page import Page
 
 __all__ = ["dds_domain"]
-
-FEW = settings(max_examples=25, deadline=None)
 
 # found, not imported: every worker of a run would spend a quarter of a second on it
 if importlib.util.find_spec("viser") is None:
@@ -89,36 +82,6 @@ def test_a_recording_plays_at_its_speed_to_its_end_and_again() -> None:
     assert (line.at, line.paused) == (1.0, True)
 
 
-# -- curves ----------------------------------------------------------------------------------------
-
-
-@FEW
-@given(
-    values=st.lists(st.one_of(st.floats(-1e3, 1e3), st.just(float("nan"))), max_size=400),
-    most=st.integers(4, 60),
-)
-def test_thin_curves_keep_their_extremes(values: list[float], most: int) -> None:
-    t, y = np.arange(len(values)) * 0.5, np.array(values, dtype=float)
-    few_t, few = thin(t, y, most)
-    assert len(few) <= max(most, len(values) if len(values) <= most else 0)
-    assert (np.diff(few_t) > 0).all()
-    finite = y[np.isfinite(y)]
-    if len(finite):
-        assert np.nanmax(few) == finite.max()
-        assert np.nanmin(few) == finite.min()
-
-
-def test_curves_on_common_times_hold_their_values() -> None:
-    nan = float("nan")
-    first = (np.array([0.0, 2.0]), np.array([1.0, 3.0]))
-    second = (np.array([1.0, 1.5, 3.0]), np.array([5.0, nan, 7.0]))
-    times, (a, b, c) = common_times([first, second, (np.array([2.0]), np.array([nan]))])
-    assert times.tolist() == [0.0, 1.0, 1.5, 2.0, 3.0]
-    assert a.tolist() == [1.0, 1.0, 1.0, 3.0, 3.0]
-    assert b.tolist() == [5.0, 5.0, 5.0, 5.0, 7.0]
-    assert c.tolist() == [0.0] * 5
-
-
 # -- tables ----------------------------------------------------------------------------------------
 
 
@@ -151,12 +114,6 @@ def test_page_shows_faults_and_second_client_of_a_hand() -> None:
     assert "at a limit: thumb_1 upper, index_1 lower" in hand_table(near, "left")
     old = collector.picture(60.0).subjects[0]
     assert "the state is 59.0 s old" in hand_table(old, "left")
-
-
-def test_times_are_formatted_for_people() -> None:
-    for value, text in ((0.0, "0 ms"), (0.0123, "12 ms"), (1.25, "1.2 s"), (250.4, "250 s"),
-                        (float("nan"), "-")):  # fmt: skip
-        assert seconds(value) == text
 
 
 # -- marks -----------------------------------------------------------------------------------------
@@ -209,42 +166,10 @@ def test_page_shows_the_moment(page: Page) -> None:
     ]
 
 
-def test_numbers_of_both_hands_on_one_topic_can_be_charted() -> None:
-    from dexkit.view.browser_page import Page
-
-    (spoken,) = INSPIRE_DFX.dialects
-    topic = spoken.topics(Side.LEFT)[1]
-    state = unitree_go.MotorStates_([unitree_go.MotorState_() for _ in range(12)])
-    collector = Collector()
-    collector.take(topic, spoken.state_type, [encode(state)], [ns(0)], [0])
-    with Page([Recorded("one", collector)], port=0) as page:
-        page.step(0.0)
-        options = page._number.options
-        assert len(options) == len(collector.fields())
-        curves = [c for chart in page._charts for c in chart.curves]
-    name = topic.removeprefix("rt/")
-    assert [c.name for c in curves] == [f"{name} {side}  pinky q" for side in ("left", "right")]
-    assert [c.path for c in curves] == [f"states[{spoken.index[side]}].q" for side in Side]
-
-
-def test_unchanged_figures_are_not_sent_again(page: Page) -> None:
-    page.go_to(0, 0.5)
-    page.go_to(1, 0.5)
-    page.step(20.0)
-    figure = next(iter(page._shown[0].figures.values()))
-    before = dict(figure._shown)
-    page.step(20.01)
-    assert all(figure._shown[name] is value for name, value in before.items())
-
-
 def test_page_is_bound_to_this_machine_and_to_a_free_port(page: Page) -> None:
     assert page.url == f"http://127.0.0.1:{page.port}"
     with pytest.raises(UsageError, match="cannot be bound"):
         type(page)([Recorded("x", Collector())], port=page.port)
-
-
-def test_page_asks_nobody_for_a_share_link(page: Page) -> None:
-    assert page._server.request_share_url() is None
 
 
 def test_nothing_on_the_page_can_command_a_hand(
@@ -319,12 +244,6 @@ def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(ExtraMissing) as error:
         import dexkit.view.browser_page  # noqa: F401
     assert "dexkit[view]" in error.value.hint
-
-
-def test_view_beside_another_command_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ExtraMissing), viewer(1, "lo"):
-        pass
 
 
 def test_command_serves_the_page_until_it_is_stopped() -> None:

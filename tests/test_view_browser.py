@@ -117,17 +117,6 @@ def test_hands_move_when_a_recording_is_scrubbed(seen: Seen) -> None:
     assert moved.mean() > 0.002  # of the scene
 
 
-def test_page_adds_a_chart_of_any_number(seen: Seen) -> None:
-    browser, _ = seen
-    browser.click("Charts")
-    browser.wait("document.querySelectorAll('.uplot canvas').length >= 2")
-    before = browser.run("document.querySelectorAll('.uplot').length")
-    browser.click("Add a chart")
-    browser.wait(f"document.querySelectorAll('.uplot').length == {before + 1}")
-    browser.click("Remove all")
-    browser.wait("document.querySelectorAll('.uplot').length == 0")
-
-
 def test_a_fault_of_a_live_hand_shows_and_goes(tmp_path: Path) -> None:
     pytest.importorskip("cyclonedds")
     from dexkit.dds import DdsNode

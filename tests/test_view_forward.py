@@ -18,7 +18,7 @@ from dexkit.cli.view import command, recorded
 from dexkit.errors import UsageError
 from dexkit.traces import open_trace, sample_path
 from dexkit.view.forward import RATE, Moment, forward
-from dexkit.view.sources import Recorded, Source
+from dexkit.view.sources import Source
 from tests.patience import PATIENCE
 
 
@@ -64,28 +64,6 @@ def test_a_recording_is_shown_to_its_end_30_times_a_second() -> None:
         assert np.linalg.norm(np.diff(placed, axis=0), axis=1) == pytest.approx(
             np.linalg.norm(np.diff(own, axis=0), axis=1)
         )
-
-
-def test_two_sources_have_names_of_their_own_and_stand_beside_each_other() -> None:
-    source = pinch()
-    assert isinstance(source, Recorded)
-    viewer = Kept(most=30)
-    other = Recorded("baseline.mcap", source.collector)
-    forward([source, other], viewer, viewer.stop, paced=False)
-    _, moments = viewer.shown[-1]
-    assert {m.name for m in moments} == {
-        f"{title}/{side}_hand"
-        for title in ("dex3_pinch.mcap", "baseline.mcap")
-        for side in ("left", "right")
-    }
-    assert len({tuple(m.root[:3, 3]) for m in moments}) == 4
-
-
-def test_two_other_viewers_are_refused() -> None:
-    arguments = [str(sample_path("dex3_pinch")), "--rerun", "x.rrd", "--foxglove"]
-    result = CliRunner().invoke(command, arguments)
-    assert isinstance(result.exception, UsageError)
-    assert "exclude each other" in str(result.exception)
 
 
 @pytest.mark.parametrize(

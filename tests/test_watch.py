@@ -18,10 +18,8 @@ from dexkit.models import DEX1_1, DEX3_1
 from dexkit.traces import open_trace, sample_path
 from dexkit.traces.watched import feed
 from dexkit.watch import Collector
-from dexkit.watch.collector import fault_names
 from dexkit.watch.cycles import Cycles
 from dexkit.watch.fields import parts_of
-from dexkit.watch.history import History
 from tests.watch_helpers import COMMAND, STATE, closing_hands, dex3_command, dex3_state, ns
 
 LEFT = "rt/dex3/left/state"
@@ -50,14 +48,6 @@ def test_missed_cycles_are_counted_however_the_times_are_split(
     assert whole.missed == expected
 
 
-def test_a_slow_publisher_misses_no_cycles() -> None:
-    cycles = Cycles()
-    cycles.add(np.arange(1000) * 0.01)
-    assert (cycles.count, cycles.period) == (0, pytest.approx(0.01))
-    cycles.add(10.0 + np.arange(1000) * 0.02)  # slower from now on: a period of two is no gap
-    assert (cycles.count, cycles.period) == (0, pytest.approx(0.02))
-
-
 def test_gaps_after_a_moment_do_not_count_for_it() -> None:
     cycles = Cycles()
     cycles.add(np.array([*(-0.01 * i for i in range(30, 0, -1)), 0.0]))
@@ -69,43 +59,6 @@ def test_gaps_after_a_moment_do_not_count_for_it() -> None:
     assert early.count == 0  # not before there are 16 intervals
     early.add(np.array([0.25, 0.26]))
     assert (early.count, early.missed) == (1, 9)
-
-
-# -- history ---------------------------------------------------------------------------------------
-
-
-@FEW
-@given(sizes=st.lists(st.integers(0, 700), max_size=12), most=st.sampled_from([None, 5, 300]))
-def test_history_keeps_the_newest_rows(sizes: list[int], most: int | None) -> None:
-    history, wanted = History(2, most), []
-    for size in sizes:
-        start = len(wanted)
-        rows = [(float(start + i), -1.0) for i in range(size)]
-        wanted += rows
-        history.append(np.array([r[0] for r in rows]), np.array(rows).reshape(-1, 2))
-    kept = len(history)
-    assert history.added == len(wanted)
-    assert kept >= min(len(wanted), most or len(wanted))
-    assert history.rows[:, 0].tolist() == [r[0] for r in wanted[len(wanted) - kept :]]
-    if most is None:
-        assert kept == len(wanted)
-
-
-def test_history_of_a_slow_topic_is_no_longer_than_it_has_to_be() -> None:
-    history = History(1, most=20_000, seconds=100.0)
-    for second in range(10_000):
-        t = second + np.arange(20) / 20
-        history.append(t, t[:, None])
-    assert 2000 <= len(history) <= 4096
-    assert history.rows[-2000:, 0].tolist() == history.t[-2000:].tolist()
-    assert len(history._t) == 4096
-
-
-def test_times_never_fall() -> None:
-    history = History(1)
-    history.append(np.array([1.0, 3.0]), np.zeros((2, 1)))
-    history.append(np.array([2.0, 2.5, 4.0]), np.zeros((3, 1)))
-    assert history.t.tolist() == [1.0, 3.0, 3.0, 3.0, 4.0]
 
 
 # -- rows ------------------------------------------------------------------------------------------
@@ -260,12 +213,6 @@ def test_curves_are_the_history_of_a_number() -> None:
     assert values[-1] == pytest.approx(picture.q[2])
     with pytest.raises(UsageError):
         collector.curve(LEFT, "nothing", 0.0, 1.0)
-
-
-def test_fault_names_of_bits_without_a_name() -> None:
-    assert fault_names(0) == []
-    assert fault_names(0x1) == ["overcurrent"]
-    assert fault_names(0x00200002) == ["overvoltage transient", "0x200000"]
 
 
 # -- recordings ------------------------------------------------------------------------------------
