@@ -91,6 +91,7 @@ def test_campaign_has_its_own_exit_code_for_its_own_failure(tmp_path: Path) -> N
     assert done["tests.campaign_cases::CLEAN"]["units"] > 0
 
 
+@pytest.mark.slow
 def test_sigint_prints_the_table_and_leaves_no_process_or_file(tmp_path: Path) -> None:
     process = start(tmp_path, ["Slow"], "--minutes", "5", "--jobs", "1")
     try:

@@ -20,7 +20,7 @@ _SLOW = {"fuzz:mcap"}  # 'make campaign-sample' runs it, too
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(c, id=c.name, marks=[pytest.mark.soak] if c.name in _SLOW else [])
+        pytest.param(c, id=c.name, marks=pytest.mark.soak if c.name in _SLOW else pytest.mark.slow)
         for c in CASES
     ],
 )

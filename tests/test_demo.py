@@ -38,7 +38,9 @@ def alive(pid: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
 def test_signal_during_the_demo_leaves_no_process(how: signal.Signals, tmp_path: Path) -> None:
     demo = start("--out", tmp_path)
     assert demo.stdout is not None

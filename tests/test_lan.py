@@ -195,6 +195,7 @@ def test_packets_of_another_network_are_ignored_and_clients_obeyed(hosts: dict[s
         assert (local.end(), named.end()) == (0, 0)
 
 
+@pytest.mark.slow
 def test_sending_socket_takes_nothing_from_another_network(hosts: dict[str, Host]) -> None:
     """CycloneDDS reads that socket, too, and takes commands by it as by the others."""
     robot, friend, stranger = hosts["robot"], hosts["friend"], hosts["stranger"]
@@ -384,6 +385,7 @@ def _hears_this_machine_only(name: str, program: Program) -> None:
         assert address == _LOCAL or (protocol, address) == ("udp", _ANY), (name, seen)
 
 
+@pytest.mark.slow
 def test_every_program_on_loopback_filters_its_sockets(
     hosts: dict[str, Host], tmp_path: Path
 ) -> None:
@@ -523,6 +525,7 @@ def _reached(host: Host, places: Iterable[str], seconds: float) -> set[str]:
     return set(host.run(sys.executable, "-c", _REACH, seconds, *places).split())
 
 
+@pytest.mark.slow
 def test_what_listens_is_documented_and_reached_by_this_machine_only(
     hosts: dict[str, Host],
 ) -> None:

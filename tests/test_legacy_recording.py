@@ -31,23 +31,6 @@ STATE = struct.Struct("<B3x7fB3x3I")
 COMMAND = struct.Struct("<B3x5f3I")
 HEADER = 8  # bytes of encapsulation header and sequence length
 
-# what a recording of a session gives occasion to judge, and what it shows
-PASSES = {
-    f"DEX1-{family}-{number:02}"
-    for family, numbers in {
-        "TOPIC": (1,),
-        "QOS": (1, 2),
-        "START": (1, 2),
-        "RATE": (1, 2, 3, 4),
-        "ORDER": (1,),
-        "FRESH": (1, 2),
-        "FIELD": (1, 2, 3, 4, 5, 7, 10),
-        "FORCE": (4,),
-        "TRACK": (1, 2),
-    }.items()
-    for number in numbers
-}
-
 
 @dataclass(frozen=True)
 class Session:
@@ -85,29 +68,6 @@ def verdicts() -> RunResult:
     return judge(Recording.decode(open_trace(sample_path("dex1_legacy_v1_1"))))
 
 
-def test_legacy_recording_gets_its_verdicts() -> None:
-    result = verdicts()
-    assert result.overall is Overall.PASS
-    assert set(result.stage.values()) == {"moving"}
-    for side in Side:
-        found = {r.requirement.id: r.verdict for r in result.results if r.side == side}
-        assert {name for name, v in found.items() if v is Verdict.PASS} >= PASSES
-        assert set(found.values()) == {Verdict.PASS, Verdict.NOT_APPLICABLE}
-    reasons = {r.requirement.id: r.reason for r in result.results if r.reason}
-    # the recording's list of endpoints has no types
-    assert "does not say of which type" in reasons.pop("DEX1-TOPIC-02")
-    for name in ("DEX1-FIELD-06", "DEX1-FIELD-08"):  # ddq and temperature
-        assert "not filled (0 throughout)" in reasons.pop(name)
-    for name in ("DEX1-FORCE-02", "DEX1-FORCE-07", "DEX1-FORCE-13"):
-        assert "does not say what the hand touched" in reasons.pop(name)
-    # no client starts from rest here
-    assert "no step from rest" in reasons.pop("DEX1-FORCE-08")
-    for name in ("DEX1-FORCE-16", "DEX1-FORCE-20"):
-        assert "in any step from rest" in reasons.pop(name)
-    for name, reason in reasons.items():
-        assert "only a live run" in reason or "does not apply to the dialect" in reason, name
-
-
 def test_figures_equal_those_computed_from_the_messages() -> None:
     s, result = session(), verdicts()
     gaps = np.diff(s.t)
@@ -143,17 +103,6 @@ def test_figures_equal_those_computed_from_the_messages() -> None:
         )
         assert figure("DEX1-TRACK-01", side) == pytest.approx(rms, abs=0.004)
         assert figure("DEX1-TRACK-02", side) == pytest.approx(1e3 * delay, abs=5)
-
-
-def test_right_gripper_holds_the_object() -> None:
-    """Index 0, whatever the enum of that release says (docs/sources/unitree-dex.md#a1)."""
-    s = session()
-    q, tau = s.states[:, INDEX[Side.RIGHT], 1], s.states[:, INDEX[Side.RIGHT], 4]
-    held = (tau < -0.85) & (np.abs(s.states[:, INDEX[Side.RIGHT], 2]) < 0.02)
-    assert held.sum() > 2 * 500  # s at 500 Hz
-    assert q[held] == pytest.approx(2.37, abs=0.05)
-    recording = Recording.decode(open_trace(sample_path("dex1_legacy_v1_1")))
-    assert recording.sides[Side.RIGHT].states.q[:, 0] == pytest.approx(q)
 
 
 def without(side: Side, path: Path, *, driven: bool) -> Path:

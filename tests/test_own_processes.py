@@ -8,56 +8,12 @@ import select
 import subprocess
 import sys
 import tempfile
-import threading
 from pathlib import Path
 
 import pytest
 
-from dexkit.child_processes import Tool, command_line
-from dexkit.emulators.mx64 import EmulatedProcess
+from dexkit.child_processes import command_line
 from dexkit.temporary_folder import PREFIX, TemporaryFolder, sweep
-
-_HOSTILE = """
-import os
-open(os.path.join(os.path.dirname(os.path.abspath(__file__)), "was-run"), "w").close()
-raise SystemExit(99)
-"""
-
-
-@pytest.fixture
-def hostile_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder with modules that must not be imported."""
-    folder = tmp_path / "work"
-    folder.mkdir()
-    for name in ("click", "json", "dexkit", "rich", "cyclonedds", "socket", "typing", "pickle"):
-        (folder / f"{name}.py").write_text(_HOSTILE)
-    for name in ("numpy", "multiprocessing", "logging"):
-        (folder / name).mkdir()
-        (folder / name / "__init__.py").write_text(_HOSTILE.replace("was-run", "../was-run"))
-    monkeypatch.chdir(folder)
-    monkeypatch.delenv("PYTHONPATH", raising=False)
-    return folder
-
-
-def test_programs_import_nothing_from_the_working_directory(hostile_folder: Path) -> None:
-    commands = (
-        ("check", "--list", "--dialect", "dex3"),
-        ("doctor", "--scan", "none", "--domain", "1", "--seconds", "0.2"),
-    )
-    started = [
-        subprocess.Popen(command_line(*c), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        for c in commands
-    ]
-    for command, process in zip(commands, started, strict=True):
-        out = process.communicate(timeout=60)[0].decode()
-        # 1: the doctor finds fault with an empty domain
-        assert process.returncode in (0, 1), (command, out)
-    with Tool("emulate", "mx64", "--link", str(hostile_folder / "link")) as tool:
-        tool.wait_ready(threading.Event())
-    emulator = EmulatedProcess([])
-    emulator.close()
-    assert not (hostile_folder / "was-run").exists()
-
 
 _PARENT = """
 import os, sys, threading

@@ -18,6 +18,8 @@ from tests import optional
 from tests.optional import UV
 from tests.reproduction_helpers import checked, without_surroundings, write_run
 
+pytestmark = pytest.mark.slow  # the wheel is built and installed
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("drivers", "emulators", "conformance", "traces")
 SAMPLE = ROOT / "traces" / "samples" / "dex1_pick_place.mcap"

@@ -371,6 +371,7 @@ def stop_live(tries: int, *backends: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_sigstop_in_motion_and_sigcont_do_not_move_the_hand_back() -> None:
     stop_live(1, "ezgripper", "sim-dex3")
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from dexkit.child_processes import Tool, command_line
 from dexkit.cli import cli
@@ -23,6 +21,7 @@ from dexkit.hand import Side
 from dexkit.topics import checked_prefix, split_prefix, under_prefix
 from dexkit.traces import open_trace
 from dexkit.traces.samples import sample_path
+from dexkit.traces.writer import RecordingWriter
 from tests.patience import PATIENCE
 from tests.test_doctor_rules import GOOD, _seen
 
@@ -56,35 +55,19 @@ def test_what_cannot_be_one(text: str) -> None:
 
 
 def _moved(target: Path, *prefixes: str) -> Path:
-    """A sample's hands under one prefix or several."""
-    with open(sample_path("dex3_pinch"), "rb") as file, open(target, "wb") as out:
-        writer = Writer(out)
-        writer.start(library="dexkit")
-        reader = make_reader(file)
-        channels: dict[tuple[int, str], int] = {}
-        schemas: dict[int, int] = {}
-        for schema, channel, message in reader.iter_messages():
-            assert schema is not None
-            if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-            for prefix in prefixes:
-                if (channel.id, prefix) not in channels:
-                    channels[channel.id, prefix] = writer.register_channel(
-                        under_prefix(channel.topic, prefix),
-                        channel.message_encoding,
-                        schemas[schema.id],
-                        dict(channel.metadata),
-                    )
-                writer.add_message(
-                    channels[channel.id, prefix],
-                    message.log_time,
-                    message.data,
-                    message.publish_time,
-                    message.sequence,
-                )
-        writer.finish()
+    """Three seconds of a sample, whose hands are under one prefix or several."""
+    trace = open_trace(sample_path("dex3_pinch"))
+    with RecordingWriter(target) as writer:
+        channels = {
+            (key, prefix): writer.add_channel(replace(d, topic=under_prefix(d.topic, prefix)))
+            for key, d in trace.definitions.items()
+            for prefix in prefixes
+        }
+        for m in trace.messages():
+            if m.log_time_ns < trace.first_ns + 3 * 10**9:
+                for prefix in prefixes:
+                    number = channels[(m.topic, m.type_name), prefix]
+                    writer.put(number, m.data, m.log_time_ns, m.publish_time_ns)
     return target
 
 
@@ -156,6 +139,7 @@ def test_a_client_without_the_prefix_is_told() -> None:
 # ----------------------------------------------------------------------------------- live
 
 
+@pytest.mark.slow
 def test_a_hand_is_served_recorded_and_watched_under_a_prefix(tmp_path: Path) -> None:
     helpers = pytest.importorskip("tests.dds_helpers")
     domain = ("--domain", str(helpers.free_domain()))

@@ -174,6 +174,7 @@ def long(tmp_path: Path, part: Path) -> Path:
     return out
 
 
+@pytest.mark.slow
 @each("form", ["csv", "parquet"])
 def test_tables_are_the_same_in_pieces_of_any_size(
     tmp_path: Path, long: Path, form: str, monkeypatch: pytest.MonkeyPatch

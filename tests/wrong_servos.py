@@ -52,8 +52,5 @@ def _backend(base: Any, wrong: Callable[[Any], Any]) -> Backend:
 
 
 brainco_reversed = _backend(SimBrainCo, reversed_scale)
-brainco_swapped = _backend(SimBrainCo, swapped_states)
-dfx_reversed = _backend(SimInspireDfx, reversed_scale)
 dfx_swapped = _backend(SimInspireDfx, swapped_states)
-ftp_reversed = _backend(SimInspireFtp, reversed_scale)
 ftp_swapped = _backend(SimInspireFtp, swapped_states)
