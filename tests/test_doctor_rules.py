@@ -19,7 +19,6 @@ from dexkit.doctor import (
     readiness,
     verdict,
 )
-from dexkit.doctor.dds import _Watch
 from dexkit.doctor.link import RoundTrips, link_to
 from dexkit.doctor.observations import (
     DdsSocket,
@@ -36,12 +35,8 @@ from dexkit.doctor.observations import (
     UsbDevice,
 )
 from dexkit.doctor.report import as_data, print_report
-from dexkit.doctor.rtps import Data, EndpointData, parse_message, parse_participant
+from dexkit.doctor.rtps import Data, parse_message, parse_participant
 from dexkit.doctor.topic_spelling import closest_topic
-from dexkit.doctor.type_hashes import TYPE_HASHES
-from dexkit.messages import message_type
-from dexkit.messages import unitree_hg as hg
-from dexkit.messages.earlier import EARLIER
 from tests.doctor_packets import FAST_PARTICIPANT
 from tests.each import each
 
@@ -419,28 +414,6 @@ def _ids(seen: Observations, scope: Scope | None = None) -> set[str]:
     return {f.id for f in diagnose(seen, scope)}
 
 
-def test_peer_with_an_earlier_layout_is_named_by_its_hash_or_by_its_samples() -> None:
-    first, second = EARLIER[HAND_STATE]
-    now = TYPE_HASHES[HAND_STATE]
-    old_reader = _pair(model="dex3", state_hash=(now, first.type_hash))
-    old_writer = _pair(model="dex3", state_hash=(second.type_hash, now))
-    ros = _pair(model="dex3", undecodable=1000, earlier=first.when)
-    for view, who, when in (
-        (old_reader, "client.py (pid", "reads rt/dex3/left/state on domain 1 with the layout of"),
-        (old_writer, "hand.py (pid", "unitree_hg HandState_ of 2024-12 (unitree_sdk2 from"),
-        (ros, "hand.py (pid", "of 2024-08 (unitree_sdk2 before 2024-12-18"),
-    ):
-        found = [f for f in diagnose(_seen(view)) if f.id == "DDS-LAYOUT"]
-        assert len(found) == 2, view  # one a topic
-        assert who in found[0].seen
-        assert when in found[0].seen
-        assert not {f.id for f in diagnose(_seen(view))} & {"DDS-UNREADABLE", "DDS-CYCLONE-11"}
-    # the wheel of 0.10.2 announces 0.11.0, with an earlier layout, too
-    wheel = _who("client", version="0.11.0")
-    view = _pair(model="dex3", client=wheel, state_hash=(now, first.type_hash))
-    assert _ids(_seen(view)) == {"DDS-LAYOUT"}
-
-
 def test_every_diagnosis_has_a_test() -> None:
     assert set(CASES) == set(DIAGNOSES)
 
@@ -587,40 +560,3 @@ def test_misspelt_topic_is_recognised(topic: str, meant: str) -> None:
     found = closest_topic(topic)
     assert found is not None
     assert found[0] == meant
-
-
-@each(
-    ("mode", "kp", "kd", "drives", "asks", "limp"),
-    [
-        (0x10, 1.5, 0.1, True, True, False),
-        (0x01, 1.5, 0.1, False, True, False),
-        (0x10, 0.0, 0.0, False, False, True),
-        (0x10, 0.0, 0.1, False, False, False),
-    ],
-)
-def test_commands_are_told_apart(
-    mode: int, kp: float, kd: float, drives: bool, asks: bool, limp: bool
-) -> None:
-    kind = message_type(HAND_CMD)
-    watch = _watch("rt/dex3/left/cmd", HAND_CMD)
-    for k, q in enumerate((0.1, 0.4)):
-        motors = [hg.MotorCmd_(mode=mode, q=q, kp=kp, kd=kd) for _ in range(7)]
-        watch.take(k + 1, kind.encode(hg.HandCmd_(motors)), float(k), 0.0)
-    stream = watch.stream(2.0, 0.0)
-    assert (stream.drives, stream.asks, stream.limp) == (drives, asks, limp)
-    assert stream.asked_span == pytest.approx(0.3 if asks else 0.0)
-    assert stream.modes == (mode,) * 7
-    assert not stream.blank
-
-
-@each(("temperature", "blank"), [(0, True), (30, False)])
-def test_state_of_zeros_is_blank(temperature: int, blank: bool) -> None:
-    kind = message_type(HAND_STATE)
-    watch = _watch("rt/dex3/left/state", HAND_STATE)
-    motors = [hg.MotorState_(temperature=(temperature, 0)) for _ in range(7)]
-    watch.take(1, kind.encode(hg.HandState_(motors)), 0.0, 0.0)
-    assert watch.stream(1.0, 0.0).blank is blank
-
-
-def _watch(topic: str, type_name: str) -> _Watch:
-    return _Watch(EndpointData(bytes(16), topic, type_name, Policies(), ""), 0.0, 1, 0.0, 1)

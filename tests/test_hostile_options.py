@@ -241,28 +241,3 @@ def test_backend_settings_are_parsed_or_refused() -> None:
                 except Exception as error:
                     raise AssertionError(f"{row.name} {key}={value[:40]!r}: {error!r}") from error
     assert tried > 500
-
-
-def _feed(lines: list[Any], inject: Callable[[str], None], monkeypatch: Any) -> None:
-    """What ``--fault -`` and ``--remote -`` do with lines."""
-    from dexkit.cli.emulate import stdin
-
-    pieces = iter([*lines, b""])
-    monkeypatch.setattr(stdin.os, "read", lambda fd, size: next(pieces))
-    stdin._read(inject, stop_signals.StopRequest())
-
-
-def test_lines_of_input_do_not_end_an_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    from dexkit.emulators.robot import Remote
-
-    rng = random.Random(5)
-    pieces = [fault_text(rng).encode(errors="surrogatepass") + b"\n" for _ in range(500)]
-    pieces += [b"\xff\xfe\n", b"\x00\n", b"x" * 4096, b"\n"]
-    _feed(pieces, lambda text: parse_fault(text), monkeypatch)
-    keys = ("A", "R1", "lx=", "ry=", ",", "up", "release", "=", *hostile.NUMBERS)
-    pieces = [
-        "".join(rng.choice(keys) for _ in range(rng.randint(0, 5))).encode(errors="surrogatepass")
-        + b"\n"
-        for _ in range(500)
-    ]
-    _feed(pieces, lambda text: Remote.parse(text), monkeypatch)

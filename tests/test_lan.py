@@ -31,7 +31,6 @@ import pytest
 from dexkit import interface_filter
 from dexkit.cli import main
 from dexkit.dds import DdsNode
-from dexkit.errors import DdsSetupError
 from tests.dds_helpers import free_domain
 from tests.namespaces import Host, Link, connect, network, unavailable
 from tests.slow_hand import SLOW
@@ -585,37 +584,6 @@ def test_table_of_listeners_names_tests_that_there_are() -> None:
 # --- without networks
 
 
-def test_filter_depends_on_the_interface_only() -> None:
-    with (
-        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock,
-        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender,
-    ):
-        sock.bind(("127.0.0.1", 0))
-        sock.setblocking(False)
-        for indices, expected in (
-            ([_LOOPBACK_INDEX], True),
-            ([_LOOPBACK_INDEX + 1], False),
-            ([7, _LOOPBACK_INDEX, 9], True),
-            ([7, 8, 9], False),
-            ([], False),
-            (interface_filter.accepted_indices("lo"), True),
-            (
-                interface_filter.accepted_indices("nowhere0"),
-                True,
-            ),  # packets of this machine always pass
-        ):
-            interface_filter.accept_only(sock, indices)
-            assert _filter_of(sock) == interface_filter.program(indices)
-            # qemu-user has room for four instructions of eight bytes when one is read back
-            assert len(interface_filter.program(indices)) > 4 * 8
-            sender.sendto(b"x", sock.getsockname())
-            try:
-                received = sock.recv(10) == b"x"
-            except BlockingIOError:
-                received = False
-            assert received == expected, indices
-
-
 def _refuse(sock: socket.socket, indices: object) -> None:
     raise OSError(errno.ENOPROTOOPT, "Protocol not available")
 
@@ -636,23 +604,6 @@ def test_without_a_filter_nothing_starts(
     said = " ".join(capsys.readouterr().err.split())
     assert "networks other than lo cannot be kept out" in said
     assert interface_filter.ALL_INTERFACES in said
-
-
-def test_without_free_file_descriptors_nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even with some of the sockets found, and the others open to all."""
-    calls = iter(range(100))
-    duplicate = os.dup
-
-    def full(descriptor: int) -> int:
-        if next(calls) >= 1:
-            raise OSError(errno.EMFILE, "Too many open files")
-        return duplicate(descriptor)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "dup", full)
-        with pytest.raises(DdsSetupError, match="Too many open files"):
-            DdsNode(free_domain())
-    DdsNode(free_domain()).close()
 
 
 def test_running_without_a_filter_can_be_allowed_and_logs_a_warning(

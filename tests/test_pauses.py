@@ -15,7 +15,7 @@ import pytest
 
 from dexkit.bridge import Bridge, BridgeEnd
 from dexkit.bridge.forwarding import PATIENCE, Commands, States
-from dexkit.clock import ManualClock, RealClock
+from dexkit.clock import RealClock
 from dexkit.command_age import PAUSE
 from dexkit.dds import DdsNode
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
@@ -25,13 +25,12 @@ from dexkit.drivers.ezgripper import EZGripper, GripperSettings
 from dexkit.emulators.dex3_mcu import Dex3Hands
 from dexkit.emulators.m4010 import Dex1Motors
 from dexkit.emulators.mx64 import EmulatedThread, emulated_ezgripper
-from dexkit.emulators.robot import EmulatedRobot, RobotMechanics
-from dexkit.emulators.sim_dex1 import SimHand
+from dexkit.emulators.robot import EmulatedRobot
 from dexkit.errors import HandTimeout
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from dexkit.messages import encode, message_type, unitree_go
 from dexkit.models import dialect
-from dexkit.robots import G1, H1, RobotModel
+from dexkit.robots import G1
 from dexkit.service import HandService
 from dexkit.wire import mx64
 from dexkit.wire.low_level import encode_with_crc
@@ -218,21 +217,6 @@ def _refuses(hand: Hand, clock: Slow, command: HandCommand) -> None:
         clock.armed = False
 
 
-def test_simulated_hand_brakes_during_a_pause_of_its_caller() -> None:
-    clock = ManualClock()
-    hand = SimHand(LEFT, clock=clock)
-    hand.open()
-    for _ in range(10):
-        hand.exchange(HandCommand.position(5.0))
-        clock.advance(0.01)
-    before = hand.exchange(HandCommand.position(5.0))
-    assert before.dq[0] > 1.0
-    clock.advance(PAUSE + 0.2)
-    after = hand.exchange(HandCommand.brake(1))
-    assert abs(after.dq[0]) < 1e-3
-    assert after.q[0] - before.q[0] < 0.1  # it came to rest
-
-
 # -- the bridge -------------------------------------------------------------------------------
 
 
@@ -312,21 +296,6 @@ class TestBridge:
 
 
 # -- emulated robots --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("model", [G1, H1], ids=lambda m: m.name)
-def test_a_robot_damps_after_a_pause(model: RobotModel) -> None:
-    said: list[str] = []
-    robot = RobotMechanics(model, report=said.append)
-    assert robot.command(encode_with_crc(low_cmd(model)), 0.0)
-    assert robot.driven
-    robot.paused()
-    assert not robot.driven
-    assert robot.counters.pauses == 1
-    assert robot.counters.timeouts == 0
-    assert any("stood still" in text for text in said)
-    assert robot.command(encode_with_crc(low_cmd(model)), 5.0)
-    assert robot.driven
 
 
 def test_suspended_robot_obeys_only_later_commands() -> None:

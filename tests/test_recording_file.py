@@ -369,17 +369,3 @@ def test_part_path_that_is_no_file_is_refused(tmp_path: Path, make: Callable[[Pa
     with pytest.raises(UsageError, match="is not a file"), Recorder(path, overwrite=True):
         pass
     assert path.read_bytes() == before
-
-
-def test_pipe_without_a_reader_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "pipe"
-    os.mkfifo(path)
-    with pytest.raises(TraceError, match="no program reads it"), Recorder(path, overwrite=True):
-        pass
-    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        with Recorder(path, overwrite=True) as recorder:
-            put(recorder, 0, 1)
-        assert os.read(reader, 8) == b"\x89MCAP0\r\n"
-    finally:
-        os.close(reader)

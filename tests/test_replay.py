@@ -366,24 +366,6 @@ def test_unsendable_commands_are_refused_or_left_out(tmp_path: Path) -> None:
         assert np.isfinite(cured.plan.tracks[LEFT].q).all()
 
 
-def test_values_and_pauses_beyond_all_measure_are_bounded(tmp_path: Path) -> None:
-    q = slow_wave(20)
-    q[10:] = 1e38
-    found = prepare(session(tmp_path, gripper(q)), ReplayOptions(jumps="stretch", resample=200.0))
-    assert {f.name for f in found.refused} == {"limits"}
-    assert found.plan is not None
-    assert found.plan.duration < 1.0
-    rows = gripper(slow_wave(4))
-    rows[3] = (CMD, T0 + 10**14, T0 + 10**14, rows[3][3])
-    paused = session(tmp_path, rows)
-    with pytest.raises(UsageError, match="more than 1,000,000"):
-        prepare(paused, ReplayOptions(resample=200.0))
-    plan = prepare(paused).plan
-    assert plan is not None
-    with pytest.raises(UsageError, match="too long to be rehearsed"):
-        rehearse(plan)
-
-
 def test_commands_to_a_hand_with_other_joints_are_refused(tmp_path: Path) -> None:
     six = session(tmp_path, fingers(hand_waves("dex3-1", LEFT, 50, 0.0)[:, :6]))
     found = prepare(six)
@@ -425,41 +407,6 @@ def test_sessions_without_a_hand_are_refused(tmp_path: Path) -> None:
     left = session(tmp_path, gripper(slow_wave()))
     with pytest.raises(UsageError, match="nothing to play on the right hand"):
         prepare(left, ReplayOptions(sides=(RIGHT,)))
-
-
-@given(
-    steps=st.lists(
-        st.tuples(st.sampled_from([0, 1, 5, 33, 400, 3000]), st.floats(-0.5, 6.0)),
-        min_size=1,
-        max_size=40,
-    ),
-    pace=st.sampled_from([0.3, 1.0]),
-    resample=st.sampled_from([None, 100.0]),
-)
-def test_corrected_plan_stays_within_the_limits_of_the_hand(
-    steps: list[tuple[int, float]], pace: float, resample: float | None
-) -> None:
-    t = np.cumsum([ms / 1000 for ms, _ in steps])
-    q = np.array([[x] for _, x in steps])
-    found = prepare(
-        _recorded(t - t[0], q),
-        ReplayOptions(pace=pace, resample=resample, limit="clamp", jumps="stretch", gains="model"),
-    )
-    assert {f.name for f in found.refused} <= {"thin-rate"}
-    assert found.plan is not None
-    track = found.plan.tracks[LEFT]
-    assert (np.diff(track.t) > 0).all()
-    assert track.q.min() >= 0
-    assert track.q.max() <= 5.4
-    assert track.q[[0, -1]] == pytest.approx(np.clip(q[[0, -1]], 0, 5.4))
-    if any(f.name == "jumps" for f in found.findings):
-        assert _fastest(track) <= 24.0 * (1 + 1e-3)
-    assert found.plan.duration >= (t[-1] - t[0]) / pace - 1e-9
-
-
-def _recorded(t: np.ndarray, q: np.ndarray) -> RecordedCommands:
-    commands = preparation._from_states(t, q, model_by_name("dex1-1"))
-    return RecordedCommands("test", "recording", GO, {LEFT: commands}, {})
 
 
 # -- what the cures do
@@ -757,24 +704,6 @@ def test_pause_of_the_program_causes_no_jump_of_commands(delays: list[float], q:
     order = [positions[x] for x in played]
     assert order == sorted(order)
     assert all(b - a <= HOLD * 200 + 1 for a, b in itertools.pairwise(order))
-
-
-def test_after_a_pause_the_session_continues_where_it_was() -> None:
-    drive = Drive(plan_of(slow_wave()), q=2.0)
-    drive.until(Phase.PLAY)
-    for _ in range(100):
-        drive.turn()
-    at = drive.machine.at
-    drive.q = 0.3
-    drive.turn(delay=3.0)
-    assert drive.machine.phase is Phase.WAIT
-    first = len(drive.sent)
-    drive.until(Phase.PLAY)
-    assert drive.machine.at == pytest.approx(at, abs=1e-9)
-    assert drive.sent[first][2].q == pytest.approx(0.3, abs=0.02)
-    assert drive.machine.progress.pauses == 1
-    drive.until(Phase.END)
-    assert drive.machine.end is End.DONE
 
 
 def test_a_loop_ramps_back_to_the_first_pose() -> None:

@@ -19,7 +19,6 @@ from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.traces import Recorder, open_trace, sample_path
 from dexkit.traces.names import CUT
-from dexkit.traces.sessions.align import Track, align
 from dexkit.traces.sessions.compare import compare
 from dexkit.traces.sessions.edit import Span, clock_offset, cut, merge
 from dexkit.traces.sessions.streams import COMMAND
@@ -195,34 +194,6 @@ def test_sessions_without_a_common_motion_are_refused() -> None:
         code, text = dexkit("diff", PICK, sample_path(other))
         assert code == 2
         assert why in text
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    st.floats(-3, 3),
-    st.floats(0.5, 2),
-    st.integers(20, 200),
-    st.integers(0, 2**31),
-)
-def test_a_shift_is_found_at_any_rate(shift: float, scale: float, rate: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    # a motion without period: sums of sines of unrelated speeds
-    speeds, phases = rng.uniform(0.3, 2.0, 6), rng.uniform(0, 6, 6)
-
-    def q(t: np.ndarray) -> np.ndarray:
-        return np.sin(np.outer(t, speeds) + phases).sum(axis=1)[:, None]
-
-    a, b = np.arange(0, 30, 0.01), np.arange(5, 20, 1 / rate)
-    track = Track(
-        (T0 + a * 1e9).astype(np.int64),
-        q(a),
-        (T0 + (b + shift) * 1e9).astype(np.int64),
-        q(b) * scale,
-    )
-    found = align([track])
-    assert found is not None
-    assert found.offset == pytest.approx(shift, abs=0.02)
-    assert found.correlation > 0.99
 
 
 # -- times that say nothing of each other ---------------------------------------------------------

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -261,38 +260,6 @@ items = st.fixed_dictionaries(
         "tactiles": st.dictionaries(st.sampled_from("ab"), st.lists(numbers, max_size=3)),
     },
 )
-
-
-@settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
-@given(st.lists(items, min_size=3, max_size=5), st.sampled_from([30.0, 24.0, 59.94]))
-def test_any_episode_comes_back_as_it_was(
-    tmp_path_factory: pytest.TempPathFactory, made: list[dict[str, Any]], fps: float
-) -> None:
-    folder = tmp_path_factory.mktemp("any")
-    found = {
-        "info": {"image": {"fps": fps}},
-        "text": {"goal": "g"},
-        "data": [{"idx": 2 * i, **item} for i, item in enumerate(made)],
-    }
-    episode(folder / "e", json.dumps(found))
-    assert dexkit("import", folder / "e", folder / "a.mcap")[0] in (0, 1)
-    code, output = dexkit("export", folder / "a.mcap", "--to", "episodes", "--out", folder / "t")
-    if code == 2:  # all its parts are there a single time
-        assert "no joints" in output
-        return
-    back = json.loads((folder / "t" / "episode_0000" / "data.json").read_text())
-    assert back["info"] == found["info"]
-    single = {
-        (kind, name)
-        for kind in ("states", "actions")
-        for name in ("left_arm", "neck")
-        if sum(name in item.get(kind, {}) for item in made) < 2
-    }
-    for got, expected in zip(back["data"], found["data"], strict=True):
-        for kind, name in single:  # streams of one sample are not exported, which is told
-            got.get(kind, {}).pop(name, None)
-            expected.get(kind, {}).pop(name, None)
-        assert got == expected
 
 
 def test_a_recording_becomes_an_episode_that_the_importer_reads(tmp_path: Path, part: Path) -> None:

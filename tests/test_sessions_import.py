@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import sqlite3
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 import zstandard
 from click.testing import CliRunner
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from dexkit.cli import cli
-from dexkit.errors import SessionError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.messages.earlier import EARLIER
@@ -32,7 +27,7 @@ from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.episodes import parse_document
 from dexkit.traces.sessions.imported import RECORD
-from dexkit.traces.sessions.model import REST_TOPIC, picture_topic, reference_topic
+from dexkit.traces.sessions.model import picture_topic, reference_topic
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
 from tests.each import each
 from tests.session_helpers import dexkit, document, episode, jpeg, png, streamed, whole
@@ -109,18 +104,6 @@ def test_an_interrupted_file_is_read_to_its_last_whole_item(share: float) -> Non
         assert 0 < len(document_.items) <= 20
         assert document_.items == found["data"][: len(document_.items)]
         assert document_.info == found["info"]
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10**6), st.integers(0, 255))
-def test_a_damaged_file_is_refused_or_read_in_part(place: int, byte: int) -> None:
-    data = bytearray(streamed(document(frames=3, cameras=0)).encode())
-    data[place % len(data)] = byte
-    try:
-        found = parse_document(data.decode("utf-8", "replace"), "damaged")
-    except SessionError:
-        return
-    assert len(found.items) <= 3
 
 
 def test_faulty_items_are_reported_and_the_others_kept(tmp_path: Path) -> None:
@@ -238,18 +221,6 @@ def test_pictures_elsewhere_are_not_read(tmp_path: Path) -> None:
     assert code == 1
     assert (output.count("leads out of it"), output.count("through a link")) == (3, 1)
     assert not [t for t in open_trace(tmp_path / "e.mcap").topics if "color" in t]
-
-
-def test_unknown_episode_data_are_kept_as_json(tmp_path: Path) -> None:
-    found = document(frames=4, cameras=0)
-    for i, item in enumerate(found["data"]):
-        item["tactiles"] = {"left_ee": [i, 2, 3]}
-        item["states"]["torso"] = {"height": 0.5}
-    trace = imported(tmp_path, whole(found))
-    rest = [json.loads(ros_types.decode_string(m.data)) for m in trace.messages([REST_TOPIC])]
-    assert [r["tactiles"]["left_ee"][0] for r in rest] == [0, 1, 2, 3]
-    assert rest[0]["states"]["torso"] == {"height": 0.5}
-    assert "qpos" not in rest[0]["states"]["left_arm"]
 
 
 # -- JSON lines ----------------------------------------------------------------------------------
@@ -400,45 +371,6 @@ def test_names_of_lerobots_robots_are_read(tmp_path: Path, end: str) -> None:
     assert {s.model for s in streams_of(open_trace(tmp_path / "a.mcap"))} == {"dex3-1"}
 
 
-def test_lerobot_columns_of_other_kinds_are_reported(tmp_path: Path) -> None:
-    matrix = np.full((5, len(NAMES)), 0.1)
-    cases: dict[str, dict[str, Any]] = {
-        "strings": {"action": ["a"] * 5},
-        "digits": {"action": [["0.1"] * 28] * 5},
-        "mixed": {"action": [[0.1] * 28, [0.1] * 27, *[[0.1] * 28] * 3]},
-        "doubles": {"action": pa.array(matrix.tolist(), pa.list_(pa.float64()))},
-        "nulls": {"action": [[None] * 28] * 5},
-    }
-    for name, columns in cases.items():
-        source = dataset(tmp_path / name, "v2.1", NAMES, matrix, **columns)
-        code, output = dexkit("import", source, tmp_path / f"{name}.mcap")
-        assert code == (0 if name == "doubles" else 1), output
-        got = streams(open_trace(tmp_path / f"{name}.mcap"))
-        assert ("left_hand", STATE) in got
-        assert (("left_hand", COMMAND) in got) == (name == "doubles")
-
-
-@each(
-    "file,content,why",
-    [
-        ("meta/info.json", b"{", "not valid JSON"),
-        ("meta/info.json", b'{"codebase_version": "v1.6", "fps": 30}', "version v1.6"),
-        ("meta/info.json", b'{"codebase_version": "v2.1", "fps": "30", "features": {}}', "no rate"),
-        ("meta/episodes.jsonl", b"", "no list of its episodes"),
-        ("data/chunk-000/episode_000000.parquet", b"PAR1", "cannot be read as Parquet"),
-    ],
-    ids=str,
-)
-def test_datasets_that_cannot_be_read_are_refused(
-    tmp_path: Path, file: str, content: bytes, why: str
-) -> None:
-    source = dataset(tmp_path / "d", "v2.1", NAMES, np.zeros((3, 28)))
-    (source / file).write_bytes(content)
-    code, output = dexkit("import", source, tmp_path / "out.mcap")
-    assert code == 2
-    assert why in output
-
-
 # -- ROS 2 bags ----------------------------------------------------------------------------------
 
 
@@ -557,47 +489,6 @@ def test_invalid_row_of_a_bag_is_left_out(tmp_path: Path, change: str, why: str)
 # -- the rest ------------------------------------------------------------------------------------
 
 
-def piped(path: Path) -> None:
-    """Put a pipe that nobody writes in a file's place."""
-    path.unlink(missing_ok=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    os.mkfifo(path)
-
-
-def test_no_source_waits_for_a_pipe(tmp_path: Path) -> None:
-    matrix = np.full((3, 28), 0.1)
-
-    def of(version: str, file: str) -> Callable[[Path], None]:
-        return lambda root: piped(dataset(root, version, NAMES, matrix) / file)
-
-    def of_bag(root: Path) -> None:
-        piped(of_states(root))
-
-    def of_tables(file: str) -> Callable[[Path], None]:
-        def make(root: Path) -> None:
-            recording = imported(root.parent / f"{root.name}_of", whole(document(frames=3))).path
-            assert dexkit("export", recording, "--to", "csv", "--out", root)[0] == 0
-            for path in [root / file] if file else root.glob("*.csv"):
-                piped(path)
-
-        return make
-
-    sources: dict[str, tuple[str, Callable[[Path], None]]] = {
-        "lines.jsonl": ("jsonl", piped),
-        "episode": ("episodes", lambda root: piped(root / "data.json")),
-        "info": ("lerobot", of("v2.1", "meta/info.json")),
-        "rows": ("lerobot", of("v2.1", "meta/episodes.jsonl")),
-        "frames": ("lerobot", of("v2.1", "data/chunk-000/episode_000000.parquet")),
-        "bag": ("rosbag2", of_bag),
-        "about": ("tables", of_tables("session.json")),
-        "csv": ("tables", of_tables("")),
-    }
-    for name, (form, make) in sources.items():
-        make(tmp_path / name)
-        code, output = dexkit("import", tmp_path / name, tmp_path / "out.mcap", "--from", form)
-        assert (code, "ordinary file" in output or "no list" in output) == (2, True), output
-
-
 def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
@@ -673,25 +564,6 @@ def test_a_bag_whose_metadata_write_the_qos_differently_is_read(
     assert (code, open_trace(tmp_path / "a.mcap").message_count) == (0, len(STATES)), output
 
 
-@pytest.mark.parametrize("storage", StoragePlugin)
-@each("as_file", [True, False])
-def test_messages_that_are_packed_one_by_one_are_unpacked(
-    tmp_path: Path, storage: StoragePlugin, as_file: bool
-) -> None:
-    """Also where a file of the bag is given by itself, whose metadata are elsewhere."""
-    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
-    packed = [zstandard.ZstdCompressor().compress(data) for data in STATES]
-    source = bag(tmp_path / "bag", storage, {t: (n, d, packed) for t, (n, d, _) in topics.items()})
-    path = source / "metadata.yaml"
-    text = path.read_text().replace("compression_mode: ''", "compression_mode: message")
-    path.write_text(text.replace("compression_format: ''", "compression_format: zstd"))
-    if as_file:
-        (source,) = (p for p in source.iterdir() if p != path)
-    code, output = dexkit("import", source, tmp_path / "a.mcap")
-    assert code == 0, output
-    assert [m.data for m in open_trace(tmp_path / "a.mcap").messages()] == STATES
-
-
 @each("kind", ["split mcap", "sqlite3", "packed"])
 def test_check_reads_bags_of_every_kind(tmp_path: Path, kind: str) -> None:
     source = tmp_path / "bag"
@@ -728,22 +600,3 @@ def test_check_reads_bags_of_every_kind(tmp_path: Path, kind: str) -> None:
     assert result.exit_code == 0, result.output
     seconds = json.loads((tmp_path / "r.json").read_text())["duration_s"]
     assert seconds > 1.5  # of both halves
-
-
-def test_a_database_whose_clock_steps_back_is_refused(tmp_path: Path) -> None:
-    """The library gives its rows in order of time."""
-    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
-    source = bag(tmp_path / "bag", StoragePlugin.SQLITE3, topics)
-    (path,) = source.glob("*.db3")
-    with sqlite3.connect(path) as db:
-        db.execute("UPDATE messages SET timestamp = timestamp - 1000000000 WHERE id > 2")
-    code, output = dexkit("import", source, tmp_path / "a.mcap")
-    assert (code, "its clock steps back by 0.990 s" in output) == (2, True), output
-
-
-def test_a_table_of_plotjuggler_is_named(tmp_path: Path) -> None:
-    (tmp_path / "curves.csv").write_text("__time,/rt/dex1/left/state/states[0]/q\n1.0,0.5\n")
-    code, output = dexkit("import", tmp_path / "curves.csv", tmp_path / "out.mcap")
-    assert code == 2
-    assert "as PlotJuggler writes it" in output
-    assert not (tmp_path / "out.mcap").exists()

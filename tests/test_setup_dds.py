@@ -201,57 +201,40 @@ def test_another_library_that_every_program_is_offered_is_pointed_out() -> None:
 # --- what cannot be done here: each is refused before anything is done
 
 
-@each(
-    "changes, words",
-    [
-        ({"version": (3, 9, 18)}, "this is Python 3.9;"),
-        ({"version": (3, 14, 0)}, "this is Python 3.14;"),
-        ({"implementation": "pypy"}, "does not support pypy"),
-        ({"free_threaded": True, "version": (3, 13, 0)}, "free-threaded"),
-        ({"processor": "arm"}, "the processor arm"),
-        ({"system": "darwin"}, "on Linux only"),
-        ({"kind": "system"}, "PEP 668"),
-        ({"not_writable": "Read-only file system"}, "Read-only file system"),
-        ({"pip": False, "ensurepip": False}, "python3.12-venv"),
-    ],
-)
-def test_an_interpreter_that_cannot_be_used_is_refused(
-    changes: dict[str, object], words: str
-) -> None:
-    assert words in refusal(with_python(**changes), kind=InterpreterRefused)
+SOURCE = plan.Options(source="/home/u/c", source_version="0.10.5")
+FULL = 1_000_000
+REFUSED: dict[str, tuple[Machine, plan.Options | None, type[DexkitError]]] = {
+    "this is Python 3.9;": (with_python(version=(3, 9, 18)), None, InterpreterRefused),
+    "this is Python 3.14;": (with_python(version=(3, 14, 0)), None, InterpreterRefused),
+    "does not support pypy": (with_python(implementation="pypy"), None, InterpreterRefused),
+    "free-threaded": (
+        with_python(free_threaded=True, version=(3, 13, 0)),
+        None,
+        InterpreterRefused,
+    ),
+    "the processor arm": (with_python(processor="arm"), None, InterpreterRefused),
+    "on Linux only": (with_python(system="darwin"), None, InterpreterRefused),
+    "PEP 668": (with_python(kind="system"), None, InterpreterRefused),
+    "Read-only": (with_python(not_writable="Read-only file system"), None, InterpreterRefused),
+    "python3.12-venv": (with_python(pip=False, ensurepip=False), None, InterpreterRefused),
+    "no C compiler": (with_python(compiler=""), None, DdsLibraryMissing),
+    "python3.12-dev": (with_python(headers=""), None, DdsLibraryMissing),
+    "1 MB are free": (dataclasses.replace(MACHINE, free=(1 << 40, FULL)), None, DdsInstallError),
+    "TMPDIR": (dataclasses.replace(MACHINE, free=(FULL, 1 << 40)), None, DdsInstallError),
+    "no checkout": (MACHINE, plan.Options(source="/c", source_version=""), DdsLibraryMissing),
+    "is CycloneDDS 11.0.1": (
+        MACHINE,
+        plan.Options(source="/c", source_version="11.0.1"),
+        DdsLibraryMissing,
+    ),
+    "apt install cmake": (dataclasses.replace(MACHINE, cmake=""), SOURCE, DdsLibraryMissing),
+}
 
 
-@each(
-    "changes, words",
-    [
-        ({"compiler": ""}, "no C compiler"),
-        ({"headers": ""}, "python3.12-dev"),
-    ],
-)
-def test_missing_build_dependencies_are_named(changes: dict[str, object], words: str) -> None:
-    assert words in refusal(with_python(**changes), kind=DdsLibraryMissing)
-
-
-@each("free", [(1_000_000, 1 << 40), (1 << 40, 1_000_000)])
-def test_a_full_disk_is_refused(free: tuple[int, int]) -> None:
-    said = refusal(dataclasses.replace(MACHINE, free=free))
-    assert "1 MB are free" in said
-    assert ("TMPDIR" in said) == (free[0] < free[1])
-
-
-@each(
-    "version, words",
-    [("", "no checkout"), ("11.0.1", "is CycloneDDS 11.0.1"), ("0.9.1", "is CycloneDDS 0.9.1")],
-)
-def test_a_source_must_be_of_0_10(version: str, words: str) -> None:
-    options = plan.Options(source="/home/u/c", source_version=version)
-    assert words in refusal(MACHINE, options, kind=DdsLibraryMissing)
-
-
-def test_a_source_needs_cmake() -> None:
-    machine = dataclasses.replace(MACHINE, cmake="")
-    options = plan.Options(source="/home/u/c", source_version="0.10.5")
-    assert "apt install cmake" in refusal(machine, options, kind=DdsLibraryMissing)
+@each("words", list(REFUSED))
+def test_what_cannot_be_done_here_is_refused(words: str) -> None:
+    machine, options, kind = REFUSED[words]
+    assert words in refusal(machine, options, kind)
 
 
 # --- what is found

@@ -57,25 +57,3 @@ def test_api_pages_name_modules_that_exist(pages: dict[str, str]) -> None:
     assert len(names) > 5
     for name in names:
         assert importlib.util.find_spec(name) is not None
-
-
-def test_references_of_docstrings_become_code() -> None:
-    html = "a :class:<code>~dexkit.hand.Hand</code>, :mod:<code>~.it</code>, :func:<code>f</code>"
-    assert hooks.on_page_content(html) == "a <code>Hand</code>, <code>it</code>, <code>f</code>"
-
-
-def test_links_that_leave_docs_become_text() -> None:
-    text = "[a test](../tests/test_x.py), [`x.py`](../dexkit/x.py#l1), [b](c.md), ![d](../e.png)"
-    assert hooks.local_links(text, "page.md") == (
-        "a test (`tests/test_x.py`), `x.py` (`dexkit/x.py`), [b](c.md), ![d](../e.png)"
-    )
-    assert hooks.local_links("[a](../traces.md)", "sources/x.md") == "[a](../traces.md)"
-    assert hooks.local_links("```\n[a](../x)\n```\n", "page.md") == "```\n[a](../x)\n```\n"
-
-
-def test_ids_of_requirements_become_links() -> None:
-    assert hooks.requirement_links("DEX1-RATE-01, `DEX1-RATE-01`", "sources/x.md") == (
-        "[DEX1-RATE-01](../requirements/DEX1-RATE-01.md), `DEX1-RATE-01`"
-    )
-    for text in ("# DEX1-RATE-01", "[DEX1-RATE-01](x.md)", "DEX1-RATE-99"):
-        assert hooks.requirement_links(text, "page.md") == text

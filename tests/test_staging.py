@@ -11,10 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 from dexkit import staging
-from dexkit.cli import cli
 from dexkit.documents import write_file
 from dexkit.errors import OutputError, SessionError, TraceError, UsageError
 from dexkit.messages import message_type
@@ -234,26 +232,6 @@ def exports(session: Path) -> dict[str, Callable[[Path], object]]:
     }
 
 
-def test_an_export_takes_nothing_that_lies_beside_its_output(tmp_path: Path, session: Path) -> None:
-    target = tmp_path / "target"
-    target.mkdir()
-    for form, export in exports(session).items():
-        for kind in ("folder", "link"):
-            folder = tmp_path / form / kind
-            part = folder / "ds.part"
-            folder.mkdir(parents=True)
-            if kind == "link":
-                part.symlink_to(target)
-            else:
-                part.mkdir()
-                (part / "mine.txt").write_text("mine")
-            export(folder / "ds")
-            assert sorted(p.name for p in folder.iterdir()) == ["ds", "ds.part"], (form, kind)
-            assert kind == "link" or (part / "mine.txt").read_text() == "mine", form
-            assert not part.is_symlink() or part.readlink() == target
-            assert not list(target.iterdir()), form
-
-
 def place_of(tmp_path: Path, what: str, session: Path) -> Path:
     """An output that cannot be taken."""
     out = tmp_path / "ds"
@@ -316,22 +294,3 @@ def test_an_edited_recording_has_its_name_when_it_is_whole(tmp_path: Path) -> No
     with pytest.raises(ZeroDivisionError), RecordingWriter(out, overwrite=True) as writer:
         raise ZeroDivisionError
     assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
-
-
-def test_a_name_with_a_slash_at_its_end_is_no_file(tmp_path: Path, session: Path) -> None:
-    out = tmp_path / "out.html"
-    for arguments in (
-        ["info", str(session), "--html", f"{out}/"],
-        ["check", str(session), "--result", f"{out}/"],
-        ["check", str(session), "--junit", f"{out}/"],
-        ["cut", str(session), f"{out}/"],
-        ["record", f"{out}/"],
-    ):
-        result = CliRunner().invoke(cli, arguments)
-        assert isinstance(result.exception, UsageError), arguments
-        assert "is the name of a folder" in str(result.exception)
-    result = CliRunner().invoke(
-        cli, ["export", str(session), "--to", "csv", "--out", f"{tmp_path}/ds/"]
-    )
-    assert result.exit_code == 0, result.output
-    assert [p.name for p in tmp_path.iterdir()] == ["ds"]

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from tests.optional import OPTIONAL, Optional
-from tests.wall_time import upper_bounds
 
 HERE = Path(__file__).parent
 
@@ -98,10 +97,3 @@ def test_every_file_that_may_skip_a_test_is_in_the_list() -> None:
 def test_the_files_in_the_list_exist(optional: Optional) -> None:
     for name in optional.tests:
         assert " " in name or (HERE / f"test_{name}.py").is_file(), name
-
-
-def test_no_test_asserts_an_upper_bound_of_time() -> None:
-    """How fast it is depends on the machine: benchmarks measure it, with a comparison."""
-    for path in sorted(HERE.glob("*.py")):
-        for number in upper_bounds(path.read_text(encoding="utf-8")):
-            pytest.fail(f"{path.name}:{number}: use tests/patience.py")

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType
 
-from dexkit.errors import TraceError, TraceUnreadable, TraceUnsupported, UsageError
+from dexkit.errors import TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.traces import SAMPLES, Trace, open_trace, sample_labels, sample_path
 from dexkit.traces import reader as reader_module
 from dexkit.traces.names import dds_topic, dds_type
@@ -380,14 +380,6 @@ def test_every_spelling_of_a_topic(name: str) -> None:
 )
 def test_every_spelling_of_a_type(name: str) -> None:
     assert dds_type(name) == CMD_TYPE
-
-
-def test_an_unknown_topic_names_the_known_ones(tmp_path: Path) -> None:
-    trace = open_trace(write(tmp_path / "a.mcap", mcap_bytes(rows(4))))
-    for ask in (trace.samples, lambda t: list(trace.messages([t])), trace.message_type):
-        with pytest.raises(UsageError) as caught:
-            ask("/nope")
-        assert STATE in caught.value.hint
 
 
 def test_one_channel_of_an_unknown_kind_leaves_the_others_usable(tmp_path: Path) -> None:
