@@ -12,10 +12,8 @@ import numpy as np
 from rich.text import Text
 
 from benchmarks import Result
-from dexkit.conformance.report.pages import document
-from dexkit.conformance.report.svg_charts import Level, Line, chart
-from dexkit.conformance.report.tables import table
-from dexkit.escaping import html as escape
+from dexkit.conformance.report.charts import Chart, Level, Line
+from dexkit.conformance.report.pages import fill
 
 __all__ = ["Run", "page", "saved", "terminal_lines"]
 
@@ -89,49 +87,26 @@ def page(runs: Sequence[Run]) -> str:
     newest: dict[tuple[str, str, str], tuple[Run, Result]] = {}
     for run in runs:
         newest.update({key: (run, result) for key, result in run.results.items()})
-    content = [
-        "<h1>Benchmarks</h1>",
-        f"<p>{len(runs)} saved runs. A ratio above 1: dexkit is better than the peer. The figure "
-        "is that of the newest run that measured it.</p>",
-    ]
-    for benchmark in dict.fromkeys(key[0] for key in newest):
-        content.append(f"<h2>{escape(benchmark)}</h2>")
-        rows = [_row(key, *found) for key, found in newest.items() if key[0] == benchmark]
-        content.append(table(("measured", "dexkit", "peer", "ratio", "target", "run"), rows))
-        for key in newest:
-            if key[0] == benchmark:
-                content.append(_trend(key, runs))
-    return document("Benchmarks of dexkit", "".join(content))
+    groups: dict[str, list[tuple[Run, Result, Chart | None]]] = {}
+    for key, (run, result) in newest.items():
+        groups.setdefault(key[0], []).append((run, result, _trend(key, runs)))
+    return fill("benchmarks.html", title="Benchmarks of dexkit", runs=runs, groups=groups)
 
 
-def _row(key: tuple[str, str, str], run: Run, r: Result) -> Sequence[str]:
-    verdict = {None: "", True: '<b class="ok">met</b>', False: '<b class="bad">missed</b>'}[r.met]
-    note = f'<br><span class="dim">{escape(r.note)}</span>' if r.note else ""
-    return (
-        escape(r.name) + note,
-        escape(f"{r.value:,.4g} {r.unit}"),
-        escape(f"{r.peer}: {r.peer_value:,.4g} {r.unit}"),
-        f"{r.ratio:.2f}",
-        f"{escape(r.target)} {verdict}",
-        f"{escape(run.name)}<br><span class='dim'>{escape(run.about)}</span>",
-    )
-
-
-def _trend(key: tuple[str, str, str], runs: Sequence[Run]) -> str:
-    """The ratio over the runs that measured it; empty with fewer than two."""
+def _trend(key: tuple[str, str, str], runs: Sequence[Run]) -> Chart | None:
+    """The ratio over the runs that measured it; None with fewer than two."""
     found = [(i + 1.0, run.results[key].ratio) for i, run in enumerate(runs) if key in run.results]
     if len(found) < 2:
-        return ""
+        return None
     x, y = (np.array(values, dtype=float) for values in zip(*found, strict=True))
-    return f'<p class="joint"><b>{escape(key[1])}</b> over {escape(key[2])}</p>' + chart(
+    return Chart(
         f"{key[1]}: ratio in each run",
         [Line("ratio", "state", x, y), Line("ratio", "state", x, y, "dots")],
+        span=(1.0, float(max(len(runs), 2))),
         y_unit="x",
         x_unit="run",
-        span=(1.0, float(max(len(runs), 2))),
         levels=[Level(1.0, "as the peer")],
         height=90,
         include=(0.0,),
-        legend=False,
-        titled=False,
+        bare=True,
     )

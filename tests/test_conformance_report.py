@@ -18,10 +18,10 @@ from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.layers.usb import LAYER as USB
+from dexkit.conformance.report.charts import Chart, Line
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.labels import VERDICTS
 from dexkit.conformance.report.result_plots import plots_of
-from dexkit.conformance.report.svg_charts import Line, chart
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side
 from dexkit.traces import open_trace, sample_path
@@ -163,7 +163,7 @@ def test_size_of_plots_on_page_is_limited(monkeypatch: pytest.MonkeyPatch) -> No
     assert "as many as it can hold" in render(result, view)
     x = np.linspace(0, 100, 100_000)
     noise = np.random.default_rng(0).normal(size=len(x))
-    assert len(chart("t", [Line("a", "state", x, noise)], y_unit="", span=(0, 100))) < 15_000
+    assert len(Chart("t", [Line("a", "state", x, noise)], (0, 100)).__html__()) < 15_000
 
 
 def luminance(colour: str) -> float:

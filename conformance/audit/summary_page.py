@@ -10,7 +10,6 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from dexkit import __version__
 from dexkit.conformance.audit.file_records import FileRecord, State
@@ -18,9 +17,9 @@ from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import Overall, Verdict
 from dexkit.conformance.kit.run_record import catalogue_digest
 from dexkit.conformance.layers import LAYERS
+from dexkit.conformance.report.charts import Chart, Line
 from dexkit.conformance.report.labels import ANSWERS
 from dexkit.conformance.report.pages import fill
-from dexkit.conformance.report.svg_charts import Line, chart
 
 __all__ = ["Group", "Summary", "render"]
 
@@ -198,7 +197,6 @@ def render(summary: Summary, *, locations: Sequence[str], left: int = 0) -> str:
         short=lambda name: _short(name, locations),
         count=_count,
         span=_span,
-        br=Markup("<br>"),
     )
 
 
@@ -243,27 +241,26 @@ def _short(name: str, locations: Sequence[str]) -> str:
     return name.removeprefix(locations[0].rstrip("/") + "/") if len(locations) == 1 else name
 
 
-def _trend(summary: Summary, days: Sequence[float]) -> Markup | str:
+def _trend(summary: Summary, days: Sequence[float]) -> Chart | None:
     """The part of files that fail, and that cannot be used, day by day."""
     if len(days) < 2:
-        return ""
+        return None
     x = (np.array(days) - days[0]) / _DAY
     groups = [summary.days[day] for day in days]
     failing = np.array([100 * g.failing / g.files for g in groups])
     unusable = np.array([100 * g.unusable / g.files for g in groups])
     draw = "dots" if len(days) < 8 else "line"
-    plot = chart(
+    return Chart(
         "files with a failure, and files that cannot be used, per cent by day",
         [
             Line("with a failure", "bad", x, failing, draw),
             Line("not usable or inconclusive", "other", x, unusable, draw),
         ],
-        y_unit="%",
         span=(0.0, float(x[-1])),
+        y_unit="%",
         x_unit=f"days since {_date(days[0])}",
         include=(0.0,),
     )
-    return Markup(plot)
 
 
 def _changes(summary: Summary, days: Sequence[float]) -> list[tuple[str, str, str]]:

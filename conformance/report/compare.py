@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from markupsafe import Markup
-
 from dexkit.conformance.kit.requirements import Requirement
 from dexkit.conformance.kit.results import Result, RunResult, Verdict, worst
+from dexkit.conformance.report.curves import Recorded, beside
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -164,10 +163,13 @@ def _change_text(comparison: Comparison, change: Change) -> str:
 # ----------------------------------------------------------------------------------- HTML
 
 
-def render_comparison(comparison: Comparison, curves: str = "") -> str:
+def render_comparison(
+    comparison: Comparison, recordings: Sequence[Recorded] = (), missing: Sequence[str] = ()
+) -> str:
     """Return the page as text.
 
-    :param curves: of the runs' recordings, HTML, for the end of the page.
+    :param recordings: of the runs, whose curves are at the end of the page.
+    :param missing: the runs whose recordings are not among them.
     """
     about = f"{len(comparison.runs)} runs as {model_title(comparison.runs[0])}"
     return fill(
@@ -175,7 +177,9 @@ def render_comparison(comparison: Comparison, curves: str = "") -> str:
         title=f"Comparison: {about}",
         about=about,
         comparison=comparison,
-        curves=Markup(curves),
+        parts=beside(recordings),
+        names=[r.name for r in recordings],
+        missing=missing,
         ANSWERS=ANSWERS,
         VERDICTS=VERDICTS,
         change_text=_change_text,

@@ -7,7 +7,7 @@ evidence of each failure and of the whole run. Its text is in ``templates/result
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -131,7 +131,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         ),
         operator=_operator(result),
         recorded=view is not None,
-        run_plots=Markup(run_plots(result, view) if view is not None else ""),
+        hands=run_plots(result, view) if view is not None else [],
         # every requirement
         link=link,
         file=Path(link).name,
@@ -214,21 +214,21 @@ def _anchor(area: str) -> str:
     return "area-" + "".join(c if c.isalnum() else "-" for c in area.lower())
 
 
-def _with_plots(troubles: Sequence[Card], view: Recording | None) -> Iterable[tuple[Card, Markup]]:
-    """Each card with the plots of its evidence, up to a maximum size of the page."""
+def _with_plots(
+    troubles: Sequence[Card], view: Recording | None
+) -> Iterator[tuple[Card, list[Markup | None]]]:
+    """Each card with the plots of its evidence; None where the page can hold no more."""
     left = _PLOT_BUDGET
     for card in troubles:
-        figures = ""
+        figures: list[Markup | None] = []
         for result in card.results:
-            if view is None:
-                break
-            if left <= 0:
-                figures += '<p class="dim">No plot: this page has as many as it can hold.</p>'
-                continue
-            drawn = "".join(plots_of(result, view))
-            left -= len(drawn)
-            figures += drawn
-        yield card, Markup(figures)
+            if view is not None and left > 0:
+                drawn = plots_of(result, view)
+                left -= sum(map(len, drawn))
+                figures += drawn
+            elif view is not None:
+                figures.append(None)
+        yield card, figures
 
 
 def _operator(result: RunResult) -> list[tuple[str, str]]:

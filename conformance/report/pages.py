@@ -1,7 +1,7 @@
 """Fill the templates of the pages, in ``templates``. No page loads anything or runs a script.
 
 What is put into a template is text: it is escaped, and characters that cannot be seen are shown,
-unless it is marked as HTML.
+unless it is marked as HTML or, as a chart, makes its own.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from dexkit.escaping import html
 
-__all__ = ["document", "fill"]
+__all__ = ["fill"]
 
 _HERE = Path(__file__).parent
 
@@ -23,14 +23,6 @@ _HERE = Path(__file__).parent
 def fill(template: str, **values: object) -> str:
     """The page that a template makes of these values."""
     return _environment().get_template(template).render(values)
-
-
-def document(title: str, content: str) -> str:
-    """A page with the reports' style.
-
-    :param content: HTML.
-    """
-    return fill("document.html", title=title, content=Markup(content))
 
 
 @cache
@@ -49,4 +41,4 @@ def _environment() -> Environment:
 
 
 def _shown(value: Any) -> Markup:
-    return value if isinstance(value, Markup) else Markup(html(value))
+    return Markup(value.__html__() if hasattr(value, "__html__") else html(value))

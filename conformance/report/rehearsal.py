@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 
 import numpy as np
-from markupsafe import Markup
 
 from dexkit import __version__
+from dexkit.conformance.report.charts import Band, Chart, Level, Line
 from dexkit.conformance.report.pages import fill
-from dexkit.conformance.report.svg_charts import Band, Level, Line, chart
 from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehearsed
 from dexkit.hand import Side
 from dexkit.models import model
@@ -91,18 +90,18 @@ def _hand(rehearsal: Rehearsal, side: Side) -> dict[str, object]:
     if len(hand.t) < 2:
         return {"side": side, "figures": figures, "plots": []}
     span = (0.0, float(hand.t[-1]))
-    plots = [_overview(rehearsal, hand, span, bands)]
+    plots = _overview(rehearsal, hand, span, bands)
     drawn = _drawn(hand, limits.stroke.tolist())
     for j in drawn:
         q = hand.q[:, j]
         middle = float(np.median(q))
         room = 0.05 * float(limits.stroke[j])
         plots.append(
-            chart(
+            Chart(
                 f"{side} {hand.names[j]}: command and emulated position",
                 [Line("command", "cmd", hand.t, hand.command[:, j]), Line("q", "state", hand.t, q)],
-                y_unit="rad",
                 span=span,
+                y_unit="rad",
                 bands=bands,
                 height=150,
                 include=(middle - room, middle + room),
@@ -111,7 +110,7 @@ def _hand(rehearsal: Rehearsal, side: Side) -> dict[str, object]:
     return {
         "side": side,
         "figures": figures,
-        "plots": [Markup(plot) for plot in plots],
+        "plots": plots,
         "still": [name for j, name in enumerate(hand.names) if j not in drawn],
     }
 
@@ -128,7 +127,7 @@ def _drawn(hand: Rehearsed, strokes: Sequence[float]) -> list[int]:
 
 def _overview(
     rehearsal: Rehearsal, hand: Rehearsed, span: tuple[float, float], bands: Sequence[Band]
-) -> str:
+) -> list[Chart]:
     """The largest distance from a command, and the largest torque, over time."""
     limits = joint_limits(rehearsal.plan.dialect, hand.side)
     machine = rehearsal.machine
@@ -136,24 +135,27 @@ def _overview(
     part = 100 * (away / np.array(machine.farthest_allowed(hand.side))).max(axis=1)
     stopped = Level(100.0, f"stopped beyond, for {machine.guards.distance_time:g} s")
     torque = 100 * (np.abs(hand.tau) / limits.tau).max(axis=1)
-    return chart(
-        f"{hand.side} hand: distance from the command, of the farthest joint",
-        [Line("distance", "state", hand.t, part)],
-        y_unit="% of allowed",
-        span=span,
-        bands=bands,
-        levels=[stopped],
-        height=140,
-        include=(0.0,),
-    ) + chart(
-        f"{hand.side} hand: torque, of the joint nearest to its largest one",
-        [Line("torque", "force", hand.t, torque)],
-        y_unit="% of largest",
-        span=span,
-        bands=bands,
-        height=140,
-        include=(0.0, 10.0),
-    )
+    return [
+        Chart(
+            f"{hand.side} hand: distance from the command, of the farthest joint",
+            [Line("distance", "state", hand.t, part)],
+            span=span,
+            y_unit="% of allowed",
+            bands=bands,
+            levels=[stopped],
+            height=140,
+            include=(0.0,),
+        ),
+        Chart(
+            f"{hand.side} hand: torque, of the joint nearest to its largest one",
+            [Line("torque", "force", hand.t, torque)],
+            span=span,
+            y_unit="% of largest",
+            bands=bands,
+            height=140,
+            include=(0.0, 10.0),
+        ),
+    ]
 
 
 def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> list[tuple[str, ...]]:

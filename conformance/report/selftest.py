@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from markupsafe import Markup
-
 from dexkit import __version__
+from dexkit.conformance.report.charts import Chart, Line
 from dexkit.conformance.report.html import utc
 from dexkit.conformance.report.pages import fill
-from dexkit.conformance.report.svg_charts import Line, chart
 from dexkit.conformance.selftest.result import (
     FIGURES,
     Condition,
@@ -160,22 +158,20 @@ def _facts(result: SelfTestResult) -> dict[str, str]:
     }
 
 
-def _curves(joint: JointResult, unit: str) -> list[Markup]:
+def _curves(joint: JointResult, unit: str) -> list[Chart]:
     titles = {
         "range": "over its range, led slowly",
         "speed+": "the fastest run, q rising",
         "speed-": "the fastest run, q falling",
     }
     return [
-        Markup(
-            chart(
-                f"{joint.name}: {titles[name]}",
-                [Line("command", "cmd", s.t, s.command), Line("q", "state", s.t, s.q)],
-                y_unit=unit,
-                span=(0.0, float(s.t[-1]) or 1.0),
-                height=170,
-                width=_PLOT,
-            )
+        Chart(
+            f"{joint.name}: {titles[name]}",
+            [Line("command", "cmd", s.t, s.command), Line("q", "state", s.t, s.q)],
+            span=(0.0, float(s.t[-1]) or 1.0),
+            y_unit=unit,
+            height=170,
+            width=_PLOT,
         )
         for name, s in joint.curves.items()
     ]

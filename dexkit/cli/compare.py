@@ -19,6 +19,7 @@ from dexkit.errors import UsageError
 
 if TYPE_CHECKING:
     from dexkit.conformance.report.compare import Comparison
+    from dexkit.conformance.report.curves import Recorded
 
 
 @click.command(
@@ -61,7 +62,7 @@ def command(results: tuple[Path, ...], html_path: Path | None) -> None:
     check_output_paths([html_path], results)
     comparison = Comparison([read_json(path) for path in results], [path.stem for path in results])
     if html_path:
-        write_text(html_path, render_comparison(comparison, _curves(comparison, results)))
+        write_text(html_path, render_comparison(comparison, *_recordings(comparison, results)))
         click.echo(f"report: {html_path}", err=True)
     else:
         click.echo(render_comparison_markdown(comparison), nl=False)
@@ -73,16 +74,18 @@ def command(results: tuple[Path, ...], html_path: Path | None) -> None:
         raise click.exceptions.Exit(1)
 
 
-def _curves(comparison: Comparison, results: tuple[Path, ...]) -> str:
-    """The curves of the recordings that lie beside the results, as HTML.
+def _recordings(
+    comparison: Comparison, results: tuple[Path, ...]
+) -> tuple[list[Recorded], list[str]]:
+    """The recordings that lie beside the results, and the runs without theirs.
 
     A recording is taken only if it is the one that was judged.
     """
-    from dexkit.conformance.report.curves import beside, recorded
-    from dexkit.escaping import html as escape
+    from dexkit.conformance.report.curves import recorded
     from dexkit.traces import open_trace
 
-    found, missing = [], []
+    found: list[Recorded] = []
+    missing: list[str] = []
     for run, name, path in zip(comparison.runs, comparison.names, results, strict=True):
         file = recording_beside(path, run.subject.get("recording", ""))
         wanted = run.subject.get("recording_sha256")
@@ -90,7 +93,4 @@ def _curves(comparison: Comparison, results: tuple[Path, ...]) -> str:
             found.append(recorded(open_trace(file), name))
         else:
             missing.append(name)
-    if not found:
-        return ""
-    lacking = f"<p>Not beside its result: the recording of {escape(', '.join(missing))}.</p>"
-    return "<h2>What they did</h2>" + (lacking if missing else "") + beside(found)
+    return found, missing

@@ -87,9 +87,7 @@ def command(
 
 def _page(found: Comparison, a: Trace, b: Trace) -> str:
     """The joints of both, on A's clock; those that differ most come first."""
-    from dexkit.conformance.report.curves import over_each_other, recorded, topics
-    from dexkit.conformance.report.pages import document
-    from dexkit.escaping import html as escape
+    from dexkit.conformance.report.curves import difference_page, recorded
 
     names = (f"A: {a.path.name}", f"B: {b.path.name}")
     one = recorded(a, names[0])
@@ -106,15 +104,13 @@ def _page(found: Comparison, a: Trace, b: Trace) -> str:
         for j in sorted(found.joints, key=lambda j: -j.worst if j.samples else 1.0)
         if j.samples
     ]
-    title = f"{a.path.name} and {b.path.name}"
     drawn = ", and is drawn on A's clock" if found.overlap else ""
-    head = (
-        f"<h1>{escape(title)}</h1><p>T{escape(_conclusion(found))[1:]}. B is "
-        f"{found.offset:+.4f} s later than A{drawn}; they have {found.overlap:.3f} s in "
-        "common.</p>"
+    conclusion = (
+        f"T{_conclusion(found)[1:]}. B is {found.offset:+.4f} s later than A{drawn}; they have "
+        f"{found.overlap:.3f} s in common."
     )
-    notes = "".join(f"<p>{escape(note)}</p>" for note in found.notes)
-    return document(title, head + notes + over_each_other(one, other, order) + topics([one, other]))
+    title = f"{a.path.name} and {b.path.name}"
+    return difference_page(title, [conclusion, *found.notes], one, other, order)
 
 
 def _conclusion(found: Comparison) -> str:
