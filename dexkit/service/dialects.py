@@ -484,10 +484,10 @@ def _zero_where_finite(values: list[float]) -> Floats:
 
 def _imu(imu: ImuState) -> unitree_hg.IMUState_:
     return unitree_hg.IMUState_(
-        quaternion=imu.quaternion,
-        gyroscope=imu.gyroscope,
-        accelerometer=imu.accelerometer,
-        rpy=imu.rpy,
+        quaternion=tuple(map(_known, imu.quaternion)),
+        gyroscope=tuple(map(_known, imu.gyroscope)),
+        accelerometer=tuple(map(_known, imu.accelerometer)),
+        rpy=tuple(map(_known, imu.rpy)),
         temperature=_celsius(imu.temperature, low=-32768, high=32767),
     )
 
