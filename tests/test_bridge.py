@@ -457,12 +457,6 @@ class TestToTheSpecification:
         assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=kp, dq=1.0)) == {LEFT: 2.0}
         assert q_of(HG, "cmd", wire.command(LEFT, q=0.0, kp=5.0)) == {LEFT: 0.0}
 
-    def test_commands_of_the_specification_reach_both_sides(self) -> None:
-        for target in (GO, ACTUATOR):
-            wire = Wire(HG, target)
-            out = wire.command(*BOTH, q=1.0)
-            assert q_of(target, "cmd", out) == {LEFT: 1.0, RIGHT: 2.0}
-
 
 class TestOneMessageIntoTwoTopics:
     """From unitree_actuator."""

@@ -23,7 +23,6 @@ from dexkit.wire.dex3_usb import (
     COMMAND_LAYOUTS,
     HandCodec,
     Mounting,
-    SensorCmd,
     parse_command,
 )
 from tests.bringup_helpers import Bring
@@ -123,36 +122,12 @@ def test_bringup_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
     check_wiring(seed, tmp_path, FAST)
 
 
-@each("seed", [10])
-def test_bringup_finds_the_motors_of_random_wirings(seed: int, tmp_path: Path) -> None:
-    wiring = Wiring.random(seed)
-    bring = Bring(tmp_path, wiring=wiring, effort=FAST)
-    findings = bring.session.findings
-    while len(findings.motors) < 7:
-        question = bring.until_question()
-        assert question is not None
-        bring.session.answer(bring.look(question))
-    for joint, sign, (bus, number) in zip(
-        DEX3_1.joints[Side.LEFT], wiring.mounting.signs, wiring.bus_map.motors, strict=True
-    ):
-        assert findings.motors_of(joint.name) == [f"{bus}.{number}"]
-        assert findings.motors[f"{bus}.{number}"].sign == sign
-
-
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(20))
 def test_bringup_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> None:
     for seed in range(10 * part, 10 * part + 10):
         (tmp_path / str(seed)).mkdir()
         check_wiring(seed, tmp_path / str(seed), FAST)
-
-
-def test_wirings_differ_and_repeat() -> None:
-    many = {Wiring.random(seed) for seed in range(200)}
-    assert len(many) == 200
-    assert Wiring.random(5) == Wiring.random(5)
-    places = {w.bus_map.motors for w in many}
-    assert len(places) > 190
 
 
 # ------------------------------------------------------------------------------ stopping
@@ -382,12 +357,6 @@ def test_mounting_round_trips(
     assert back.tau_est == pytest.approx(state.tau_est, abs=1e-3)
     raw = codec.mounting.motor(0, q[0])
     assert codec.mounting.joint(0, raw) == pytest.approx(q[0])
-
-
-def test_sensor_command_is_packed() -> None:
-    data = SensorCmd(3).pack()
-    assert len(data) == 20
-    assert data[:3] == b"\x7e\xe7\x03"
 
 
 @each(

@@ -133,14 +133,6 @@ def test_bringup_finds_two_hundred_random_wirings(part: int, tmp_path: Path) -> 
         check_wiring(seed, tmp_path / str(seed))
 
 
-def test_wirings_differ_and_repeat() -> None:
-    many = [Wiring.random(seed) for seed in range(200)]
-    assert len({str(w) for w in many}) == 200
-    assert Wiring.random(5) == Wiring.random(5)
-    assert {len(servos) for w in many for servos in w.servos.values()} == {1, 2}
-    assert {len(w.servos) for w in many} == {1, 2}
-
-
 def test_released_key_or_fault_switches_torque_off(tmp_path: Path) -> None:
     grippers, bring = watched(
         tmp_path, Wiring.random(0), Side.RIGHT, Effort.from_plan(plan_of(Side.LEFT))
@@ -247,11 +239,3 @@ def test_quad_gripper_is_brought_up_unattended_and_served(tmp_path: Path) -> Non
             exchange(hand, HandCommand.brake(1))
     finally:
         gripper.close()
-
-
-def test_the_plan_opens_nothing() -> None:
-    code, out, _ = hostile.run_command(
-        ["bringup", "ezgripper", "--side", "left", "--device", "/dev/none", "--dry-run"]
-    )
-    assert code == 0
-    assert "for each gripper (left)" in out

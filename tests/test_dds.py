@@ -21,7 +21,6 @@ from dexkit.dds import (
     interfaces,
     type_hash,
 )
-from dexkit.dds.cyclone import library
 from dexkit.errors import DdsError, DdsSetupError, EncodeError, UsageError, WireError
 from dexkit.interface_filter import interface_address
 from dexkit.messages import message_type
@@ -51,20 +50,6 @@ def test_sample_arrives_unchanged_with_its_timestamp(dds_node: DdsNode) -> None:
         writer.write(message)
         (sample,) = take_until(reader, bool)
         assert before <= sample.source_timestamp_ns <= sample.reception_ns
-
-
-def test_a_writer_keeps_its_one_instance(dds_node: DdsNode) -> None:
-    """Otherwise CycloneDDS makes and frees it with each sample."""
-    lookup = library().layer.ddspy_lookup_instance
-    messages = [MotorCmds_([MotorCmd_(q=q)]) for q in (1.0, 2.0, 3.0)]
-    handles = set()
-    with dds_node.writer("rt/instance", CMDS) as writer:
-        for message in messages:
-            writer.write(message)
-            time.sleep(0.05)  # its collector works some milliseconds later
-            handles |= {lookup(writer._ref, message_type(CMDS).encode(m)) for m in messages}
-    (handle,) = handles
-    assert handle > 0
 
 
 def test_reader_keeps_as_many_samples_as_its_depth_in_order(dds_node: DdsNode) -> None:

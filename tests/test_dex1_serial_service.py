@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import pytest
 
 from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings
 from dexkit.emulators.m4010 import Dex1Motors
-from dexkit.hand import HandCommand, JointMode, MotorError, Side
+from dexkit.hand import JointMode, MotorError, Side
 from dexkit.messages import encode, message_type, unitree_go
 from dexkit.models import dialect
 from dexkit.service import HandService
@@ -67,53 +66,6 @@ def test_unplugged_hand_is_reported_and_ignores_stale_commands_on_return() -> No
             deliver_until(node, command, message(2.0), lambda: core.driving)
             assert core.counters.reconnects >= 1
         assert motor.mechanics.mode is JointMode.BRAKE
-
-
-def test_a_fault_is_published_with_the_temperatures() -> None:
-    node = FakeNode()
-    with Dex1Motors((Side.RIGHT,)) as motors:
-        hand = hand_at(motors.path, Side.RIGHT)
-        with HandService(hand, node=node, state_rate=200.0):  # type: ignore[arg-type]
-            motors.inject("overcurrent:for=5s")
-
-            def shown() -> bool:
-                return bool(
-                    node.sent and newest(node, Side.RIGHT).reserve[0] & MotorError.OVERCURRENT
-                )
-
-            wait_until(shown)
-            assert newest(node, Side.RIGHT).temperature == 25
-
-
-def test_two_hands_on_one_line_in_one_process(tmp_path: Path) -> None:
-    link = tmp_path / "tty"
-    nodes = {side: FakeNode() for side in Side}
-    with Dex1Motors(tuple(Side), links=dict.fromkeys(Side, link)) as motors:
-        services = [
-            HandService(hand_at(str(link), side), node=nodes[side], state_rate=200.0)  # type: ignore[arg-type]
-            for side in Side
-        ]
-        for service in services:
-            service.start()
-        try:
-            goals = {Side.LEFT: 4.0, Side.RIGHT: 0.4}
-
-            def there() -> bool:
-                for side, goal in goals.items():
-                    nodes[side].deliver(GO.topics(side)[0], message(goal))
-                time.sleep(0.01)
-                return all(abs(motors.motors[s].q - goal) < 0.15 for s, goal in goals.items())
-
-            wait_until(there)
-            for side, goal in goals.items():
-                wait_until(lambda s=side, g=goal: abs(newest(nodes[s], s).q - g) < 0.15)
-        finally:
-            for service in services:
-                service.stop()
-        assert all(m.mechanics.mode is JointMode.BRAKE for m in motors.motors.values())
-        for side in Side:
-            with hand_at(str(link), side) as hand:  # the port is free again
-                hand.exchange(HandCommand.brake(1))
 
 
 def test_commands_are_clamped_at_the_widest_clients_limit() -> None:

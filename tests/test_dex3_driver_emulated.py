@@ -22,12 +22,11 @@ from dexkit.drivers.dex3_usb.settings import format_places
 from dexkit.emulators.dex3_mcu import Dex3Hands, emulated_dex3
 from dexkit.errors import HandError, HandLost, HandNotFound, HandRefused, HandTimeout
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
-from dexkit.messages import encode, message_type, unitree_hg
-from dexkit.models import DEX3_1, dialect
+from dexkit.models import DEX3_1
 from dexkit.service import HandService
 from dexkit.wire.dex3_usb import DEFAULT_BUS_MAP
 from tests.patience import PATIENCE
-from tests.service_helpers import FakeNode, deliver_until, wait_until
+from tests.service_helpers import FakeNode, wait_until
 
 GOAL = {
     Side.LEFT: np.array([0.3, 0.5, 0.8, -0.6, -0.7, -0.5, -0.9]),
@@ -92,9 +91,8 @@ def test_a_hand_that_was_never_brought_up_gets_no_command(
             assert hand.serial == key
 
 
-@pytest.mark.parametrize("process", [False, True], ids=["thread", "process"])
-def test_both_hands_reach_their_goals(process: bool) -> None:
-    with emulated_dex3((Side.LEFT, Side.RIGHT), process=process) as emulated:
+def test_both_hands_reach_their_goals() -> None:
+    with emulated_dex3((Side.LEFT, Side.RIGHT), process=True) as emulated:
         hands = {side: hand_at(emulated.url, side, **PATIENT) for side in Side}
         for hand in hands.values():
             hand.open()
@@ -149,22 +147,8 @@ def test_the_units_are_right_on_both_ends() -> None:
             )
 
 
-def test_opening_and_closing_move_nothing() -> None:
-    with emulated_dex3() as emulated:
-        assert isinstance(emulated, Dex3Hands)
-        mechanics = emulated.device().mechanics
-        before = np.array(mechanics.q)
-        for _ in range(2):
-            with hand_at(emulated.url, **PATIENT) as hand:
-                for _ in range(20):
-                    hand.exchange(HandCommand.brake(7))
-        assert np.array(mechanics.q) == pytest.approx(before, abs=1e-3)
-
-
 class TestFaults:
-    @pytest.mark.parametrize(
-        "fault", ["drop:p=0.2", "corrupt:p=0.2", "delay:ms=150,p=0.2,for=1s", "delay:ms=2"]
-    )
+    @pytest.mark.parametrize("fault", ["drop:p=0.2", "corrupt:p=0.2", "delay:ms=150,p=0.2,for=1s"])
     def test_hand_reaches_its_goal_despite_faults(self, fault: str) -> None:
         with emulated_dex3() as emulated, hand_at(emulated.url) as hand:
             emulated.inject(fault)
@@ -184,27 +168,6 @@ class TestFaults:
                 timeout=10.0,
             )
             assert not (state.fault & ~np.uint32(LOST | TRIPPED)).any()
-
-    @pytest.mark.parametrize("fault", ["stall", "stall-out"])
-    def test_stalled_endpoint_is_cleared_by_the_driver(self, fault: str) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
-            emulated.inject(fault)
-            drive(hand, go(GOAL[Side.LEFT]), lambda s: hand.statistics.link.stalls == 1)
-            drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
-            assert hand.statistics.link.stalls == 1
-
-    def test_silent_motor_is_in_the_state(self) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
-            emulated.inject("silent:id=4,for=500ms")
-            state = drive(hand, go(GOAL[Side.LEFT]), lambda s: s.fault[4] & LOST)
-            assert np.flatnonzero(state.fault & LOST).tolist() == [4]
-            drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault[4] & LOST)
-
-    def test_motor_errors_are_in_the_state(self) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
-            emulated.inject("overcurrent:id=2,for=300ms")
-            drive(hand, HandCommand.brake(7), lambda s: s.fault[2] & int(MotorError.OVERCURRENT))
-            drive(hand, HandCommand.brake(7), lambda s: not s.fault.any())
 
 
 class TestTimeoutProtection:
@@ -253,17 +216,6 @@ for count in range(10**9):
             with hand_at(emulated.url, **PATIENT) as hand:
                 assert not hand.exchange(HandCommand.brake(7)).fault.any()
 
-    def test_a_closed_hand_is_braked_and_not_tripped(self) -> None:
-        with emulated_dex3() as emulated:
-            assert isinstance(emulated, Dex3Hands)
-            device = emulated.device()
-            with hand_at(emulated.url, **PATIENT) as hand:
-                hand.exchange(go(GOAL[Side.LEFT]))
-            state = device.mechanics.state(0.0)
-            assert state.mode.tolist() == [JointMode.BRAKE] * 7
-            time.sleep(1.2)
-            assert not any(device.tripped)
-
 
 class TestCable:
     def test_lost_cable_is_detected_and_recovered(self) -> None:
@@ -290,61 +242,7 @@ class TestCable:
             hand.close()
 
 
-D = dialect("dex3")
-CMD, STATE = D.topics(Side.LEFT)
-STATES = message_type(D.state_type)
-
-
-def message(q: np.ndarray) -> bytes:  # type: ignore[type-arg]
-    return encode(
-        unitree_hg.HandCmd_(
-            [
-                unitree_hg.MotorCmd_(mode=0x10 | i, q=float(v), kp=1.5, kd=0.2)
-                for i, v in enumerate(q)
-            ]
-        )
-    )
-
-
 class TestService:
-    def test_hand_unplugged_in_motion_comes_back_without_motion(self) -> None:
-        """Publishing goes on with the fault visible; back within a second; nothing stale moves."""
-        node = FakeNode()
-        with emulated_dex3() as emulated:
-            assert isinstance(emulated, Dex3Hands)
-            device = emulated.device()
-            hand = hand_at(emulated.url)
-            with HandService(hand, node=node, dialect="dex3", state_rate=200.0) as service:  # type: ignore[arg-type]
-                core = service.cores[Side.LEFT]
-                deliver_until(node, CMD, message(GOAL[Side.LEFT]), lambda: core.driving)
-                emulated.inject("unplug:for=1500ms")
-                wait_until(lambda: not device.plugged)
-                wait_until(lambda: not core.connected, what="the loss")
-                sent = len(node.sent)
-                wait_until(lambda: len(node.sent) > sent + 15, what="more states")
-                view = core.view()
-                assert view is not None
-                assert all(bits & LOST for bits in view.fault)
-                lost = STATES.decode(next(d for t, d in reversed(node.sent) if t == STATE))
-                assert all(motor.motorstate & LOST for motor in lost.motor_state)
-                # the motors stop by themselves; the last command, and one sent meanwhile, do not
-                # count any more when the cable is back
-                wait_until(lambda: all(device.tripped), what="the protection")
-                still = np.array(device.mechanics.q)
-                node.deliver(CMD, message(-0.5 * GOAL[Side.LEFT]))
-                wait_until(lambda: device.plugged)
-                wait_until(lambda: core.connected, what="the reconnection")
-                done = core.counters.exchanges
-                wait_until(lambda: core.counters.exchanges > done + 50)
-                assert not core.driving
-                assert np.array(device.mechanics.q) == pytest.approx(still, abs=0.02)
-                assert not any(device.tripped)
-                view = core.view()
-                assert view is not None
-                assert not any(view.fault)
-                deliver_until(node, CMD, message(GOAL[Side.LEFT]), lambda: core.driving)
-                assert core.counters.reconnects == 1
-
     def test_attempts_to_reopen_continue(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """After a long absence too, a hand is looked for every half second."""
         pauses: list[float] = []

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dexkit.child_processes import command_line
 from dexkit.dds import DdsNode, Qos, Sample
 from dexkit.emulators.dex3_mcu import emulated_dex3
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
-from dexkit.service import real_time
 from tests.dds_helpers import dds_domain, dds_node
-from tests.process_helpers import started
 from tests.test_service_cli import serving
 
 __all__ = ["dds_domain", "dds_node"]
@@ -150,19 +144,3 @@ def test_served_hand_unplugged_in_motion_comes_back_without_motion(
         code, _, log = service.end(signal.SIGTERM)
         assert code == 0
         assert "Traceback" not in log
-
-
-def test_emulator_accepts_realtime_priority() -> None:
-    with real_time() as permitted:
-        pass
-    arguments = ["emulate", "dex3-usb", "--link", "usbip://127.0.0.1:0", "--set", "real-time=yes"]
-    with started(command_line(*arguments), stderr=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("ready: usbip://127.0.0.1:")
-        threads = [int(entry.name) for entry in Path(f"/proc/{process.pid}/task").iterdir()]
-        policies = {os.sched_getscheduler(thread) for thread in threads}
-        process.send_signal(signal.SIGTERM)
-        _, log = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert (os.SCHED_RR in policies) == permitted  # a library's threads may be older
-    assert ("no real-time priority" in log) == (not permitted)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.errors import (
@@ -234,65 +233,6 @@ def packets(draw: st.DrawFn) -> Packet:
     if code == Instruction.STATUS:
         return Packet(draw(st.integers(0, 252)), code, b"\0" + draw(nasty))
     return Packet(draw(ids), code, draw(nasty))
-
-
-@given(nasty)
-@settings(deadline=None)
-def test_byte_stuffing_round_trips_and_leaves_no_header(body: bytes) -> None:
-    stuffed = dxl.stuff(body)
-    assert dxl.unstuff(stuffed) == body
-    assert dxl.HEADER not in stuffed
-
-
-@given(packets())
-@settings(deadline=None)
-def test_decode_inverts_encode(packet: Packet) -> None:
-    assert dxl.decode(dxl.encode(packet.id, packet.instruction, packet.params)) == packet
-
-
-@given(packets(), st.data())
-@settings(deadline=None)
-def test_any_flipped_bit_is_noticed(packet: Packet, data: st.DataObject) -> None:
-    wire = bytearray(dxl.encode(packet.id, packet.instruction, packet.params))
-    bit = data.draw(st.integers(0, 8 * len(wire) - 1))
-    wire[bit // 8] ^= 1 << bit % 8
-    with pytest.raises(WireError):
-        dxl.decode(bytes(wire))
-
-
-@given(st.lists(packets(), max_size=5), st.data())
-def test_parser_does_not_care_how_bytes_are_cut(sent: list[Packet], data: st.DataObject) -> None:
-    stream = b"".join(dxl.encode(p.id, p.instruction, p.params) for p in sent)
-    parser = PacketParser()
-    got: list[Packet] = []
-    while stream:
-        n = data.draw(st.integers(1, len(stream)))
-        got += parser.feed(stream[:n])
-        stream = stream[n:]
-    assert got == sent
-    assert (parser.skipped, parser.crc_errors, parser.pending) == (0, 0, 0)
-
-
-@given(st.binary(max_size=2000))
-@settings(deadline=None)
-def test_parser_survives_anything_within_bounds(noise: bytes) -> None:
-    parser = PacketParser()
-    parser.feed(noise)
-    assert parser.pending <= dxl.MAX_PACKET
-
-
-@given(nasty, packets())
-@settings(deadline=None)
-def test_good_packet_is_found_behind_garbage(noise: bytes, packet: Packet) -> None:
-    """A false header can hide a packet only until the bytes that it claims have come."""
-    parser = PacketParser()
-    wire = dxl.encode(packet.id, packet.instruction, packet.params)
-    got = parser.feed(noise + wire)
-    while packet not in got and parser.pending < dxl.MAX_PACKET and len(got) < 500:
-        got += parser.feed(b"\0" * 64)
-        if not parser.pending:
-            break
-    assert packet in got
 
 
 def test_wrong_length_loses_only_its_own_packet() -> None:

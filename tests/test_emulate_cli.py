@@ -19,22 +19,16 @@ from types import SimpleNamespace
 
 import pytest
 import usbip
-from click.testing import CliRunner
 
 from dexkit.child_processes import command_line
-from dexkit.cli.emulate import command
 from dexkit.emulators.dex3_mcu import Dex3Process
 from dexkit.emulators.faults import MX64_FAULTS
 from dexkit.emulators.mx64 import (
-    Bus,
     EmulatedProcess,
     EmulatedThread,
     Firmware,
-    Port,
-    Servo,
     emulated_ezgripper,
 )
-from dexkit.emulators.serial_port import client_baudrate
 from dexkit.errors import EmulatorError, UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire.dynamixel import Instruction, Packet
@@ -143,13 +137,6 @@ def test_port_thread_takes_part_in_shutdown_while_a_client_is_connected(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_grippers_on_one_line(tmp_path: Path) -> None:
-    with emulated_ezgripper(process=True, servo_ids=(1, 2)) as gripper:
-        assert ping(gripper.path, 1)
-        assert ping(gripper.path, 2)
-        assert not ping(gripper.path, 3, 0.2)
-
-
 def test_stale_link_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
     link = tmp_path / "gripper"
     link.symlink_to("/dev/pts/9999")
@@ -219,13 +206,6 @@ def test_wrong_options_of_mx64_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_names_every_option() -> None:
-    result = CliRunner().invoke(command, ["mx64", "--help"])
-    assert result.exit_code == 0
-    for option in ("--link", "--fault", "id=N", "object=PCT", "line-time=yes|no", "eeprom=FILE"):
-        assert option in result.output
-
-
 def test_helper_reports_why_it_did_not_start() -> None:
     with pytest.raises(EmulatorError) as caught, emulated_ezgripper(process=True, faults=["fire"]):
         pass
@@ -238,13 +218,6 @@ def test_helper_gives_up_waiting_for_a_silent_emulator() -> None:
         EmulatedProcess([], timeout=0.01)
     with pytest.raises(EmulatorError, match="did not start"):
         Dex3Process(["--link=usbip://127.0.0.1:0"], timeout=0.01)
-
-
-def test_helper_refuses_unsupported_options() -> None:
-    with pytest.raises(UsageError), emulated_ezgripper(process=True, firmware=Firmware()):
-        pass
-    with pytest.raises(UsageError), emulated_ezgripper(extra=["--set=backup=yes"]):
-        pass
 
 
 # --- EEPROM from run to run
@@ -318,28 +291,6 @@ def test_client_must_have_the_servos_baud_rate(speed: int, answers: bool) -> Non
         assert gripper.bus.counters.garbled == (0 if answers else len(PING))
 
 
-def test_any_baud_rate_option_accepts_all_rates() -> None:
-    with (
-        emulated_ezgripper(check_baudrate=False) as gripper,
-        client(gripper.path, termios.B9600) as opened,
-    ):
-        assert opened.ask(PING) is not None
-
-
-def test_baud_rate_of_a_terminal_is_read() -> None:
-    master, slave = os.openpty()
-    settings = termios.tcgetattr(slave)
-    settings[4] = settings[5] = termios.B2000000
-    termios.tcsetattr(slave, termios.TCSANOW, settings)
-    assert client_baudrate(master) == 2_000_000
-    os.close(master)
-    os.close(slave)
-    read_end, write_end = os.pipe()
-    assert client_baudrate(read_end) is None
-    os.close(read_end)
-    os.close(write_end)
-
-
 def test_unplug_and_replug_under_one_path(tmp_path: Path) -> None:
     link = tmp_path / "gripper"
     with emulated_ezgripper(link=link) as gripper:
@@ -350,13 +301,6 @@ def test_unplug_and_replug_under_one_path(tmp_path: Path) -> None:
             assert is_cut_off(opened)
             wait_for(lambda: link.is_symlink())
         assert ping(gripper.path)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_stopped_while_unplugged_leaves_nothing(tmp_path: Path) -> None:
-    with emulated_ezgripper(link=tmp_path / "g") as gripper:
-        gripper.inject("unplug")
-        wait_for(lambda: not (tmp_path / "g").is_symlink())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -404,16 +348,6 @@ def test_client_that_never_reads_does_not_block_the_servo() -> None:
             wait_for(lambda: gripper.port.overruns > 0)
             termios.tcflush(opened.fd, termios.TCIFLUSH)
             assert opened.ask(PING) is not None
-
-
-def test_port_in_the_callers_thread_can_be_stopped() -> None:
-    bus = Bus([Servo(now=time.monotonic())], start=time.monotonic())
-    with Port(bus) as port:
-        port.stop()
-        port.run()
-        assert os.path.islink(port.path)
-    assert not os.path.islink(port.path)
-    assert not os.path.exists(os.path.dirname(port.path))
 
 
 # --- the hand on USB/IP
@@ -494,16 +428,6 @@ def test_invalid_hand_options_are_refused(arguments: list[str], expected: str) -
     code, _, err = run_command(["emulate", "dex3-usb", *arguments])
     assert code == 2
     assert expected in err
-
-
-def test_help_lists_the_devices_and_their_options() -> None:
-    result = CliRunner().invoke(command, ["--help"])
-    assert "dex3-usb" in result.output
-    assert "mx64" in result.output
-    result = CliRunner().invoke(command, ["dex3-usb", "--help"])
-    for option in ("--side", "--link", "--fault", "serial=S", "object=PCT", "seed=N"):
-        assert option in result.output
-    assert CliRunner().invoke(command, ["dex9"]).exit_code == 2
 
 
 def test_hand_on_every_address_prints_the_host_name() -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import re
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend, simulators
 from dexkit.cli import cli
@@ -16,8 +21,20 @@ from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import Verdict
 from dexkit.emulators.simulated_hand import SimulatedHand
 from dexkit.errors import HandLost, UsageError
-from dexkit.hand import Floats, Hand, HandCommand, HandState, JointMode, Side
+from dexkit.hand import (
+    CommandGate,
+    Floats,
+    Hand,
+    HandCommand,
+    HandState,
+    ImuState,
+    JointMode,
+    Side,
+    SupplyState,
+)
+from dexkit.messages import message_type
 from dexkit.models import BUILT_IN, HandModel
+from dexkit.service.dialects import StateView, dialect_map
 from dexkit.service.hand_core import HandCore
 from dexkit.topics import roles
 from dexkit.watch.fields import parts_of
@@ -151,7 +168,93 @@ def test_a_start_inside_the_object_is_refused(hand: HandModel) -> None:
         simulated(hand, Side.LEFT, start="50", object="40")
 
 
+@every_hand
+def test_the_same_commands_give_the_same_states(hand: HandModel) -> None:
+    def run() -> list[HandState]:
+        made, clock = simulated(hand, Side.LEFT)
+        made.open()
+        random = np.random.default_rng(1)
+        low, stroke = made.spec.q_min, made.spec.q_max - made.spec.q_min
+        goals = [low + random.random(low.size) * stroke for _ in range(10)]
+        return [hold(made, clock, towards(hand, goal), 0.05) for goal in goals]
+
+    for one, other in zip(run(), run(), strict=True):
+        for name in ("q", "dq", "tau_est", "pressure"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+@every_hand
+@given(st.lists(st.floats(-1e4, 1e4), min_size=4, max_size=4), st.floats(0.0, 1.0))
+def test_it_stays_within_its_stops_under_any_command(
+    hand: HandModel, values: list[float], part: float
+) -> None:
+    kp, kd, tau, dq = values
+    made, clock = simulated(hand, Side.LEFT)
+    made.open()
+    low, stroke = made.spec.q_min, made.spec.q_max - made.spec.q_min
+    wild = HandCommand.position(low + part * stroke, kp=kp, kd=kd, tau=tau, dq=dq)
+    command = CommandGate(made.spec).admit(wild)
+    state = hold(made, clock, command, 0.3)
+    assert ((state.q > low - 0.1 * stroke) & (state.q < low + 1.1 * stroke)).all()
+    most = np.array([joint.tau_max for joint in made.spec.joints])
+    assert (np.abs(state.tau_est) <= most).all()
+    assert np.isfinite(state.dq).all()
+
+
+@every_hand
+def test_a_long_pause_is_survived(hand: HandModel) -> None:
+    made, clock = simulated(hand, Side.LEFT)
+    made.open()
+    made.exchange(towards(hand, made.spec.q_max))
+    clock.advance(3600.0)
+    assert np.isfinite(made.exchange(HandCommand.brake(made.spec.n_joints)).q).all()
+
+
 # ------------------------------------------------------------------------------ service and topics
+
+
+def numbers(value: object) -> Iterator[float]:
+    """Every number in a message."""
+    if isinstance(value, (int, float)):
+        yield float(value)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from numbers(item)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from numbers(getattr(value, field.name))
+
+
+anything = st.floats(allow_nan=True, allow_infinity=True, width=32)
+
+
+@every_hand
+@given(st.lists(anything, min_size=6, max_size=6), st.integers(0, 2**32 - 1), st.integers(0, 2**40))
+def test_whatever_a_backend_returns_no_client_reads_nan(
+    hand: HandModel, values: list[float], fault: int, missed: int
+) -> None:
+    dq, tau, celsius, volt, pascal, amps = values
+    joints, sensors = len(hand.joints[Side.LEFT]), (len(hand.sensors), 12)
+    state = HandState.from_values(
+        hand.rest_q[Side.LEFT],
+        stamp=0.0,
+        dq=dq,
+        ddq=tau,
+        tau_est=tau,
+        temperature=celsius,
+        voltage=volt,
+        winding_temperature=np.full(joints, celsius),
+        pressure=np.full(sensors, pascal) if hand.sensors else None,
+        sensor_temperature=np.full(sensors, celsius) if hand.sensors else None,
+        imu=ImuState(rpy=(dq, tau, volt), temperature=celsius),
+        supply=SupplyState(volt, amps, volt, amps),
+    )
+    spec = hand.spec(Side.LEFT, io_rate=100.0)
+    for dialect in hand.dialects:
+        mapping = dialect_map(dialect, {Side.LEFT: spec})
+        sent = mapping.encode({Side.LEFT: StateView(state, (fault,) * joints, missed)})
+        message = message_type(dialect.state_type).decode(sent)
+        assert all(map(math.isfinite, numbers(message)))
 
 
 @every_hand

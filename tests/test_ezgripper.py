@@ -12,7 +12,6 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,6 @@ from click.testing import CliRunner
 from dexkit.backends import BackendOptions
 from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
-from dexkit.descriptors import wait_readable
 from dexkit.drivers.ezgripper import (
     Calibrate,
     EZGripper,
@@ -33,7 +31,6 @@ from dexkit.drivers.ezgripper import (
     calibration,
     servo_registers,
 )
-from dexkit.drivers.ezgripper import bus as bus_module
 from dexkit.drivers.ezgripper import gripper as gripper_module
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus, ServoError
 from dexkit.drivers.ezgripper.calibration import CalibrationFailed, measure_speed
@@ -47,14 +44,11 @@ from dexkit.drivers.ezgripper.discovery import (
 from dexkit.drivers.ezgripper.gripper import ZeroGains
 from dexkit.drivers.ezgripper.register_block import Goal, Sample
 from dexkit.drivers.ezgripper.scaling import STROKE
-from dexkit.drivers.ezgripper.servo import exchange_bytes, line_time
-from dexkit.drivers.serial_port import exchange_period
 from dexkit.emulators.mx64 import (
     Bus,
     Firmware,
     Port,
     Servo,
-    emulated_ezgripper,
 )
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
 from dexkit.emulators.mx64.settings import Physics
@@ -68,7 +62,7 @@ from dexkit.errors import (
     HandTimeout,
     UsageError,
 )
-from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
+from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
 from tests.dds_helpers import wait_until
@@ -109,71 +103,6 @@ def _patient_servo(monkeypatch: pytest.MonkeyPatch) -> None:
     """The servo's bus watchdog outlasts a pause of the emulator's thread on a busy machine."""
     for module in ("servo_registers", "servo"):
         monkeypatch.setattr(f"dexkit.drivers.ezgripper.{module}.WATCHDOG_UNITS", 127)
-
-
-# --- packets
-
-
-class _FakePort(DevicePort):
-    """A port with a reply prepared."""
-
-    def __init__(self, reply: bytes) -> None:
-        super().__init__("fake", 0.1)
-        self.reply = reply
-        self.sent = b""
-
-    def clear(self) -> None:
-        pass
-
-    def write(self, data: bytes) -> bool:
-        self.sent += data
-        return True
-
-    def read(self, deadline: float) -> bytes:
-        taken, self.reply = self.reply, b""
-        return taken
-
-
-def _bus_on(port: _FakePort) -> ServoBus:
-    bus = ServoBus(port.path, 1_000_000, retries=0)
-    bus._port = port
-    return bus
-
-
-def test_transmit_stuffing_follows_the_manual() -> None:
-    # docs/sources/mx64-ezgripper.md#a6: write 116 = 0x00FDFFFF, correctly stuffed
-    port = _FakePort(bytes.fromhex("FFFFFD00010400 5500 A10C"))
-    assert not _bus_on(port).write(1, 116, bytes.fromhex("FFFFFD00"))
-    assert port.sent.hex(" ").upper() == "FF FF FD 00 01 0A 00 03 74 00 FF FF FD FD 00 21 E7"
-
-
-@each(
-    "payload",
-    [
-        # current -1, velocity -3 (docs/sources/mx64-ezgripper.md#a3)
-        bytes.fromhex("FFFFFDFFFFFF00080000"),
-        # loses a byte in the SDK (docs/sources/mx64-ezgripper.md#a3)
-        bytes.fromhex("FFFFFDFFFDFD00000000"),
-        bytes.fromhex("FFFFFDFFFFFDFFFFFDFD"),
-        bytes(10),
-    ],
-)
-def test_stuffing_is_removed_from_received_packets(payload: bytes) -> None:
-    port = _FakePort(b"\x00\xff garbage first" + dynamixel.status(1, 0, payload))
-    assert _bus_on(port).read(1, 126, 10) == (payload, False)
-
-
-def test_held_goal_is_sent_once_with_next_request() -> None:
-    port = _FakePort(b"")
-    bus = _bus_on(port)
-    bus.retries = 1
-    kind = dynamixel.Instruction
-    bus.write_unacknowledged(1, 102, bytes(2), with_next=True)
-    assert not port.sent
-    with pytest.raises(HandTimeout):
-        bus.read(1, 126, 10)
-    found = [p.instruction for p in dynamixel.PacketParser().feed(port.sent)]
-    assert found == [kind.SYNC_WRITE, kind.READ, kind.READ]
 
 
 # --- opening
@@ -385,23 +314,6 @@ def test_ctrl_c_during_exchange_switches_torque_off(
         assert not gripper.servo.torque
 
 
-def test_a_brake_before_any_command_exerts_no_torque(tmp_path: Path) -> None:
-    with (
-        emulated() as gripper,
-        gripper_on(gripper.path, configured(tmp_path)) as hand,
-    ):
-        state = drive_for(hand, BRAKE, 0.1)
-        assert int(state.mode[0]) == JointMode.BRAKE
-        assert not gripper.servo.torque
-        drive(hand, HALF, at(2.7))
-        drive_for(hand, BRAKE, 0.1)
-        assert gripper.servo.torque, "now there is something to brake"
-        hand.close()
-        hand.open()  # a link that came back
-        drive_for(hand, BRAKE, 0.1)
-        assert not gripper.servo.torque
-
-
 def test_zero_gains_apply_no_torque_and_brake_holds(tmp_path: Path) -> None:
     with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
         before = travel(gripper)
@@ -559,25 +471,6 @@ def test_servo_in_shutdown_is_rebooted_at_open(tmp_path: Path) -> None:
             time.sleep(0.005)
         with gripper_on(gripper.path, configured(tmp_path)) as hand:
             assert hand.statistics.reboots == 1
-            assert exchange(hand, BRAKE).fault[0] == 0
-
-
-def test_cooled_servo_is_rebooted_by_next_driver(tmp_path: Path) -> None:
-    with emulated() as gripper:
-        gripper.inject("overheat:c=85")
-        deadline = time.monotonic() + LONG
-        while not gripper.servo.hardware_error:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        hot = EZGripper(gripper.path, configuration=configured(tmp_path))
-        with pytest.raises(HandFault, match="overheating"):
-            hot.open()
-        assert gripper.servo.hardware_error, "left to cool"
-        gripper.inject("overheat:c=30")
-        while gripper.servo.get(mx64.PRESENT_TEMPERATURE) > 30:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        with gripper_on(gripper.path, configured(tmp_path)) as hand:
             assert exchange(hand, BRAKE).fault[0] == 0
 
 
@@ -806,24 +699,6 @@ def test_refused_register_is_clear_error(tmp_path: Path) -> None:
                 bus.read(1, 14, 2)
         finally:
             bus.close()
-
-
-def test_torque_off_is_tried_when_opening_fails_late(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with emulated() as gripper:
-
-        def fail(*args: object, **kwargs: object) -> int:
-            raise CalibrationFailed("no stop")
-
-        monkeypatch.setattr(calibration, "find_zero", fail)
-        hand = EZGripper(
-            gripper.path, configuration=configured(tmp_path, zero=None, calibrate=Calibrate.YES)
-        )
-        with pytest.raises(CalibrationFailed):
-            hand.open()
-        assert not gripper.servo.torque
-        assert hand._servo is None
 
 
 # --- calibration
@@ -1087,69 +962,9 @@ def test_the_baud_rate_is_changed(tmp_path: Path) -> None:
 # --- time
 
 
-@pytest.mark.realtime
-def test_exchange_is_not_faster_than_the_line(tmp_path: Path) -> None:
-    """On a real terminal and clock too. The rate itself is measured by the benchmark."""
-    count = 100
-    busy = line_time(1_000_000)
-    with (
-        emulated_ezgripper(process=True, latency_timer=1e-3) as gripper,
-        gripper_on(gripper.path, configured(tmp_path)) as hand,
-    ):
-        started = time.monotonic()
-        for _ in range(count):
-            before = time.monotonic()
-            exchange(hand, HALF)
-            assert time.monotonic() - before >= busy
-        took = time.monotonic() - started
-    assert took >= busy + (count - 1) * exchange_period(busy, 1e-3)
-
-
 def test_rate_follows_latency_timer_of_adapter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gripper_module, "latency_timer", lambda path: 16)
     with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
         assert hand.spec.io_rate == pytest.approx(62.5)
-
-
-@pytest.mark.realtime
-def test_default_latency_timer_is_slow_but_works(tmp_path: Path) -> None:
-    with (
-        emulated(latency_timer=16e-3) as gripper,
-        gripper_on(gripper.path, configured(tmp_path)) as hand,
-    ):
-        started = time.monotonic()
-        for _ in range(20):
-            exchange(hand, BRAKE)
-        # 20 waits of about 16 ms each
-        assert time.monotonic() - started > 20 * 0.010
-        drive(hand, HALF, at(2.7))
-
-
-def test_waiting_exchange_blocks_until_bytes_arrive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It takes no processor time meanwhile; the SDK's own loop asks the port again and again."""
-    waits: list[bool] = []
-
-    def wait(descriptors: Sequence[int], seconds: float) -> list[int]:
-        ready = wait_readable(descriptors, seconds)
-        waits.append(bool(ready))
-        return ready
-
-    with (
-        emulated_ezgripper(process=True, latency_timer=16e-3) as gripper,
-        gripper_on(gripper.path, configured(tmp_path)) as hand,
-    ):
-        monkeypatch.setattr(bus_module, "wait_readable", wait)
-        statistics = hand.bus_statistics
-        transactions, timeouts = statistics.transactions, statistics.timeouts
-        for _ in range(50):
-            exchange(hand, BRAKE)
-        _, answer = exchange_bytes()
-        transactions = statistics.transactions - transactions
-        assert transactions >= 50
-        # one wait for an answer, and another one for each part that comes by itself
-        assert transactions <= len(waits) <= transactions * answer
-        assert waits.count(False) <= statistics.timeouts - timeouts, "it waits for bytes only"

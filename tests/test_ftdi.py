@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from usbip.core import Stall
 
 from dexkit.clock import ManualClock, RealClock
 from dexkit.drivers.serial_port import exchange_period
@@ -226,27 +225,6 @@ def test_exchanges_take_the_period_of_the_formula(timer: int, rate: int) -> None
     periods = [later - earlier for earlier, later in itertools.pairwise(times)]
     expected = exchange_period(line_time, timer * 1e-3)
     assert [round(period, 6) for period in periods[1:]] == [round(expected, 6)] * 6
-
-
-def test_a_transfer_ends_with_a_packet_that_is_not_full(
-    adapter: tuple[FtdiUsb, ManualClock],
-) -> None:
-    usb, clock = adapter
-    read: list[bytes] = []
-    usb.chip.receive(bytes(150))
-    usb._in.take_or_park(512, lambda data, status=0: read.append(data), 1)
-    _pass_time(usb, clock, 0.001)
-    assert read == []
-    _pass_time(usb, clock, 0.02)
-    assert [len(data) for data in read] == [64 + 64 + 28]
-
-
-def test_requests_are_answered_or_stalled(adapter: tuple[FtdiUsb, ManualClock]) -> None:
-    usb, _ = adapter
-    assert usb._control(_Setup(Request.GET_LATENCY, into=True)) == b"\x10"
-    for setup in (_Setup(0x55), _Setup(Request.RESET, into=True)):
-        with pytest.raises(Stall):
-            usb._control(setup)
 
 
 def test_a_client_finds_the_adapter_on_the_server() -> None:

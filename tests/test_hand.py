@@ -12,18 +12,15 @@ from hypothesis import strategies as st
 from dexkit.errors import CommandRejected, UsageError
 from dexkit.hand import (
     CommandGate,
-    Hand,
     HandCommand,
     HandSpec,
     HandState,
     JointMode,
     JointSpec,
-    MotorError,
     Side,
 )
 from dexkit.models import DEX1_1, DIALECTS, MODELS, dialect, model
 from tests.each import each
-from tests.service_helpers import ScriptedHand
 
 THREE = HandSpec(
     model="three",
@@ -96,10 +93,6 @@ class TestCommand:
         assert (c.kp[0], c.kd[0], c.mode[0]) == (5.0, 0.05, JointMode.FOC)
         assert not c.is_brake
 
-    def test_scalars_are_repeated_for_each_joint(self) -> None:
-        c = HandCommand.position([1.0, 2.0, 3.0], kp=7.0)
-        assert list(c.kp) == [7.0, 7.0, 7.0]
-
     def test_brake_command_has_no_gains(self) -> None:
         c = HandCommand.brake(3)
         assert c.is_brake
@@ -119,10 +112,6 @@ class TestState:
         assert np.isnan(s.voltage).all()
         assert (s.pressure, s.imu, s.supply) == (None, None, None)
         assert s.measured
-
-    def test_faults_hold_all_32_bits(self) -> None:
-        s = HandState.from_values(0.0, stamp=0.0, fault=int(MotorError.HOST_SAW_MOTOR_TIMEOUT))
-        assert MotorError(int(s.fault[0])) is MotorError.HOST_SAW_MOTOR_TIMEOUT
 
 
 class TestSpec:
@@ -149,11 +138,6 @@ class TestSpec:
     def test_a_hand_has_joints(self) -> None:
         with pytest.raises(UsageError, match="at least one joint"):
             HandSpec(model="x", side=Side.LEFT, joints=(), io_rate=1.0)
-
-    def test_spec_gives_limits_as_arrays(self) -> None:
-        assert list(THREE.q_min) == [-1.0, 0.0, -3.0]
-        assert list(THREE.q_max) == [1.0, 2.0, -1.0]
-        assert (THREE.n_joints, THREE.joints[1].stroke) == (3, 2.0)
 
 
 class TestModels:
@@ -194,8 +178,3 @@ class TestModels:
         with pytest.raises(UsageError) as raised:
             dialect("klingon")
         assert all(name in raised.value.hint for name in DIALECTS)
-
-
-def test_object_with_the_four_members_is_a_hand() -> None:
-    assert isinstance(ScriptedHand(), Hand)
-    assert not isinstance(object(), Hand)

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dexkit.backends import BackendOptions, backend
 from dexkit.drivers import inspire_serial
@@ -16,19 +14,16 @@ from dexkit.drivers.inspire_serial import InspireSerial, InspireSerialSettings
 from dexkit.emulators.faults import RH56_FAULTS, parse_fault
 from dexkit.emulators.rh56 import Rh56, Rh56Hand, rh56_bus
 from dexkit.errors import (
-    ChecksumError,
     EncodeError,
     HandLost,
     HandNotFound,
     HandTimeout,
-    OversizeError,
-    TruncatedError,
     UsageError,
     WireError,
 )
 from dexkit.hand import Hand, HandCommand, HandState, MotorError, Side
 from dexkit.wire import rh56
-from dexkit.wire.rh56 import Error, Frame, FrameParser, Operation, Register, Status
+from dexkit.wire.rh56 import Error, Frame, Operation, Register, Status
 from tests.each import each
 
 N = rh56.JOINTS
@@ -50,53 +45,6 @@ def test_frames_are_those_of_unitrees_service() -> None:
     answer = Frame(1, Operation.READ, Register.ANGLE_ACT, bytes(12), answer=True).pack()
     assert len(answer) == 20  # what the service waits for
     assert answer[7:9] == bytes(2)
-
-
-FRAMES = st.builds(
-    Frame,
-    st.integers(0, 255),
-    st.sampled_from(Operation),
-    st.integers(0, 65535),
-    st.binary(max_size=40),
-    st.booleans(),
-)
-
-
-@given(FRAMES, st.binary(max_size=20))
-def test_frames_survive_packing_and_are_found_in_a_stream(frame: Frame, noise: bytes) -> None:
-    data = frame.pack()
-    assert Frame.parse(data) == frame
-    assert sum(data[2:-1]) & 0xFF == data[-1]
-    parser = FrameParser(answers=frame.answer)
-    quiet = noise.replace(data[:1], b"")
-    pieces = [quiet + data[:3], data[3:-1], data[-1:] + data]
-    assert [f for piece in pieces for f in parser.feed(piece)] == [frame, frame]
-    assert (parser.skipped, parser.pending) == (len(quiet), 0)
-
-
-@given(st.binary(max_size=60))
-def test_garbage_is_skipped(data: bytes) -> None:
-    parser = FrameParser(answers=True)
-    found = parser.feed(data)
-    parser.reset()
-    assert sum(len(f.pack()) for f in found) + parser.skipped == len(data)
-
-
-@each(
-    ("data", "error"),
-    [
-        (READ_ANGLES[:-1], TruncatedError),
-        (READ_ANGLES[:5], TruncatedError),
-        (READ_ANGLES + b"\x00", OversizeError),
-        (READ_ANGLES[:-1] + b"\x00", ChecksumError),
-        (b"\x00" + READ_ANGLES[1:], WireError),
-        (bytes.fromhex("eb900104130a060c34"), WireError),
-        (bytes.fromhex("eb90010200000003"), WireError),
-    ],
-)
-def test_damaged_frames_are_refused(data: bytes, error: type[Exception]) -> None:
-    with pytest.raises(error):
-        Frame.parse(data)
 
 
 def test_values_that_do_not_fit_are_refused() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock, Rate
@@ -22,8 +22,6 @@ from tests.mx64_helpers import servo, write
 
 BAUD_RATES = sorted(mx64.BAUD_RATES.values())
 TIMERS = (0.0, 1e-3, 16e-3)
-DELAYS = (0, 2, 250)  # Return Delay Time, units of 2 us
-HOST_TIMES = (0.0, 0.25e-3, 0.26e-3, 1.25e-3, 1.26e-3)
 ENOUGH = 1e-9  # seconds of rounding
 
 
@@ -114,11 +112,7 @@ def _check(baudrate: int, timer: float, delay: int, host: float, phase: float) -
     assert end - begin >= busy + 3 * exchange_period(busy, timer) - ENOUGH, what
 
 
-def test_the_formula_agrees_with_the_emulated_line() -> None:
-    for case in itertools.product(BAUD_RATES, TIMERS, DELAYS, HOST_TIMES):
-        _check(*case, phase=0.37e-3)
-
-
+@settings(max_examples=40)
 @given(
     baudrate=st.sampled_from(BAUD_RATES),
     timer=st.integers(0, 20).map(lambda ms: ms * 1e-3),

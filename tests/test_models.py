@@ -17,7 +17,7 @@ from dexkit.cli import cli
 from dexkit.cli.emulate import command as emulate
 from dexkit.errors import UsageError
 from dexkit.hand import JointSpec, Side
-from dexkit.model_facts import describe, indices, names
+from dexkit.model_facts import describe, names
 from dexkit.models import BUILT_IN, DEX3_1, MODELS
 from dexkit.robots import ROBOTS
 from tests.each import each
@@ -76,9 +76,6 @@ class TestCommandLine:
                 for text in (dialect.name, dialect.cmd_type, dialect.state_type):
                     assert text in output
 
-    def test_several_models_are_printed(self) -> None:
-        assert run("dex1-1", "h1") == f"{run('dex1-1')}\n{run('h1')}"
-
     def test_all_models_are_printed(self) -> None:
         assert run(*names()) == "\n".join(run(name) for name in names())
 
@@ -125,10 +122,6 @@ class TestCommandLine:
         for name in ROBOTS:
             assert describe(name)["emulator"] == f"dexkit emulate {name}"
             assert f"  {name} " in listed
-
-    def test_indices_are_shortened_to_ranges(self) -> None:
-        assert indices([0, 1, 2, 5, 8, 9]) == "0 to 2, 5, 8, 9"
-        assert indices([]) == ""
 
 
 @pytest.mark.parametrize("name", names())

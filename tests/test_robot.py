@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dexkit.emulators.robot import Remote, RobotMechanics, Settings
+from dexkit.emulators.robot import Remote, Settings
 from dexkit.errors import UsageError
 from dexkit.hand import MotorError
 from dexkit.messages import encode, message_type
-from dexkit.robots import DQ_STOP, G1, H1, Q_STOP, ROBOTS, RobotModel, robot
+from dexkit.robots import DQ_STOP, G1, H1, Q_STOP, ROBOTS, RobotModel
 from dexkit.wire.low_level import (
     LOW_LEVEL_TYPES,
     encode_with_crc,
@@ -28,7 +28,6 @@ from tests.each import each
 from tests.robot_helpers import Bench, low_cmd
 
 both = pytest.mark.parametrize("model", list(ROBOTS.values()), ids=list(ROBOTS))
-ARM = {"h1": "left_elbow", "g1": "left_elbow"}
 FIELDS = ("q", "dq", "tau", "kp", "kd")
 
 
@@ -59,15 +58,6 @@ def test_joint_limits_are_consistent(model: RobotModel) -> None:
             mirrored = joint.name.endswith(("roll", "yaw"))
             limits = (-joint.q_max, -joint.q_min) if mirrored else (joint.q_min, joint.q_max)
             assert (other.q_min, other.q_max) == limits
-
-
-def test_unknown_robot_slot_or_joint_is_refused() -> None:
-    with pytest.raises(UsageError, match="no robot 'h3'"):
-        robot("h3")
-    with pytest.raises(UsageError, match="slot 9 of the h1 has no joint"):
-        H1.joint(9)
-    with pytest.raises(UsageError, match="no joint 'tail'"):
-        G1.slot("tail")
 
 
 # --------------------------------------------------------------------------------- commands
@@ -151,18 +141,6 @@ def test_motor_that_is_off_is_limp(model: RobotModel) -> None:
     )
     assert state.motor_state[slot].tau_est == 0
     assert state.motor_state[other].q == pytest.approx(0.8, abs=0.02)
-
-
-@both
-def test_joint_coasts_when_its_motor_is_turned_off(model: RobotModel) -> None:
-    slot = model.slot("waist_yaw")
-    bench = Bench(model)
-    spin = {slot: {"kp": 0.0, "kd": 5.0, "dq": 3.0}}
-    assert bench.run(0.2, low_cmd(model, change=spin)).motor_state[slot].dq > 2
-    off = low_cmd(model, change={slot: {"mode": 0}})
-    coasting = bench.run(0.02, off, hz=500).motor_state[slot]
-    assert 0.5 < coasting.dq < 2.9  # friction only
-    assert coasting.tau_est == 0
 
 
 def test_mode_of_another_motor_type_does_not_drive() -> None:
@@ -254,19 +232,6 @@ def test_command_for_another_machine_is_refused() -> None:
     other = Bench(dataclasses.replace(G1, mode_machine=13))
     assert other.state().mode_machine == 13
     assert other.send(low_cmd(G1, mode_machine=13))
-
-
-def test_mode_pr_is_in_the_state() -> None:
-    bench = Bench(G1)
-    assert bench.run(0.01, low_cmd(G1, mode_pr=1)).mode_pr == 1
-    assert "A and B" in bench.reports[0]
-    assert bench.run(0.01, low_cmd(G1)).mode_pr == 0
-
-
-def test_head_of_a_go_command() -> None:
-    bench = Bench(H1)
-    assert bench.send(low_cmd(H1, head=(0, 0)))
-    assert "head and level_flag" in bench.reports[0]
 
 
 @both
@@ -387,14 +352,6 @@ def test_the_same_commands_give_the_same_states(model: RobotModel) -> None:
     assert run() == run()
 
 
-def test_noise_of_the_imu() -> None:
-    bench = Bench(G1, Settings(noise=1.0))
-    rates = np.array([bench.state().imu_state.gyroscope for _ in range(300)])
-    assert 0.004 < rates.std() < 0.006
-    pulls = np.array([bench.state().imu_state.accelerometer for _ in range(300)])
-    assert pulls.mean(axis=0) == pytest.approx((0, 0, 9.81), abs=0.02)
-
-
 @both
 def test_work_heats_motors_and_drains_the_battery(model: RobotModel) -> None:
     slot = model.slot("left_knee")
@@ -411,11 +368,6 @@ def test_work_heats_motors_and_drains_the_battery(model: RobotModel) -> None:
         assert after.power_a > before.power_a
         assert after.bms_state.cell_vol[0] == pytest.approx(1000 * after.power_v / 15, abs=1)
         assert after.bms_state.current == pytest.approx(-1000 * after.power_a, abs=1)
-
-
-def test_settings_keep_temperatures_in_range() -> None:
-    with pytest.raises(UsageError, match="between 0 and 127"):
-        Settings(ambient=60, heating=70)
 
 
 @both
@@ -458,8 +410,3 @@ def test_sample_converts_to_c_struct_and_back(name: str, noise: bytes) -> None:
     assert all(a in (0, b) for a, b in zip(image, noise, strict=False))
     with pytest.raises(UsageError, match=f"has {size} bytes"):
         payload_of_struct(name, image[:-1])
-
-
-def test_robot_without_settings() -> None:
-    assert RobotMechanics(H1).timeout == H1.command_timeout
-    assert RobotMechanics(H1, Settings(command_timeout=0.2)).timeout == 0.2

@@ -16,7 +16,6 @@ from dexkit.emulators.mx64 import emulated_ezgripper
 from dexkit.hand import MotorError, Side
 from dexkit.messages import unitree_go
 from dexkit.models import dialect
-from dexkit.stop_signals import stop_on_signals
 from tests.cli_helpers import Process, running
 from tests.dds_helpers import dds_domain, dds_node, take_until
 from tests.each import each
@@ -36,7 +35,7 @@ def counters(line: str) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_the_service_cleanly(dds_domain: int, dds_node: DdsNode, number: int) -> None:
     def there() -> bool:
         return any(not e.own and e.topic.startswith("rt/dex1/") for e in dds_node.endpoints())
@@ -56,17 +55,6 @@ def test_signals_end_the_service_cleanly(dds_domain: int, dds_node: DdsNode, num
     assert last["published"]
 
 
-def test_sighup_under_nohup_is_ignored() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with stop_on_signals() as request:
-            signal.raise_signal(signal.SIGHUP)
-            assert not request
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
 def test_service_under_nohup_survives_the_terminal(dds_domain: int) -> None:
     """A hangup is ignored as it was asked for; an interrupt that is sent still ends it in order."""
     ignored = (signal.SIGHUP, signal.SIGINT)
@@ -84,24 +72,6 @@ def test_service_under_nohup_survives_the_terminal(dds_domain: int) -> None:
         assert process.end(signal.SIGINT)[0] == 0
     finally:
         process.end(signal.SIGKILL)
-
-
-def test_sigusr1_logs_the_counters(dds_domain: int) -> None:
-    with serving("sim-dex1", "--side", "right", "--domain", dds_domain, "--quiet") as process:
-        process.ready()
-        process.signal(signal.SIGUSR1)
-        found = counters(process.line("counters"))
-        assert found["state_topic"] == "rt/dex1/right/state"
-        assert process.end(signal.SIGTERM)[0] == 0
-
-
-def test_both_sides_in_one_process(dds_domain: int, dds_node: DdsNode) -> None:
-    readers = [dds_node.reader(GO.topics(side)[1], GO.state_type) for side in Side]
-    with serving("sim-dex1", "--side", "both", "--domain", dds_domain) as process:
-        process.ready()
-        assert "right" in process.ready()
-        for reader in readers:
-            take_until(reader, bool)
 
 
 def test_dex3_is_served_in_its_own_dialect(dds_domain: int, dds_node: DdsNode) -> None:
@@ -240,29 +210,9 @@ class TestArguments:
         hint = getattr(result.exception, "hint", "")
         assert message in f"{result.output} {result.exception} {hint}"
 
-    def test_help_shows_the_defaults(self) -> None:
-        result = CliRunner().invoke(cli, ["serve", "--help"])
-        assert result.exit_code == 0
-        for text in (
-            "--side",
-            "unitree_go",
-            "domain 0",
-            "domain 1",
-            "--wait-for-device",
-            "SIGUSR1",
-        ):
-            assert text in result.output
-
 
 def test_a_mistyped_command_gets_a_suggestion() -> None:
     result = CliRunner().invoke(cli, ["srve"])
     assert result.exit_code == 2
     assert "Did you mean 'serve'?" in result.output
     assert "mean" not in CliRunner().invoke(cli, ["xyzzy"]).output
-
-
-def test_backends_fit_a_narrow_terminal() -> None:
-    result = CliRunner().invoke(cli, ["backends"], env={"COLUMNS": "80"})
-    assert result.exit_code == 0
-    assert max(map(len, result.output.splitlines())) <= 80
-    assert "--set zero=..." in result.output

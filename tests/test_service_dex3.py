@@ -35,7 +35,6 @@ from dexkit.messages import message_type, unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.service import HandService, Publisher
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
-from dexkit.service.finger_state import FingerStateEncoder
 from dexkit.service.hand_core import HandCore
 from tests.each import each
 from tests.service_helpers import FakeNode, deliver_until, wait_until
@@ -81,10 +80,6 @@ class TestModeByte:
         assert ("wrong_ids" in counters) == any(m & 15 != i for i, m in enumerate(modes))
         assert ("unknown_status" in counters) == any((m >> 4) & 7 > 1 for m in modes)
 
-    @each("high", [0x00, 0x10, 0x80, 0x90])
-    def test_correct_motor_ids_give_no_remark(self, high: int) -> None:
-        assert mapping().remarks(message([high | i for i in range(N)]), LEFT) == ()
-
     def test_mode_byte_1_for_every_motor_locks_all_and_is_explained(self) -> None:
         """A public client does this: id 1, status 0 of RIS_Mode."""
         assert understood([1] * N).is_brake
@@ -124,15 +119,6 @@ class TestModeByte:
         assert sim_dex3.make(BackendOptions(LEFT)).spec.mode_rule is ModeRule.MANUAL
         with pytest.raises(UsageError, match="no mode_byte 'other'"):
             sim_dex3.make(BackendOptions(LEFT, settings={"mode_byte": "other"}))
-
-    def test_calibration_is_not_passed_on(self) -> None:
-        """Status 6 means calibration on a sibling motor (docs/sources/unitree-dex.md#b4)."""
-        modes = [0x10 | i for i in range(N)]
-        modes[2] = 0x62
-        assert understood(modes).mode.tolist() == [1, 1, 0, 1, 1, 1, 1]
-        (remark,) = mapping().remarks(message(modes), LEFT)
-        assert remark.counter == "unknown_status"
-        assert "motor 2 has id 2, status 6" in remark.text
 
     def test_motors_go_by_index_whatever_their_id(self) -> None:
         commands = message([0x10 | (N - 1 - i) for i in range(N)])
@@ -244,9 +230,6 @@ class TestState:
         assert tuple(m.error) == (0x10, 0)
         assert m.motor_state[0].temperature == (30, 40)
 
-    def test_a_lost_link_is_in_the_hands_error(self) -> None:
-        assert sent(StateView(full_state(), (LINK,) * N)).error[0] == LINK | 0x10
-
     def test_unknown_values_are_zero_or_no_value(self) -> None:
         m = sent(StateView(HandState.from_values([0.1] * N, stamp=0.0, dq=math.nan), (0,) * N))
         assert [x.dq for x in m.motor_state] == [0.0] * N
@@ -262,39 +245,7 @@ class TestState:
             assert all(p != 30000.0 for p in packet.pressure)
             assert packet.pressure[0] == pytest.approx(reading, abs=0.003)
 
-    def test_states_share_no_values(self) -> None:
-        encoder = FingerStateEncoder(spec())
-        fresh = FingerStateEncoder(spec()).encode(
-            HandState.from_values([0.1] * N, stamp=0.0), (0,) * N
-        )
-        encoder.encode(full_state(), self.VIEW.fault, 3, self.VIEW.tripped)
-        assert encoder.encode(HandState.from_values([0.1] * N, stamp=0.0), (0,) * N) == fresh
-
     anything = st.floats(allow_nan=True, allow_infinity=True)
-
-    @given(
-        st.lists(anything, min_size=6, max_size=6),
-        st.lists(st.integers(0, 2**32 - 1), min_size=N, max_size=N),
-        st.integers(0, 2**40),
-    )
-    def test_any_state_can_be_sent(
-        self, values: list[float], fault: list[int], missed: int
-    ) -> None:
-        dq, tau, celsius, volt, pascal, amps = values
-        state = HandState.from_values(
-            [0.1] * N, stamp=0.0, dq=dq, ddq=tau, tau_est=tau, temperature=celsius, voltage=volt,
-            winding_temperature=np.full(N, celsius), pressure=np.full((SENSORS, 12), pascal),
-            sensor_temperature=np.full((SENSORS, 12), celsius),
-            imu=ImuState(rpy=(dq, tau, volt), temperature=celsius),
-            supply=SupplyState(volt, amps, volt, amps),
-        )  # fmt: skip
-        m = sent(StateView(state, tuple(fault), missed))
-        numbers = [x for motor in m.motor_state for x in (motor.dq, motor.tau_est, motor.vol)]
-        numbers += [x for p in m.press_sensor_state for x in (*p.pressure, *p.temperature)]
-        numbers += [*m.imu_state.rpy, m.power_v, m.power_a]
-        assert all(math.isfinite(x) for x in numbers)
-        assert [x.motorstate for x in m.motor_state] == fault
-        assert (m.press_sensor_state[0].pressure[0] == 30000.0) == (not math.isfinite(pascal))
 
 
 class Bench:
@@ -346,16 +297,6 @@ ON, OFF = [True] * N, [False] * N
 
 
 class TestTimeouts:
-    def test_protected_joint_brakes_and_reports_it(self) -> None:
-        bench = Bench()
-        bench.send(ON)
-        assert not bench.after(TIMEOUT - 0.01).is_brake
-        assert bench.modes == [0x10 | i for i in range(N)]
-        assert bench.after(0.01).is_brake
-        assert bench.modes == [0x80 | i for i in range(N)]
-        assert not bench.core.driving
-        assert (bench.core.counters.brakes, bench.core.counters.holds) == (1, 0)
-
     def test_after_a_pause_joints_without_protection_brake_too(self) -> None:
         bench = Bench()
         bench.send(OFF)
@@ -391,14 +332,6 @@ class TestTimeouts:
         bench.send(ON)  # cleared: the protection is armed again
         assert not bench.exchange().is_brake
 
-    def test_protection_trips_without_exchanges(self) -> None:
-        bench = Bench()
-        bench.send(ON)
-        bench.exchange()
-        bench.clock.advance(TIMEOUT)
-        bench.send(ON)  # comes before the exchange thread has seen the silence
-        assert bench.exchange().is_brake
-
     def test_unprotected_joint_keeps_position_but_no_velocity_or_torque(self) -> None:
         bench = Bench()
         bench.send(OFF)
@@ -417,15 +350,6 @@ class TestTimeouts:
         bench.send(OFF)
         assert np.array_equal(bench.exchange().dq, driven.dq)
         assert not bench.core.holding
-
-    def test_timeout_bit_applies_to_each_joint(self) -> None:
-        bench = Bench()
-        bench.send([True, False, True, False, False, False, False])
-        command = bench.after(TIMEOUT)
-        assert command.mode.tolist() == [0, 1, 0, 1, 1, 1, 1]
-        assert bench.modes == [0x80, 0x11, 0x82, 0x13, 0x14, 0x15, 0x16]
-        bench.send([False, True, True, False, False, False, False])
-        assert bench.exchange().mode.tolist() == [1, 1, 0, 1, 1, 1, 1]
 
     def test_a_locked_joint_stays_locked(self) -> None:
         bench = Bench()
@@ -597,23 +521,6 @@ class TestService:
                 COMMANDS.encode(message()),
                 lambda: newest(node).motor_state[0].mode == 0x10,
             )
-
-    def test_one_thread_publishes_for_both_hands(self) -> None:
-        publisher = Publisher(1000.0)
-        nodes = {side: FakeNode() for side in Side}
-        services = [
-            HandService(InstantDex3(s), node=n, publisher=publisher) for s, n in nodes.items()
-        ]
-        for service in services:
-            service.start()
-        wait_until(lambda: all(n.sent for n in nodes.values()))
-        services[0].stop()
-        count = len(nodes[LEFT].sent)
-        before = len(nodes[RIGHT].sent)
-        wait_until(lambda: len(nodes[RIGHT].sent) > before + 20)  # the other goes on
-        assert len(nodes[LEFT].sent) == count
-        services[1].stop()
-        assert all(n.open_entities == 0 for n in nodes.values())
 
 
 if find_spec("unitree_sdk2py") is not None:

@@ -100,20 +100,6 @@ def test_follows_the_recorded_session_as_the_recorded_hand_did(side: Side) -> No
     assert np.sqrt(np.mean(np.square(error))) < 0.01
 
 
-def test_sim_dex3_is_deterministic() -> None:
-    runs = []
-    for _ in range(2):
-        hand, clock = opened(object_at=30.0)
-        rng = np.random.default_rng(1)
-        runs.append(
-            [
-                hold(hand, clock, HandCommand.position(rng.uniform(-1, 1, 7), kp=KP), 0.1).q
-                for _ in range(20)
-            ]
-        )
-    assert np.array_equal(runs[0], runs[1])
-
-
 def test_backend_sim_dex3_reads_its_settings() -> None:
     hand = sim_dex3.create(
         BackendOptions(Side.RIGHT, settings={"object": "60", "start": "50", "supply": "36"})

@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
 from dexkit.emulators.sim_dex1 import SimHand
-from dexkit.errors import HandLost
-from dexkit.hand import HandCommand, HandState, JointMode
+from dexkit.hand import HandCommand, HandState
 
 
 def opened(**options: float) -> tuple[SimHand, ManualClock]:
@@ -31,17 +27,6 @@ def hold(
         clock.advance(1 / hz)
         state = hand.exchange(command)
     return state
-
-
-def test_position_is_reached_and_held() -> None:
-    hand, clock = opened()
-    state = hold(hand, clock, HandCommand.position(4.0), 2.0)
-    # friction holds it as soon as kp times the rest is below 0.08 N m
-    assert state.q[0] == pytest.approx(4.0, abs=0.03)
-    assert state.dq[0] == 0.0
-    assert state.mode[0] == JointMode.FOC
-    assert state.measured
-    assert state.stamp == clock.now()
 
 
 def teleoperate(hand: SimHand, clock: ManualClock, target: float) -> list[tuple[float, ...]]:
@@ -111,68 +96,9 @@ def test_brake_stops_a_moving_hand_at_once() -> None:
     assert state.q[0] - moving.q[0] < 0.05
 
 
-def test_feedforward_torque_pushes() -> None:
-    hand, clock = opened()
-    state = hold(hand, clock, HandCommand.position(0.0, kp=0.0, kd=0.0, tau=0.3), 0.2)
-    assert state.dq[0] > 1.0
-    assert state.tau_est[0] == pytest.approx(0.3)
-
-
 def test_hard_stops_hold() -> None:
     hand, clock = opened()
     state = hold(hand, clock, HandCommand.position(0.0, kp=0.0, kd=0.0, tau=5.0), 1.0)
     assert state.q[0] == pytest.approx(math.radians(322) + 5.0 / 200, abs=0.01)
     state = hold(hand, clock, HandCommand.position(0.0, kp=0.0, kd=0.0, tau=-5.0), 1.0)
     assert state.q[0] == pytest.approx(-5.0 / 200, abs=0.01)
-
-
-@given(
-    st.floats(0, 5.4),
-    st.floats(0, 2000),
-    st.floats(0, 200),
-    st.floats(-15, 15),
-    st.floats(-24, 24),
-)
-def test_any_admitted_command_stays_finite_and_within_the_stops(
-    q: float, kp: float, kd: float, tau: float, dq: float
-) -> None:
-    hand, clock = opened()
-    state = hold(hand, clock, HandCommand.position(q, kp=kp, kd=kd, tau=tau, dq=dq), 0.3)
-    assert -0.5 < state.q[0] < 6.2
-    assert abs(state.dq[0]) < 30
-    assert abs(state.tau_est[0]) <= 15
-
-
-def test_sim_dex1_is_deterministic() -> None:
-    traces = []
-    for _ in range(2):
-        hand, clock = opened(object_pct=30.0)
-        rng = np.random.default_rng(1)
-        traces.append(
-            [
-                float(hold(hand, clock, HandCommand.position(float(rng.uniform(0, 5.4))), 0.1).q[0])
-                for _ in range(30)
-            ]
-        )
-    assert traces[0] == traces[1]
-
-
-def test_long_pause_is_not_simulated() -> None:
-    hand, clock = opened()
-    hand.exchange(HandCommand.position(0.0, kp=0.0, kd=0.0, tau=0.1))
-    clock.advance(3600.0)
-    state = hand.exchange(HandCommand.brake(1))
-    assert np.isfinite(state.q[0])
-    assert hand._steps.done == int(3600 / 0.5e-3)
-
-
-def test_only_an_open_hand_exchanges() -> None:
-    hand = SimHand()
-    with pytest.raises(HandLost):
-        hand.exchange(HandCommand.brake(1))
-    hand.open()
-    hand.exchange(HandCommand.brake(1))
-    hand.close()
-    hand.close()
-    with pytest.raises(HandLost):
-        hand.exchange(HandCommand.brake(1))

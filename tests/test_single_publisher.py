@@ -136,7 +136,7 @@ class Program:
 
 
 def test_one_of_many_simultaneous_publishers_remains() -> None:
-    for seed in range(1500):
+    for seed in range(300):
         rnd = random.Random(seed)
         net = Network(rnd, slow=rnd.choice((0.1, 1.0, 5.0)))
         skew = rnd.choice((0.0, 100.0))
@@ -149,7 +149,7 @@ def test_one_of_many_simultaneous_publishers_remains() -> None:
 
 
 def test_running_publisher_stays_and_new_one_leaves() -> None:
-    for seed in range(300):
+    for seed in range(60):
         rnd = random.Random(seed)
         net = Network(rnd, slow=0.1)
         first = Program(net, "first", 0.0, 50.0)  # its clock is wrong, and does not matter
