@@ -50,7 +50,7 @@ ifneq ($(PYTHON_VERSION),$(LAST_VERSION))
 .PHONY: $(STAMP)
 endif
 
-.PHONY: help setup demo test test-all mutants soak pins coverage platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
+.PHONY: help setup demo test test-all mutants soak pins consequences coverage platforms aarch64 lab wheels campaign campaign-sample lint format docs docs-site pictures bench lock clean
 
 help: ## this list
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 18
@@ -80,6 +80,9 @@ soak: $(STAMP) ## the long tests
 
 pins: $(STAMP) ## whether each wrong hand and sample is judged as pinned (ARGS="--only dds-dex3-1", ARGS=--update; docs/mutants.md)
 	$(RUN) python -m tools.pins $(ARGS)
+
+consequences: $(STAMP) ## what a client suffers from each wrong hand; writes tools/consequences/table.json (ARGS="--only dex3-1")
+	$(RUN) python -m tools.consequences $(ARGS)
 
 campaign: $(STAMP) ## fuzz and fault campaign: MINUTES=10 SEED=1 JOBS=2 ONLY=fuzz,kill:record (docs/campaign.md)
 	$(RUN) python -m tools.campaign $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED)) \

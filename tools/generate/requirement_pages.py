@@ -13,6 +13,7 @@ from dexkit.conformance.faults import mutants
 from dexkit.conformance.kit.requirements import Kind, Level, Requirement, catalogue, renamed
 from dexkit.conformance.layers import LAYERS
 from dexkit.models import BUILT_IN
+from tools.consequences.table import sentence
 
 __all__ = ["REQUIREMENT", "area_table", "pages"]
 
@@ -71,6 +72,8 @@ def _entry(requirement: Requirement, where: str, killers: Iterable[str]) -> list
         )
     if requirement.original and requirement.original not in known:
         lines.append(f"*The original:* {_linked(requirement.original)}  ")
+    if consequence := sentence(requirement.id):
+        lines.append(f"*Consequence:* {consequence}  ")
     source = f"{_linked(requirement.source)} ({requirement.confidence})"
     lines.append(f"*Source:* {source}. *Judged from:* {where}. *Proven by:* {proof}.")
     return [*lines, ""]

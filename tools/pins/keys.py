@@ -15,7 +15,7 @@ import math
 import platform
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -44,6 +44,7 @@ __all__ = [
     "judging",
     "played_by",
     "recording_key",
+    "run_key",
     "sample_key",
     "verdict_keys",
 ]
@@ -175,6 +176,27 @@ def recording_key(mutant: Mutant) -> str:
     bases = [f"{c.__module__}.{c.__qualname__}" for c in mutant.made.__mro__]
     code = sources().digest(played_by(mutant), JUDGES_ONLY)
     return _digest("recording", _environment(), mutant.key, bases, run_of(mutant).about, code)
+
+
+def run_key(
+    made: type[Any],
+    model: str,
+    play: Callable[..., Any],
+    about: object,
+    without: Mapping[str, str],
+) -> str:
+    """The key of what another program plays with a service of hands.
+
+    :param model: of the hands.
+    :param play: what plays it.
+    :param about: all values that it depends on besides.
+    :param without: what the code names, but does not need, with the reason.
+    """
+    places = set(_messages()) | {sources().place(play.__module__, play.__qualname__)}
+    for each in (made, layer("dds").reference(model)):
+        places.update(_class_places(each))
+    code = sources().digest(frozenset(places), {**JUDGES_ONLY, **without})
+    return _digest("run", _environment(), about, [c.__qualname__ for c in made.__mro__], code)
 
 
 def sample_key(path: Path) -> str:

@@ -1,0 +1,113 @@
+"""Command line: ``python -m tools.consequences``, which ``make consequences`` runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from dexkit.conformance.faults.matrix import in_processes
+from dexkit.conformance.kit.requirements import Level
+from dexkit.console import Console
+from dexkit.models import MODELS
+from dexkit.stop_signals import stop_on_signals
+from tools.consequences.kinds import consequences
+from tools.consequences.table import FILE, Table, told
+from tools.consequences.work import Task, default_folder, known, tasks, work
+
+
+@click.command("consequences")
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="TEXT",
+    help="Only wrong hands with TEXT in their name: 'dds dex3-1', a class, a requirement.",
+)
+@click.option("--jobs", "-j", type=click.IntRange(1), help="Processes; one per processor.")
+@click.option("--kept", is_flag=True, help="Measure nothing; use what is kept.")
+@click.option("--verbose", "-v", is_flag=True, help="Print the consequences of each hand.")
+@click.option(
+    "--cache",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=default_folder,
+    show_default=True,
+    help="Where figures are kept.",
+)
+@click.pass_context
+def main(
+    context: click.Context,
+    only: tuple[str, ...],
+    jobs: int | None,
+    kept: bool,
+    verbose: bool,
+    cache: Path,
+) -> None:
+    """Measure what clients suffer from each wrong hand, and write the table.
+
+    Figures are kept, and not measured again after Ctrl-C. With --only the table is not written.
+
+    Exit code: 0 done; 1 a reference has a consequence; 130 stopped.
+    """
+    console = Console()
+    given = tasks(cache.absolute(), only)
+    stopped = False
+    if not kept:
+        with stop_on_signals() as stop:
+            _measure(console, [task for task in given if known(task) is None], stop, jobs)
+            stopped = bool(stop)
+    table = _table(given)
+    if verbose:
+        for name, kinds in table.hands.items():
+            console.print(name, markup=False, highlight=False)
+            for found in kinds.values():
+                console.print(f"    {told(found)}", markup=False, highlight=False)
+    if not only:
+        table.save()
+        console.print(f"{FILE}: {len(table.hands)} wrong hands", soft_wrap=True)
+        _summary(console, table)
+    if stopped:
+        console.print("stopped; the same command goes on from here", style="yellow")
+        context.exit(130)
+
+
+def _measure(console: Console, given: Sequence[Task], stop: object, jobs: int | None) -> None:
+    columns = (MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        shown = progress.add_task("", total=len(given))
+        for task, broken in in_processes(work, given, stop, jobs):
+            progress.update(shown, advance=1, description=task.name)
+            if broken:
+                console.print(broken, style="red", markup=False, soft_wrap=True)
+
+
+def _table(given: Sequence[Task]) -> Table:
+    """The table of what is kept."""
+    good = {(t.model, t.dialect, t.sides): known(t) for t in given if t.mutant is None}
+    table = Table()
+    for task in given:
+        found, reference = known(task), good[task.model, task.dialect, task.sides]
+        if task.mutant is not None and found is not None and reference is not None:
+            table.hands[task.name] = consequences(found, reference)
+    return table
+
+
+def _summary(console: Console, table: Table) -> None:
+    for model in MODELS:
+        rows = [r for r in table.rows(model) if r.requirement.level is Level.MUST and r.hands]
+        if not rows:
+            continue
+        none = [r.requirement.id for r in rows if r.proposed is Level.SHOULD]
+        shared = [r.requirement.id for r in rows if not r.own and r.shared]
+        console.print(
+            f"{model}: of {len(rows)} MUSTs {len(rows) - len(none)} have a consequence, "
+            f"{len(shared)} of them only by hands that fail others as well",
+            soft_wrap=True,
+        )
+        console.print(f"  none: {', '.join(none) or '-'}", soft_wrap=True, highlight=False)
+        console.print(f"  by others: {', '.join(shared) or '-'}", soft_wrap=True, highlight=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""The table of consequences: of each wrong hand, and of each requirement its level by them."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dexkit.conformance.faults import mutants
+from dexkit.conformance.kit.requirements import Level, Requirement, catalogue
+from dexkit.documents import write_file
+from dexkit.models import MODELS
+from tools.consequences.kinds import KINDS, Consequence
+
+__all__ = ["FILE", "Row", "Table", "sentence"]
+
+FILE = Path(__file__).with_name("table.json")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A requirement by its consequences.
+
+    :param hands: names of the wrong hands that fail it and were measured.
+    :param own: the worst consequence of the hands that were made for it, or fail it alone, and the
+        hand; None without any. ``shared`` likewise, of the others that fail it.
+    """
+
+    requirement: Requirement
+    hands: tuple[str, ...]
+    own: tuple[str, Consequence] | None
+    shared: tuple[str, Consequence] | None
+
+    @property
+    def proposed(self) -> Level:
+        """The level that follows: none of its hands has a consequence, and it is a SHOULD."""
+        if not self.hands or self.requirement.level is not Level.MUST:
+            return self.requirement.level
+        return Level.MUST if self.own or self.shared else Level.SHOULD
+
+
+@dataclass
+class Table:
+    """Consequences of wrong hands.
+
+    :ivar hands: by a hand's name, its worst consequence of each kind; empty without any.
+    """
+
+    hands: dict[str, dict[str, Consequence]] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, file: Path = FILE) -> Table:
+        """Read the committed table."""
+        data: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return cls(
+            {
+                name: {kind: Consequence(kind, *values) for kind, values in kinds.items()}
+                for name, kinds in data["hands"].items()
+            }
+        )
+
+    def save(self, file: Path = FILE) -> None:
+        """Write it: a line for each hand and each requirement."""
+        hands = {
+            name: {
+                kind: [*c[1:5], *(round(x, 3) for x in c[5:])] for kind, c in sorted(kinds.items())
+            }
+            for name, kinds in sorted(self.hands.items())
+        }
+        rows = {
+            row.requirement.id: {
+                "level": str(row.requirement.level),
+                "proposed": str(row.proposed),
+                "hands": len(row.hands),
+                "own": row.own and [row.own[0], row.own[1].kind],
+                "shared": row.shared and [row.shared[0], row.shared[1].kind],
+            }
+            for row in self.rows()
+        }
+        text = ",\n".join(
+            f'"{title}": {{\n{_lines(values)}\n}}'
+            for title, values in (("requirements", rows), ("hands", hands))
+        )
+        write_file(file, f"{{\n{text}\n}}\n")
+
+    def rows(self, model: str | None = None) -> list[Row]:
+        """The requirements of hands on DDS, of a model or of all."""
+        every = catalogue(model, "dds")
+        failing = _failing()
+        return [self._row(r, failing.get(r.id, ())) for r in every if r.model in MODELS]
+
+    def _row(self, requirement: Requirement, failing: Iterable[tuple[str, bool]]) -> Row:
+        measured = [(name, own) for name, own in failing if name in self.hands]
+        own = self._worst(name for name, mine in measured if mine)
+        shared = self._worst(name for name, mine in measured if not mine)
+        return Row(requirement, tuple(name for name, _ in measured), own, shared)
+
+    def _worst(self, names: Iterable[str]) -> tuple[str, Consequence] | None:
+        found = [(name, c) for name in names for c in self.hands[name].values()]
+        return max(found, key=lambda pair: pair[1].size, default=None)
+
+
+@functools.cache
+def _failing() -> Mapping[str, tuple[tuple[str, bool], ...]]:
+    """By requirement, the wrong hands that fail it; whether each was made for it, or fails no other
+    one.
+    """
+    found: dict[str, list[tuple[str, bool]]] = {}
+    for mutant in mutants("dds"):
+        fails = (mutant.pinned or frozenset()) | {mutant.kills}
+        for name in fails:
+            own = name == mutant.kills or len(fails) == 1
+            found.setdefault(name, []).append((mutant.pin, own))
+    return {name: tuple(hands) for name, hands in found.items()}
+
+
+def _lines(values: Mapping[str, object]) -> str:
+    return ",\n".join(f"{json.dumps(k)}: {json.dumps(v)}" for k, v in values.items())
+
+
+# ------------------------------------------------------------------------------------ as text
+
+
+@functools.cache
+def _rows() -> Mapping[str, Row]:
+    return {row.requirement.id: row for row in Table.load().rows()} if FILE.exists() else {}
+
+
+def sentence(requirement_id: str) -> str:
+    """What a client suffers from the worst hand that fails a requirement; "" if nobody knows."""
+    row = _rows().get(requirement_id)
+    if row is None or not row.hands:
+        return ""
+    worst = row.own or row.shared
+    if worst is None:
+        return (
+            f"None of the {len(row.hands)} wrong hands that fail this has a consequence for a "
+            "genuine client."
+        )
+    name, found = worst
+    return f"With `{name.split()[2]}` {told(found)}."
+
+
+def told(found: Consequence) -> str:
+    """A consequence in words, with both figures."""
+    kind = KINDS[found.kind]
+    where = f"joint {found.joint}, {found.side}" if found.kind != "starts" else found.side
+    if found.kind == "starts":
+        return f"{found.client} gets no state or does not start ({found.task})"
+    return (
+        f"{found.client} has a hand that {kind.words}: {_amount(found.found, kind.unit)} instead "
+        f"of {_amount(found.good, kind.unit)} ({found.task}; {where})"
+    )
+
+
+def _amount(value: float, unit: str) -> str:
+    if unit == "part":
+        return f"{100 * value:.0f} % of the range" if value < 99 else "nothing finite"
+    if unit == "s":
+        return f"{value:.2f} s" if value < 99 else "never"
+    if unit.startswith("of "):
+        return f"{100 * value:.0f} % {unit}" if value < 99 else "nothing finite"
+    return f"{value:.2g} {unit}"
