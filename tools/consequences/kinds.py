@@ -9,18 +9,18 @@ from typing import NamedTuple
 
 from tools.consequences.stage import Figure
 
-__all__ = ["KINDS", "Consequence", "Kind", "consequences"]
+__all__ = ["KINDS", "NO_END", "Consequence", "Kind", "consequences"]
 
-_FINITE = 99.0
-"""As much as is written of a consequence that is larger than any."""
+NO_END = 99.0
+"""What is written of a figure, and of a size, that has no end."""
 
 
 @dataclass(frozen=True)
 class Kind:
     """One kind of consequence.
 
-    :param words: how it is said of a hand.
-    :param unit: of its figures; ``part`` of a joint's range.
+    :param words: how it is told, with the hand's figure and the reference's.
+    :param unit: of its figures; what is told in percent is measured in parts.
     :param size: how large it is, where 1 is its limit, from the hand's figure and the reference's.
     :param reason: why the limit is where it is.
     """
@@ -56,7 +56,7 @@ KINDS: Mapping[str, Kind] = {
     for kind in (
         Kind(
             "starts",
-            "its client gets no state, or does not start",
+            "a client gets no state or does not start",
             "s",
             lambda found, good: found / 5.0,
             "An operator takes a program that has done nothing for 5 s for dead; xr_teleoperate "
@@ -64,15 +64,15 @@ KINDS: Mapping[str, Kind] = {
         ),
         Kind(
             "ends",
-            "ends elsewhere",
-            "part",
+            "a move ends at {found} instead of {good}",
+            "% of its range",
             _away_by(0.05),
             "Three times the place at which xr_teleoperate's own filter leaves a Dex1-1 (half a "
             "lead of 0.18 rad), and as much as its jaws open for a finger of 5 mm.",
         ),
         Kind(
             "lags",
-            "takes longer",
+            "a move is made after {found} instead of {good}",
             "s",
             lambda found, good: found / (2.0 * good + 0.1),
             "Twice as long as the original is plainly another hand to an operator; a tenth of a "
@@ -80,15 +80,15 @@ KINDS: Mapping[str, Kind] = {
         ),
         Kind(
             "misses",
-            "does not make a commanded move",
-            "of the move",
+            "{found} is made instead of {good}",
+            "% of the move",
             lambda found, good: 0.5 * good / max(found, 1e-6) if good > 0.3 else 0.0,
             "A hand that makes less than half of a move that the original makes in this time has "
             "not made it.",
         ),
         Kind(
             "presses",
-            "presses otherwise",
+            "an object is pressed with {found} instead of {good}",
             "N m",
             _ratio(2.5, 0.4),
             "Clients set no force, but a lead or a depth, and the stiffness of vendors differs by "
@@ -96,45 +96,52 @@ KINDS: Mapping[str, Kind] = {
         ),
         Kind(
             "drops",
-            "drops the object",
+            "a grip falls to {found} instead of {good}, and the object is dropped",
             "N m",
             lambda found, good: 0.4 * good / max(found, 1e-6) if good > 0.01 else 0.0,
             "Grips are made with about twice the force at which an object slips, and the arm that "
             "lifts it adds some: below 0.4 of the original's least force it slips.",
         ),
         Kind(
+            "lets go",
+            "{found} holds the object when its client has gone, instead of {good}",
+            "% of the grip",
+            lambda found, good: 0.4 * good / max(found, 1e-6) if good > 0.4 else 0.0,
+            "Where the original holds an object on when its client has gone, it must not fall.",
+        ),
+        Kind(
             "moves",
-            "moves what was not commanded",
-            "part",
+            "a joint moves by {found} against what was commanded, instead of {good}",
+            "% of its range",
             _more_by(0.05),
             "As far as where a hand ends: what is seen from outside, and opens a light grip.",
         ),
         Kind(
             "reads",
-            "shows its client what is not so",
-            "part",
+            "a client reads what is {found} away from all that was true",
+            "% of its range",
             _more_by(0.05),
             "One frame of a data set that is so far from anything that was true within the last "
             "0.1 s is an outlier; and a Dex1-1's next command is made of it.",
         ),
         Kind(
             "touch",
-            "shows touch that is not so",
-            "of a grip",
+            "an element of touch reads {found} instead of {good}",
+            "% of what a grip adds",
             _away_by(0.5),
             "Half of what a grip makes the elements read decides whether something is held.",
         ),
         Kind(
             "left moving",
-            "moves when its client has gone",
-            "part",
+            "a joint moves by {found} when its client has gone, instead of {good}",
+            "% of its range",
             _more_by(0.05),
             "As far as where a hand ends: nobody watches a hand whose client has been stopped.",
         ),
         Kind(
             "left pressing",
-            "presses on when its client has gone",
-            "of the grip",
+            "{found} is pressed on when its client has gone, instead of {good}",
+            "% of the grip",
             _more_by(0.3),
             "A third of a grip hurts, and heats a motor that nobody watches.",
         ),
@@ -168,10 +175,10 @@ def consequences(
         value = found.get(figure, math.nan)
         if math.isnan(value) or not math.isfinite(reference):
             continue  # nobody can say
-        size = min(KINDS[figure.kind].size(value, reference), _FINITE)
+        size = min(KINDS[figure.kind].size(value, reference), NO_END)
         if size <= 1.0:
             continue
         before = worst.get(figure.kind)
         if before is None or size > before.size:
-            worst[figure.kind] = Consequence(*figure, min(value, _FINITE), reference, size)
+            worst[figure.kind] = Consequence(*figure, min(value, NO_END), reference, size)
     return worst

@@ -30,6 +30,8 @@ RIVAL = 1000
 """Number of the second client."""
 _OPEN, _SHUT = 0.03, 0.97
 """How far an operator opens and closes: short of the stops."""
+_NO_GRIP = 0.01
+"""N m: a joint that presses with less does not."""
 _SHARE = {Side.LEFT: 1.0, Side.RIGHT: 0.8}
 _TOUCH_UNITS = {"dex3-1": 5e4, "inspire-ftp": 400.0}
 """About what a grip adds to an element of touch."""
@@ -53,7 +55,7 @@ class Session:
         self.stage = Stage(made, spoken, sides, touch)
         self.dialect, self.sides = spoken, tuple(sides)
         self.figures: dict[Figure, float] = {}
-        self.grip: dict[Side, float] = {}
+        self.grip: dict[Side, Floats] = {}
 
     # ------------------------------------------------------------------------------ to measure
 
@@ -67,11 +69,11 @@ class Session:
         first = bisect_left(self.stage.times, since)
         return np.asarray(self.stage.times[first:]) - since, self.stage.places(side, since)
 
-    def force(self, side: Side, since: float) -> Floats:
-        """Force of contact, means of 50 ms."""
-        values = np.array(self.stage.forces[side][bisect_left(self.stage.times, since) :])
+    def forces(self, side: Side, since: float) -> Floats:
+        """Force of contact of each joint, means of 50 ms."""
+        values = self.stage.forces(side, since)
         whole = len(values) // 5 * 5
-        return np.asarray(values[:whole].reshape(-1, 5).mean(axis=1))
+        return np.asarray(values[:whole].reshape(-1, 5, values.shape[1]).mean(axis=1))
 
     # --------------------------------------------------------------------------- to do and measure
 
@@ -175,11 +177,16 @@ class Session:
         self.stage.run(seconds)
         self.feel(task)
         for side in self.sides:
-            force = self.force(side, since)
-            self.grip[side] = float(np.median(force))
-            self.add("presses", task, side, [self.grip[side]])
-            self.add("presses", f"{task}: most", side, [force.max()])
-            self.add("drops", task, side, [force.min()])
+            self.grip[side] = np.median(self.forces(side, since), axis=0)
+            self.add("presses", task, side, self.grip[side])
+        self._held(task, since)
+
+    def _held(self, task: str, since: float) -> None:
+        """How hard at most, and how little."""
+        for side in self.sides:
+            forces = self.forces(side, since)
+            self.add("presses", f"{task}: most", side, forces.max(axis=0))
+            self.add("drops", task, side, [forces.sum(axis=1).min()])
 
     def feel(self, task: str) -> None:
         """What the elements of touch read, of hands whose touch clients read."""
@@ -193,38 +200,32 @@ class Session:
         """Something happens while an object is held."""
         since = self.stage.now
         self.stage.run(seconds)
-        for side in self.sides:
-            force = self.force(side, since)
-            self.add("drops", task, side, [force.min()])
-            self.add("presses", f"{task}: most", side, [force.max()])
+        self._held(task, since)
 
-    def gone(self, task: str) -> None:
+    def gone(self, task: str, seconds: float = 1.2) -> None:
         """The client has been stopped: what moves and presses after the time-out."""
         self.stage.connect(None)
-        self.still(task, 1.2, kind="left moving", after=1.3)
-        since = self.stage.now - 0.4
-        for side in self.sides:
-            if self.grip.get(side, 0.0) > 0.02:
-                self.add(
-                    "left pressing", task, side, [self.force(side, since).mean() / self.grip[side]]
-                )
+        self.still(task, seconds, kind="left moving", after=1.3)
+        self.left(task)
+
+    def left(self, task: str) -> None:
+        """How much of the last grip is left."""
+        for side, grip in self.grip.items():
+            force = self.forces(side, self.stage.now - 0.4).mean(axis=0)
+            known = np.where(grip > _NO_GRIP, grip, np.nan)
+            self.add("left pressing", task, side, force / known)
+            self.add("lets go", task, side, [force.sum() / max(grip.sum(), _NO_GRIP)])
 
     def records(self) -> None:
-        """What 30 frames a second of the whole session hold, against what was true."""
+        """What the client has read, against what was true within the last 0.1 s."""
         times = np.array(self.stage.times)
-        frames = np.unique(np.searchsorted(times, np.arange(times[0], times[-1], 1 / 30)))
-        back = 10  # 0.1 s of the notes
         for side in self.sides:
+            at, shown = self.stage.shown(side)
             places = self.stage.places(side)
-            at = frames[(frames >= back) & (frames < len(times))]
-            shown = np.array([self.stage.shown(side, row) for row in at.tolist()])
-            there = ~np.isnan(shown).all(axis=1)
-            at, shown = at[there], shown[there]
-            if not len(at):
-                continue
-            window = np.stack([places[at - i] for i in range(back + 1)])
-            off = np.maximum(window.min(axis=0) - shown, shown - window.max(axis=0))
-            self.add("reads", "record", side, np.nan_to_num(off.max(axis=0), nan=math.inf))
+            if len(at):
+                rows = np.minimum(np.searchsorted(times, at), len(times) - 1)
+                window = np.stack([places[np.maximum(rows - i, 0)] for i in range(11)])
+                self.add("reads", "all that it reads", side, _apart(shown, window))
 
     def other_readers(self) -> None:
         """Whether a ROS 2 node with the usual, reliable, reader gets a state, and the example."""
@@ -240,13 +241,21 @@ class Session:
         times = np.array(self.stage.times)
         for side in self.sides:
             places = self.stage.places(side)
-            worst = np.zeros(places.shape[1])
+            worst: Floats = np.zeros(places.shape[1])
             for now, shown in self.stage.low.get(side, ()):
                 window = places[(times > now - 0.2) & (times <= now + 0.01)]
                 if len(window):
-                    off = np.maximum(window.min(axis=0) - shown, shown - window.max(axis=0))
-                    worst = np.maximum(worst, np.nan_to_num(off, nan=math.inf))
+                    worst = np.maximum(worst, _apart(shown[np.newaxis], window[:, np.newaxis]))
             self.add("reads", "the low-rate copy", side, worst)
+
+
+def _apart(shown: Floats, window: Floats) -> Floats:
+    """How far each joint was shown from all places of its window, at the most.
+
+    :param window: first the places, then as ``shown``.
+    """
+    off = np.maximum(window.min(axis=0) - shown, shown - window.max(axis=0))
+    return np.asarray(np.nan_to_num(off, nan=math.inf).max(axis=0))
 
 
 def _outside(places: Floats, goal: Floats) -> Floats:
@@ -267,7 +276,7 @@ def _delay(goal: Floats, place: Floats) -> float:
 
 def _stroke(spoken: Dialect) -> float:
     """Seconds for a whole stroke: of a gripper, that of a slow one at xr_teleoperate's lead."""
-    return 2.2 if spoken.is_gripper else 1.2
+    return 1.8 if spoken.is_gripper else 1.2
 
 
 def _both(session: Session, *parts: float) -> dict[Side, Pose]:
@@ -453,7 +462,7 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     touch = object_places(spoken, dict.fromkeys(sides, percent))
     s = Session("xr_teleoperate", made, spoken, sides, touch)
     stage = s.stage
-    stage.run(0.5)
+    stage.run(0.3)
     client = Teleoperation(spoken, sides)
     client.goals = _both(s, 0.2)
     s.start(client, "start with an object")
@@ -471,10 +480,10 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     stage.send(stage.codec.encode(bad), 0)
     s.held_through("NaN in a grip", 0.3)
     stage.connected = False
-    s.held_through("network away for 0.5 s in a grip", 0.5)
+    s.held_through("network away for 0.9 s in a grip", 0.9)
     stage.connected = True
     s.held_through("network back in a grip", 0.5)
-    s.gone("stopped in a grip")
+    s.gone("stopped in a grip", 2.4)
     second = Teleoperation(spoken, sides, 1)
     second.goals = deep
     s.start(second, "a second client in a grip")
@@ -485,15 +494,7 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     stage.connect(None)
     stage.restart()
     s.still("the service restarts in a grip", 2.6, kind="left moving")
-    since = stage.now - 0.4
-    for side in s.sides:
-        if s.grip[side] > 0.02:
-            s.add(
-                "left pressing",
-                "the service restarts",
-                side,
-                [s.force(side, since).mean() / s.grip[side]],
-            )
+    s.left("the service restarts")
     third = Teleoperation(spoken, sides, 2)
     third.goals = deep
     s.start(third, "a client after a restart in a grip")

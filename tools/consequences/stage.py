@@ -74,8 +74,7 @@ class Stage:
     :param made: the service.
     :param touch: where each side touches an object, in the plan's terms.
     :ivar now: seconds of the virtual clock.
-    :ivar times: when what is true was noted; ``forces``, by side, the sum of the forces of contact
-        then, N m.
+    :ivar times: when what is true was noted.
     :ivar published: a state has come.
     :ivar low: by side, the low-rate copies: when they came, and q in parts of the range.
     """
@@ -95,10 +94,9 @@ class Stage:
         self.client: Client | None = None
         self.connected = True
         self.times: list[float] = []
-        self.forces: dict[Side, list[float]] = {s: [] for s in self.sides}
+        self._contacts: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
         self._q_true: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
-        self._q_shown: dict[Side, list[Sequence[float] | None]] = {s: [] for s in self.sides}
-        self._last: dict[Side, Sequence[float]] = {}
+        self._shown: dict[Side, list[tuple[float, Sequence[float]]]] = {s: [] for s in self.sides}
         self._down_until: float | None = None
         self._waiting: list[tuple[str, bytes]] = []
         self._waiting_since = 0.0
@@ -118,7 +116,6 @@ class Stage:
     def connect(self, client: Client | None) -> None:
         """A client starts, in place of the one before; or that one is stopped."""
         self.client = client
-        self._last.clear()
         if client is not None:
             client.due = self.now
 
@@ -196,7 +193,7 @@ class Stage:
             client.crashed = True
             return
         client.receive(self.now, side, read[1])
-        self._last[side] = read[1]
+        self._shown[side].append((self.now, read[1]))
 
     def _q(self, side: Side, payload: bytes) -> Sequence[float] | None:
         """Q in a state; None if it cannot be read, or is too short."""
@@ -261,11 +258,10 @@ class Stage:
             hand = self.service.hands[side]
             if self.codec.joints == 1:
                 self._q_true[side].append([hand.q / hand.stroke])
-                self.forces[side].append(abs(hand.contact()))
+                self._contacts[side].append([hand.contact()])
             else:
                 self._q_true[side].append(hand.q)
-                self.forces[side].append(sum(map(abs, hand.contact)))
-            self._q_shown[side].append(self._last.get(side))
+                self._contacts[side].append(hand.contact)
 
     def places(self, side: Side, since: float = 0.0) -> Floats:
         """Where each joint was from then on, in parts of its range: a row for each of the times."""
@@ -276,7 +272,13 @@ class Stage:
         hand = self.service.hands[side]
         return np.asarray((found - hand.low) / (hand.high - hand.low))
 
-    def shown(self, side: Side, row: int) -> Floats:
-        """The same as a client has read it at one of the times; NaN where it has read nothing."""
-        q = self._q_shown[side][row]
-        return np.full(self.codec.joints, np.nan) if q is None else self.part(side, q)
+    def forces(self, side: Side, since: float = 0.0) -> Floats:
+        """The force of contact of each joint from then on, N m: a row for each of the times."""
+        return np.asarray(np.abs(self._contacts[side][bisect_left(self.times, since) :]))
+
+    def shown(self, side: Side) -> tuple[Floats, Floats]:
+        """(times, places) as clients have read them."""
+        shown = self._shown[side]
+        places = np.array([q for _, q in shown]).reshape(-1, self.codec.joints)
+        low, stroke = self.limits[side]
+        return np.array([now for now, _ in shown]), np.asarray((places - low) / stroke)

@@ -13,7 +13,7 @@ from dexkit.conformance.faults import mutants
 from dexkit.conformance.kit.requirements import Level, Requirement, catalogue
 from dexkit.documents import write_file
 from dexkit.models import MODELS
-from tools.consequences.kinds import KINDS, Consequence
+from tools.consequences.kinds import KINDS, NO_END, Consequence
 
 __all__ = ["FILE", "Row", "Table", "sentence"]
 
@@ -147,20 +147,18 @@ def sentence(requirement_id: str) -> str:
 def told(found: Consequence) -> str:
     """A consequence in words, with both figures."""
     kind = KINDS[found.kind]
-    where = f"joint {found.joint}, {found.side}" if found.kind != "starts" else found.side
-    if found.kind == "starts":
-        return f"{found.client} gets no state or does not start ({found.task})"
-    return (
-        f"{found.client} has a hand that {kind.words}: {_amount(found.found, kind.unit)} instead "
-        f"of {_amount(found.good, kind.unit)} ({found.task}; {where})"
+    words = kind.words.format(
+        found=_amount(found.found, kind.unit), good=_amount(found.good, kind.unit)
     )
+    joint = "" if found.kind == "starts" else f" joint {found.joint}"
+    return f"{words} ({found.client}, {found.task}; {found.side}{joint})"
 
 
 def _amount(value: float, unit: str) -> str:
-    if unit == "part":
-        return f"{100 * value:.0f} % of the range" if value < 99 else "nothing finite"
+    if value >= NO_END:
+        return "never" if unit == "s" else "no end"
     if unit == "s":
-        return f"{value:.2f} s" if value < 99 else "never"
-    if unit.startswith("of "):
-        return f"{100 * value:.0f} % {unit}" if value < 99 else "nothing finite"
+        return f"{value:.2f} s"
+    if unit.startswith("% "):
+        return f"{100 * value:.0f} {unit}"
     return f"{value:.2g} {unit}"

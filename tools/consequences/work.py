@@ -62,7 +62,8 @@ def musts() -> frozenset[str]:
 def tasks(folder: Path, only: tuple[str, ...]) -> list[Task]:
     """The wrong hands whose name has one of the texts, and the references that they need.
 
-    Those that fail a MUST are first, models by turns.
+    First is one hand of each MUST, then a second one, and so on: a run that is stopped knows
+    something of all of them.
     """
     every = musts()
     found = [m for m in mutants("dds") if m.model in MODELS]
@@ -70,9 +71,8 @@ def tasks(folder: Path, only: tuple[str, ...]) -> list[Task]:
     turns: dict[str, int] = {}
 
     def order(mutant: Mutant) -> tuple[bool, bool, int]:
-        turns[mutant.model] = turn = turns.get(mutant.model, 0) + 1
-        fails = (mutant.pinned or frozenset()) & every
-        return not fails, mutant.model not in _UNITREE, turn
+        turns[mutant.kills] = turn = turns.get(mutant.kills, 0) + 1
+        return mutant.kills not in every, mutant.model not in _UNITREE, turn
 
     hands = [_task(m, folder) for m in sorted(found, key=order)]
     references = {(t.model, t.dialect, t.sides): _reference(t, folder) for t in hands}
