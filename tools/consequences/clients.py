@@ -9,7 +9,7 @@ pressure of a Dex3-1 is read by Unitree's example and by clients of two other pr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
@@ -20,10 +20,8 @@ from dexkit.teleop import Pose, client_for
 from dexkit.teleop.client import PINCH_MAX, PINCH_MIN
 from tools.consequences.stage import Client
 
-__all__ = ["Example", "Script", "Teleoperation", "closed", "steady"]
+__all__ = ["Example", "Script", "Teleoperation", "closed"]
 
-Goals = Callable[[float], Mapping[Side, Pose]]
-"""What the operator wants of each side at a time, in q."""
 FPS = 30.0
 """Rate of the operator's input, and of data sets (docs/sources/sessions.md#a2)."""
 
@@ -55,8 +53,7 @@ class Teleoperation(Client):
         self.dialect, self.sides = spoken, tuple(sides)
         self.client = client_for(spoken, sides)
         self.period = self.client.period
-        self.course: Goals | None = None
-        self._input = (-1.0, self.goals)
+        self._input = (-1, self.goals)
 
     def receive(self, now: float, side: Side, q: Sequence[float]) -> None:
         """Take a state: reads of both sides take turns."""
@@ -66,7 +63,7 @@ class Teleoperation(Client):
         """A turn of its control loop."""
         frame = math.floor(now * FPS)
         if frame != self._input[0]:
-            self._input = frame, dict(self.course(now) if self.course else self.goals)
+            self._input = frame, self.wanted(now)
         wanted = self._input[1]
         inputs: dict[Side, Pose | None] = {s: self._tracked(q) for s, q in wanted.items()}
         found = {}
@@ -99,7 +96,7 @@ class Script(Client):
 
     def commands(self, now: float) -> Mapping[Side, Sequence[Motor]]:
         """The goals as they are."""
-        return {s: self.motors(s, q) for s, q in self.goals.items()}
+        return {s: self.motors(s, q) for s, q in self.wanted(now).items()}
 
     def motors(self, side: Side, q: Sequence[float]) -> list[Motor]:
         """A command with the client's gains."""
@@ -139,8 +136,3 @@ class Example(Script):
             return [replace(m, mode=1) for m in made]
         modes = (self.codec.mode(i, self.status, self.timeout) for i in range(len(made)))
         return [replace(m, mode=mode) for m, mode in zip(made, modes, strict=True)]
-
-
-def steady(pose: Mapping[Side, Pose]) -> Goals:
-    """Goals that do not change."""
-    return lambda now: pose

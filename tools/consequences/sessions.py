@@ -138,17 +138,18 @@ class Session:
     def follow(self, task: str, low: float, high: float, period: float, seconds: float) -> None:
         """The operator moves to and fro slowly: how much later the hand follows."""
         client = self.stage.client
-        assert isinstance(client, Teleoperation)
-        since = self.stage.now
+        assert client is not None
+        since, sides = self.stage.now, list(client.goals)
 
         def course(now: float) -> Mapping[Side, Pose]:
             swing = 0.5 - 0.5 * math.cos(2 * math.pi * (now - since) / period)
-            return _both(self, low + (high - low) * swing)
+            every = _both(self, low + (high - low) * swing)
+            return {s: every[s] for s in sides}
 
         client.course = course
         self.stage.run(seconds)
         client.goals, client.course = dict(course(self.stage.now)), None
-        for side in self.sides:
+        for side in sides:
             t, places = self.places(side, since)
             goal = np.array([self.parts(side, course(since + x)[side]) for x in t])
             self.add(
@@ -367,7 +368,7 @@ def _events(s: Session, client: Teleoperation) -> None:
     near = _beyond(s, good)
     stage.connect(None)
     for name, wrong in (("degrees", far), ("a little too far", near)):
-        _burst(s, wrong, 80)
+        _burst(s, wrong, round(100 * stroke))
         for side in s.sides:
             s.add("ends", name, side, stage.places(side, stage.now - 0.05)[-1])
     stage.connect(client)
@@ -511,12 +512,11 @@ def example(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sess
     stage.run(0.8)
     s.other_readers()
     client = Example(spoken, sides[:1])
-    client.goals = {sides[0]: closed(spoken, sides[0], (0.5,))}
+    client.goals = {sides[0]: closed(spoken, sides[0], (_OPEN,))}
     stage.connect(client)
     if spoken.is_gripper:
-        s.move("half way", {}, 1.0)
-        for part in (_SHUT, _OPEN, 0.5):
-            s.move(f"to {part}", {sides[0]: closed(spoken, sides[0], (part,))}, 1.2)
+        stage.run(_stroke(spoken))
+        s.follow("to and fro", _OPEN, _SHUT, 4.0, 6.0)
     else:
         client.gains, client.period = client.TURN, client.fast
         for i, part in enumerate((0.3, 0.7, 0.3, 0.7)):

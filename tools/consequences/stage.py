@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,12 +52,18 @@ class Client(ABC):
 
     def __init__(self, number: int = 0) -> None:
         self.number = number
-        self.goals: dict[Side, Pose] = {}
+        self.goals: Mapping[Side, Pose] = {}
+        self.course: Callable[[float], Mapping[Side, Pose]] | None = None
+        """The goals at a time, in place of those that stay."""
         self.due = 0.0
         self.began: float | None = None
         """When it sent its first command."""
         self.crashed = False
         """Its receiving thread has ended: a state had fewer motors than it reads."""
+
+    def wanted(self, now: float) -> Mapping[Side, Pose]:
+        """What its user wants of each side, in q."""
+        return self.course(now) if self.course else self.goals
 
     def receive(self, now: float, side: Side, q: Sequence[float]) -> None:
         """Take the q of a state; not every client looks at it."""
