@@ -30,6 +30,8 @@ RIVAL = 1000
 """Number of the second client."""
 _OPEN, _SHUT = 0.03, 0.97
 """How far an operator opens and closes: short of the stops."""
+_HALF = 1.3
+"""Seconds for half a stroke: of a gripper that is slow and late, too."""
 _NO_GRIP = 0.01
 """N m: a joint that presses with less does not."""
 _SHARE = {Side.LEFT: 1.0, Side.RIGHT: 0.8}
@@ -301,14 +303,14 @@ def teleoperate(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> 
     s.move("a first stroke", _both(s, _OPEN), stroke)
     s.move("close", _both(s, _SHUT), stroke)
     s.move("open", _both(s, _OPEN), stroke)
-    s.move("half way", _both(s, 0.5), 1.0)
+    s.move("half way", _both(s, 0.5), _HALF)
     s.still("hold still", 1.0)
-    s.move("a small step", _both(s, 0.42), 0.6)
+    s.move("a small step", _both(s, 0.42), 1.0)
     s.follow("follow slowly", 0.1, 0.9, 3.0, 4.5)
-    s.move("half way again", _both(s, 0.5), 1.0)
+    s.move("half way again", _both(s, 0.5), _HALF)
     for i, part in enumerate((_SHUT, _OPEN, _SHUT, _OPEN)):
         s.move(f"quickly {i + 1}", _both(s, part), 0.5, settles=False, hurried=True)
-    s.move("to rest", _both(s, 0.5), 1.0)
+    s.move("to rest", _both(s, 0.5), _HALF)
     _one_at_a_time(s, client)
     _events(s, client)
     s.records()
@@ -319,8 +321,8 @@ def _one_at_a_time(s: Session, client: Teleoperation) -> None:
     """One side, then one joint of each, moves alone; the others must not."""
     if len(s.sides) > 1:
         for side in s.sides:
-            s.move(f"only {side}", {side: closed(s.dialect, side, (_SHUT,))}, 1.0)
-            s.move(f"only {side} back", {side: closed(s.dialect, side, (0.5,))}, 1.0)
+            s.move(f"only {side}", {side: closed(s.dialect, side, (_SHUT,))}, _HALF)
+            s.move(f"only {side} back", {side: closed(s.dialect, side, (0.5,))}, _HALF)
     joints = s.stage.codec.joints
     if joints == 1:
         return
@@ -328,7 +330,7 @@ def _one_at_a_time(s: Session, client: Teleoperation) -> None:
         parts = [0.5] * joints
         parts[joint] = 0.9
         s.move(f"joint {joint} alone", _both(s, *parts), 0.35, settles=False)
-    s.move("all back", _both(s, 0.5), 0.5)
+    s.move("all back", _both(s, 0.5), 0.8)
 
 
 def _events(s: Session, client: Teleoperation) -> None:
@@ -340,7 +342,7 @@ def _events(s: Session, client: Teleoperation) -> None:
     stage.service.loaded = True
     s.follow("follow while a slow viewer is there", 0.2, 0.8, 2.0, 3.0)
     stage.service.loaded = False
-    s.move("half way after it", mid, 0.8)
+    s.move("half way after it", mid, _HALF)
 
     # the network pauses in a move, for less and for longer than the time-out
     for seconds in (0.4, 1.4):
@@ -352,7 +354,7 @@ def _events(s: Session, client: Teleoperation) -> None:
         stage.run(0.1)
         stage.connected = True
         s.move(f"open after {seconds} s", _both(s, _OPEN), stroke)
-        s.move(f"half way after {seconds} s", mid, 0.8)
+        s.move(f"half way after {seconds} s", mid, _HALF)
 
     # inverse kinematics fails: NaN for one joint, for one cycle and for long
     hold = Script(s.dialect, s.sides)
@@ -372,7 +374,7 @@ def _events(s: Session, client: Teleoperation) -> None:
         for side in s.sides:
             s.add("ends", name, side, stage.places(side, stage.now - 0.05)[-1])
     stage.connect(client)
-    s.move(f"half way after {name}", mid, 1.0)
+    s.move(f"half way after {name}", mid, _HALF)
 
     # a message without motors, with too few, with too many; of another hand's type
     for name, payloads in (
@@ -399,7 +401,7 @@ def _events(s: Session, client: Teleoperation) -> None:
     for _ in range(100):
         stage.send(rival, RIVAL)
         stage.run(0.01)
-    s.move("half way when the second client has gone", mid, 0.6)
+    s.move("half way when the second client has gone", mid, _HALF)
     s.move("close when the second client has gone", _both(s, _SHUT), stroke)
 
     # stopped in a move, and started again
@@ -414,7 +416,7 @@ def _events(s: Session, client: Teleoperation) -> None:
     s.still("a NaN of the second client", 0.4, after=_burst(s, bad, 10, 1))
 
     # the hand's service is restarted; the client goes on, if it can
-    s.move("to rest before the restart", mid, 0.8)
+    s.move("to rest before the restart", mid, _HALF)
     s.gone("stopped before the restart")
     stage.restart()
     s.still("the service restarts", 2.2)
@@ -470,10 +472,10 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     stage.run(0.5)
     s.feel("before the grip")
     deep = _both(s, 0.95)
-    s.move("grasp", deep, 1.0)
+    s.move("grasp", deep, _HALF)
     s.hold("lift", 3.0)
-    s.move("let go", _both(s, 0.1), 1.0)
-    s.move("grasp again", deep, 1.0)
+    s.move("let go", _both(s, 0.1), _HALF)
+    s.move("grasp again", deep, _HALF)
     s.hold("lift again", 1.0)
     hold = Script(spoken, sides)
     good = {side: hold.motors(side, q) for side, q in deep.items()}
@@ -489,8 +491,8 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     second.goals = deep
     s.start(second, "a second client in a grip")
     s.hold("lift, second client", 0.6)
-    s.move("let go, second client", _both(s, 0.1), 1.0)
-    s.move("grasp, second client", deep, 0.8)
+    s.move("let go, second client", _both(s, 0.1), _HALF)
+    s.move("grasp, second client", deep, _HALF)
     s.hold("lift once more", 0.4)
     stage.connect(None)
     stage.restart()
@@ -500,7 +502,7 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     third.goals = deep
     s.start(third, "a client after a restart in a grip")
     s.hold("lift after the restart", 0.6)
-    s.move("let go after the restart", _both(s, 0.1), 1.0)
+    s.move("let go after the restart", _both(s, 0.1), _HALF)
     s.records()
     return s
 
