@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dexkit.conformance.behaviours.operator import OPERATOR
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.operator import LateState
@@ -23,7 +24,6 @@ from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.kit.results import Evidence, Load, Verdict
 from dexkit.conformance.kit.stimulus_record import Beats
 from dexkit.conformance.kit.verdicts import MOST_PLACES, excuse
-from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side, Subject
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats

@@ -23,6 +23,8 @@ from dexkit.conformance.kit import judge as judge_module
 from dexkit.conformance.kit.judge import judge_layer
 from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
+from dexkit.conformance.stimuli import script_class
+from dexkit.conformance.stimuli.script import parts_of
 from tests.each import each
 from tools.pins.__main__ import main
 from tools.pins.keys import (
@@ -132,6 +134,14 @@ EDITS = [
     # what plays: the stimulus, the reference, the player, the facts of the model, the codec
     ("dexkit/conformance/stimuli/fingers.py", "0.5", "0.51", True, None),
     ("dexkit/conformance/stimuli/script.py", "3_000_000_000", "3_100_000_000", True, None),
+    (
+        "dexkit/conformance/behaviours/motion.py",
+        "(joints, CLOSED)",
+        "(joints, CLOSED + 1)",
+        True,
+        None,
+    ),
+    ("dexkit/conformance/behaviours/load.py", "count = 40", "count = 41", False, None),
     ("dexkit/conformance/virtual/fingers.py", "- 0.03", "- 0.04", True, None),
     ("dexkit/conformance/virtual/topic_run.py", "_STARTS_S = 2.0", "_STARTS_S = 2.1", True, None),
     ("dexkit/conformance/virtual/service.py", "self.now += dt", "self.now += 2 * dt", True, None),
@@ -190,6 +200,14 @@ def test_a_key_changes_with_the_code_that_it_is_about(
     changes = sources().digest(played, JUDGES_ONLY) != after.digest(played, JUDGES_ONLY)
     assert plays is None or changes == plays
     assert judges is None or (sources().digest(judged) != after.digest(judged)) == judges
+
+
+@each("name", ["dex1-1", "dex3-1", "brainco-revo2", "g1"])
+def test_no_phase_depends_on_a_check(name: str) -> None:
+    phases = parts_of(script_class(name))
+    places = [sources().place(p.play.__module__, p.play.__qualname__) for p in phases]
+    reached = sources().reached(places, JUDGES_ONLY)
+    assert not {place for place in reached if place[0].startswith("dexkit.conformance.checks")}
 
 
 def test_a_changed_check_is_judged_anew_and_no_other() -> None:

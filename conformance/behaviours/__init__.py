@@ -1,4 +1,5 @@
-"""What hands, robots and their clients must do: one file for each behaviour, for all models.
+"""What hands, robots and their clients must do: one file for each behaviour, for all models, and
+beside it a module with the phases that show it and the checks that judge it.
 
 :mod:`dexkit.conformance.kit.requirements` reads them and explains their keys.
 """
@@ -46,7 +47,7 @@ BEHAVIOURS = (
 """The behaviours, in the order in which requirements of one area are listed."""
 
 CHECKS = tuple(f"{__name__}.{name}" for name in BEHAVIOURS)
-"""The modules with their checks, one beside each file."""
+"""The modules with their phases and checks, one beside each file."""
 
 AREAS = (
     "Discovery",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,8 +17,495 @@ from dexkit.conformance.checks.robot import LATE_S, RobotContext, no_state
 from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, steps, steps_of
 from dexkit.conformance.checks.timing import gaps
 from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.stimulus_record import Phase
+from dexkit.conformance.stimuli.fingers import FingerScript
+from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, HandScript
+from dexkit.conformance.stimuli.robot import STEP, RobotScript
+from dexkit.conformance.stimuli.script import (
+    NOT_FINITE,
+    Join,
+    Leave,
+    Moment,
+    Payloads,
+    Place,
+    Role,
+    Send,
+    Steps,
+    stimulus,
+    with_gains,
+)
+from dexkit.hand import Side
 from dexkit.unseen import UNSEEN_S
+
+_FLOOD = 500
+"""Commands of a burst."""
+_BETWEEN = 0.3
+"""Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
+_STATUSES = range(2, 8)
+"""Values of the three status bits without a meaning in a command to a hand. A status
+of 6 calibrates a motor only with a certain torque, which these commands do not have
+(docs/sources/unitree-dex.md#g)."""
+_BAD = {
+    "nan": "broken commands (NaN and infinity): nothing may move",
+    "out-of-range": "commands far out of range: no harm may be done",
+    "empty": "empty commands: nothing may move",
+    "short": "commands for a motor too few: nothing may move",
+    "long": "commands for more motors than there are: nothing may move",
+    "negative": "negative gains: nothing may run away",
+    "status": "mode bytes with an unknown status: nothing may move",
+    "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
+}
+
+
+@stimulus("fingerprint", HandScript, after="step joint dead-zone")
+def make_fingerprint(script: HandScript) -> Steps:
+    """Steps to compare the ``recover`` steps with."""
+    for _ in range(2):
+        yield from script.everyone("fingerprint", script.other_place(), most=script.step_most)
+
+
+@stimulus("nan", HandScript, after="fingerprint")
+def send_not_finite(script: HandScript) -> Steps:
+    """NaN and infinity in each field, on each side alone."""
+    yield from _send_and_recover(script, "nan")
+
+
+@stimulus("out-of-range", HandScript, after="nan")
+def send_out_of_range(script: HandScript) -> Steps:
+    """Positions far outside of the range, and beyond each end."""
+    yield from _send_and_recover(script, "out-of-range")
+
+
+@stimulus("empty long", GripperScript, after="out-of-range")
+def send_wrong_lengths(script: GripperScript) -> Steps:
+    """Commands for no motor, and for motors too many."""
+    yield from _send_and_recover(script, "empty long")
+
+
+@stimulus("negative", GripperScript, after="long", applies=with_gains)
+def send_negative_gains(script: GripperScript) -> Steps:
+    """Negative gains."""
+    yield from _send_and_recover(script, "negative")
+
+
+@stimulus("foreign", GripperScript, after="negative")
+def send_other_type(script: GripperScript) -> Steps:
+    """A client of another type on the topic."""
+    yield from _send_and_recover(script, "foreign", most=1.5)
+
+
+@stimulus("foreign empty short long negative status wrong-id", FingerScript, after="out-of-range")
+def send_malformed(script: FingerScript) -> Steps:
+    """Every other kind, with one step after them, to save time."""
+    yield from _send_and_recover(script, "foreign empty short long negative status wrong-id")
+
+
+def _send_and_recover(script: HandScript, kinds: str, *, most: float | None = None) -> Steps:
+    """Bad commands of these kinds, and a good step after all of them.
+
+    :param most: seconds of the step, if not as of every other one.
+    """
+    most = script.step_most if most is None else most
+    these = [name for name in kinds.split() if name in script.plan.phases]
+    for name in these:
+        if name != these[0]:
+            yield from script.hold(_BETWEEN)
+        yield from _send_foreign(script) if name == "foreign" else _send_kind(script, name)
+    if these:
+        yield from script.everyone(
+            "recover", script.other_place(), most=most, after=" ".join(these)
+        )
+
+
+def _send_kind(script: HandScript, name: str) -> Steps:
+    """Bad commands of one kind, for a while on each side alone where it has a topic of its own."""
+    script.report(_BAD[name])
+    yield from script.hold(0.1)
+    if name == "nan":
+        for side in script.plan.sides:
+            kinds = [{side: motors} for motors in not_finite_motors(script, side)]
+            # long enough for a step of the other side beside them
+            each = max(0.065, ASIDE_SECONDS / len(kinds))
+            yield from _send_bad(script, name, (side,), kinds, each)
+    elif isinstance(script, GripperScript):
+        yield from _send_to_gripper(script, name)
+    elif isinstance(script, FingerScript):
+        yield from _send_to_fingers(script, name)
+
+
+def _send_to_gripper(script: GripperScript, name: str) -> Steps:
+    sides = script.plan.sides
+    if name == "out-of-range":
+        places = (1000.0, -1000.0, 1.3 * script.stroke, -0.3 * script.stroke)
+        far = [dict.fromkeys(sides, (Motor(q=q),)) for q in places]
+        yield from _send_beyond_each_end(script, name, far, 0.3)
+    elif name == "long":
+        good = {s: script.motors(s, pose) for s, pose in script.goal.items()}
+        for alone in _each_alone(script):
+            mine = {s: good[s] for s in alone}
+            others = {s: m for s, m in good.items() if s not in alone}
+            rest = script.codec.encode(others) if others else []
+            longer = [
+                script.codec.encode_longer(mine, [Motor(q=_gripper_far(script, alone[0]))] * more)
+                + rest
+                for more in (1, 19)
+            ]
+            yield from _send_bad(script, name, alone, longer, 0.15)
+    elif name == "negative":
+        kp, kd = script.model.gains[0]
+        for alone in _each_alone(script):
+            near = {s: script.aside(s, 0.1)[0] for s in alone}
+            for damping in (-kd, kd):
+                wrong = {s: (Motor(q=q, kp=-kp, kd=damping),) for s, q in near.items()}
+                yield from _send_bad(script, name, alone, [wrong], 0.15)
+    else:
+        for alone in _each_alone(script):
+            yield from _send_bad(script, name, alone, [_gripper_empty(script, alone)], 0.25)
+
+
+def _gripper_empty(
+    script: GripperScript, sides: Sequence[Side]
+) -> Mapping[Side, Motors] | Payloads:
+    """Commands without a motor."""
+    if script.codec.shared:
+        return script.codec.encode_empty(sides)
+    return dict.fromkeys(sides, ())
+
+
+def _gripper_far(script: GripperScript, side: Side) -> float:
+    """A q far from the goal."""
+    return script.low(side) if script.goal[side][0] > 0.6 * script.stroke else script.high()
+
+
+def _send_to_fingers(script: FingerScript, name: str) -> Steps:
+    if name == "status":
+        kinds = [
+            {s: _with_status(script, s, first) for s in script.plan.sides} for first in _STATUSES
+        ]
+        yield from _send_bad(script, name, script.plan.sides, kinds, 0.1)
+    elif name == "out-of-range":
+        far = [
+            {s: _at(script, s, [end] * len(script.joints[s])) for s in script.plan.sides}
+            for end in (1000.0, -1000.0)
+        ]
+        for way in (0.3, -0.3):
+            ends = {
+                s: [(j.q_max if way > 0 else j.q_min) + way * j.stroke for j in joints]
+                for s, joints in script.joints.items()
+            }
+            far.append({s: _at(script, s, ends[s]) for s in script.plan.sides})
+        # long enough for the fastest joint to leave its range from anywhere
+        travel = min(j.stroke / j.dq_max for joints in script.joints.values() for j in joints)
+        each = max(0.2, 0.7 * travel)
+        yield from _send_beyond_each_end(script, name, far, each, most=1.5)
+    else:
+        for alone in _each_alone(script):
+            wrong = _malformed(script, name, alone)
+            for malformed in wrong:
+                each = 0.18 if name != "negative" else 0.25 / len(wrong)
+                yield from _send_bad(script, name, alone, [malformed], each)
+
+
+def _malformed(
+    script: FingerScript, name: str, sides: Sequence[Side]
+) -> Sequence[Mapping[Side, Motors] | Payloads]:
+    """The bad commands of a phase to these sides, whole messages where they share one."""
+    good = {s: script.motors(s, script.goal[s]) for s in sides}
+    surplus = replace(good[sides[0]][0], q=1.0)
+    if script.codec.shared and name == "empty":
+        return [script.codec.encode_empty(sides)]
+    if script.codec.shared and name == "short":
+        return [script.codec.encode_shorter(good)]
+    if script.codec.shared and name == "long":
+        return [script.codec.encode_longer(good, [surplus] * more) for more in (1, 13)]
+    if name == "empty":
+        return [{s: [] for s in sides}]
+    if name == "short":
+        return [{s: motors[:-1] for s, motors in good.items()}]
+    if name == "long":
+        return [
+            {s: [*m, *[replace(m[0], q=1.0)] * more] for s, m in good.items()} for more in (1, 13)
+        ]
+    if name == "negative":
+        near = {s: script.motors(s, script.aside(s, 0.1)) for s in sides}
+        # kp alone, in all but the first joint: that one may be checked for all
+        return [
+            {s: [replace(m, kp=-m.kp, kd=-m.kd) for m in motors] for s, motors in near.items()},
+            {
+                s: [good[s][0], *(replace(m, kp=-m.kp, kd=0.1 * m.kd) for m in motors[1:])]
+                for s, motors in near.items()
+            },
+        ]
+    return [{s: _crossed(script, s, motors) for s, motors in good.items()}]
+
+
+def _with_status(script: FingerScript, side: Side, first: int) -> Motors:
+    """Far goals with statuses that have no meaning, another one in each joint."""
+    count = len(_STATUSES)
+    return [
+        replace(m, mode=script.codec.mode(i, _STATUSES[(first + i) % count]))
+        for i, m in enumerate(script.motors(side, script.other_place()[side]))
+    ]
+
+
+def _crossed(script: FingerScript, side: Side, motors: Motors) -> Motors:
+    """Two motors with each other's id, and a goal elsewhere for the first."""
+    first, other = script.roles.crossed
+    target = script.other_place()[side][first]
+    crossed = list(motors)
+    crossed[first] = replace(motors[first], q=target, mode=script.codec.mode(other))
+    crossed[other] = replace(motors[other], mode=script.codec.mode(first))
+    return crossed
+
+
+def not_finite_motors(script: HandScript, side: Side) -> list[Motors]:
+    """Commands with one field each that is not finite, and a goal far away: it shows if one counts.
+
+    Of a hand of several joints one joint has it: the last, the first and a middle one in turn.
+    """
+    found: list[Motors] = []
+    if isinstance(script, GripperScript):
+        motor = Motor(q=_gripper_far(script, side))
+        for field, value in NOT_FINITE:
+            if field == "q" or script.gains_used:
+                found.append((replace(motor, **{field: value}),))  # type: ignore[arg-type]
+        return found
+    last = len(script.model.gains) - 1
+    joints = (last, 0, last // 2)
+    for i, (field, value) in enumerate(NOT_FINITE):
+        if field in script.plan.dialect.command_fields:
+            motors = list(script.motors(side, script.other_place()[side]))
+            joint = joints[(i + i // 3) % 3]
+            motors[joint] = replace(motors[joint], **{field: value})  # type: ignore[arg-type]
+            found.append(motors)
+    return found
+
+
+def _at(script: HandScript, side: Side, q: Sequence[float]) -> Motors:
+    """The command to go to q of every joint, rad, which may be out of range."""
+    if isinstance(script, GripperScript):
+        return (Motor(q=q[0]),)
+    return [replace(m, q=x) for m, x in zip(script.motors(side, tuple(q)), q, strict=True)]
+
+
+def _each_alone(script: HandScript) -> list[tuple[Side, ...]]:
+    """Each side by itself; both where they share a message."""
+    if script.codec.shared:
+        return [script.plan.sides]
+    return [(s,) for s in script.plan.sides]
+
+
+def _send_bad(
+    script: HandScript,
+    name: str,
+    sides: Sequence[Side],
+    kinds: Sequence[Mapping[Side, Motors] | Payloads],
+    each: float,
+) -> Steps:
+    """Bad commands to some sides, as a phase: each kind long enough to show what it does.
+
+    The other sides go on being commanded; where there is time, they make a step.
+
+    :param kinds: motors of each of these sides, or whole messages.
+    :param each: seconds of each kind.
+    """
+    beside = script.beside_others(sides, len(kinds) * each)
+    good = {s: script.motors(s, q) for s, q in script.goal.items() if s not in sides}
+    phase = script.begin(name, sides)
+    for kind in kinds:
+        bad = kind if isinstance(kind, list) else script.codec.encode({**good, **kind})
+        yield from script.repeat(each, lambda bad=bad: script.send(bad))  # type: ignore[misc]
+        yield from script.command()  # or it would brake, as it must without good commands
+    script.end(phase)
+    for other in beside:
+        script.end(other)
+
+
+def _send_beyond_each_end(
+    script: HandScript,
+    name: str,
+    far: Sequence[Mapping[Side, Motors]],
+    each: float,
+    most: float = 2.5,
+) -> Steps:
+    """Goals beyond the ends to all sides, each way from inside of the range.
+
+    At an end, a hand that goes there in any case cannot be told from one that ignores them.
+
+    :param far: in turn beyond the one end and the other.
+    :param each: seconds of each.
+    :param most: seconds to come back inside in between.
+    """
+    for way in range(2):
+        if way:
+            yield from script.everyone("center", script.other_place(), most=most)
+        yield from _send_bad(script, name, script.plan.sides, far[way::2], each)
+
+
+def _send_foreign(script: HandScript) -> Steps:
+    """Another participant publishes another type on the command topics, with far targets."""
+    script.report("another type on the command topics: it must not reach the hand")
+    yield from script.hold(0.1)
+    far = script.codec.encode_foreign(
+        {s: script.motors(s, pose) for s, pose in script.other_place().items()}
+    )
+    yield from script.do(Join(Role.STRANGER))
+    phase = script.begin("foreign", script.plan.sides)
+    # two goals in turn cancel out in a servo whose speed does not depend on the distance
+    turns = 3 if script.plan.dialect.position_servo else 1
+    yield from script.beside(phase, far, Role.STRANGER, 0.4, turns)
+    script.end(phase)
+    yield from script.do(Leave(Role.STRANGER))
+
+
+@stimulus("burst", HandScript, after="foreign stiffness")
+def flood(script: HandScript) -> Steps:
+    """Hundreds of commands at once to another place, the last of them back to this one."""
+    script.report(f"{_FLOOD} commands at once: only the last one counts")
+    yield from script.hold(0.1)
+    far = script.codec.encode(
+        {s: script.motors(s, pose) for s, pose in script.other_place().items()}
+    )
+    phase = script.begin("burst", script.plan.sides)
+    yield from script.do(Send(far * (_FLOOD - 1), 0))
+    phase.observed = {"sent_s": script.elapsed(phase)}
+    yield from script.hold(0.6)
+    script.end(phase)
+
+
+def send_bad_at_once(script: HandScript) -> Steps:
+    """Commands that are not finite, and such that are far out of range, soon after a pause."""
+    sides = script.plan.sides
+    broken = {s: not_finite_motors(script, s)[-1] for s in sides}
+    if "nan" in script.plan.phases:
+        yield from _send_bad(script, "nan", sides, [broken], 0.1)
+    # taken modulo a turn, 11 rad leads to the wrong end, and 1000 rad to the right one
+    yield from _send_far_away(script, (11.0, -1000.0), 0.15)
+    if script.plan.phases & {"nan", "out-of-range"}:
+        yield from script.everyone(
+            "recover", script.other_place(), after=_bad_since_recovery(script)
+        )
+
+
+@stimulus("nan", GripperScript, moment=Moment.NEW_CLIENT, after="grip")
+def send_to_gripper_again(script: GripperScript) -> Steps:
+    """Each kind once more, of a new client."""
+    script.report("bad commands of the new client: nothing may move")
+    sides, phases = script.plan.sides, script.plan.phases
+    yield from _send_not_finite_at_once(script, 0.1)
+    good = {s: script.motors(s, pose) for s, pose in script.goal.items()}
+    if "empty" in phases:
+        yield from script.hold(_BETWEEN)
+        yield from _send_bad(script, "empty", sides, [_gripper_empty(script, sides)], 0.15)
+    if "long" in phases:
+        yield from script.hold(_BETWEEN)
+        longer = script.codec.encode_longer(good, [Motor(q=_gripper_far(script, sides[0]))])
+        yield from _send_bad(script, "long", sides, [longer], 0.15)
+    if "negative" in phases and script.gains_used:
+        yield from script.hold(_BETWEEN)
+        kp, kd = script.model.gains[0]
+        wrong = {s: (Motor(q=script.aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
+        yield from _send_bad(script, "negative", sides, [wrong], 0.15)
+    yield from _send_far_away(script, (1e6, -1e6), 0.2)
+    yield from script.everyone("recover", script.other_place(), after=_bad_since_recovery(script))
+
+
+@stimulus("nan", FingerScript, moment=Moment.NEW_CLIENT, after="squeeze")
+def send_to_fingers_again(script: FingerScript) -> Steps:
+    """Each kind once more, of a new client."""
+    script.report("bad commands of the new client: nothing may move")
+    sides = script.plan.sides
+    yield from _send_not_finite_at_once(script, 0.07)
+    for name in ("empty", "short", "long", "negative"):
+        if name in script.plan.phases:
+            yield from script.hold(_BETWEEN)
+            bad = _malformed(script, name, sides)[0]
+            yield from _send_bad(script, name, sides, [bad], 0.15)
+    yield from _send_far_away(script, (1000.0, -1000.0), 0.2)
+    yield from script.everyone(
+        "recover", script.other_place(), most=1.5, after=_bad_since_recovery(script)
+    )
+
+
+def _send_not_finite_at_once(script: HandScript, each: float) -> Steps:
+    """Every second kind of them, to all sides at once; seconds of each."""
+    sides = script.plan.sides
+    every = zip(*(not_finite_motors(script, s) for s in sides), strict=True)
+    kinds = [dict(zip(sides, motors, strict=True)) for motors in every]
+    yield from _send_bad(script, "nan", sides, kinds[::2], each)
+
+
+def _send_far_away(script: HandScript, goals: Sequence[float], each: float) -> Steps:
+    """Commands far beyond both ends, to all sides at once.
+
+    :param goals: q of every joint, rad, one after the other.
+    :param each: seconds of each.
+    """
+    sides = script.plan.sides
+    if "out-of-range" in script.plan.phases:
+        joints = len(script.joints[sides[0]])
+        kinds = [{s: _at(script, s, [q] * joints) for s in sides} for q in goals]
+        yield from _send_bad(script, "out-of-range", sides, kinds, each)
+
+
+def _bad_since_recovery(script: HandScript) -> str:
+    """The phases of bad commands since the last step that a hand can recover by."""
+    names = [p.name for p in script.phases]
+    last = max(i for i, name in enumerate(names) if name in ("restart", "resume", "recover"))
+    return " ".join(dict.fromkeys(names[last + 1 :]))
+
+
+@stimulus("nan", RobotScript, after="wrong-crc", leaves=Place.AWAY)
+def send_robot_not_finite(script: RobotScript) -> Steps:
+    """A goal elsewhere, with NaN or infinity somewhere; ``params["kind"]``."""
+    kinds = {"q": math.nan, "dq": math.inf, "tau": math.nan, "kp": math.inf, "kd": math.nan}
+    for kind, value in kinds.items():
+        order = script.wish(**{kind: value})
+        yield from script.bad("nan", partial(script.put, order), 0.15, kind=kind)
+
+
+@stimulus("unused", RobotScript, after="nan", leaves=Place.AWAY)
+def drive_unused_slots(script: RobotScript) -> Steps:
+    """Slots without a motor are driven."""
+    order = list(script.order)
+    for slot in set(range(script.robot.slots)) - set(script.robot.used):
+        order[slot] = Motor(q=1.0, dq=0.0, tau=5.0, kp=100.0, kd=3.0, mode=1)
+    yield from script.bad("unused", lambda: script.put(order), 0.3)
+
+
+@stimulus("machine", RobotScript, after="unused", leaves=Place.AWAY)
+def command_other_machine(script: RobotScript) -> Steps:
+    """A goal elsewhere for another machine, where messages have ``mode_machine``."""
+    other = script.obs.machine % 255 + 1
+    order = script.wish()
+    yield from script.bad("machine", lambda: script.put(order, machine=other), 0.3)
+
+
+@stimulus("foreign", RobotScript, after="machine", leaves=Place.AWAY)
+def send_other_family(script: RobotScript) -> Steps:
+    """Commands of the other family's type."""
+    yield Join(Role.STRANGER)
+    wish = list(script.order)  # of every joint: the families' slots are not the same
+    for slot in script.robot.used:
+        wish[slot] = replace(wish[slot], q=wish[slot].q + script.inward(slot, STEP))
+    payload = script.codec.encode_foreign_command(wish)
+
+    def send() -> Steps:
+        script.next_ns += script.period_ns
+        payloads = [(script.robot.cmd_topic, payload)]
+        yield from script.do(Send(payloads, script.next_ns, by=Role.STRANGER))
+
+    yield from script.keep(0.1)
+    yield from script.bad("foreign", send, 0.3)
+    yield Leave(Role.STRANGER)
+
+
+@stimulus("recover", RobotScript, after="foreign", leaves=Place.AWAY)
+def step_after_bad_commands(script: RobotScript) -> Steps:
+    """A step, after all that."""
+    yield from script.step("recover")
 
 
 @check("DEX1-SAFE-01", "DEX3-SAFE-01")

@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
+from dexkit.conformance.kit.robot import WRONG_CRCS
+from dexkit.conformance.stimuli.robot import RobotScript
+from dexkit.conformance.stimuli.script import Place, Steps, stimulus
 from dexkit.conformance.usb.context import UsbContext, all_frames
+
+
+@stimulus("wrong-crc", RobotScript, after="off", leaves=Place.AWAY)
+def send_wrong_crcs(script: RobotScript) -> Steps:
+    """A goal elsewhere, with wrong CRCs; their kind is ``params["kind"]``."""
+    script.report("commands that are wrong: nothing may move")
+    for kind in WRONG_CRCS:
+        order = script.wish()
+        yield from script.bad("wrong-crc", partial(script.put, order, kind), 0.25, kind=kind)
 
 
 @check("H1-CRC-01")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,7 +36,403 @@ from dexkit.conformance.checks.steps import (
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.kit.measurement_error import Measure, Quantity
 from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.stimulus_record import Phase
+from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
+from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.hand import ASIDE
+from dexkit.conformance.stimuli.robot import SPEED, RobotScript
+from dexkit.conformance.stimuli.script import Place, Steps, stimulus, with_gains, without_gains
+from dexkit.hand import Side
+
+_PUSH = (0.25, 1.0)
+"""Least and greatest torque of a push, N m: the greatest is that of a grip by the client's lead."""
+_NUDGE, NUDGE_SECONDS = 0.6, 0.3
+"""A torque that pushes a hand that is held by kp, N m, and for how long, s."""
+_BACK_SECONDS = 0.15
+"""Seconds in which it comes back from there."""
+_LIMP_SECONDS = 0.25
+"""Seconds of zero gains with one q; the other side makes a step meanwhile, as in ``single``."""
+_SOFTEST, _SOFT_STEP = 0.8, 0.3
+"""kp, N m/rad, and size, in parts of the stroke, of a soft step."""
+_PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
+_FED_DQ, _FED_TAU, _FED_SECONDS = -0.5, 0.1, 0.6
+"""A feed-forward towards closed and a torque towards open, rad/s and N m, and for how long, s: with
+the client's gains they move the end of a step by less than 0.02 rad. A hand that takes them for
+limits makes a quarter of the step."""
+_SOFTER = 0.1
+"""Stiffness of a soft step as a part of the client's."""
+_MILD = 1.0 / 3.0
+"""The same of a step with the stiffness of Unitree's C++ example, 0.5 N m/rad where its grip has
+1.5 (docs/sources/unitree-dex.md#b1)."""
+_TORQUE, _TORQUE_DAMPING, _TORQUE_SECONDS = 0.3, 0.5, 0.25  # N m, N m s/rad, s
+# rad/s and N m s/rad of joints that are driven by a velocity
+_DRIVE_SPEED, _DRIVE_DAMPING = 0.35, 0.5
+# of joints that move slowly, N m/rad and N m s/rad: still under way five seconds later
+_SLOW_GAINS = (0.2, 0.8)
+_SLOW_PART = 0.08
+"""The same of position servos: part of their full speed."""
+_TORQUE_PART = 0.1  # of the joint's largest torque
+_MOVED = 0.1  # rad after which the torque is taken off
+
+
+@stimulus("stiffness", GripperScript, after="foreign")
+def push_each_held(script: GripperScript) -> Steps:
+    """A torque pushes hands that are held by kp without contact, after the bad commands."""
+    yield from push_held(script, script.plan.sides)
+
+
+def push_held(script: GripperScript, sides: Sequence[Side]) -> Steps:
+    """Push hands that are held without contact by a torque."""
+    if not sides or not script.gains_used or "stiffness" not in script.plan.phases:
+        return
+    phase = script.begin("stiffness", sides)
+    yield from script.hold(NUDGE_SECONDS, nudged(script, sides))
+    script.end(phase)
+    yield from script.hold(_BACK_SECONDS)
+
+
+def nudged(script: GripperScript, sides: Sequence[Side]) -> dict[Side, Motors]:
+    """Commands to hold, with a torque beside."""
+    return {s: (replace(script.motors(s, script.goal[s])[0], tau=_NUDGE),) for s in sides}
+
+
+@stimulus(
+    "limp unlike push drive fed",
+    GripperScript,
+    after="burst",
+    leaves=Place.AWAY,
+    applies=with_gains,
+)
+def drive_without_kp(script: GripperScript) -> Steps:
+    """Commands without a position gain."""
+    sides = script.plan.sides
+    yield from script.everyone("center", dict.fromkeys(sides, (0.8 * script.stroke,)))
+    if script.plan.phases & {"limp", "unlike"}:
+        script.report("commands without force (zero gains): the hand must not be pulled")
+        for side in sides:
+            yield from _gripper_limp(script, side)
+    if "push" in script.plan.phases:
+        # in opposite directions, so that a torque of the other side's shows
+        for names in (("pull", "push"), ("push", "pull")):
+            yield from push_gripper(script, dict(zip(sides, names, strict=False)))
+    if "drive" in script.plan.phases:
+        yield from drive_gripper(script, sides, 0.16, seconds=0.35)
+    if "fed" in script.plan.phases:
+        yield from _feed_forward(script, sides)
+
+
+def _feed_forward(script: GripperScript, sides: Sequence[Side]) -> Steps:
+    """The way back to the middle, with a feed-forward that hardly changes it."""
+    script.report("a velocity and a torque beside a position: it must be reached all the same")
+    goals = {s: script.home(s) for s in sides}
+    phase = script.begin("fed", sides, targets={s: {0: q} for s, (q,) in goals.items()})
+    fed = {s: (Motor(q=q, dq=_FED_DQ, tau=_FED_TAU),) for s, (q,) in goals.items()}
+    yield from script.hold(_FED_SECONDS, fed)
+    script.end(phase)
+    script.goal.update(goals)
+
+
+def _gripper_limp(script: GripperScript, side: Side) -> Steps:
+    """Zero gains of one side, with a q on either side of the hand, as a weight pulls the same
+    way at both; the others make steps by their own gains.
+    """
+    others = [s for s in script.plan.sides if s != side]
+    for q in (script.low(side), script.stroke):
+        phase = script.begin("limp", (side,), targets={side: {0: q}})
+        ends = [phase]
+        if others:
+            script.goal.update({s: script.aside(s, 0.4 * ASIDE) for s in others})
+            targets = {s: dict(enumerate(script.goal[s])) for s in others}
+            ends.append(script.begin("unlike", others, targets=targets))
+        yield from script.hold(_LIMP_SECONDS, {side: (Motor(q=q, kp=0.0, kd=0.0),)})
+        for ended in ends:
+            script.end(ended)
+
+
+def push_gripper(script: GripperScript, names: Mapping[Side, str]) -> Steps:
+    """Close or open each side by a torque alone, which grows until the hand moves.
+
+    :param names: ``pull`` or ``push`` for each side.
+    """
+    script.report("a torque without a position gain: the hand must move with it")
+    ways = {s: -1 if name == "pull" else 1 for s, name in names.items()}
+    phases = []
+    for name in dict.fromkeys(names.values()):
+        mine = [s for s in names if names[s] == name]
+        end = 0.0 if name == "pull" else script.stroke
+        phases.append(script.begin(name, mine, targets={s: {0: end} for s in mine}))
+    tau = dict.fromkeys(names, _PUSH[0])
+    while script.elapsed(phases[0]) < _PUSH_SECONDS:
+        for s, way in ways.items():
+            if way * script.obs.dq.get(s, (0.0,))[0] < _PUSH_SPEED * script.stroke:
+                tau[s] = min(tau[s] * 1.02, _PUSH[1])
+        yield from script.command(
+            {
+                s: (Motor(script.goal[s][0], tau=way * tau[s], kp=0.0, kd=_PUSH_DAMPING),)
+                for s, way in ways.items()
+            }
+        )
+    for phase in phases:
+        script.end(phase)
+
+
+def drive_gripper(
+    script: GripperScript,
+    sides: Sequence[Side],
+    part: float,
+    kd: float = 0.5,
+    *,
+    seconds: float = 0.8,
+    last_hz: float = 0.0,
+) -> Steps:
+    """Open at a steady low speed by velocity feedback alone, whatever the friction.
+
+    :param part: of the stroke in a second: far from the stop even after a whole time-out.
+    :param last_hz: rate of the last few commands; 0: as the others.
+    """
+    script.report("slow motion")
+    if not sides:
+        return
+    phase = script.begin("drive", sides)
+    slow = part * script.stroke
+    wanted = dict.fromkeys(sides, slow)
+    # by q, as dq may be wrong: over as many commands as are visible as motion
+    seen: deque[tuple[int, Mapping[Side, float]]] = deque(maxlen=8)
+    motors: dict[Side, Motors] = {}
+    while script.elapsed(phase) < seconds:
+        here = {s: script.obs.q[s][0] for s in sides if s in script.obs.q}
+        seen.append((script.obs.now_ns, here))
+        then, before = seen[0]
+        took = max((script.obs.now_ns - then) / 1e9, 1e-3)
+        for s in sides:
+            if (here.get(s, 0.0) - before.get(s, 0.0)) / took < slow:
+                wanted[s] = min(wanted[s] * 1.03, 20 * slow)
+        motors = {s: (Motor(script.goal[s][0], wanted[s], kp=0.0, kd=kd),) for s in sides}
+        yield from script.command(motors)
+    if last_hz:
+        period, script.period_ns = script.period_ns, round(1e9 / last_hz)
+        yield from script.hold(max(0.05, 5 / last_hz), motors)
+        script.period_ns = period
+    script.end(phase)
+
+
+@stimulus("", GripperScript, after="burst", before="replay", applies=without_gains)
+def send_no_gains(script: GripperScript) -> Steps:
+    """From here on, as clients of such a dialect send none."""
+    script.gainless = True
+    yield from ()
+
+
+def step_softly(script: GripperScript, sides: Sequence[Side]) -> Steps:
+    """A step without contact with the least stiffness."""
+    if not script.gains_used or "soft" not in script.plan.phases:
+        return
+    goals = {s: script.aside(s, _SOFT_STEP) for s in sides}
+    phase = script.begin("soft", sides, targets={s: {0: q} for s, (q,) in goals.items()})
+    yield from script.hold(0.8, {s: (Motor(q=q, kp=_SOFTEST),) for s, (q,) in goals.items()})
+    script.end(phase)
+    script.goal.update(goals)
+
+
+@stimulus("stiff soft mild", FingerScript, after="burst", leaves=Place.AWAY)
+def step_stiff_and_soft(script: FingerScript) -> Steps:
+    """A step with the client's gains, with a tenth of its stiffness and with a third of it."""
+    script.report("a stiff step and a soft one: the gains must make a difference")
+    yield from script.to("center", OPEN)
+    kinds = [("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, _SOFTER)]
+    if "mild" in script.plan.phases:
+        kinds.append(("mild", CLOSED - 5.0, _MILD))
+    for name, percent, part in kinds:
+        poses = {s: script.pose(s, percent) for s in script.plan.sides}
+        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        phase = script.begin(name, script.plan.sides, targets=targets)
+        motors = {
+            s: [replace(m, kp=part * m.kp) for m in script.motors(s, pose)]
+            for s, pose in poses.items()
+        }
+        yield from script.hold(0.6, motors)
+        script.end(phase)
+        script.goal.update(poses)
+    if "soft" in script.plan.phases:
+        yield from _step_unevenly(script)
+
+
+def _step_unevenly(script: FingerScript) -> Steps:
+    """Steps in which some joints are soft and the others are not, three times with others."""
+    script.report("some joints soft, the others not: each by its own gains")
+    sides = script.plan.sides
+    for percent in (OPEN, CLOSED - 5.0, OPEN):
+        splits = script.next_splits()
+        poses = {s: script.pose(s, percent) for s in sides}
+        targets = {s: {i: poses[s][i] for i in sorted(splits[s])} for s in sides}
+        phase = script.begin("soft", sides, targets=targets)
+        motors = {
+            s: [
+                replace(m, kp=_SOFTER * m.kp) if i in splits[s] else m
+                for i, m in enumerate(script.motors(s, pose))
+            ]
+            for s, pose in poses.items()
+        }
+        yield from script.hold(0.5, motors)
+        script.end(phase)
+        script.goal.update(poses)
+
+
+@stimulus("limp", FingerScript, after="soft", leaves=Place.AWAY)
+def limp_fingers(script: FingerScript) -> Steps:
+    """Zero gains, with a q far towards closed, and then with one towards open."""
+    script.report("commands without force (zero gains): the hand must not be pulled")
+    sides = script.plan.sides
+    yield from script.hold(0.1)
+    # what moves by its weight moves the same way whatever q is
+    for percent in (CLOSED, 0.0):
+        targets = {s: dict(enumerate(script.pose(s, percent))) for s in sides}
+        phase = script.begin("limp", sides, targets=targets)
+        yield from script.hold(0.2, script.all(percent, kp=0.0, kd=0.0))
+        script.end(phase)
+
+
+@stimulus("push", FingerScript, after="mixed", leaves=Place.AWAY)
+def push_fingers(script: FingerScript) -> Steps:
+    """Close and open each flexing joint by a torque alone, while others are driven the other
+    way: a torque of another joint or side shows.
+    """
+    script.report("a torque without a position gain: the joints must move with it")
+    sides = script.plan.sides
+    for first in (True, False):
+        pushed = {s: _pushed_ways(script, s, first) for s in sides}
+        phases = []
+        for name, way, percent in (("push", 1, 100.0), ("pull", -1, 0.0)):
+            targets = {
+                s: {i: script.pose(s, percent)[i] for i, w in pushed[s].items() if w == way}
+                for s in sides
+            }
+            phases.append(script.begin(name, sides, targets=targets))
+        motors = {s: list(script.motors(s, script.goal[s])) for s in sides}
+        for s in sides:
+            for i, way in pushed[s].items():
+                tau = way * math.copysign(_TORQUE, script.joints[s][i].closing)
+                motors[s][i] = replace(motors[s][i], tau=tau, kp=0.0, kd=_TORQUE_DAMPING)
+        yield from script.hold(_TORQUE_SECONDS, motors)
+        for phase in phases:
+            script.end(phase)
+
+
+def _pushed_ways(script: FingerScript, side: Side, first: bool) -> dict[int, int]:
+    """The flexing joints with 1 where they close and -1 where they open, first or afterwards.
+
+    Joints of one motor go the same way. On the left no motor goes as the next one does for
+    long, and neither do those of one place in two fingers; the right hand has another order.
+    """
+    flexing = [[i for i in m if script.joints[side][i].closing] for m in script.model.motors]
+    bit = 1 if side is Side.LEFT else 2
+    return {
+        i: 1 if bool((n ^ n >> bit) & 1) is not first else -1
+        for n, joints in enumerate(filter(None, flexing))
+        for i in joints
+    }
+
+
+def drive_fingers(
+    script: FingerScript,
+    name: str,
+    sides: Sequence[Side],
+    others: Mapping[Side, Motors],
+    *,
+    guarded: Mapping[Side, frozenset[int]] | None = None,
+) -> Steps:
+    """Some joints by a velocity or a torque, others slowly to a position: both are under way
+    for long.
+
+    :param guarded: the joints with time-out protection.
+    """
+    hands = dict(others)
+    targets: dict[Side, dict[int, float]] = {}
+    by_torque = _by_torque(script)
+    for s in sides:
+        motors = script.guarded(script.motors(s, script.goal[s]), s, guarded or {})
+        # to the farther place, so that it lasts
+        far = max(
+            (script.pose(s, percent) for percent in (CLOSED, OPEN)),
+            key=lambda pose: sum(abs(pose[i] - script.goal[s][i]) for i in script.roles.slow),
+        )
+        for i in script.roles.driven:
+            speed = math.copysign(_DRIVE_SPEED, script.joints[s][i].closing)
+            dq, tau = (0.0, _DRIVE_DAMPING * speed) if i == by_torque else (speed, 0.0)
+            motors[i] = replace(motors[i], dq=dq, tau=tau, kp=0.0, kd=_DRIVE_DAMPING)
+        for i in script.roles.slow:
+            motors[i] = _slowly(script, motors[i], far[i])
+        hands[s] = motors
+        targets[s] = {i: far[i] for i in script.roles.slow}
+    phase = script.begin(name, sides, targets=targets)
+    yield from script.hold(0.3, hands)
+    script.end(phase)
+
+
+def _slowly(script: FingerScript, motor: Motor, q: float) -> Motor:
+    """The command to a motor to go to q for seconds, where the dialect has a way to say so."""
+    if script.plan.dialect.position_servo:
+        return replace(motor, q=q, dq=_SLOW_PART)
+    return replace(motor, q=q, kp=_SLOW_GAINS[0], kd=_SLOW_GAINS[1])
+
+
+def _by_torque(script: FingerScript) -> int | None:
+    """The joint that is driven by a torque this time, where protection is for each joint."""
+    script.drives += 1
+    if "guard" not in script.plan.phases:
+        return None
+    return script.roles.driven[script.drives % len(script.roles.driven)]
+
+
+@stimulus("stiffness", RobotScript, after="joint", leaves=Place.AWAY)
+def soften_robot_joint(script: RobotScript) -> Steps:
+    """A quarter of the client's kp, and a torque against it."""
+    script.report("a soft joint, a speed, a torque")
+    kp, _ = script.robot.client_gains[script.slot]
+    soft = kp / 4
+    script.order = script.changed(kp=soft)
+    yield from script.keep(0.2)
+    way = script.inward(script.slot, 0.1)
+    phase = script.phase("stiffness", way=repr(way))
+    script.order = script.changed(tau=soft * way)
+    yield from script.keep(0.6)
+    script.end(phase)
+    script.order = script.changed(tau=0.0)
+    yield from script.keep(0.2)
+    script.order = script.changed(kp=kp)
+
+
+@stimulus("velocity", RobotScript, after="stiffness", leaves=Place.AWAY)
+def turn_robot_joint(script: RobotScript) -> Steps:
+    """Zero kp, a speed, and kd."""
+    speed = script.inward(script.slot, SPEED)
+    phase = script.phase("velocity", speed=repr(speed))
+    script.order = script.changed(kp=0.0, dq=speed)
+    yield from script.keep(0.5)
+    script.end(phase)
+    script.catch()
+
+
+@stimulus("torque", RobotScript, after="velocity", leaves=Place.AWAY)
+def push_robot_joint(script: RobotScript) -> Steps:
+    """Zero kp and kd, and a torque, until the joint has moved."""
+    tau = script.inward(script.slot, _TORQUE_PART * script.robot.joint(script.slot).tau_max)
+    phase = script.phase("torque", torque=repr(tau))
+    begin = script.here(script.slot)
+    script.order = script.changed(kp=0.0, kd=0.0, tau=tau)
+    while script.elapsed(phase) < 0.4 and abs(script.here(script.slot) - begin) < _MOVED:
+        yield from script.put(script.order)
+    script.end(phase)
+    script.catch()
+    yield from script.keep(0.2)
+
+
+@stimulus("limp", RobotScript, after="torque", leaves=Place.AWAY)
+def limp_robot_joint(script: RobotScript) -> Steps:
+    """Zero kp, and a q elsewhere."""
+    yield from script.refused("limp", kp=0.0)
+
 
 _GROWS = 0.25
 """Part of the growth of the error by which the way may grow where a soft start limits it."""

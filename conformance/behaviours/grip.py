@@ -10,11 +10,13 @@ is compared with that law; a hand whose tau_est has another scale while it moves
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.behaviours.gains import NUDGE_SECONDS, nudged, push_held, step_softly
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.contacts import contacts
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
@@ -40,9 +42,270 @@ from dexkit.conformance.checks.torque_law import (
 )
 from dexkit.conformance.kit.measurement_error import Measure, Quantity
 from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.row_selection import Rows
 from dexkit.conformance.kit.stimulus_record import Phase
-from dexkit.hand import Floats
+from dexkit.conformance.stimuli.fingers import BEYOND, CLOSED, OPEN, FingerScript
+from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.hand import ASIDE_SECONDS
+from dexkit.conformance.stimuli.script import (
+    Moment,
+    Plan,
+    Steps,
+    of_position_servos,
+    stimulus,
+    without_gains,
+)
+from dexkit.hand import Floats, Side
+
+# of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)
+_LEAD = 0.18 / 5.4
+_FIRST_GRIP = 1.8
+"""Seconds of the first grip: until a driver has lowered its effort (DEX1-FORCE-10), and a little
+more."""
+_GRIP, _LONG_GRIP = 3.0, 30.0
+"""Seconds of equal commands between two pushes; those of a thorough run."""
+_SQUEEZE = 1.3
+"""Seconds of a squeeze: contact takes 0.3 s on an idle machine, and twice that after a pause."""
+_CAMERA_HZ = 30.0
+"""Commands a second of a client that sends one for each picture of a camera."""
+_SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (8.0, 0.2))
+"""kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 1.6 N m each. The last
+is beyond what a byte holds in steps of 1/32, and about the lead of xr_teleoperate."""
+_SOFT_SECONDS = 0.5
+_GRIP_SECONDS = 1.1
+"""Seconds of a grip after a restart of position servos."""
+_BEYOND, _BEYOND_TAU, _BEYOND_AFTER = 0.05, 0.7, 0.3
+"""A grip by a q below the closed end: by which part of the stroke, its torque, N m, and how much
+longer than a time-out it lasts, s: a command that is clamped is in force as any other."""
+_RELEASE = 0.3
+"""Seconds of zero gains at the q of a squeeze."""
+
+
+@stimulus("grip stiffness", GripperScript, after="ends", before="dead-zone fingerprint")
+def grip_first(script: GripperScript) -> Steps:
+    """Grip and hold stiffness before any disturbance."""
+    pressing, free = script.plan.pressing, script.plan.free
+    if pressing:
+        script.report("a first grip")
+        script.grip = _by_the_lead(script, pressing)
+        beyond = {s: {0: motors[0].q} for s, motors in script.grip.items()}
+        phase = script.begin("grip", pressing, targets=beyond)
+        yield from script.hold(0.3)
+        yield from push_held(script, free)
+        while script.elapsed(phase) < _FIRST_GRIP:
+            yield from script.command()
+        script.end(phase)
+        script.grip = {}
+        yield from script.turn(
+            "center", {s: script.home(s) for s in pressing}, least=0.5, stand=script.standing
+        )
+    else:
+        yield from push_held(script, free)
+
+
+@stimulus(
+    "grip nudge squeeze release soft-grip soft silence resume rejected",
+    GripperScript,
+    after="late-joiner",
+)
+def squeeze_gripper(script: GripperScript) -> Steps:
+    """Close on the object: by xr_teleoperate's lead for long, then by half as much again.
+
+    Meanwhile the other side is held, and pushed by a torque at first and at last. In the end zero
+    gains at the q of the squeeze; the grip stays in force.
+    """
+    _sides, phases = script.plan.sides, script.plan.phases
+    pressing, free = script.plan.pressing, script.plan.free
+    if free:
+        yield from script.everyone("center", {**script.goal, **script.nearly_closed()})
+    if phases & {"grip", "nudge"}:
+        yield from _hold_long(script, pressing, free)
+    if pressing:
+        if phases & {"grip", "nudge"}:  # each grip counts as the first one
+            script.grip = {}
+            opened = {s: (script.low(s),) for s in pressing}
+            yield from script.turn("center", opened, least=0.4, stand=script.standing)
+        script.report("squeezing the object")
+        script.grip = dict(gripper_squeeze(script, pressing))
+        beyond = {s: {0: motors[0].q} for s, motors in script.grip.items()}
+        phase = script.begin("squeeze", pressing, targets=beyond)
+        yield from script.hold(_SQUEEZE)
+        script.end(phase)
+        if script.gains_used and "release" in phases:
+            phase = script.begin("release", pressing)
+            grip = dict(script.grip)
+            script.grip = {s: (replace(m[0], kp=0.0, kd=0.0),) for s, m in grip.items()}
+            yield from script.hold(_RELEASE)
+            script.end(phase)
+            script.grip = grip
+
+
+def _hold_long(script: GripperScript, pressing: Sequence[Side], free: Sequence[Side]) -> Steps:
+    """Equal commands for long: a grip by the client's lead, and a hand held without contact.
+
+    They come at the rate of a camera, so that one command to the wrong side would be in force
+    long enough to show. A torque pushes the free hand at first and at last.
+    """
+    script.report("the same commands for long: they must stay in force")
+    script.grip = _by_the_lead(script, pressing)
+    period, script.period_ns = script.period_ns, round(1e9 / _CAMERA_HZ)
+    beyond = {s: {0: motors[0].q} for s, motors in script.grip.items()}
+    gripping = [script.begin("grip", pressing, targets=beyond)] if pressing else []
+    pushed = nudged(script, free)
+    push = free and script.gains_used
+    yield from script.hold(NUDGE_SECONDS)
+    for seconds in (_LONG_GRIP if script.patient else _GRIP, 0.1):
+        if push:
+            phase = script.begin("nudge", free)
+            yield from script.hold(NUDGE_SECONDS, pushed)
+            script.end(phase)
+        yield from script.hold(seconds)
+    for phase in gripping:
+        script.end(phase)
+    script.period_ns = period
+
+
+def _by_the_lead(script: GripperScript, sides: Sequence[Side]) -> dict[Side, Motors]:
+    """Commands into the objects of these sides by xr_teleoperate's lead."""
+    lead = _LEAD * script.stroke
+    return {s: (Motor(q=max(script.plan.objects[s] - lead, 0.0)),) for s in sides}
+
+
+def gripper_squeeze(script: GripperScript, sides: Sequence[Side]) -> dict[Side, Motors]:
+    """Commands into the objects of these sides."""
+    depth = 1.5 * _LEAD * script.stroke
+    return {s: (Motor(q=script.plan.objects[s] - depth),) for s in sides}
+
+
+def never_silent(plan: Plan[Any]) -> bool:
+    """Whether a gripper gets commands all the time."""
+    return not plan.phases & {"silence", "resume", "rejected"}
+
+
+@stimulus("soft-grip soft", GripperScript, after="squeeze", applies=never_silent)
+def grip_and_step_softly(script: GripperScript) -> Steps:
+    """Grips of less stiffness, and a step of less; in other runs while there is a silence."""
+    pressing = script.plan.pressing
+    yield from grip_softly(script, pressing)
+    script.grip = {}
+    yield from step_softly(script, script.plan.sides)
+
+
+def grip_softly(script: GripperScript, pressing: Sequence[Side]) -> Steps:
+    """Grips of less stiffness than the client's."""
+    if not script.gains_used or "soft-grip" not in script.plan.phases or not pressing:
+        return
+    touch = script.plan.objects
+    grips = [
+        ({s: Motor(q=max(touch[s] - depth, 0.0), kp=kp) for s in pressing}, _SOFT_SECONDS)
+        for kp, depth in _SOFT_GRIPS
+    ]
+    below = {s: Motor(q=-_BEYOND * script.stroke, kp=_BEYOND_TAU / touch[s]) for s in pressing}
+    grips.append((below, script.model.command_timeout + _BEYOND_AFTER))
+    for soft, seconds in grips:
+        targets = {s: {0: motor.q} for s, motor in soft.items()}
+        phase = script.begin("soft-grip", pressing, targets=targets)
+        script.grip.update({s: (motor,) for s, motor in soft.items()})
+        yield from script.hold(seconds)
+        script.end(phase)
+
+
+@stimulus("grip", GripperScript, moment=Moment.NEW_CLIENT, applies=without_gains)
+@stimulus("grip", GripperScript, moment=Moment.STARTED, applies=without_gains)
+def grip_again(script: GripperScript) -> Steps:
+    """A grip after the restart of the service.
+
+    Not in dialects with gains: there the steps after a restart show a loss of torque.
+    """
+    pressing = script.plan.pressing
+    if not pressing:
+        return
+    script.report("squeezing the object again")
+    script.grip = dict(gripper_squeeze(script, pressing))
+    phase = script.begin("regrip", pressing)
+    yield from script.hold(_SQUEEZE)
+    script.end(phase)
+    script.grip = {}
+    yield from script.turn("center", {s: (script.high(),) for s in pressing}, least=0.5)
+
+
+def unprotected(plan: Plan[Any]) -> bool:
+    """Whether no joint has time-out protection; with it, hands squeeze in a phase of its own."""
+    return not plan.phases & {"guard", "guard-latch", "guard-clear"}
+
+
+@stimulus("squeeze beside-grip silence resume", FingerScript, after="firmer", applies=unprotected)
+def squeeze_object(script: FingerScript) -> Steps:
+    """All fingers close on the object, for seconds; then a hand without one makes a step."""
+    pressing = script.plan.pressing
+    if pressing:
+        script.report("squeezing the object")
+        yield from squeeze_fingers(script, pressing, 2.0, beside=True)
+
+
+def squeeze_fingers(
+    script: FingerScript,
+    sides: Sequence[Side],
+    seconds: float,
+    name: str = "squeeze",
+    *,
+    beside: bool = False,
+) -> Steps:
+    """All fingers close on the object, as a phase.
+
+    :param beside: the other hands make a step in the last part of it.
+    """
+    squeeze = finger_squeezes(script, sides, {})
+    targets = {
+        s: {i: m.q for i, m in enumerate(squeeze[s]) if script.joints[s][i].closing} for s in sides
+    }
+    phases = [script.begin(name, sides, targets=targets)]
+    if beside:
+        yield from script.hold(seconds - ASIDE_SECONDS, squeeze)
+        phases += step_beside_grip(script, sides)
+        seconds = ASIDE_SECONDS
+    yield from script.hold(seconds, squeeze)
+    for phase in phases:
+        script.end(phase)
+
+
+def finger_squeezes(
+    script: FingerScript, sides: Sequence[Side], guarded: Mapping[Side, frozenset[int]]
+) -> dict[Side, Motors]:
+    """The command to press on the object: as far as a client can, where force is judged."""
+    most = 100.0 if guarded else 0.0
+    return {
+        s: script.guarded(
+            script.motors(s, script.pose(s, max(most, script.plan.objects[s] + BEYOND))), s, guarded
+        )
+        for s in sides
+    }
+
+
+def step_beside_grip(script: FingerScript, pressing: Sequence[Side]) -> list[Phase]:
+    """Begin a step of the hands that do not press, while others do."""
+    free = [s for s in script.plan.sides if s not in pressing]
+    if not (free and pressing and "beside-grip" in script.plan.phases):
+        return []
+    script.goal.update({s: script.pose(s, CLOSED - 5.0) for s in free})
+    targets = {s: dict(enumerate(script.goal[s])) for s in free}
+    return [script.begin("beside-grip", free, targets=targets)]
+
+
+@stimulus("squeeze", FingerScript, moment=Moment.NEW_CLIENT, applies=of_position_servos)
+@stimulus("squeeze", FingerScript, moment=Moment.STARTED, applies=of_position_servos)
+def squeeze_again(script: FingerScript) -> Steps:
+    """A position servo's limits of force are its own: what a restart does to them is seen by a
+    grip.
+    """
+    pressing = script.plan.pressing
+    if not pressing:
+        return
+    script.report("squeezing the object again")
+    yield from squeeze_fingers(script, pressing, _GRIP_SECONDS)
+    yield from script.to("center", OPEN)
+
 
 _HELD = 0.2
 """Quantile of tau_est that counts as held, and from above as reached: a chattering limit lets go

@@ -6,12 +6,171 @@ import math
 
 import numpy as np
 
+from dexkit.conformance.behaviours.gains import drive_fingers, drive_gripper, push_held
+from dexkit.conformance.behaviours.grip import gripper_squeeze
+from dexkit.conformance.behaviours.speed import move_at_own_speeds
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import arrival, away_first
 from dexkit.conformance.kit.measurement_error import Measure
 from dexkit.conformance.kit.motor_messages import MotorCodec
-from dexkit.hand import JointMode
+from dexkit.conformance.stimuli.fingers import FingerScript
+from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.robot import RobotScript
+from dexkit.conformance.stimuli.script import (
+    Join,
+    Leave,
+    Moment,
+    Place,
+    Restart,
+    StartService,
+    Steps,
+    StopService,
+    of_position_servos,
+    stimulus,
+)
+from dexkit.hand import ROBOT, JointMode
+
+_AT_SHUTDOWN = (30.0, 45.0)
+"""Percent of closing from which hands move when their service ends: far enough from both ends and
+from the object that it is seen if one opens or closes then. Two hands stand at different ones: a
+service that sends both to the same place moves at least one of them."""
+_BETWEEN_PLACES, _NEW_CLIENT_SECONDS = 30.0, 2.0
+"""Percent of closing at which position servos stand for a new client, between the places of other
+clients' commands, and for how many seconds."""
+
+
+@stimulus("late-joiner", GripperScript, after="old-stamps")
+def join_late_at_gripper(script: GripperScript) -> Steps:
+    """A new subscriber appears while free hands close."""
+    script.goal.update(script.nearly_closed())
+    yield from _join_late(script)
+
+
+@stimulus("late-joiner", FingerScript, after="old-stamps", needs=Place.ANY, leaves=Place.ANY)
+def join_late_at_fingers(script: FingerScript) -> Steps:
+    """A new subscriber appears while hands go back."""
+    script.goal.update(script.homes())
+    yield from _join_late(script)
+
+
+def _join_late(script: HandScript) -> Steps:
+    script.report("a second subscriber joins late: it must get the state at once")
+    phase = script.begin("late-joiner", script.plan.sides)
+    yield Join()
+    while script.elapsed(phase) < 3.0:
+        yield from script.command()
+        if script.elapsed(phase) >= 0.3 and set(script.plan.sides) <= set(script.obs.joined):
+            break
+    phase.observed = {f"first_state_s_{s}": script.obs.joined.get(s) for s in script.plan.sides}
+    script.end(phase)
+    yield from script.do(Leave())
+
+
+@stimulus("late-joiner", RobotScript, after="recover", leaves=Place.AWAY)
+def join_robot_late(script: RobotScript) -> Steps:
+    """A new subscriber appears."""
+    phase = script.phase("late-joiner")
+    yield Join()
+    while script.elapsed(phase) < 2.0 and ROBOT not in script.obs.joined:
+        yield from script.put(script.order)
+    phase.observed[f"first_state_s_{ROBOT}"] = script.obs.joined.get(ROBOT)
+    script.end(phase)
+    yield Leave()
+
+
+@stimulus("restart", HandScript, moment=Moment.CLIENTS, after="company")
+def restart_client(script: HandScript) -> Steps:
+    """The commanding program goes away, and another one comes."""
+    script.report("the commanding program is restarted: the new one must be obeyed")
+    yield Restart()
+    yield from script.in_turn("restart")
+    yield from script.schedule(Moment.NEW_CLIENT)
+
+
+@stimulus(
+    "",
+    FingerScript,
+    moment=Moment.NEW_CLIENT,
+    after="squeeze",
+    before="nan",
+    applies=of_position_servos,
+)
+def stand_for_new_client(script: FingerScript) -> Steps:
+    """A position servo stands for a while where no other client has sent it, so that it is seen
+    if the goals of one are still in force; and gets speeds again. Runs of hands with gains have
+    no time for it.
+    """
+    yield from script.to("center", _BETWEEN_PLACES)
+    yield from script.hold(_NEW_CLIENT_SECONDS)
+    if "speeds" in script.plan.phases:
+        yield from move_at_own_speeds(script)
+    else:
+        yield from script.back()
+
+
+@stimulus("restart", RobotScript, after="resume", leaves=Place.AWAY)
+def restart_robot_client(script: RobotScript) -> Steps:
+    """The client goes away, another comes, and makes a step."""
+    script.report("the commanding program is restarted: the new one must be obeyed")
+    yield Restart()
+    script.next_ns = script.obs.now_ns
+    yield from script.keep(0.2)
+    yield from script.step("restart")
+
+
+@stimulus("shutdown restarted service-restart", HandScript, moment=Moment.SERVICE)
+def restart_service(script: HandScript) -> Steps:
+    """End the service and start it again, where the kit can."""
+    script.report("the service is stopped and started again")
+    yield from script.schedule(Moment.STOPPING)
+    phase = script.begin("shutdown", script.plan.sides)
+    yield from script.do(StopService())
+    if not script.obs.stopped:
+        script.phases.remove(phase)
+        script.report("the kit has not started the service, so it does not restart it")
+        yield from script.schedule(Moment.NOT_STARTED)
+        return
+    phase.observed = dict(script.obs.stopped)
+    yield from script.do(StartService())
+    script.end(phase)
+    script.next_ns = script.obs.now_ns
+    # longer than a state may take, so that it must come without a command
+    yield from script.silence("restarted", 1.3)
+    yield from script.everyone("service-restart", script.after_shutdown(), most=4.0)
+    yield from script.in_turn("service-restart")
+    yield from script.schedule(Moment.STARTED)
+
+
+@stimulus("", GripperScript, moment=Moment.STOPPING)
+def drive_gripper_before_stop(script: GripperScript) -> Steps:
+    """Grip and move: what was commanded last must not be in force after the restart."""
+    sides = script.plan.sides
+    yield from push_held(script, sides)
+    pressing, free = script.plan.pressing, script.plan.free
+    script.grip = dict(gripper_squeeze(script, pressing))
+    regrip = script.begin("regrip", pressing) if pressing else None
+    if free:
+        yield from script.turn("center", script.nearly_closed(), least=0.5, stand=script.standing)
+    if free and script.gains_used:
+        yield from drive_gripper(script, free, 0.16)
+    elif pressing:
+        # on its own the last grip has to come from the open, and to be felt
+        yield from script.hold(0.5 if free else 1.5)
+    if regrip is not None:
+        script.end(regrip)
+
+
+@stimulus("", FingerScript, moment=Moment.STOPPING)
+def move_hand_before_stop(script: FingerScript) -> Steps:
+    """Move: what was commanded last must not be in force after the restart."""
+    sides, (less, more) = script.plan.sides, _AT_SHUTDOWN
+    free = script.plan.free
+    closed_more = free[-1] if free and len(sides) > 1 else None
+    poses = {s: script.pose(s, more if s is closed_more else less) for s in sides}
+    yield from script.everyone("center", poses, most=1.5)
+    yield from drive_fingers(script, "drive", sides, {})
 
 
 @check("DEX1-LIFE-01", "DEX3-LIFE-01", "H1-LIFE-01")

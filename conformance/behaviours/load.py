@@ -9,6 +9,42 @@ from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import silent
 from dexkit.conformance.checks.steps import obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gaps, least_rate, slow, too_slow
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import Join, Leave, Place, Role, Steps, stimulus
+
+_LOADS = ((400.0, 1.2, 1), (2500.0, 0.8, 10))
+"""Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation
+sends, the second what Unitree's C++ example sends (docs/sources/unitree-dex.md#b1)."""
+
+
+@stimulus("load", HandScript, after="single speeds ends", needs=Place.ANY, leaves=Place.ANY)
+def apply_load(script: HandScript) -> Steps:
+    """Many commands, and a reliable subscriber that hardly ever reads."""
+    here, there = dict(script.goal), script.other_place()
+    count = 40  # points of the way there and back
+    parts = [0.3 * (1 - abs(2 * i / count - 1)) for i in range(count + 1)]
+    points = [
+        script.codec.encode(
+            {
+                s: script.motors(
+                    s, tuple(a + part * (b - a) for a, b in zip(here[s], there[s], strict=True))
+                )
+                for s in script.plan.sides
+            }
+        )
+        for part in parts
+    ]
+    yield from script.do(Join(Role.LAGGARD))
+    period = script.period_ns
+    for rate, seconds, at_a_time in _LOADS:
+        script.report(f"{rate:g} commands a second and a slow reader: state must keep its rate")
+        script.period_ns = round(at_a_time * 1e9 / rate)
+        phase = script.begin("load", script.plan.sides)
+        while (at := script.elapsed(phase) / seconds) < 1.0:
+            yield from script.send(points[int(at * count)] * at_a_time)
+        script.end(phase)
+    script.period_ns = period
+    yield from script.do(Leave(Role.LAGGARD))
 
 
 @check("DEX1-LOAD-01", "DEX3-LOAD-01")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +15,80 @@ from dexkit.conformance.checks.obedience import stays
 from dexkit.conformance.checks.robot import RobotContext, joint_of
 from dexkit.conformance.checks.silences import mode_bytes, roles_of
 from dexkit.conformance.checks.steps import not_driven, own_speed, steps_of
-from dexkit.conformance.kit.motor_messages import MotorCodec
+from dexkit.conformance.kit.motor_messages import MotorCodec, Motors
+from dexkit.conformance.stimuli.fingers import CLOSED, SPLITS, FingerScript
+from dexkit.conformance.stimuli.robot import RobotScript
+from dexkit.conformance.stimuli.script import Moment, Place, Steps, stimulus
 from dexkit.conformance.usb.context import UsbContext, quiet_motors
-from dexkit.hand import Floats, JointMode
+from dexkit.hand import Floats, JointMode, Side
 from dexkit.models import ModeByte
+
+_WIDE = (CLOSED + 5.0, 5.0)
+"""Percent of closing between which joints are locked under way."""
+_FAR = 80.0
+"""Percent of closing that is far from both poses."""
+_UNDER_WAY = 0.08
+"""Seconds after which a joint moves fast in a step with the client's gains."""
+
+
+@stimulus("lock", FingerScript, after="limp", leaves=Place.AWAY)
+def lock_all(script: FingerScript) -> Steps:
+    """All motors locked, with a q elsewhere."""
+    script.report("locked motors: they must not follow their q")
+    yield from script.hold(0.1)
+    yield from _lock(script, CLOSED, 0.3)
+
+
+@stimulus("lock", FingerScript, moment=Moment.NEW_CLIENT, after="nan")
+def lock_again(script: FingerScript) -> Steps:
+    """All motors locked once more, by a new client."""
+    yield from _lock(script, _FAR, 0.25)
+
+
+def _lock(script: FingerScript, percent: float, seconds: float) -> Steps:
+    """All motors locked, with a q that is so far closed."""
+    sides = script.plan.sides
+    targets = {s: dict(enumerate(script.pose(s, percent))) for s in sides}
+    phase = script.begin("lock", sides, targets=targets)
+    every = {s: frozenset(range(len(script.joints[s]))) for s in sides}
+    yield from script.hold(seconds, _locked_motors(script, script.all(percent), every))
+    script.end(phase)
+
+
+@stimulus("mixed", FingerScript, after="lock", leaves=Place.AWAY)
+def lock_some(script: FingerScript) -> Steps:
+    """Steps in which some joints are locked under way: three times, with other joints."""
+    script.report("some joints are locked under way: they must stop, and the others go on")
+    sides = script.plan.sides
+    for turn in range(len(SPLITS)):
+        percent = _WIDE[turn % 2]  # wide: a joint that is not braked must have room to run
+        poses = {s: script.pose(s, percent) for s in sides}
+        hands = script.all(percent)
+        splits = script.next_splits()
+        yield from script.hold(_UNDER_WAY, hands)
+        phase = script.begin("mixed", sides, targets={s: dict(enumerate(poses[s])) for s in sides})
+        yield from script.hold(0.35, _locked_motors(script, hands, splits))
+        script.end(phase)
+        script.goal.update(poses)
+
+
+def _locked_motors(
+    script: FingerScript, hands: Mapping[Side, Motors], joints: Mapping[Side, frozenset[int]]
+) -> dict[Side, Motors]:
+    """The commands with status 0 for some joints."""
+    return {
+        s: [
+            replace(m, mode=script.codec.mode(i, JointMode.BRAKE)) if i in joints[s] else m
+            for i, m in enumerate(motors)
+        ]
+        for s, motors in hands.items()
+    }
+
+
+@stimulus("off", RobotScript, after="limp", leaves=Place.AWAY)
+def switch_off_robot_joint(script: RobotScript) -> Steps:
+    """Mode 0, and a command that asks to move."""
+    yield from script.refused("off", mode=0)
 
 
 @check("DEX3-MODE-01", rests_on=("mode",))

@@ -16,9 +16,180 @@ from dexkit.conformance.checks.goals import OWN_RULE, Goals, goals_of
 from dexkit.conformance.checks.robot import RobotContext, joint_of, no_state
 from dexkit.conformance.checks.steps import DISOBEYS, Step, rests_before, speed_of, steps, steps_of
 from dexkit.conformance.kit.sums import mean
-from dexkit.conformance.stimuli.robot import STEP
+from dexkit.conformance.stimuli.fingers import CLOSED, FEW_MOTORS, OPEN, FingerScript
+from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.hand import ASIDE, HandScript
+from dexkit.conformance.stimuli.robot import STEP, RobotScript
+from dexkit.conformance.stimuli.script import (
+    Moment,
+    Place,
+    Pose,
+    Steps,
+    of_position_servos,
+    stimulus,
+)
 from dexkit.conformance.usb.context import UsbContext, moves, named_joints, part_of_way, travel_of
-from dexkit.hand import Floats
+from dexkit.hand import Floats, Side
+
+_CLOSES, _OPENS = 0.09, 6.02
+"""rad, just within the zones that mean fully closed and open in the gripper's DDS interface
+specification: their limits, 0.1 and 6.0, are no exact numbers in a message."""
+_VENDORS_MODE = 1
+"""Mode byte of the vendor's test programs; teleoperation sends 0
+(docs/sources/unitree-dex.md#b1)."""
+_SINGLES, _SINGLE_SECONDS = 5, 0.25
+"""Commands that are sent once, and how long none follows, s: less than any time-out."""
+_LATE_SINGLE_SECONDS = 0.6
+"""The same for hands with a control of their own: those of a real G1 answer 0.37 s late."""
+
+
+@stimulus("step", GripperScript)
+def step_each_gripper(script: GripperScript) -> Steps:
+    """Large steps of one side, the others hold."""
+    for side in script.plan.sides:
+        yield from _step_gripper(script, side)
+
+
+def _step_gripper(script: GripperScript, side: Side) -> Steps:
+    script.report(f"large steps of the {side} hand; the other one must not move")
+    places = (script.high(), 0), (script.low(side), _VENDORS_MODE), (script.middle(side), 0)
+    for target, script.mode in places:
+        script.goal[side] = (target,)
+        phase = script.begin("step", (side,), targets={side: {0: target}})
+        yield from script.until_settled(phase, (side,), least=0.6, most=2.5)
+
+
+@stimulus("ends", GripperScript, after="step", before="fingerprint", leaves=Place.AWAY)
+def move_gripper_to_ends(script: GripperScript) -> Steps:
+    """Fully open, and fully closed where there is no object."""
+    script.report("fully open and fully closed")
+    sides = script.plan.sides
+    yield from script.everyone("ends", dict.fromkeys(sides, (script.stroke,)), most=1.5)
+    free = script.plan.free
+    if free:
+        script.goal.update(dict.fromkeys(free, (0.0,)))
+        phase = script.begin("ends", free, targets={s: {0: 0.0} for s in free})
+        yield from script.until_settled(phase, free, least=0.6, most=2.8)
+
+
+@stimulus(
+    "dead-zone",
+    GripperScript,
+    after="ends",
+    leaves=Place.AWAY,
+    applies=lambda plan: plan.dialect.interface_specification,
+)
+def move_gripper_to_dead_zones(script: GripperScript) -> Steps:
+    """The inner limits of the zones that mean fully open and fully closed."""
+    script.report("the zones that mean fully open and fully closed")
+    sides = script.plan.sides
+    free = script.plan.free
+    for q, end, chosen in ((_OPENS, script.stroke, sides), (_CLOSES, 0.0, free)):
+        if chosen:
+            script.goal.update(dict.fromkeys(chosen, (q,)))
+            phase = script.begin("dead-zone", chosen, targets={s: {0: end} for s in chosen})
+            yield from script.until_settled(phase, chosen, least=0.6, most=2.8)
+
+
+@stimulus("joint", FingerScript)
+def move_one_by_one(script: FingerScript) -> Steps:
+    """One joint after the other closes; then every second one opens, and the others.
+
+    Where there are many, all of them open together. Joints that share a motor are one.
+    """
+    script.report("one joint after the other: no other joint may move")
+    sides = script.plan.sides
+    motors = script.model.motors
+    turns = [(joints, CLOSED) for joints in motors]
+    few = len(motors) <= FEW_MOTORS
+    if few:  # no two neighbours together: those are the ones that get mixed up
+        turns += [(sum(motors[i::2], ()), OPEN) for i in (0, 1)]
+    for joints, percent in turns:
+        targets = {s: {joint: script.pose(s, percent)[joint] for joint in joints} for s in sides}
+        for s, moved in targets.items():
+            script.goal[s] = tuple(moved.get(i, q) for i, q in enumerate(script.goal[s]))
+        phase = script.begin("joint", sides, targets=targets)
+        yield from script.until_settled(phase, sides, least=0.5, most=1.5)
+    if not few:
+        yield from script.turn("center", {s: script.pose(s, OPEN) for s in sides}, least=0.5)
+
+
+@stimulus("step", FingerScript, after="joint")
+def step_each_hand(script: FingerScript) -> Steps:
+    """One hand closes, the other holds; one opens while the other closes; that one opens."""
+    script.report("each hand alone; the other one must not move")
+    away = {s: script.pose(s, CLOSED - 5.0) for s in script.plan.sides}
+    yield from script.in_turn("step", away=away, stand=script.settling)
+
+
+@stimulus("ends", FingerScript, after="single speeds", leaves=Place.AWAY)
+@stimulus(
+    "ends",
+    FingerScript,
+    moment=Moment.STARTED,
+    after="squeeze",
+    needs=Place.ANY,
+    leaves=Place.AWAY,
+    applies=of_position_servos,
+)
+def move_fingers_to_ends(script: FingerScript) -> Steps:
+    """One finger after the other to both ends of its range, with the thumb out of the way.
+
+    Position servos again after a restart: one that calibrates itself may come back with other ends.
+    Runs of hands with gains have no time for it.
+    """
+    script.report("to both ends of each joint's range, fingers and thumb in turn")
+    sides = script.plan.sides
+    for thumb in (False, True):
+        poses = {s: _end_pose(script, s, thumb=thumb) for s in sides}
+        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        script.goal.update(poses)
+        phase = script.begin("ends", sides, targets=targets)
+        free = [s for s in sides if script.reachable(s)]
+        # an object holds some joints back until the end
+        yield from script.until_settled(
+            phase, free, least=script.least if free else 1.0, most=1.5, stand=script.standing
+        )
+
+
+def _end_pose(script: FingerScript, side: Side, *, thumb: bool) -> Pose:
+    """The thumb closed and the fingers open, or the other way round, to the ends."""
+    pose = []
+    for j in script.joints[side]:
+        closes = j.name.startswith("thumb") is thumb
+        towards = (1 if closes else -1) * (j.closing or 1)
+        pose.append(j.q_max if towards > 0 else j.q_min)
+    return tuple(pose)
+
+
+@stimulus("single", HandScript, after="replay")
+def send_once(script: HandScript) -> Steps:
+    """Commands that are not repeated: every one counts, and the newest most of all."""
+    script.report("commands that are sent once: each must be obeyed")
+    if script.goal != {s: script.home(s) for s in script.plan.sides}:
+        yield from script.everyone("center", {s: script.home(s) for s in script.plan.sides})
+    home = dict(script.goal)
+    away = {s: script.aside(s, 0.4 * ASIDE) for s in home}
+    decoy = {s: script.aside(s, -0.2 * ASIDE) for s in home}
+    encode = script.codec.encode
+    seconds = _SINGLE_SECONDS if script.plan.dialect.gains_are_used else _LATE_SINGLE_SECONDS
+    for i in range(_SINGLES):
+        goal = home if i % 2 else away
+        if i % 3 == 2:  # a newer command replaces one that has just arrived
+            yield from script.send(encode({s: script.motors(s, q) for s, q in decoy.items()}))
+        script.goal.update(goal)
+        targets = {s: dict(enumerate(pose)) for s, pose in goal.items()}
+        phase = script.begin("single", script.plan.sides, targets=targets)
+        yield from script.command()
+        yield from script.through(phase, seconds, lambda: script.wait(0.01))
+
+
+@stimulus("joint", RobotScript, leaves=Place.AWAY)
+def move_robot_joints(script: RobotScript) -> Steps:
+    """Each joint in turn by a fifth of a radian; its slot is ``params["slot"]``."""
+    script.report("moving one joint at a time by 0.2 rad")
+    for slot in script.robot.used:
+        yield from script.step("joint", slot)
 
 
 @check("DEX1-MOVE-01", "DEX3-MOVE-01")

@@ -1,4 +1,13 @@
-"""An operator with the client of xr_teleoperate moves the hand."""
+"""An operator with the client of xr_teleoperate moves the hand: a closed loop.
+
+In all other phases the commands do not depend on the hand's answers. Here they depend on the
+states, as with the genuine client: a hand whose state is late is commanded slowly. The operator's
+motion is the profile ``check`` of :mod:`dexkit.teleop.profiles`, kept clear of an object; the
+phase's parameters are enough to compute the operator's goal at any time (:func:`operator_of`).
+
+The client gets the newest state each time its receiving thread would have read one. That a silent
+side stops the other's states, too, is not part of this phase.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +17,86 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.kit.recording import Recording
-from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
+from dexkit.conformance.kit.stimulus_record import Phase
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import Moment, Plan, Send, Steps, stimulus
 from dexkit.hand import Side
-from dexkit.teleop import client_for
+from dexkit.models import Dialect
+from dexkit.teleop import Operator, client_for, profile
 from dexkit.teleop.tracking import Step, TrackingFigures, tracking_figures
+
+OPERATOR = "operator"
+"""Name of the phase."""
+_PROFILE = "check"
+_CLEAR = 0.1  # of the stroke: room left to the object
+_DEEPEST = 0.5  # how far the profile closes a hand of several joints
+_POLL = 0.001  # s between two reads while the client waits for a state
+
+
+def _most(plan: Plan[Side], side: Side) -> float:
+    """Largest closing of a side, 0 to 1, for :class:`~dexkit.teleop.Operator`."""
+    touch = plan.objects.get(side)
+    if touch is None:
+        return 1.0
+    if not plan.dialect.is_gripper:  # percent of closing
+        return min(1.0, max(0.0, (touch / 100 - _CLEAR) / _DEEPEST))
+    return min(1.0, max(0.0, 1.0 - touch / plan.dialect.q_open - _CLEAR))
+
+
+def operator_of(phase: Phase, dialect: Dialect) -> Operator:
+    """The operator of a phase, from its parameters in the recording."""
+    hands = [s for s in phase.sides if isinstance(s, Side)]
+    most = {s: float(phase.params.get(f"most_{s}", 1.0)) for s in hands}
+    return Operator(profile(phase.params["profile"], dialect.model), dialect, most=most)
+
+
+@stimulus(OPERATOR, HandScript, moment=Moment.CLIENTS)
+def operate(script: HandScript) -> Steps:
+    """An operator at Unitree's client, and back to the middle."""
+    if script.plan.dialect.has_client:  # none of the requirements applies to other dialects
+        yield from _close_the_loop(script)
+    yield from script.everyone("center", script.homes())
+
+
+def _close_the_loop(script: HandScript) -> Steps:
+    """Unitree's client in a closed loop with the hand."""
+    plan = script.plan
+    script.report("an operator at Unitree's client: full strokes, steps, slow motion")
+    phase = script.begin(OPERATOR, plan.sides, profile=_PROFILE)
+    phase.params.update({f"most_{s}": f"{_most(plan, s):.6g}" for s in plan.sides})
+    operator = operator_of(phase, plan.dialect)
+    client = client_for(plan.dialect, plan.sides)
+    period = round(1e9 * client.period)
+    tick = begin = script.obs.now_ns
+
+    def receive() -> float:
+        now, q = (script.obs.now_ns - begin) / 1e9, script.obs.q
+        client.receive(now, {s: q[s] for s in plan.sides if s in q})
+        return now
+
+    while script.elapsed(phase) < operator.profile.duration:
+        now = receive()
+        commands = client.step(now, {}, operator.inputs(now, plan.sides))
+        payloads = script.codec.encode(
+            {s: [Motor(**m._asdict()) for m in motors] for s, motors in commands.items()}
+        )
+        # the next turn, without making up for turns that were missed
+        tick = max(tick + period, script.obs.now_ns)
+        while True:
+            wakes = max(client.receiver.wakes_at, now + _POLL)
+            wake = tick if math.isinf(wakes) else min(tick, begin + round(wakes * 1e9))
+            yield from script.do(Send(payloads, wake))
+            payloads = []
+            if script.obs.now_ns >= tick:
+                break
+            now = receive()
+    script.end(phase)
+    script.next_ns = script.obs.now_ns
+    last = script.obs.q
+    script.goal.update({s: last[s] for s in plan.sides if s in last})
+
 
 _PART = 0.75
 """Part of its nominal rate that the modelled client must reach; below it the hand is not judged."""

@@ -7,6 +7,20 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.kit.provenance import TIMES
+from dexkit.conformance.stimuli.fingers import FingerScript
+from dexkit.conformance.stimuli.gripper import GripperScript
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.script import Place, Steps, stimulus
+
+
+@stimulus("old-stamps", GripperScript, after="load")
+@stimulus("old-stamps", FingerScript, after="load", needs=Place.ANY, leaves=Place.AWAY)
+def send_old_stamps(script: HandScript) -> Steps:
+    """A step whose commands have source timestamps that are an hour old."""
+    script.report("a client whose clock is an hour behind: it must be obeyed")
+    script.age_s = 3600.0
+    yield from script.everyone("old-stamps", script.other_place(), most=1.5)
+    script.age_s = 0.0
 
 
 @check("DEX1-ORDER-01", "DEX3-ORDER-01", "H1-ORDER-01", rests_on=(TIMES,))

@@ -8,10 +8,12 @@ known here, from the phases of the run; tools that do not know it use :mod:`dexk
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.behaviours.grip import finger_squeezes
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.checks.members import (
@@ -21,10 +23,62 @@ from dexkit.conformance.checks.members import (
     span_text,
 )
 from dexkit.conformance.checks.steps import steps_of
+from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.stimulus_record import Phase
-from dexkit.hand import Floats, Subject
+from dexkit.conformance.stimuli.fingers import BEYOND, FingerScript
+from dexkit.conformance.stimuli.script import Steps, stimulus
+from dexkit.hand import Floats, Side, Subject
 from dexkit.models import HandModel
 from dexkit.pressure import NO_VALUE, known
+
+_SOFT_HOLD, _SOFT_HOLD_SECONDS, _FIRM_SECONDS = 0.5, 0.3, 0.12
+"""A soft hold: its stiffness as a part of the client's, and seconds; seconds of a firm one."""
+_RAMP, _RAMP_SECONDS = 10, 0.2
+"""Steps in which a soft hold becomes a firm one, and seconds for all of them."""
+
+
+@stimulus("firmer", FingerScript, after="touch")
+def press_firmer(script: FingerScript) -> Steps:
+    """All fingers hold the object softly; each presses firmly in turn, and softly again."""
+    pressing = script.plan.pressing
+    if not pressing:
+        return
+    script.report("holding the object softly, with one finger after the other firmly")
+    firm = finger_squeezes(script, pressing, {})
+    soft: dict[Side, Motors] = {}
+    for s in pressing:
+        near = script.pose(s, script.plan.objects[s] + BEYOND)
+        soft[s] = [
+            replace(m, q=near[i], kp=_SOFT_HOLD * m.kp) if script.joints[s][i].closing else m
+            for i, m in enumerate(firm[s])
+        ]
+    yield from script.hold(_SOFT_HOLD_SECONDS, soft)
+    fingers = dict.fromkeys(j.name.partition("_")[0] for j in script.joints[pressing[0]])
+    before = soft
+    for finger in (*fingers, ""):  # in the end all softly again
+        hands: dict[Side, Motors] = {
+            s: [
+                firm[s][i] if finger and script.joints[s][i].name.startswith(finger) else m
+                for i, m in enumerate(soft[s])
+            ]
+            for s in pressing
+        }
+        phase = script.begin("firmer", pressing, finger=finger)
+        # slowly: what is seen must not be seen by the motion that a step makes
+        for i in range(1, _RAMP + 1):
+            between = {s: _between(before[s], hands[s], i / _RAMP) for s in pressing}
+            yield from script.hold(_RAMP_SECONDS / _RAMP, between)
+        yield from script.hold(_FIRM_SECONDS, hands)
+        script.end(phase)
+        before = hands
+
+
+def _between(a: Motors, b: Motors, part: float) -> list[Motor]:
+    """Commands on the way from one hand's to another's."""
+    return [
+        replace(n, q=m.q + part * (n.q - m.q), kp=m.kp + part * (n.kp - m.kp))
+        for m, n in zip(a, b, strict=True)
+    ]
 
 
 @check("DEX3-SENS-05")

@@ -2,11 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dexkit.conformance.checks import Context, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.steps import Step, steps_of
+from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
+from dexkit.conformance.stimuli.script import Steps, stimulus
+from dexkit.hand import Side
+
+_SPEEDS = ((0.0, 0.1, 0.2, 0.3, 0.4, 0.15), (0.2, 0.4, -0.2, 0.15, 0.1, 0.3))
+"""Speeds of the joints of position servos in two turns, parts of the full one."""
+_SPEEDS_SECONDS = 0.5
+"""Seconds of each turn with them."""
+
+
+@stimulus("speeds", FingerScript, after="single")
+def move_at_own_speeds(script: FingerScript) -> Steps:
+    """Each joint closes with another speed, and one with none."""
+    script.report("a speed for each joint: each must move with its own, and with 0 not at all")
+    sides = script.plan.sides
+    for speeds in _SPEEDS:
+        yield from script.to("center", OPEN)
+        poses = {s: script.pose(s, CLOSED) for s in sides}
+        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+        hands = {
+            s: [
+                replace(m, dq=speeds[(i + 3 * (s is Side.RIGHT)) % len(speeds)])
+                for i, m in enumerate(script.motors(s, pose))
+            ]
+            for s, pose in poses.items()
+        }
+        phase = script.begin("speeds", sides, targets=targets)
+        yield from script.hold(_SPEEDS_SECONDS, hands)
+        script.end(phase)
+    yield from script.back()
+
 
 _TURNS_S = 0.08  # s after which a joint has taken up a new speed
 

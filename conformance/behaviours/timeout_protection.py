@@ -2,15 +2,87 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from dexkit.conformance.behaviours.gains import drive_fingers
+from dexkit.conformance.behaviours.grip import finger_squeezes, step_beside_grip
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.checks.silences import mode_bytes, roles_of, silences_of, stops_moving
 from dexkit.conformance.checks.steps import not_driven
+from dexkit.conformance.kit.stimulus_record import Phase
+from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
+from dexkit.conformance.stimuli.hand import ASIDE_SECONDS
+from dexkit.conformance.stimuli.script import Steps, stimulus
 from dexkit.conformance.stimuli.usb import DRIVEN, FREE
 from dexkit.conformance.usb.context import UsbContext, named_joints, part_of_way
 from dexkit.conformance.usb.recording import Answer
+from dexkit.hand import Side
+
+_STAYS = 3.0
+"""Seconds after the time-out in which a hand must do what its protection says: a client that has
+died is started again within them, and its operator relies on what the hand holds."""
+
+
+@stimulus("guard guard-latch guard-clear", FingerScript, after="firmer")
+def squeeze_and_guard(script: FingerScript) -> Steps:
+    """Close on the object, with some joints protected; then no commands."""
+    pressing, free = script.plan.pressing, script.plan.free
+    splits = script.next_splits()
+    for percent in (CLOSED - 5.0, OPEN):
+        yield from _protected_step(script, percent, splits)
+    squeeze = finger_squeezes(script, pressing, splits)
+    phases: list[Phase] = []
+    if pressing:
+        script.report("squeezing the object")
+        targets = {
+            s: {i: m.q for i, m in enumerate(squeeze[s]) if script.joints[s][i].closing}
+            for s in pressing
+        }
+        phases.append(script.begin("squeeze", pressing, targets=targets))
+    if free:
+        phases.append(script.begin("guarded", tuple(free)))
+    still = {s: script.guarded(script.motors(s, script.goal[s]), s, splits) for s in free}
+    yield from script.hold(1.6 - ASIDE_SECONDS, {**squeeze, **still})
+    phases += step_beside_grip(script, pressing)
+    moved = {s: script.guarded(script.motors(s, script.goal[s]), s, splits) for s in free}
+    yield from script.hold(ASIDE_SECONDS, {**squeeze, **moved})
+    for phase in phases:
+        script.end(phase)
+    script.report("some joints have time-out protection, some of them move, and then ...")
+    yield from drive_fingers(script, "guard-drive", free, squeeze, guarded=splits)
+    script.report("... silence: the protected ones must brake and say so, the others go on")
+    yield from script.silence("guard", script.model.command_timeout + _STAYS)
+    script.report("they stay braked until the protection is cleared")
+    yield from latch_and_clear(script, splits)
+
+
+def _protected_step(
+    script: FingerScript, percent: float, guarded: Mapping[Side, frozenset[int]]
+) -> Steps:
+    """A step in which some joints have time-out protection: it changes nothing until then."""
+    sides = script.plan.sides
+    poses = {s: script.pose(s, percent) for s in sides}
+    targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
+    phase = script.begin("guarded-step", sides, targets=targets)
+    hands = {s: script.guarded(script.motors(s, pose), s, guarded) for s, pose in poses.items()}
+    yield from script.hold(0.45, hands)
+    script.end(phase)
+    script.goal.update(poses)
+
+
+def latch_and_clear(script: FingerScript, guarded: Mapping[Side, frozenset[int]]) -> Steps:
+    """Commands to elsewhere with the same joints protected, and then with none."""
+    sides = script.plan.sides
+    poses = {s: script.pose(s, CLOSED - 5.0) for s in sides}
+    targets = {s: {i: poses[s][i] for i in sorted(guarded[s])} for s in sides}
+    phase = script.begin("guard-latch", sides, targets=targets)
+    hands = {s: script.guarded(script.motors(s, poses[s]), s, guarded) for s in sides}
+    yield from script.hold(0.35, hands)
+    script.end(phase)
+    yield from script.everyone("guard-clear", poses, most=1.5)
 
 
 @check("DEX3-GUARD-01")

@@ -2,14 +2,66 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measure
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.stands import FEW_STANDS, stands
 from dexkit.conformance.checks.timing import gap_beside_states
+from dexkit.conformance.kit.motor_messages import Motors
 from dexkit.conformance.kit.touch import Touch
-from dexkit.hand import Floats
+from dexkit.conformance.stimuli.fingers import BEYOND, FingerScript
+from dexkit.conformance.stimuli.script import Steps, stimulus
+from dexkit.hand import Floats, Side
+
+_TOUCH_SECONDS = 0.22
+"""Seconds in which a finger presses on the object alone."""
+_TOUCH_STANDS, _TOUCH_MORE = 0.1, 12
+"""Seconds in which it stands then, and how often it is waited for that."""
+
+
+@stimulus("touch", FingerScript, after="late-joiner")
+def touch_object(script: FingerScript) -> Steps:
+    """One finger after the other presses on the object."""
+    pressing = script.plan.pressing
+    if not pressing:
+        return
+    script.report("touching the object with one finger after the other")
+    for finger in dict.fromkeys(j.name.partition("_")[0] for j in script.joints[pressing[0]]):
+        targets: dict[Side, dict[int, float]] = {}
+        hands: dict[Side, Motors] = {}
+        for s in pressing:
+            far = script.pose(s, script.plan.objects[s] + BEYOND)
+            targets[s] = {
+                i: far[i]
+                for i, j in enumerate(script.joints[s])
+                if j.closing and j.name.startswith(finger)
+            }
+            pose = [targets[s].get(i, q) for i, q in enumerate(script.home(s))]
+            hands[s] = script.motors(s, tuple(pose))
+        phase = script.begin("touch", pressing, targets=targets, finger=finger)
+        yield from script.hold(_TOUCH_SECONDS + _travel(script, targets), hands)
+        # a slow finger is still on its way
+        for _ in range(_TOUCH_MORE):
+            before = {s: script.obs.q.get(s, script.home(s)) for s in pressing}
+            yield from script.hold(_TOUCH_STANDS, hands)
+            if all(script.near(s, before[s], script.obs.q.get(s, before[s])) for s in pressing):
+                break
+        script.end(phase)
+
+
+def _travel(script: FingerScript, targets: Mapping[Side, Mapping[int, float]]) -> float:
+    """Seconds that position servos need from home; others are there at once."""
+    if not script.plan.dialect.position_servo:
+        return 0.0
+    return max(
+        abs(q - script.home(s)[i]) / script.joints[s][i].dq_max
+        for s, mine in targets.items()
+        for i, q in mine.items()
+    )
+
 
 _WINDOW_S = 1.0
 

@@ -9,12 +9,52 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from dexkit.command_age import PAUSE
 from dexkit.conformance.checks import STROKE_S, Context, Late, Outcome, check
 from dexkit.conformance.checks.figures import Figure, judged
 from dexkit.conformance.checks.steps import own_speed, speed_of, steps_of
 from dexkit.conformance.kit.row_selection import Selected, finite_rows
 from dexkit.conformance.kit.sums import mean
+from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.recorded_session import CommandSession
+from dexkit.conformance.stimuli.script import Send, Steps, stimulus
 from dexkit.hand import Floats
+
+
+@stimulus("replay", HandScript, after="burst limp push")
+def replay_session(script: HandScript) -> Steps:
+    """The recorded session, if there is one, and back to the middle."""
+    if script.plan.session is not None:
+        yield from _replay(script, script.plan.session)
+        yield from script.everyone("center", script.homes())
+
+
+def _replay(script: HandScript, session: CommandSession) -> Steps:
+    sides = [s for s in script.plan.sides if s in session.sides]
+    if not sides:
+        return
+    dialect = script.plan.dialect
+    timeline = script.timeline
+    newest = {s: session.first(s, dialect) for s in sides}
+    script.goal.update({s: tuple(m.q for m in motors) for s, motors in newest.items()})
+    reachable = [s for s in sides if script.reachable(s)]
+    yield from script.until_settled(None, reachable, least=0.4, most=2.0)
+    script.report(f"replaying {session.duration:.0f} s of the recorded session {session.name}")
+    phase = script.begin("replay", sides, session=session.name)
+    start = script.obs.now_ns
+    for i, (at, motors) in enumerate(timeline):
+        late = script.obs.now_ns - start - at
+        if late > PAUSE * 1e9:  # all that fell due, sent at once, would move the hand wildly
+            script.report(f"this program stood still for {late / 1e9:.2f} s; the session is held")
+            start += late
+        newest.update(motors)
+        payloads = script.codec.encode(newest if script.codec.shared else motors)
+        later = timeline[i + 1][0] if i + 1 < len(timeline) else at + script.period_ns
+        yield from script.do(Send(payloads, start + later))
+    script.end(phase)
+    script.next_ns = script.obs.now_ns
+    script.goal.update({s: tuple(m.q for m in newest[s]) for s in sides})
+
 
 _GRID = 0.005  # seconds; clients send commands at 200 Hz
 

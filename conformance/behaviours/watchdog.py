@@ -2,11 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from dexkit.conformance.behaviours.bad_commands import (
+    send_bad_at_once,
+)
+from dexkit.conformance.behaviours.gains import (
+    drive_fingers,
+    drive_gripper,
+    push_gripper,
+    step_softly,
+)
+from dexkit.conformance.behaviours.grip import (
+    finger_squeezes,
+    grip_softly,
+    gripper_squeeze,
+    squeeze_fingers,
+    unprotected,
+)
 from dexkit.conformance.behaviours.motion import robot_follows
+from dexkit.conformance.behaviours.timeout_protection import latch_and_clear
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
 from dexkit.conformance.checks.obedience import arrival, away_first, silent, stopped
@@ -17,7 +36,304 @@ from dexkit.conformance.checks.timing import gaps, survived
 from dexkit.conformance.checks.torque_law import torque_scales
 from dexkit.conformance.kit.measurement_error import Measure, Quantity
 from dexkit.conformance.kit.median import median
-from dexkit.hand import Floats
+from dexkit.conformance.kit.motor_messages import Motor, Motors
+from dexkit.conformance.kit.stimulus_record import Phase
+from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
+from dexkit.conformance.stimuli.gripper import NEARLY, GripperScript
+from dexkit.conformance.stimuli.hand import ASIDE_SECONDS
+from dexkit.conformance.stimuli.robot import SPEED, RobotScript
+from dexkit.conformance.stimuli.script import Moment, Place, Pose, Steps, stimulus, with_gains
+from dexkit.hand import Floats, Side
+
+_SILENCE, _LONG_SILENCE = 3.8, 67.0
+"""Seconds without a command: longer than counters of 8 bits in steps of 10 ms last; in a thorough
+run, than those of 16 bits in milliseconds."""
+_REGRIP_SECONDS = 0.6
+"""Seconds of a grip at the end: hands with gains touch the object after 0.2 s."""
+_ALONE_SECONDS = 0.35
+"""Seconds in which the first command after a silence is the only one: a hand that has received it
+has begun to move by then (DEX1-MOVE-09)."""
+_SLOWEST_HZ, _FASTEST_HZ = 30.0, 1000.0
+"""Commands a second before a silence: the time-out counts seconds, whatever the client's rate."""
+_GRIP_ON_SECONDS = 1.5
+"""Seconds for which position servos grip on after a silence, which they need not let go in: five
+seconds of contact, in which a force that fades within six is down to a sixth."""
+
+
+@stimulus("silence resume rejected", GripperScript, after="squeeze")
+def stop_gripper_commands(script: GripperScript) -> Steps:
+    """No commands for long: to each side alone where they have topics of their own."""
+    sides = script.plan.sides
+    pressing, free = script.plan.pressing, script.plan.free
+    timeout = script.model.command_timeout
+    long = _LONG_SILENCE if script.patient else _SILENCE
+    first = free[0] if free else sides[0]
+    rest = [s for s in sides if s != first]
+    alone = bool(rest) and not script.codec.shared and "rejected" in script.plan.phases
+    if not alone:
+        yield from grip_softly(script, pressing)
+        script.grip = dict(gripper_squeeze(script, pressing))
+        if free and script.gains_used:
+            yield from drive_gripper(script, free, 0.16, last_hz=_FASTEST_HZ)
+        script.report("... silence: after a second the hand must brake")
+        yield from script.silence("silence", long)
+        script.grip = {}
+        yield from _resume(script, script.other_place())
+        yield from step_softly(script, sides)
+    else:
+        script.grip.pop(first, None)
+        if script.gains_used:
+            if not free:
+                yield from script.turn("center", {first: (script.low(first),)}, least=0.5)
+            yield from drive_gripper(script, (first,), 0.16, last_hz=_FASTEST_HZ)
+        script.report(f"... silence on the {first} side: after a second it must brake")
+        yield from _silent_beside(script, first, [s for s in rest if s in pressing], long)
+        # away from where it was going before the silence
+        yield from _resume(script, {first: (NEARLY * script.stroke,)})
+        if script.gains_used:
+            low = {s: (script.low(s),) for s in (first,) if s in pressing}
+            if low:
+                yield from script.turn("center", low, least=0.5)
+            gain = script.model.gains[0][1]
+            yield from drive_gripper(
+                script, [s for s in sides if s not in script.grip], 0.07, kd=gain
+            )
+        script.report("... silence on both sides, and broken commands to one: both must brake")
+        yield from _silent_and_rejected(script, first, rest, timeout)
+        script.grip = {}
+        yield from _resume(script, script.other_place())
+    yield from send_bad_at_once(script)
+
+
+def _silent_beside(
+    script: GripperScript, side: Side, pressing: Sequence[Side], seconds: float
+) -> Steps:
+    """No command to one side, while the others grip softly, hold, and make a step."""
+    phase = script.begin("silence", (side,))
+    script.grip[side] = ()
+    yield from grip_softly(script, pressing)
+    yield from script.hold(max(0.2, seconds - 4.9))
+    grip, script.grip = script.grip, {side: ()}
+    beside = script.beside_others((side,), ASIDE_SECONDS)
+    yield from script.hold(0.8)
+    for ended in beside:
+        script.end(ended)
+    script.grip = {**grip, **gripper_squeeze(script, pressing)}
+    while script.elapsed(phase) < seconds:
+        yield from script.command()
+    script.end(phase)
+    del script.grip[side]
+
+
+def _silent_and_rejected(
+    script: GripperScript, first: Side, rest: Sequence[Side], timeout: float
+) -> Steps:
+    """No commands, then only rejected ones to one side; the others stay silent longer."""
+    both, long = script.begin("silence", (first,)), script.begin("silence", rest)
+    script.grip = dict.fromkeys((first, *rest), ())
+    yield from script.hold(timeout + 0.6)
+    script.end(both)
+    # they must not wake it, either
+    rejected = script.begin("rejected", (first,))
+    script.grip[first] = (Motor(q=math.nan),)
+    yield from script.hold(0.8 * timeout)
+    script.end(rejected)
+    del script.grip[first]
+    yield from _resume(script, {first: script.other_place()[first]})
+    yield from step_softly(script, (first,))
+    beside = script.beside_others(rest, ASIDE_SECONDS)
+    yield from script.hold(0.6)
+    for ended in (*beside, long):
+        script.end(ended)
+
+
+def _resume(script: GripperScript, goals: Mapping[Side, Pose]) -> Steps:
+    """A step after a silence, whose first command is alone for a while: it counts as it is."""
+    script.goal.update(goals)
+    targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
+    phase = script.begin("resume", tuple(goals), targets=targets)
+    yield from script.command()
+    yield from script.through(phase, _ALONE_SECONDS, lambda: script.wait(0.01))
+    yield from script.until_settled(
+        phase, tuple(goals), least=0.6 - _ALONE_SECONDS, most=2.5, stand=script.standing
+    )
+
+
+@stimulus("silence", GripperScript, moment=Moment.STARTED, after="grip", applies=with_gains)
+@stimulus("silence rejected", GripperScript, moment=Moment.NOT_STARTED, applies=with_gains)
+def stop_gripper_commands_again(script: GripperScript) -> Steps:
+    """The commands end once more, at the end."""
+    sides = script.plan.sides
+    script.grip = {}
+    if "push" in script.plan.phases:
+        yield from push_gripper(script, dict.fromkeys(sides, "push"))
+    pressing, free = script.plan.pressing, script.plan.free
+    # a free hand is elsewhere in this silence: one that goes to a fixed position shows then
+    starts = {s: (script.low(s) if s in pressing else script.middle(s),) for s in sides}
+    yield from script.everyone("center", starts)
+    script.grip = dict(gripper_squeeze(script, pressing))
+    yield from drive_gripper(script, free, 0.16, last_hz=_SLOWEST_HZ)
+    first, *rest = sides
+    if rest and not script.codec.shared and "rejected" in script.plan.phases:
+        begun = script.begin("silence", (first,))
+        rejected = script.begin("rejected", rest)
+        script.grip = {first: (), **dict.fromkeys(rest, (Motor(q=math.inf),))}
+        yield from script.hold(script.model.command_timeout + 0.6)
+        script.end(begun)
+        script.end(rejected)
+    else:
+        yield from script.silence("silence", script.model.command_timeout + 0.6)
+    script.grip = {}
+    yield from _resume(script, script.other_place())
+
+
+@stimulus("squeeze beside-grip silence resume", FingerScript, after="squeeze", applies=unprotected)
+def stop_finger_commands(script: FingerScript) -> Steps:
+    """No commands to hands of which some joints move and others may press; none has protection."""
+    sides = script.plan.sides
+    pressing, free = script.plan.pressing, script.plan.free
+    squeeze = finger_squeezes(script, pressing, {})
+    if script.plan.phases & {"silence", "resume"}:
+        script.report("slow motion without protection, and then ...")
+        yield from drive_fingers(script, "drive", free, squeeze)
+        script.report("... silence: nothing may be left driven by a velocity, a grip is kept")
+        yield from script.silence("silence", script.model.command_timeout + 0.7)
+        if pressing and script.plan.dialect.position_servo:
+            script.report("squeezing the object on: its force must not fade")
+            yield from squeeze_fingers(script, pressing, _GRIP_ON_SECONDS)
+    yield from script.everyone("resume", {s: script.home(s) for s in sides}, most=1.5)
+
+
+@stimulus("silence resume", FingerScript, after="squeeze guard")
+def stop_each_hands_commands(script: FingerScript) -> Steps:
+    """No commands to each hand alone.
+
+    Some joints have time-out protection, which must trip more than once; and once none has, as
+    a hand may latch only then. A hand that is alone gets both silences, of two hands each gets
+    one: a service rarely has a fault of time in one hand alone.
+    """
+    sides = script.plan.sides
+    if len(sides) == 1 and "guard" in script.plan.phases:
+        yield from _silent_by_motion(script, _once_more(script))
+        yield from _silent_by_motion(script, {})
+    if len(sides) > 1 and "silence" in script.plan.phases:
+        for side, bad in zip(sides, (math.nan, math.inf), strict=True):
+            home = script.motors(side, script.home(side))
+            rejected = [replace(m, q=bad) for m in home] if script.codec.holds_nan else []
+            guarded = _once_more(script) if side is sides[0] else {}
+            yield from _silent_alone(script, side, rejected, guarded)
+    yield from send_bad_at_once(script)
+
+
+def _silent_by_motion(script: FingerScript, guarded: Mapping[Side, frozenset[int]]) -> Steps:
+    """No commands to moving hands, then a step.
+
+    :param guarded: the joints with time-out protection.
+    """
+    yield from drive_fingers(script, "drive", script.plan.sides, {}, guarded=guarded)
+    yield from script.silence("silence", script.model.command_timeout + 0.7)
+    yield from _after_silence(script, {s: script.pose(s, CLOSED - 5.0) for s in script.plan.sides})
+
+
+def _silent_alone(
+    script: FingerScript, side: Side, rejected: Motors, guarded: Mapping[Side, frozenset[int]]
+) -> Steps:
+    """No command to one side but rejected ones, while it moves and the other is commanded.
+
+    The first step afterwards closes that hand, away from where a hand that begins at 0 would
+    go.
+
+    :param guarded: the joints with time-out protection.
+    """
+    script.report(f"no good commands to the {side} hand alone: nothing may be left driven")
+    yield from drive_fingers(script, "drive", (side,), {}, guarded=guarded)
+    yield from _silence_alone(script, side, {side: rejected} if rejected else {})
+    yield from _after_silence(
+        script, {s: script.pose(s, CLOSED - 5.0 if s is side else OPEN) for s in script.plan.sides}
+    )
+
+
+def _silence_alone(script: FingerScript, side: Side, rejected: Mapping[Side, Motors]) -> Steps:
+    """No good command to one side, as a phase; the others make a step after the time-out.
+
+    :param rejected: what the side gets instead: it must not count as a command.
+    """
+    phase = script.begin("silence", (side,))
+    beside: list[Phase] = []
+    for seconds in (script.model.command_timeout + 0.1, script.beside_s):
+        good = {s: script.motors(s, q) for s, q in script.goal.items() if s != side}
+        payloads = script.codec.encode({**good, **rejected})
+        yield from script.repeat(
+            seconds,
+            lambda payloads=payloads: script.send(payloads),  # type: ignore[misc]
+        )
+        if not beside:
+            beside = script.beside_others((side,), ASIDE_SECONDS)
+    for ended in (phase, *beside):
+        script.end(ended)
+
+
+def _after_silence(script: FingerScript, poses: Mapping[Side, Pose]) -> Steps:
+    yield from script.everyone("resume", script.apart(poses), most=1.5)
+
+
+def _once_more(script: FingerScript) -> dict[Side, frozenset[int]]:
+    """The joints with time-out protection in a further silence."""
+    return script.next_splits() if "guard" in script.plan.phases else {}
+
+
+@stimulus("silence", FingerScript, moment=Moment.STARTED, after="squeeze ends", needs=Place.ANY)
+def stop_finger_commands_again(script: FingerScript) -> Steps:
+    """The commands end once more, after a restart of the service."""
+    yield from script.to("center", OPEN)
+    sides = script.plan.sides
+    if "guard" in script.plan.phases:
+        splits = script.next_splits()
+        yield from drive_fingers(script, "guard-drive", sides, {}, guarded=splits)
+        yield from script.silence("guard", script.model.command_timeout + 0.3)
+        yield from latch_and_clear(script, splits)
+    else:
+        yield from _silent_by_motion(script, {})
+    pressing = script.plan.pressing
+    if pressing and "squeeze" in script.plan.phases and not script.plan.dialect.position_servo:
+        script.report("squeezing the object again")
+        yield from squeeze_fingers(script, pressing, _REGRIP_SECONDS, "regrip")
+
+
+@stimulus("pause", RobotScript, after="late-joiner", leaves=Place.AWAY)
+def pause_robot_commands(script: RobotScript) -> Steps:
+    """0.3 s without a command while the joint is driven by a speed."""
+    yield from _stop_robot_commands(script, "pause", 0.3)
+
+
+@stimulus("silence", RobotScript, after="pause", leaves=Place.AWAY)
+def stop_robot_commands(script: RobotScript) -> Steps:
+    """More than a second likewise."""
+    yield from _stop_robot_commands(script, "silence", script.robot.command_timeout + 0.6)
+
+
+def _stop_robot_commands(script: RobotScript, name: str, seconds: float) -> Steps:
+    script.report("commands pause while a joint is driven: it may go on for a second, not longer")
+    speed = script.inward(script.slot, SPEED)
+    script.order = script.changed(kp=0.0, dq=speed)
+    yield from script.keep(0.3)
+    phase = script.phase(name, speed=repr(speed))
+    yield from script.through(phase, seconds, lambda: script.wait(0.02))
+    script.catch()
+    if name == "silence" and "resume" in script.plan.phases:
+        yield from resume_robot(script)
+
+
+@stimulus("resume", RobotScript, after="silence", leaves=Place.AWAY)
+def resume_robot(script: RobotScript) -> Steps:
+    """Commands again: hold at first, then a step; once in a run."""
+    if any(p.name == "resume" for p in script.phases):
+        return
+    script.next_ns = script.obs.now_ns
+    phase = script.phase("resume", what="hold")
+    yield from script.keep(0.3)
+    script.end(phase)
+    yield from script.step("resume", what="step")
 
 
 def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:

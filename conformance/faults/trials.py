@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+from dexkit.conformance.behaviours.operator import OPERATOR
 from dexkit.conformance.faults.registry import Mutant
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.kit.decoding import recording_of
@@ -26,7 +27,6 @@ from dexkit.conformance.kit.robot import robot_dialect
 from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.layers import layer
 from dexkit.conformance.stimuli import CommandSession, Plan, phases_for, script_class
-from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.conformance.stimuli.script import default_objects
 from dexkit.conformance.virtual import TopicDevice, run_virtual
 from dexkit.conformance.virtual.client import run_client

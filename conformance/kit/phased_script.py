@@ -39,46 +39,47 @@ class PhasedScript(ABC, Generic[A, O, P]):
 
     def __init__(self, start: O, report: Callable[[str], None] = lambda text: None) -> None:
         self.phases: list[P] = []
-        self._report = report
-        self._obs = start
-        self._next_ns = 0
+        self.report = report
+        self.obs = start
+        self.next_ns = 0
 
     @abstractmethod
     def run(self) -> Generator[A, O, None]:
         """The whole script."""
 
-    def _do(self, action: A) -> Generator[A, O, O]:
+    def do(self, action: A) -> Generator[A, O, O]:
         """Yield an action to the player; return the observation after it."""
-        self._obs = yield action
-        return self._obs
+        self.obs = yield action
+        return self.obs
 
-    def _mark(self, phase: P) -> P:
+    def mark(self, phase: P) -> P:
         """Record that a phase begins."""
         self.phases.append(phase)
         return phase
 
-    def _end(self, phase: P) -> None:
-        phase.end_ns = self._obs.now_ns
+    def end(self, phase: P) -> None:
+        """End a phase now."""
+        phase.end_ns = self.obs.now_ns
 
-    def _elapsed(self, phase: P) -> float:
+    def elapsed(self, phase: P) -> float:
         """Seconds since a phase began."""
-        return (self._obs.now_ns - phase.begin_ns) / 1e9
+        return (self.obs.now_ns - phase.begin_ns) / 1e9
 
-    def _repeat(
+    def repeat(
         self, seconds: float, step: Callable[[], Generator[A, O, None]]
     ) -> Generator[A, O, None]:
         """Repeat ``step`` for ``seconds``."""
-        end = self._obs.now_ns + round(seconds * 1e9)
-        while self._obs.now_ns < end:
+        end = self.obs.now_ns + round(seconds * 1e9)
+        while self.obs.now_ns < end:
             yield from step()
 
-    def _through(
+    def through(
         self, phase: P, seconds: float, step: Callable[[], Generator[A, O, None]]
     ) -> Generator[A, O, None]:
         """Repeat ``step`` until the phase is ``seconds`` long, and end it."""
-        while self._elapsed(phase) < seconds:
+        while self.elapsed(phase) < seconds:
             yield from step()
-        self._end(phase)
+        self.end(phase)
 
 
 def play(

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from dexkit.conformance.behaviours.operator import OPERATOR
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.requirements import CAPABILITIES, Kind
 from dexkit.conformance.kit.results import (
@@ -46,7 +47,6 @@ from dexkit.conformance.report.labels import (
 from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.result_plots import plots_of
 from dexkit.conformance.report.run_plots import run_plots
-from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.documents import write_file
 
 __all__ = ["render", "utc", "write_html"]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
+from dexkit.conformance.behaviours.operator import OPERATOR, operator_of
 from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.conformance.kit.recording import Recording, SideView
 from dexkit.conformance.kit.requirements import Requirement
@@ -20,7 +21,6 @@ from dexkit.conformance.report.charts import Band, Chart, Level, Line, Range, hi
 from dexkit.conformance.report.labels import whose
 from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.usb_plots import usb_plots
-from dexkit.conformance.stimuli.operator import OPERATOR, operator_of
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, JointSpec, Side, Subject
 from dexkit.pressure import known, resting_pressure

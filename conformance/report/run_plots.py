@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from dexkit.conformance.behaviours.operator import OPERATOR
 from dexkit.conformance.kit.recording import Recording, SideView
 from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.report.charts import Band, Chart, Level, Line, histogram
 from dexkit.conformance.report.labels import whose
 from dexkit.conformance.report.result_plots import command_and_state, operated, phase_bands
-from dexkit.conformance.stimuli.operator import OPERATOR
 from dexkit.hand import JointSpec
 
 __all__ = ["run_plots"]

@@ -1,8 +1,11 @@
 """The stimuli for hands and robots on DDS topics, as scripts (see
 :mod:`dexkit.conformance.kit.phased_script`).
 
-Grippers have :mod:`~.stimuli.gripper`, hands of several joints :mod:`~.stimuli.fingers`; both
-share :mod:`~.stimuli.hand`. Robots have :mod:`~.stimuli.robot`.
+The phases are beside the checks that judge by them, in :mod:`dexkit.conformance.behaviours`. Here
+is what they are written with, and what puts them in order (:mod:`~.stimuli.script`): for grippers
+:mod:`~.stimuli.gripper`, for hands of several joints :mod:`~.stimuli.fingers`, for both
+:mod:`~.stimuli.hand`, for robots :mod:`~.stimuli.robot`. USB has a script of its own,
+:mod:`~.stimuli.usb`.
 """
 
 from __future__ import annotations

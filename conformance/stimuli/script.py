@@ -4,12 +4,15 @@ rate.
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Generic, TypeVar
+from functools import cache
+from typing import Any, Generic, TypeVar
 
+from dexkit.conformance.behaviours import CHECKS
 from dexkit.conformance.hands import under_test
 from dexkit.conformance.kit.phased_script import PhasedScript, play
 from dexkit.conformance.kit.stimulus_record import Phase
@@ -22,9 +25,11 @@ __all__ = [
     "Action",
     "Join",
     "Leave",
+    "Moment",
     "Observation",
     "Part",
     "Payloads",
+    "Place",
     "Plan",
     "Pose",
     "Restart",
@@ -36,6 +41,11 @@ __all__ = [
     "StopService",
     "default_objects",
     "object_places",
+    "of_position_servos",
+    "parts_of",
+    "stimulus",
+    "with_gains",
+    "without_gains",
 ]
 
 NOT_FINITE = [
@@ -129,31 +139,8 @@ Steps = Generator[Action, Observation, None]
 """Part of a script."""
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part of a script: a phase, or some that follow from one another.
-
-    :param phases: their names; it is played in a run that needs any of them, and asks the plan for
-        the others. None: in every run.
-    :param play: its steps, from wherever the hand is.
-    :param back: it leaves the hand elsewhere, and the script moves it back to its first pose.
-    :param applies: whether the dialect has what it is about.
-    """
-
-    phases: frozenset[str]
-    play: Callable[[], Steps]
-    back: bool = False
-    applies: bool = True
-
-    @classmethod
-    def of(
-        cls, phases: str, play: Callable[[], Steps], *, back: bool = False, applies: bool = True
-    ) -> Part:
-        """A part by the names of its phases, with blanks between them."""
-        return cls(frozenset(phases.split()), play, back, applies)
-
-
 S = TypeVar("S", bound=Subject)
+PlayT = TypeVar("PlayT", bound="Callable[[Any], Steps]")
 S_co = TypeVar("S_co", bound=Subject, covariant=True)
 
 
@@ -175,6 +162,136 @@ class Plan(Generic[S_co]):
     phases: frozenset[str] = frozenset()
     rounds: int = 1
 
+    @property
+    def pressing(self) -> tuple[S_co, ...]:
+        """The sides with an object."""
+        return tuple(s for s in self.sides if s in self.objects)
+
+    @property
+    def free(self) -> tuple[S_co, ...]:
+        """The sides without one."""
+        return tuple(s for s in self.sides if s not in self.objects)
+
+
+def with_gains(plan: Plan[Any]) -> bool:
+    """Whether the hands go by the gains of commands."""
+    return plan.dialect.gains_are_used
+
+
+def without_gains(plan: Plan[Any]) -> bool:
+    """Whether they do not."""
+    return not plan.dialect.gains_are_used
+
+
+def of_position_servos(plan: Plan[Any]) -> bool:
+    """Whether the hands are position servos."""
+    return plan.dialect.position_servo
+
+
+class Moment(Enum):
+    """When a phase is played."""
+
+    ROUND = "after the first motion, once in each round"
+    CLIENTS = "after the rounds: an operator, and other clients"
+    NEW_CLIENT = "when a new client has made its first steps"
+    SERVICE = "at the end, with the hands' services"
+    STOPPING = "before the services are asked to end"
+    STARTED = "when a hand has made its first steps after a restart of its service"
+    NOT_STARTED = "at the end, where the kit cannot start the services"
+
+
+class Place(Enum):
+    """Where hands are before or after a part of a script."""
+
+    HOME = "where any part can begin"
+    AWAY = "elsewhere: they are moved back before a part that does not begin just anywhere"
+    ANY = "wherever they are"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a script: a phase, or some that follow from one another.
+
+    :param phases: their names; it is played in a run that needs any of them, and asks the plan for
+        the others. None: in every run.
+    :param kind: the scripts that it is a part of.
+    :param play: its steps.
+    :param after: names of phases that come before it where a run has both.
+    :param before: the same of phases that come after it.
+    :param needs: where it begins: ``HOME`` or ``ANY``.
+    :param leaves: where it leaves the hand: ``ANY`` is where it was.
+    :param applies: whether it is about a plan's hands.
+    """
+
+    phases: frozenset[str]
+    kind: type[Script[Any]]
+    play: Callable[[Any], Steps]
+    after: frozenset[str]
+    before: frozenset[str]
+    moment: Moment
+    needs: Place
+    leaves: Place
+    applies: Callable[[Plan[Any]], bool]
+
+    def wanted(self, plan: Plan[Any]) -> bool:
+        """Whether a run with this plan has it."""
+        return self.applies(plan) and (not self.phases or bool(self.phases & plan.phases))
+
+
+_PARTS: list[Part] = []
+"""The parts of all scripts, of those modules that have been imported."""
+
+
+def stimulus(
+    names: str,
+    kind: Callable[..., Script[Any]],
+    *,
+    after: str = "",
+    before: str = "",
+    moment: Moment = Moment.ROUND,
+    needs: Place = Place.HOME,
+    leaves: Place = Place.HOME,
+    applies: Callable[[Plan[Any]], bool] = lambda plan: True,
+) -> Callable[[PlayT], PlayT]:
+    """Make the decorated function a part of the scripts of a kind; see :class:`Part`.
+
+    :param kind: their class, which may be abstract.
+    :param names: of phases, with blanks between them; ``after`` and ``before`` likewise.
+    """
+
+    def register(play: PlayT) -> PlayT:
+        lists = [frozenset(text.split()) for text in (names, after, before)]
+        options = (moment, needs, leaves, applies)
+        assert isinstance(kind, type)
+        _PARTS.append(Part(lists[0], kind, play, lists[1], lists[2], *options))
+        return play
+
+    return register
+
+
+@cache
+def parts_of(script: type[Script[Any]]) -> tuple[Part, ...]:
+    """The parts of a script, in their order: each as soon as all that come before it are done."""
+    for module in CHECKS:
+        importlib.import_module(module)
+    left = sorted(
+        (part for part in _PARTS if issubclass(script, part.kind)),
+        key=lambda part: (part.play.__module__, part.play.__qualname__),
+    )
+    found: list[Part] = []
+    while left:
+        free = [p for p in left if not any(_precedes(q, p) for q in left if q is not p)]
+        assert free, f"{script.__name__}: phases that come before one another"
+        found.append(free[0])
+        left.remove(free[0])
+    return tuple(found)
+
+
+def _precedes(first: Part, then: Part) -> bool:
+    """Whether the order of these is given, and so."""
+    given = first.phases & then.after or first.before & then.phases
+    return first.moment is then.moment and bool(given)
+
 
 def object_places(dialect: Dialect, percents: Mapping[Side, float]) -> dict[Subject, float]:
     """Percents as the script takes them: of opening in radians, of closing as they are."""
@@ -190,7 +307,7 @@ def default_objects(dialect: Dialect, sides: Sequence[Subject]) -> dict[Subject,
 
 
 class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
-    """The stimulus for one plan; each model's script has its phases, in its order."""
+    """The stimulus for one plan: the phases of its kind of hand that the plan needs, in turn."""
 
     motion = "step"
     """The phase in which the hand moves, for requirements that need any motion."""
@@ -198,16 +315,16 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
     def __init__(self, plan: Plan[S], report: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(Observation(0), report)
         self.plan = plan
-        self._joints: dict[S, tuple[JointSpec, ...]] = {}
-        self._goal: dict[S, Pose] = {}
-        self._age_s = 0.0
-        self._period_ns = 0
+        self.joints: dict[S, tuple[JointSpec, ...]] = {}
+        self.goal: dict[S, Pose] = {}
+        self.age_s = 0.0
+        self.period_ns = 0
 
     def length(self) -> float:
         """Seconds that :meth:`run` takes with hands that reach their goals at once."""
         now = 0
         stopped: dict[str, float | None] = {}
-        still: dict[Subject, Pose] = {s: (0.0,) * len(self._joints[s]) for s in self.plan.sides}
+        still: dict[Subject, Pose] = {s: (0.0,) * len(self.joints[s]) for s in self.plan.sides}
         joined: dict[Subject, float] = dict.fromkeys(self.plan.sides, 0.0)
 
         def carry_out(action: Action) -> Observation:
@@ -218,38 +335,43 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
                 stopped = {"exit_s": 0.0, "gone_s": 0.0}
             elif isinstance(action, StartService):
                 now += _SERVICE_START_NS
-            return Observation(now, still | dict(self._goal.items()), still, joined, stopped)
+            return Observation(now, still | dict(self.goal.items()), still, joined, stopped)
 
         play(self, carry_out, lambda: False)
         return now / 1e9
 
-    def _schedule(self, parts: Sequence[Part]) -> Steps:
-        """Those of the parts that the run needs, in turn."""
-        for part in parts:
-            wanted = not part.phases or part.phases & self.plan.phases
-            if part.applies and wanted:
-                yield from part.play()
-                if part.back:
-                    yield from self._back()
+    def schedule(self, moment: Moment) -> Steps:
+        """The parts that the run needs at a moment, and the moves between them."""
+        place = Place.HOME
+        for part in parts_of(type(self)):
+            if part.moment is moment and part.wanted(self.plan):
+                if place is Place.AWAY and part.needs is Place.HOME:
+                    yield from self.back()
+                    place = Place.HOME
+                yield from part.play(self)
+                if part.leaves is not Place.ANY:
+                    place = part.leaves
+        if place is Place.AWAY:
+            yield from self.back()
 
-    def _back(self) -> Steps:
+    def back(self) -> Steps:
         """Back to the first pose."""
         yield from ()
 
-    def _send(self, payloads: Payloads) -> Steps:
+    def send(self, payloads: Payloads) -> Steps:
         """Send now, wait for the next tick of the client's rate."""
-        late = self._obs.now_ns - self._next_ns
-        if late > self._period_ns:
-            self._next_ns += late
-        self._next_ns += self._period_ns
-        yield from self._do(Send(payloads, self._next_ns, age_s=self._age_s))
+        late = self.obs.now_ns - self.next_ns
+        if late > self.period_ns:
+            self.next_ns += late
+        self.next_ns += self.period_ns
+        yield from self.do(Send(payloads, self.next_ns, age_s=self.age_s))
 
-    def _wait(self, seconds: float) -> Steps:
+    def wait(self, seconds: float) -> Steps:
         """Send nothing."""
-        self._next_ns = max(self._next_ns, self._obs.now_ns) + round(seconds * 1e9)
-        yield from self._do(Send([], self._next_ns))
+        self.next_ns = max(self.next_ns, self.obs.now_ns) + round(seconds * 1e9)
+        yield from self.do(Send([], self.next_ns))
 
-    def _begin(
+    def begin(
         self,
         name: str,
         sides: Sequence[S],
@@ -261,10 +383,11 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
         goals: dict[Subject, dict[int, float]] = {
             s: dict(joints) for s, joints in (targets or {}).items()
         }
-        begin_ns = self._obs.now_ns
-        return self._mark(Phase(name, tuple(sides), begin_ns, targets=goals, params=params))
+        begin_ns = self.obs.now_ns
+        return self.mark(Phase(name, tuple(sides), begin_ns, targets=goals, params=params))
 
-    def _listen(self) -> Steps:
-        self._report("listening: the state must flow before the first command")
-        phase = self._begin("listen", self.plan.sides)
-        yield from self._through(phase, 1.2, lambda: self._wait(0.05))
+    def listen(self) -> Steps:
+        """No commands: the state must flow."""
+        self.report("listening: the state must flow before the first command")
+        phase = self.begin("listen", self.plan.sides)
+        yield from self.through(phase, 1.2, lambda: self.wait(0.05))

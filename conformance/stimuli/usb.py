@@ -191,7 +191,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         except _NoAnswer:
             self.trouble = f"{_GIVE_UP} commands in a row were not answered"
         for phase in self.phases:
-            phase.end_ns = phase.end_ns or self._obs.now_ns
+            phase.end_ns = phase.end_ns or self.obs.now_ns
 
     def lock_frame(self) -> bytes:
         """A frame that locks every motor; it may be sent at any time."""
@@ -200,18 +200,18 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
     # -- one transfer ---------------------------------------------------------------------------
 
     def _wait(self, seconds: float) -> Steps:
-        yield from self._do(Wait(self._obs.now_ns + round(seconds * 1e9)))
+        yield from self.do(Wait(self.obs.now_ns + round(seconds * 1e9)))
 
     def _wait_for_tick(self) -> Steps:
         """Wait for the next tick; missed ticks are skipped."""
-        self._next_ns = max(self._next_ns + round(self.plan.period * 1e9), self._obs.now_ns)
-        yield from self._do(Wait(self._next_ns))
+        self.next_ns = max(self.next_ns + round(self.plan.period * 1e9), self.obs.now_ns)
+        yield from self.do(Wait(self.next_ns))
 
     def _exchange(self, frame: bytes) -> Steps:
         """Send one command and read one answer."""
-        seen = yield from self._do(Out(frame))
+        seen = yield from self.do(Out(frame))
         if not seen.status:
-            seen = yield from self._do(In())
+            seen = yield from self.do(In())
         if seen.status:
             self._missed += 1
             if self._missed >= _GIVE_UP:
@@ -230,13 +230,13 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
 
     def _count_silent_frames(self, seconds: float) -> Generator[Action, Observation, int]:
         """Read without sending; return the number of frames received."""
-        end, frames = self._obs.now_ns + round(seconds * 1e9), 0
-        while self._obs.now_ns < end:
-            seen = yield from self._do(In((end - self._obs.now_ns) / 1e9))
+        end, frames = self.obs.now_ns + round(seconds * 1e9), 0
+        while self.obs.now_ns < end:
+            seen = yield from self.do(In((end - self.obs.now_ns) / 1e9))
             if seen.status:
                 break
             frames += 1
-        yield from self._do(Wait(end))
+        yield from self.do(Wait(end))
         return frames
 
     # -- frames ---------------------------------------------------------------------------------
@@ -283,7 +283,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
     # -- phases ---------------------------------------------------------------------------------
 
     def _begin_phase(self, name: str, **params: Any) -> UsbPhase:
-        return self._mark(UsbPhase(name, self._obs.now_ns, params=params))
+        return self.mark(UsbPhase(name, self.obs.now_ns, params=params))
 
     def _send_for(self, seconds: float, frame: bytes) -> Steps:
         """Send the same command, once a tick."""
@@ -292,48 +292,48 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
             yield from self._exchange(frame)
             yield from self._wait_for_tick()
 
-        self._next_ns = self._obs.now_ns
-        yield from self._repeat(seconds, exchange)
+        self.next_ns = self.obs.now_ns
+        yield from self.repeat(seconds, exchange)
 
     def _exchange_phase(self) -> Steps:
-        self._report("exchanging frames without motion")
+        self.report("exchanging frames without motion")
         yield from self._count_silent_frames(0.1)  # reads what another program has left unread
         phase = self._begin_phase("quiet")
         yield from self._count_silent_frames(0.15)
-        self._end(phase)
+        self.end(phase)
         yield from self._probe()
 
         frame = self._frame(Motor())
         phase = self._begin_phase("exchange", status=0, size=self._size)
         yield from self._send_for(20 * self.plan.period, frame)
         yield from self._count_silent_frames(0.05)
-        self._end(phase)
+        self.end(phase)
 
         yield from self._burst()
         phase = self._begin_phase("pair")
         for _ in range(2):
-            yield from self._do(Out(frame))
+            yield from self.do(Out(frame))
         phase.params["answers"] = yield from self._count_silent_frames(0.1)
-        self._end(phase)
+        self.end(phase)
         yield from self._exchange(frame)
 
     def _burst(self) -> Steps:
         frame = self._frame(Motor())
-        yield from self._do(Alone(True))
+        yield from self.do(Alone(True))
         phase = self._begin_phase("burst", status=0)
         for _ in range(self.plan.burst):
             yield from self._exchange(frame)
-        self._end(phase)
-        yield from self._do(Alone(False))
+        self.end(phase)
+        yield from self.do(Alone(False))
 
     def _probe(self) -> Steps:
         """Find the size of command frame that the hand answers."""
         for size in (1234, 734):
             self._size = size
             phase = self._begin_phase("probe", size=size)
-            yield from self._do(Out(self._frame(Motor())))
-            seen = yield from self._do(In())
-            self._end(phase)
+            yield from self.do(Out(self._frame(Motor())))
+            seen = yield from self.do(In())
+            self.end(phase)
             if not seen.status:
                 return
         self._size = 1234
@@ -344,7 +344,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         return bool(self._q)
 
     def _motion(self) -> Steps:
-        self._report("moving one joint at a time by 0.2 rad")
+        self.report("moving one joint at a time by 0.2 rad")
         hold = self._hold_commands()
         yield from self._send_for(0.05, self._frame(hold))
         for joint in range(len(self._joints)):
@@ -354,13 +354,13 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
             )
             hold[joint] = replace(hold[joint], q=target)
             yield from self._send_for(0.2, self._frame(hold))
-            self._end(phase)
+            self.end(phase)
 
         locked = [replace(m, status=0) for m in self._goals_inward(self._hold_commands())]
         yield from self._send_for(0.05, self._frame(Motor(protect=True)))
         phase = self._begin_phase("lock", status=0)
         yield from self._send_for(0.2, self._frame(locked))
-        self._end(phase)
+        self.end(phase)
         yield from self._burst()
 
     def _hold_still(self, seconds: float) -> Steps:
@@ -394,16 +394,16 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         return self._frame(mixed, sizes={bus: size})
 
     def _damage(self) -> Steps:
-        self._report("damaged frames: nothing may move")
+        self.report("damaged frames: nothing may move")
         for kind in DAMAGES:
             yield from self._hold_still(0.03)
             phase = self._begin_phase("malformed", kind=kind)
-            yield from self._do(Out(self._damaged(kind)))
+            yield from self.do(Out(self._damaged(kind)))
             phase.params["answers"] = yield from self._count_silent_frames(_SETTLE)
             hold = self._frame(self._hold_commands())
             for _ in range(3):
                 yield from self._exchange(hold)
-            self._end(phase)
+            self.end(phase)
         yield from self._broadcast()
         yield from self._short()
 
@@ -422,10 +422,10 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
                     motor_packet(number, hold[i], self._joints[i])
                 )
         phase = self._begin_phase("broadcast", bus=bus, target=target, begin=begin)
-        yield from self._do(Out(pack_command(elsewhere, self._size)))
+        yield from self.do(Out(pack_command(elsewhere, self._size)))
         phase.params["answers"] = yield from self._count_silent_frames(0.2)
         yield from self._exchange(self._frame(self._hold_commands()))
-        self._end(phase)
+        self.end(phase)
 
     def _short(self) -> Steps:
         size = 734 if self._size == 1234 else 1234
@@ -437,13 +437,13 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
             "short", size=size, joint=joint, begin=self._q[joint], target=target
         )
         hold[joint] = replace(hold[joint], q=target)
-        yield from self._do(Out(self._frame(hold, size=size)))
+        yield from self.do(Out(self._frame(hold, size=size)))
         phase.params["answers"] = yield from self._count_silent_frames(0.2)
         yield from self._exchange(self._frame(self._hold_commands()))
-        self._end(phase)
+        self.end(phase)
 
     def _protection(self) -> Steps:
-        self._report("time-out protection: a pause, then 1.5 s of silence while a finger moves")
+        self.report("time-out protection: a pause, then 1.5 s of silence while a finger moves")
         spec = self._joints[DRIVEN]
         hold = self._hold_commands()
         yield from self._exchange(self._frame(self._hold_commands(protect=False)))
@@ -457,7 +457,7 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         phase = self._begin_phase("pause", seconds=0.6)
         yield from self._wait(0.6)
         yield from self._exchange(self._frame(self._hold_commands()))
-        self._end(phase)
+        self.end(phase)
         yield from self._exchange(self._frame(self._hold_commands(protect=False)))
 
         motors = self._hold_commands()
@@ -465,11 +465,11 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         motors[FREE] = Motor(1, dq=self._joints[FREE].closing * _SPEED / 2, kd=_KD)
         phase = self._begin_phase("drive")
         yield from self._send_for(0.4, self._frame(motors))
-        self._end(phase)
+        self.end(phase)
 
         phase = self._begin_phase("silence", seconds=1.5)
         yield from self._wait(1.5)
-        self._end(phase)
+        self.end(phase)
 
         # the first answer has the positions; goals elsewhere come after it
         phase = self._begin_phase("tripped")
@@ -481,21 +481,21 @@ class UsbScript(PhasedScript[Action, Observation, UsbPhase]):
         phase.params["begin"] = list(self._q)
         phase.params["targets"] = [m.q for m in motors]
         yield from self._send_for(0.25, self._frame(motors))
-        self._end(phase)
+        self.end(phase)
 
         free = [replace(m, protect=False) for m in self._hold_commands()]
         free[DRIVEN] = replace(free[DRIVEN], q=self._goal_inward(DRIVEN))
         phase = self._begin_phase("clear", begin=self._q[DRIVEN], target=free[DRIVEN].q)
         yield from self._send_for(0.25, self._frame(free))
-        self._end(phase)
+        self.end(phase)
 
     def _reopen(self) -> Steps:
-        self._report("releasing the interface and claiming it again")
+        self.report("releasing the interface and claiming it again")
         hold = self._frame(self._hold_commands())
         yield from self._exchange(hold)
         phase = self._begin_phase("reopen")
-        yield from self._do(Reopen())
+        yield from self.do(Reopen())
         for _ in range(5):
             yield from self._exchange(hold)
             yield from self._wait_for_tick()
-        self._end(phase)
+        self.end(phase)

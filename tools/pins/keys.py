@@ -34,6 +34,8 @@ from dexkit.conformance.faults.trials import run_of
 from dexkit.conformance.kit.judge import deciding
 from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
+from dexkit.conformance.stimuli import Plan, script_class
+from dexkit.conformance.stimuli.script import parts_of
 from tools.pins.sources import WHOLE, Place, Sources
 
 __all__ = [
@@ -60,6 +62,7 @@ SPLIT = (
 """Modules of many independent parts; see :mod:`tools.pins.sources`."""
 JUDGES_ONLY: Mapping[str, str] = {
     "dexkit.conformance.layers": "names script and reference, both of which are in the key",
+    "dexkit.conformance.behaviours:CHECKS": "the phases that are played are in the key",
     "dexkit.conformance.kit.recording:Recording": "has read the session: a value in the key",
     "dexkit.conformance.kit.recording:TopicDecoder": "reads recordings; a robot has no session",
     "dexkit.conformance.kit.requirements": "has chosen the phases, which are in the key by value",
@@ -163,11 +166,15 @@ def _class_places(made: type[Any]) -> Iterable[Place]:
 
 def played_by(mutant: Mutant) -> frozenset[Place]:
     """The places of the code that plays a wrong hand; all that plays it is reached from them."""
-    play = run_of(mutant).play
+    run = run_of(mutant)
     named = layer("dds").reference if mutant.layer == "client" else layer(mutant.layer).script
     classes = (mutant.made, named(mutant.model))
     found = {place for made in classes for place in _class_places(made)}
-    found.add(sources().place(play.__module__, play.__qualname__))
+    functions: list[Any] = [run.play]
+    if isinstance(run.about, Plan):
+        parts = parts_of(script_class(mutant.model))
+        functions += [part.play for part in parts if part.wanted(run.about)]
+    found |= {sources().place(f.__module__, f.__qualname__) for f in functions}
     return frozenset(found | _messages())
 
 
