@@ -70,7 +70,7 @@ HOMES = ("dexkit/models/", "dexkit/robots.py", "conformance/kit/catch_rates.py")
 # wrong hands are declared for the models on which they are tried
 WRONG_HANDS = "conformance/faults/"
 # names of subcommands, with the module or the arguments of each
-COMMANDS = ("dexkit/cli/emulate/__init__.py", "tools/campaign/options.py")
+COMMANDS = ("dexkit/cli/emulate/__init__.py",)
 # the lab's cases are about its own devices, one of each kind
 LAB = "tools/lab/"
 

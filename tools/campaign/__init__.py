@@ -1,4 +1,4 @@
-"""A robustness campaign: fuzzers, unplugs, kills, hostile peers, full disks and a soak.
+"""A robustness campaign: fuzzers, unplugs, kills and a soak.
 
 ``python -m tools.campaign --minutes 30``; docs/campaign.md describes what it does and how a finding
 is repeated.

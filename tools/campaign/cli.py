@@ -60,7 +60,7 @@ def command(
     list_only: bool,
     again: Path | None,
 ) -> int:
-    """Try to break dexkit: fuzzers, unplugs, kills, hostile peers, full disks, a soak.
+    """Try to break dexkit: fuzzers, unplugs, kills, a soak.
 
     Ctrl-C prints the table so far.
 

@@ -1,7 +1,7 @@
 """Namespaces of the campaign's own, so that it does not affect other programs on the machine.
 
-Network: ports, DDS domains. Mounts: small file systems that fill up, and scratch folders that go
-with the campaign. As root, or where users may make namespaces; elsewhere the campaign runs without
+Network: ports, DDS domains. Mounts: pseudo-terminals, and scratch folders that go with the
+campaign. As root, or where users may make namespaces; elsewhere the campaign runs without
 and reports it.
 """
 

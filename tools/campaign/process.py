@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -44,15 +43,12 @@ class Program:
     kills it if it still runs.
 
     :param command: behind ``python -m``; mostly ``["dexkit", "serve", ...]``.
-    :param limits: of its resources, as :func:`resource.setrlimit` takes them.
     """
 
     def __init__(
         self,
         batch: Batch,
         command: Sequence[str],
-        *,
-        limits: Sequence[tuple[int, int]] = (),
     ) -> None:
         self.command = list(command)
         self.temporary = batch.scratch / "tmp"
@@ -70,20 +66,15 @@ class Program:
         self.below: set[int] = set()
 
         def prepare() -> None:
-            import resource
-
             isolation.die_with_parent()
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
                 signal.signal(number, signal.SIG_DFL)
-            for kind, value in limits:
-                resource.setrlimit(kind, (value, value))
 
         with open(self._output, "ab") as out:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", *self.command],
                 stdin=subprocess.DEVNULL,
-                # a limit of the size of files would be one of the log's, too
-                stdout=subprocess.PIPE if limits else out,
+                stdout=out,
                 stderr=subprocess.STDOUT,
                 # not the checkout: some write where they are
                 cwd=ROOT if self.command[0] == "pytest" else batch.scratch,
@@ -91,16 +82,6 @@ class Program:
                 start_new_session=True,
                 preexec_fn=prepare,
             )
-        self._copy: threading.Thread | None = None
-        if limits:
-            self._copy = threading.Thread(target=self._listen, name="campaign-log", daemon=True)
-            self._copy.start()
-
-    def _listen(self) -> None:
-        assert self.process.stdout is not None
-        with open(self._output, "ab", buffering=0) as out, self.process.stdout as source:
-            while data := os.read(source.fileno(), 65536):
-                out.write(data)
 
     def __enter__(self) -> Program:
         return self
@@ -145,12 +126,9 @@ class Program:
     def wait(self, timeout: float = 60.0) -> int | None:
         """Its exit code; None if it does not end."""
         try:
-            code = self.process.wait(timeout)
+            return self.process.wait(timeout)
         except subprocess.TimeoutExpired:
             return None
-        if self._copy is not None:
-            self._copy.join(5.0)
-        return code
 
     def left_behind(self, timeout: float = 20.0) -> list[str]:
         """Those of its children that are not gone some time after it."""

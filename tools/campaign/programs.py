@@ -32,7 +32,7 @@ from tools.campaign.devices import DEVICES, M4010, Bench, DeviceBench, Dex3, Mx6
 from tools.campaign.process import Program
 from tools.campaign.waiting import WaitTimeout, until
 
-__all__ = ["Client", "Scene", "Spec", "cases", "robots_and_hands", "specs"]
+__all__ = ["Client", "Scene", "Spec", "cases", "specs"]
 
 SIDE = Side.LEFT
 _SETTLED = 0.2
@@ -596,11 +596,3 @@ def cases() -> list[Case]:
     for spec in specs():
         found += [KillCase(spec), StopCase(spec)]
     return found
-
-
-def robots_and_hands() -> list[Spec]:
-    """The programs that read from any peer on a domain."""
-    devices = {f"serve-{bench.backend}" for bench in DEVICES}
-    names = {f"serve-{backend}" for backend in _served()} - devices
-    names |= {f"emulate-{robot}" for robot in ROBOTS} | {"bridge", "record", "doctor-watch"}
-    return [spec for spec in specs() if spec.name in names]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cache
 
 from dexkit.errors import UsageError
-from tools.campaign import devices, disk, options, peers, programs, soak
+from tools.campaign import devices, programs, soak
 from tools.campaign.case import Case
 from tools.campaign.fuzz import devices as fuzzed_devices
 from tools.campaign.fuzz import (
@@ -27,7 +27,7 @@ def all_cases() -> tuple[Case, ...]:
     """Every case, fuzzers first."""
     found: list[Case] = []
     fuzzers = (packet_codecs, messages, fuzzed_devices, drivers, recordings, sessions, files)
-    for module in (*fuzzers, sources, devices, programs, peers, disk, options, soak):
+    for module in (*fuzzers, sources, devices, programs, soak):
         found += module.cases()
     return tuple(found)
 

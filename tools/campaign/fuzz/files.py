@@ -57,27 +57,13 @@ from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.urdf import read_urdf
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.fuzz.messages import filled
-from tools.campaign.fuzz.recordings import TIME, TYPES, content
+from tools.campaign.fuzz.recordings import TIME, TYPES
 from tools.campaign.mutate import TextMutator, damaged_json, mutator
 
 __all__ = ["cases"]
 
 
 # --- recordings
-
-
-def _own(path: Path, compression: str, rng: random.Random) -> bytes:
-    """A recording by dexkit's recorder."""
-    with Recorder(path, compression=compression) as recorder:
-        for number in range(12):
-            for topic, name in TYPES.items():
-                data = message_type(name).encode(filled(name, rng))
-                stamp = TIME + number * 10_000_000
-                recorder.put(topic, name, data, stamp, stamp)
-        recorder.add_metadata("campaign", {"key": "value"})
-    data = path.read_bytes()
-    path.unlink()
-    return data
 
 
 def _record(opcode: int, content: bytes) -> bytes:
@@ -129,32 +115,6 @@ def _greedy(rng: random.Random, scratch: Path) -> Target:
         trace = open_trace(path)
         list(trace.messages())
         trace.load()
-
-    return Target(make, run)
-
-
-def _flips(rng: random.Random, scratch: Path) -> Target:
-    """One byte of a recording of dexkit's own changed: read as it was, or reported as damage."""
-    kind = rng.choice(("none", "zstd"))
-    good = _own(scratch / "own.mcap", kind, rng)
-    path = scratch / "x.mcap"
-    path.write_bytes(good)
-    wanted, odd = content(path)
-    assert not odd
-
-    def make() -> bytes:
-        data = bytearray(good)
-        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-        return bytes(data)
-
-    def run(data: bytes) -> None:
-        path.write_bytes(data)
-        found, damage = content(path)
-        if found != wanted and not damage:
-            at = next(i for i, (a, b) in enumerate(zip(data, good, strict=True)) if a != b)
-            raise Difference(
-                f"byte {at} of {len(good)} ({kind}) changes what is read without a report"
-            )
 
     return Target(make, run)
 
@@ -255,17 +215,6 @@ def _faults(rng: random.Random, scratch: Path) -> Target:
                 raise Difference(f"a fault that cannot be: {fault}")
 
     return Target(text, run)
-
-
-def _stdin(rng: random.Random, scratch: Path) -> Target:
-    """Faults as lines of standard input, as bytes that need not be text."""
-    lines = [b"overload@3s", b"drop:p=0.05", b"unplug@5s:for=2s", b"\xff\xfe", b""]
-    damaged = mutator(lines, rng)
-
-    def run(data: bytes) -> None:
-        parse_fault(data.decode(errors="replace"))
-
-    return Target(damaged, run)
 
 
 def _store(rng: random.Random, scratch: Path) -> Target:
@@ -482,12 +431,10 @@ def cases() -> list[FuzzCase]:
     return [
         FuzzCase("urdf", "skeletons of hands in XML", _urdf),
         FuzzCase("picture", "heads of JPEG and PNG", _picture),
-        FuzzCase("mcap.flip", "one bit of a recording of dexkit's own", _flips),
         FuzzCase("mcap.greedy", "small recordings that want much", _greedy),
         FuzzCase("check", "recordings of odd content, judged", _judged),
         FuzzCase("result", "result files, and the reports of them", _results),
         FuzzCase("faults", "fault specifications of three families", _faults),
-        FuzzCase("stdin", "faults as lines of input", _stdin),
         FuzzCase("ezgripper.json", "calibration files", _store),
         FuzzCase("eeprom", "EEPROM files of the emulator", _eeprom),
         FuzzCase("capabilities.toml", "claims", _claims),

@@ -22,12 +22,10 @@ from dexkit.errors import WireError
 from dexkit.hand import JointMode, Side
 from dexkit.messages import layout, message_type, message_types
 from dexkit.messages.columns import Columns
-from dexkit.messages.packed import Packed
 from dexkit.models import DIALECTS, model
 from dexkit.service.dialects import dialect_map
 from dexkit.service.hand_core import HandCore
 from dexkit.teleop.client_codec import ClientCodec
-from dexkit.traces import names as trace_names
 from dexkit.traces import schemas
 from tools.campaign.fuzz.case import Difference, FuzzCase, Target
 from tools.campaign.mutate import TextMutator, mutator
@@ -101,22 +99,6 @@ def _columns(rng: random.Random, scratch: Path) -> Target:
                 fine = False
             if fine is (row in columns.errors):
                 raise Difference(f"{name}: row {row}: {columns.errors.get(row)!r}: {payload.hex()}")
-
-    return Target(make, run, ())
-
-
-def _packed(rng: random.Random, scratch: Path) -> Target:
-    def make() -> list[bytes]:
-        return [rng.randbytes(rng.choice((4, 8, 8, 12, 40))) for _ in range(rng.randrange(1, 12))]
-
-    def run(payloads: list[bytes]) -> None:
-        data = np.frombuffer(b"".join(payloads), np.uint8)
-        sizes = np.array([len(p) for p in payloads], np.int64)
-        half = int(sizes[: len(sizes) // 2].sum())
-        starts = np.concatenate(([0], np.cumsum(sizes)[:-1])).astype(np.int64)
-        packed = Packed([data[:half], data[half:]], starts, sizes)
-        if [bytes(p) for p in packed] != payloads or len(packed) != len(payloads):
-            raise Difference("packed and taken out again")
 
     return Target(make, run, ())
 
@@ -332,26 +314,6 @@ def _schema(encoding: str) -> Callable[[random.Random, Path], Target]:
     return prepare
 
 
-def _own_idl(rng: random.Random, scratch: Path) -> Target:
-    texts = [m.omgidl for m in message_types()]
-    return Target(TextMutator(texts, _IDL_WORDS, rng), layout.parse)
-
-
-def _names(rng: random.Random, scratch: Path) -> Target:
-    text = TextMutator(
-        ["rt/dex1/left/cmd", "/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_", "a/msg/B"],
-        ["::", "/", "*", "?", "rt/", "dds_", "["],
-        rng,
-    )
-
-    def run(given: str) -> None:
-        trace_names.dds_topic(given)
-        trace_names.dds_type(given)
-        trace_names.select_topics(["rt/dex1/left/cmd", given], [given])
-
-    return Target(text, run)
-
-
 def _remote(rng: random.Random, scratch: Path) -> Target:
     text = TextMutator(["A,R1,lx=0.5", "", "L2,ry=-1"], ["B", "lx=", "=", ",", "nan"], rng)
     return Target(text, lambda given: Remote.parse(given).bits)
@@ -368,7 +330,6 @@ def cases() -> list[FuzzCase]:
     return [
         *found,
         FuzzCase("columns", "samples as columns, against one by one", _columns),
-        FuzzCase("packed", "payloads in one buffer", _packed),
         FuzzCase("service.command", "a command through the service's core", _service),
         FuzzCase("bridge", "both ways of the bridge", _bridge),
         FuzzCase("teleop.state", "a state as the teleoperation client reads it", _teleop),
@@ -380,8 +341,6 @@ def cases() -> list[FuzzCase]:
         FuzzCase("rtps.observer", "the doctor's observer", _observer),
         FuzzCase("schema.ros2msg", "schemas of recordings", _schema("ros2msg")),
         FuzzCase("schema.omgidl", "schemas of recordings", _schema("omgidl")),
-        FuzzCase("schema.idl", "the parser of dexkit's own IDL", _own_idl),
-        FuzzCase("names", "topics and types", _names),
         FuzzCase("remote", "keys of the emulated remote", _remote),
     ]  # fmt: skip
 

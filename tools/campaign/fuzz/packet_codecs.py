@@ -15,7 +15,7 @@ from dexkit.clock import ManualClock
 from dexkit.emulators.dex3_mcu.device import Dex3Mcu
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.models import DEX3_1
-from dexkit.wire import dex3_usb, dynamixel, low_level, m4010, mx64, ris
+from dexkit.wire import dex3_usb, dynamixel, low_level, m4010, ris
 from dexkit.wire.crc32 import crc32_words
 from dexkit.wire.dex3_usb import packets
 from tools.campaign.fuzz.case import Difference, FuzzCase, Prepare, Target
@@ -205,22 +205,10 @@ def _split(data: bytes) -> None:
         _same(len(part) in sizes, True, "size of a part")
 
 
-def _stuffing(data: bytes) -> None:
-    body = b"\x03" + data
-    _same(dynamixel.unstuff(dynamixel.stuff(body)), body, "unstuffed")
-
-
 def _status_fields(data: bytes) -> None:
     packet = dynamixel.decode(data)
     assert packet.error_number | packet.alert << 7 == packet.error
     assert len(packet.data) + 1 == len(packet.params)
-
-
-def _table(data: bytes) -> None:
-    items = list(mx64.TABLE.values())
-    item = items[data[0] % len(items)] if data else items[0]
-    value = item.decode(data[1 : 1 + item.size].ljust(item.size, b"\0"))
-    _same(item.decode(item.encode(value)), value, item.name)
 
 
 def _pack_again(kind: Any) -> Callable[[bytes], None]:
@@ -307,13 +295,6 @@ def _fix_command(data: bytearray) -> None:
         _fix_frame(layout.structure)(data)
 
 
-def _crc(data: bytes) -> None:
-    whole = data[: len(data) & ~3]
-    value = crc32_words(whole)
-    _same(crc32_words(memoryview(whole)), value, "of a view")
-    assert 0 <= value <= 0xFFFFFFFF
-
-
 def _low(name: str) -> Prepare:
     def prepare(rng: random.Random, scratch: Path) -> Target:
         from dexkit.messages import message_type
@@ -329,19 +310,6 @@ def _low(name: str) -> Prepare:
         return Target(mutator([good], rng), run)
 
     return prepare
-
-
-def _scale(rng: random.Random, scratch: Path) -> Target:
-    scales = [ris.POSITION, m4010.VELOCITY, m4010.TORQUE, m4010.STIFFNESS, m4010.DAMPING]
-    corpus = [struct.pack("<d", v) for v in (0.0, 1.5, -3e5, 1e300, float("nan"), float("inf"))]
-
-    def run(data: bytes) -> None:
-        (value,) = struct.unpack("<d", data[:8].ljust(8, b"\0"))
-        scale = scales[len(data) % 5]
-        count = scale.encode(value, 25.0)
-        _same(scale.encode(scale.decode(count, 25.0), 25.0), count, scale.name)
-
-    return Target(mutator(corpus, rng), run)
 
 
 # --- emulated devices, without a line
@@ -380,14 +348,10 @@ def cases() -> list[FuzzCase]:
         ("dynamixel.status", "fields of a status packet",
          _bytes(statuses, fix_dynamixel, _status_fields)),
         ("dynamixel.fast", "a combined status", _bytes(statuses, None, _split)),
-        ("dynamixel.stuffing", "byte stuffing there and back", _bytes(both, None, _stuffing)),
-        ("mx64.table", "items of the control table", _bytes(both, None, _table)),
         ("m4010.command", "a command frame of the M4010", _bytes(commands, to_motor, _m4010_motor)),
         ("m4010.data", "a data frame of the M4010", _bytes(answers, from_motor, _m4010_data)),
         ("m4010.parser", "a stream of M4010 frames, cut anywhere",
          _streams(commands + answers, to_motor, frames, 26)),
-        ("ris.scale", "counts of a quantity", _scale),
-        ("crc32", "the word CRC", _bytes([*commands, *_dex3_states()], None, _crc)),
         ("dex3.MotorCmd", "a MotorCmd packet of the Dex3-1",
          _bytes([drive], to_joint, _pack_again(packets.MotorCmd))),
         ("dex3.MotorState", "a MotorState packet of the Dex3-1",
