@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from dexkit.cli import cli
 from dexkit.conformance.kit.stimulus_record import RECORD, Phase, Stimulus
-from dexkit.errors import DexkitError, UsageError
+from dexkit.errors import DexkitError, TraceError, UsageError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.traces import Recorder, open_trace, sample_path
@@ -140,6 +140,14 @@ def test_clocks_of_two_recorders_are_compared_by_common_messages(tmp_path: Path)
     stranger = write(tmp_path / "c.mcap", mcap_bytes(rows(60, T0 + 1)))
     with pytest.raises(UsageError, match="0 messages in common"):
         clock_offset(open_trace(a), open_trace(stranger))
+
+
+def test_recordings_of_different_schemas_are_not_merged(tmp_path: Path) -> None:
+    a = write(tmp_path / "a.mcap", mcap_bytes(rows(10)))
+    b = write(tmp_path / "b.mcap", mcap_bytes(rows(10), encoding="omgidl"))
+    with pytest.raises(TraceError, match="another schema"):
+        merge([open_trace(a), open_trace(b)], tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_two_runs_are_aligned_and_compared(tmp_path: Path) -> None:

@@ -172,6 +172,10 @@ def test_page_is_bound_to_this_machine_and_to_a_free_port(page: Page) -> None:
         type(page)([Recorded("x", Collector())], port=page.port)
 
 
+def test_page_asks_nobody_for_a_share_link(page: Page) -> None:
+    assert page._server.request_share_url() is None
+
+
 def test_nothing_on_the_page_can_command_a_hand(
     dds_domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
