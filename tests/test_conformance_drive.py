@@ -70,15 +70,6 @@ class Servo(ReferenceService):
     hand = _Strong
 
 
-def test_tau_est_may_have_either_sign_but_only_one() -> None:
-    ids = ("DEX1-FORCE-08", "DEX1-FORCE-01")
-    for service in (ReferenceService, Turned, InContact):
-        assert {r.verdict for r in judged(service, *ids)} == {Verdict.PASS}, service
-    (turned,) = judged(AlwaysOpening, "DEX1-FORCE-08")
-    assert turned.verdict is Verdict.WARN
-    assert turned.figure == "two signs"
-
-
 def test_stiffer_servo_passes_the_check_of_grip_strength() -> None:
     (strength,) = judged(Servo, "DEX1-FORCE-09")
     assert strength.verdict is Verdict.PASS

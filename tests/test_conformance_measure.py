@@ -30,7 +30,7 @@ from tests.each import each
 
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]  # a MUST
-JITTER = BY_ID["DEX1-RATE-04"]  # a SHOULD
+JITTER = BY_ID["DEX1-RATE-02"]  # a SHOULD
 STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
 
 

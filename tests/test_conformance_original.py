@@ -40,7 +40,7 @@ def test_the_original_meets_every_drop_in_requirement() -> None:
     unjudged = {r.requirement.id for r in drop_in if r.verdict is not Verdict.PASS}
     ids = {r.requirement.id for r in drop_in if r.verdict is Verdict.PASS}
     spoken = {r.id for r in catalogue("dex1-1") if "unitree_go" in r.dialects}
-    assert (unjudged - ids) & spoken == {"DEX1-FIELD-06", "DEX1-FIELD-08"}
+    assert (unjudged - ids) & spoken == {"DEX1-FIELD-08"}
 
 
 def test_the_original_fails_exactly_the_safety_requirements_that_the_catalogue_names() -> None:
@@ -52,7 +52,7 @@ def test_the_original_fails_exactly_the_safety_requirements_that_the_catalogue_n
         failed
         == named
         == {
-            *("DEX1-SAFE-01", "DEX1-SAFE-02", "DEX1-SAFE-05", "DEX1-LIFE-04"),
+            *("DEX1-SAFE-01", "DEX1-SAFE-02", "DEX1-LIFE-04"),
         }
     )
     grade = judged().grade(Kind.SAFETY)
@@ -62,8 +62,8 @@ def test_the_original_fails_exactly_the_safety_requirements_that_the_catalogue_n
 
 def test_a_failure_in_safety_is_in_every_report() -> None:
     result = judged()
-    assert badge_text(result)[1].endswith(" pass, 2 not applicable (simulated)")
-    assert badge_text(result, Kind.SAFETY)[1].startswith("fail, 2 of 10 not met")
+    assert badge_text(result)[1].endswith(" pass, 1 not applicable (simulated)")
+    assert badge_text(result, Kind.SAFETY)[1].startswith("fail, 2 of 9 not met")
     assert badges(result) == tuple(Kind)
     both = render_badge(result)
     assert "Dex1-1 safety: fail" in both

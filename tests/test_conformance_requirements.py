@@ -108,7 +108,7 @@ def test_selection_includes_stimuli_of_dependencies() -> None:
 
 def test_requirements_are_selected_by_prefix_and_level() -> None:
     rates = select(catalogue(), prefixes=["dex1-rate"])
-    assert {r.id for r in rates} == {f"DEX1-RATE-0{i}" for i in range(1, 6)}
+    assert {r.id for r in rates} == {f"DEX1-RATE-0{i}" for i in (1, 2, 3, 5)}
     musts = select(catalogue(), level="must")
     assert musts
     assert {r.level for r in musts} == {Level.MUST}

@@ -266,7 +266,7 @@ SERVO = frozenset({"DEX1-GAIN-02", "DEX1-GAIN-03"})
 WEAK = SERVO | {"DEX1-FORCE-09"}
 DRY_DEX3 = frozenset({"DEX3-MOVE-04", "DEX3-GAIN-02"})
 DRY_DEX5 = frozenset({"DEX5-MOVE-04", "DEX5-GAIN-02", "DEX5-OPER-04"})
-RAW = frozenset({"DEX3-FORCE-02", "DEX3-FORCE-04", "DEX3-FORCE-05", "DEX3-FORCE-07"})
+RAW = frozenset({"DEX3-FORCE-02", "DEX3-FORCE-05"})
 HANDS = [
     Legal(ReferenceService, GO, sides=RIGHT),
     Legal(ReferenceService, GO, FORCE | {"acceleration"}, soak=True),
@@ -325,8 +325,8 @@ def test_a_claim_makes_no_must_of_what_is_inferred() -> None:
     bad = Outcome(False, "0.5 N m", "weaker than the original")
     assert BY_ID["DEX1-FORCE-09"].confidence == "inferred"
     assert concluded(bad, "DEX1-FORCE-09", CLAIMED).verdict is Verdict.WARN
-    assert BY_ID["DEX1-FORCE-13"].confidence == "vendor document"
-    assert concluded(bad, "DEX1-FORCE-13", CLAIMED).verdict is Verdict.FAIL
+    assert BY_ID["DEX1-FIELD-04"].confidence == "vendor code"
+    assert concluded(bad, "DEX1-FIELD-04", CLAIMED).verdict is Verdict.FAIL
 
 
 def test_what_real_hands_do_is_a_warning_of_a_must_too() -> None:

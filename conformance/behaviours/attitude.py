@@ -9,18 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.members import all_finite
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.kit.sums import mean
 from dexkit.hand import Floats
-
-_IMU = [f"imu_state.{name}" for name in ("quaternion", "gyroscope", "accelerometer", "rpy")]
-
-
-@check("DEX3-IMU-02")
-def attitude_numbers(ctx: Context) -> Outcome:
-    """Values in the attitude; the sensors have separate requirements."""
-    return all_finite(ctx, _IMU)
 
 
 def _odd(ctx: Context, quaternions: Floats) -> NDArray[np.bool_]:

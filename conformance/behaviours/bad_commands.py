@@ -597,12 +597,6 @@ def long(ctx: Context) -> Outcome:
     return stays(ctx, "commands for more motors than there are")
 
 
-@check("DEX1-SAFE-05", "DEX3-SAFE-06")
-def negative_gains(ctx: Context) -> Outcome:
-    """Commands with negative kp and kd."""
-    return stays(ctx, "commands with negative gains", sags=sags(ctx))
-
-
 @check("DEX1-SAFE-10", "DEX3-SAFE-11")
 @worst("motion_rad", "max_motion_stroke", nothing="no state during commands with negative gains")
 def driven_away(ctx: Context) -> Figures:

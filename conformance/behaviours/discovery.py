@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from dexkit.conformance.checks import Context, Outcome, causes, check
-from dexkit.conformance.checks.figures import Figure, judged
 from dexkit.conformance.checks.robot import RobotContext
-from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.models import DIALECTS
 from dexkit.traces import TraceEndpoint
 
@@ -140,61 +136,6 @@ def low_rate_topic(ctx: Context) -> Outcome:
     return ctx.failed(f"{rate:.0f} Hz", text, rate_hz=rate).because(
         "Every state is copied to the slow topic, too."
     )
-
-
-@check("DEX3-TOPIC-04")
-def low_rate_is_fresh(ctx: Context) -> Outcome:
-    """Whether each state of the low-rate topic equals a recent one of the fast topic."""
-    slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
-    if slow is None or not len(slow) or not len(fast):
-        return ctx.absent("there is no low-rate topic")
-    age = ctx.tolerance("max_age_s")
-    margin = np.array([ctx.tolerance("margin_stroke", j) for j in range(len(ctx.joints))])
-    odd: list[tuple[float, int, str]] = []
-    judged = 0
-    for i, t in enumerate(slow.t.tolist()):
-        rows = fast.between(t - age, t + _AHEAD_S)
-        q, mode = fast.q[rows], fast.mode[rows]
-        if len(q) < 3 or not np.isfinite(q).all():
-            continue
-        judged += 1
-        with np.errstate(invalid="ignore"):
-            away = np.maximum(q.min(axis=0) - slow.q[i], slow.q[i] - q.max(axis=0))
-            other = (mode.min(axis=0) > slow.mode[i]) | (mode.max(axis=0) < slow.mode[i])
-        off = ~(away <= margin)
-        if off.any():
-            joint = int(np.argmax(np.nan_to_num(away / margin, nan=np.inf)))
-            text = f"q is {away[joint]:.2f} {ctx.unit} from all of the fast topic within {age:g} s"
-            odd.append((t, joint, text))
-        elif other.any():
-            joint = int(np.argmax(other))
-            text = f"mode is {slow.mode[i, joint]:g}, which the fast topic did not have"
-            odd.append((t, joint, text))
-    if judged < 3:
-        return ctx.skipped("too few states on the low-rate topic beside those on the fast one")
-    if len(odd) < ctx.tolerance("min_odd"):
-        return ctx.passed(f"{judged} states", f"{judged} states on {slow.topic}, all as fast ones")
-    _, joint, what = odd[0]
-    text = ctx.named(f"{what}; so in {len(odd)} of {judged} states on {slow.topic}", joint)
-    outcome = ctx.failed(
-        f"{len(odd)} of {judged}", text, *(ctx.at(slow.topic, t) for t, *_ in odd[:5])
-    )
-    return outcome.about(joint).if_late(age)
-
-
-@check("DEX3-TOPIC-05")
-def low_rate_goes_on(ctx: Context) -> Outcome:
-    """The longest time without a state on the low-rate topic while the fast one had states."""
-    slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
-    if slow is None or len(slow) < 3 or not len(fast):
-        return ctx.absent("there is no low-rate topic")
-    gap, at = gap_beside_states(slow.t, fast.t)
-    text = f"no state on {slow.topic} for {gap:.2f} s, while the fast topic had states"
-    figure = Figure(gap, at, at + gap, text=text, topic=slow.topic)
-    return judged(ctx, [figure], "gap_s", "max_gap_s", nothing="")
-
-
-_AHEAD_S = 0.05  # s by which the low-rate topic may be received before the fast one
 
 
 @check("H1-TOPIC-03")

@@ -10,17 +10,13 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.members import (
-    all_finite,
-    distinct_values,
     outside,
-    packet_paths,
     span_text,
     values_of,
 )
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.kit.motor_messages import sequence_of
 from dexkit.conformance.kit.plots import Plot, PlotKind
-from dexkit.messages import message_type
 
 
 @check("DEX1-FIELD-01", "DEX3-FIELD-01", "H1-FIELD-01")
@@ -96,12 +92,6 @@ def mode(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-FIELD-07", rests_on=("q_raw",))
-def raw(ctx: Context) -> Outcome:
-    """Raw values are numbers."""
-    return all_finite(ctx, _motors(ctx, "q_raw", "dq_raw", "ddq_raw"))
-
-
 @check("DEX1-FIELD-08", "DEX3-FIELD-06", rests_on=("temperature",))
 def temperature(ctx: Context) -> Outcome:
     """Motor temperatures in degrees Celsius."""
@@ -112,37 +102,6 @@ def temperature(ctx: Context) -> Outcome:
     if not wrong and figure == "0":
         return ctx.absent("temperature is not filled (0 throughout)")
     return wrong or ctx.passed(f"{figure} C", f"temperature {figure} C")
-
-
-@check("DEX1-FIELD-09", rests_on=("lost",))
-def lost(ctx: Context) -> Outcome:
-    """The count of lost messages."""
-    path = _motors(ctx, "lost")
-    figure = span_text(ctx, path)
-    return outside(ctx, path, 0.0, ctx.tolerance("max_lost")) or ctx.passed(
-        figure, f"lost {figure}"
-    )
-
-
-@check("DEX1-FIELD-10", "DEX3-FIELD-09", rests_on=("reserve",))
-def reserved(ctx: Context) -> Outcome:
-    """Number of different values of each reserved word."""
-    paths = _motors(ctx, "reserve")
-    members = {f.name for f in message_type(ctx.recording.dialect.state_type).layout.fields}
-    if "press_sensor_state" in members:
-        paths += _motors(ctx, "sensor")
-        paths += [*packet_paths(ctx, "reserve"), "reserve"]
-    most = (0, "")
-    for path in paths:
-        values = distinct_values(ctx, path)
-        for place in range(values.shape[1]):
-            most = max(most, (len(np.unique(values[:, place])), f"{path}[{place}]"))
-    count, path = most
-    text = f"{path} takes {count} different {'value' if count == 1 else 'values'}"
-    if count <= ctx.tolerance("max_values"):
-        return ctx.passed(f"{count}", text)
-    outcome = ctx.failed(f"{count} values", text)
-    return outcome.shown_by(Plot.of_member(path), PlotKind.POSITION)
 
 
 @check("DEX1-FIELD-11", "DEX3-FIELD-07", rests_on=("voltage",))
@@ -181,17 +140,6 @@ def no_fault(ctx: Context) -> Outcome:
                 ctx.at(ctx.states.topic, float(t[free][row])),
             ).shown_by(Plot.of_member(path), PlotKind.POSITION)
     return ctx.passed("0", f"no fault in {int(free.sum())} states")
-
-
-_IMU = [f"imu_state.{name}" for name in ("quaternion", "gyroscope", "accelerometer", "rpy")]
-
-
-@check("DEX1-FIELD-13")
-def rest_of_the_hand(ctx: Context) -> Outcome:
-    """Attitude and sensors, which a gripper does not have."""
-    return all_finite(
-        ctx, [*_IMU, *packet_paths(ctx, "pressure"), *packet_paths(ctx, "temperature")]
-    )
 
 
 @check("H1-FIELD-05")

@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import ROUNDING, Context, Outcome, check
-from dexkit.conformance.checks.contacts import contacts, goals_at, newest_commands, stiffness_at
+from dexkit.conformance.checks.contacts import contacts
 from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
-from dexkit.conformance.checks.nudges import has_own_force
 from dexkit.conformance.checks.robot import RobotContext, between, only_phase
-from dexkit.conformance.checks.soft_grips import softer_grips, usual_part
 from dexkit.conformance.checks.stands import (
     FEW_STANDS,
     Stand,
@@ -29,8 +27,7 @@ from dexkit.conformance.checks.stands import (
     torque_unit,
 )
 from dexkit.conformance.checks.steps import Step, steps_of
-from dexkit.conformance.checks.torque_law import torque_factors
-from dexkit.conformance.kit.median import median, medians
+from dexkit.conformance.kit.median import medians
 from dexkit.conformance.kit.results import Evidence
 from dexkit.hand import Floats
 
@@ -72,49 +69,6 @@ def in_contact(ctx: Context) -> Figures:
     if found is not None:
         tau, begin, end = found
         yield Figure(abs(tau), begin, end, text=f"tau_est {tau:.3f} N m while squeezing")
-
-
-_OWN = "this gripper has a force of its own"
-
-
-@check("DEX1-FORCE-12")
-@worst("change", "max_change_part", nothing="no grips with little stiffness")
-def in_proportion(ctx: Context) -> Figures:
-    """The force of soft grips compared with a stiff one, each relative to the commanded force."""
-    usual, part = usual_part(ctx), ctx.tolerance("max_change_part")
-    for grip in softer_grips(ctx):
-        if usual is None:
-            yield ctx.skipped("no grip with the client's stiffness")
-        elif abs(usual - 1.0) > part or has_own_force(ctx):
-            yield ctx.skipped(_OWN)
-        else:
-            text = (
-                f"tau_est of {grip.tau:.2f} N m with a kp of {grip.kp:g} N m/rad, where kp times "
-                f"the distance is {grip.asked:.2f} N m; with the client's kp it is {usual:.0%} of "
-                "that"
-            )
-            change, shown = abs(grip.part - 1.0), f"{grip.part:.0%}"
-            yield Figure(change, grip.begin, grip.end, text=text, shown=shown)
-
-
-@check("DEX1-FORCE-13")
-@worst("tau_nm", "max_tau_nm", nothing="it was never without contact before the first command")
-def zero(ctx: Context) -> Figures:
-    """The median of tau_est, in size, without contact, before the first command."""
-    if (unknown := ctx.contact_unknown) is not None:
-        yield unknown
-    states, asked = ctx.states, ctx.commands.t
-    q, tau = states.q[:, 0], states.tau[:, 0]
-    ends = ctx.tolerance("clear_stroke")
-    low = (ctx.joints[0].q_min if ctx.object_at is None else ctx.object_at) + ends
-    with np.errstate(invalid="ignore"):
-        free = np.isfinite(tau) & (q > low) & (q < ctx.joints[0].q_max - ends)
-    if len(asked):
-        free &= states.t < asked[0]
-    if int(free.sum()) >= 20:
-        level = median(tau[free])
-        text = f"tau_est of {level:.3f} N m before the first command"
-        yield Figure(abs(level), float(states.t[free][0]), text=text)
 
 
 def _ranges(t: Floats, begins: Floats, ends: Floats, side: Literal["left", "right"]) -> Ranges:
@@ -224,62 +178,6 @@ def raw_counts(
     )
 
 
-@check("DEX1-FORCE-06")
-@with_object
-@worst("tau_nm", "min_tau_nm", nothing="it never pressed on the object for long enough")
-def force_in_every_contact(ctx: Context) -> Figures:
-    """The smallest abs(tau_est) of all pieces of all contacts with the object."""
-    for piece in contacts(ctx, ctx.touch):
-        text = (
-            f"tau_est of {piece.tau:.3f} N m while q was at {piece.q:.2f} {ctx.unit} on the object "
-            f"and {piece.goal:.2f} {ctx.unit} was commanded"
-        )
-        yield Figure(piece.tau, piece.begin, piece.end, text=text)
-
-
-@check("DEX1-FORCE-07")
-@worst("tau_nm", "max_tau_nm", nothing="the gripper never rests without contact in this recording")
-def no_force_at_any_rest(ctx: Context) -> Figures:
-    """The largest tau_est at rest without contact, beyond what the distance to the goal
-    explains.
-    """
-    states, spec = ctx.states, ctx.joints[0]
-    if (unknown := ctx.contact_unknown) is not None:
-        yield unknown
-    if not len(states) or not len(ctx.commands):
-        yield ctx.skipped("no states, or no commands to this hand")
-    ends = ctx.tolerance("clear_stroke")
-    low = (spec.q_min if ctx.object_at is None else ctx.object_at) + ends
-    rows, ages = newest_commands(ctx)
-    goals, stiff = goals_at(ctx, rows), stiffness_at(ctx, rows)
-    offs = np.abs(goals - states.q[:, 0])
-    feed = np.maximum(rows, 0)
-    with np.errstate(invalid="ignore"):
-        plain = (ctx.commands.tau[feed, 0] == 0) & (ctx.commands.dq[feed, 0] == 0)
-        held = (ages < ctx.tolerance("max_age_s")) & plain & (stiff > 0)
-        held &= offs <= ctx.tolerance("max_error_stroke")
-    idle = ages > ctx.recording.model.command_timeout + 0.5  # before the first one, too
-    window = ctx.tolerance("min_rest_s")
-    for begin in np.arange(float(states.t[0]), float(states.t[-1]) - window, 0.5 * window).tolist():
-        piece = slice(*np.searchsorted(states.t, (begin, begin + window)))
-        q, tau = states.q[piece, 0], states.tau[piece, 0]
-        if len(q) < 5 or not (np.isfinite(q).all() and np.isfinite(tau).all()):
-            continue
-        if q.min() < low or q.max() > spec.q_max - ends:
-            continue
-        if float(np.ptp(q)) > ctx.tolerance("max_ripple_stroke"):
-            continue
-        if held[piece].all() and float(np.ptp(goals[piece])) <= ctx.tolerance("max_ripple_stroke"):
-            pull = ctx.tolerance("max_stiffness") * median(stiff[piece] * offs[piece])
-        elif idle[piece].all():
-            pull = 0.0
-        else:
-            continue
-        size, limit = median(np.abs(tau)), ctx.tolerance("max_tau_nm") + pull
-        text = f"tau_est of {size:.3f} N m at the worst rest without contact"
-        yield Figure(size, begin, begin + window, text=text, limit=limit)
-
-
 _STEPS = (
     *("step", "joint", "ends", "fingerprint", "recover", "resume", "center", "beside"),
     *("beside-grip", "company", "restart", "service-restart"),
@@ -378,57 +276,6 @@ def _drives(ctx: Context) -> Iterator[_Drive]:
                 yield found
 
 
-@check("DEX1-FORCE-08", "DEX3-FORCE-04")
-def one_sign(ctx: Context) -> Outcome:
-    """Whether tau_est has a consistent sign relative to the motion that the motor causes."""
-    found = list(_drives(ctx))
-    if not found:
-        return ctx.skipped("no step from rest was made half-way")
-    for joint in range(len(ctx.joints)):
-        mine = sorted((d for d in found if d.joint == joint), key=lambda d: d.begin)
-        signs = [d.sign for d in mine if d.sign]
-        usual = 1 if sum(signs) >= 0 else -1
-        odd = [d for d in mine if d.sign == -usual]
-        # a single one may be left over from the previous motion
-        if len(odd) >= ctx.tolerance("min_odd"):
-            return _turned(ctx, odd, len(signs))
-        for way in (1, -1):
-            free = [d for d in mine if not d.contact]
-            here, there = ([d.tau for d in free if d.way == w] for w in (way, -way))
-            if min(len(here), len(there)) < 2:
-                continue
-            least = ctx.tolerance("min_part") * float(np.median(there))
-            if float(np.median(there)) >= ctx.tolerance("min_tau_nm") and max(here) < least:
-                return _one_way(ctx, next(d for d in free if d.way == way), max(here))
-    clear = sum(bool(d.sign) for d in found)
-    text = f"tau_est has one sign towards the motion in {clear} drives from rest; {len(found)} made"
-    return ctx.passed(f"{clear} of {len(found)}", text)
-
-
-@check("DEX1-FORCE-16", "DEX3-FORCE-07")
-def sign_of_the_push(ctx: Context) -> Outcome:
-    """Whether tau_est has the sign of the motion when the motor drives a joint from rest."""
-    clear = [d for d in _drives(ctx) if d.sign]
-    if not clear:
-        return ctx.skipped("tau_est has no clear sign in any step from rest")
-    wrong = [d for d in clear if d.sign < 0]
-    for joint in range(len(ctx.joints)):
-        mine = [d for d in wrong if d.joint == joint]
-        # a single one may be left over from the previous motion
-        if len(mine) < ctx.tolerance("min_odd"):
-            continue
-        among = sum(d.joint == joint for d in clear)
-        text = ctx.named(
-            f"tau_est has the sign against the push in {len(mine)} of {among} drives; the first at "
-            f"{mine[0].begin:.2f} s, {mine[0]}, with {mine[0].tau:.2f} N m",
-            joint,
-        )
-        places = [ctx.at(ctx.states.topic, d.begin, d.end) for d in mine[:5]]
-        return ctx.failed("against the push", text, *places, turned=len(mine)).about(joint)
-    text = f"tau_est has the sign of the push in {len(clear) - len(wrong)} of {len(clear)} drives"
-    return ctx.passed(f"{len(clear) - len(wrong)} of {len(clear)}", text)
-
-
 @check("DEX1-FORCE-20")
 def constant_sign(ctx: Context) -> Outcome:
     """Whether tau_est has the same sign in all motions towards one end, and in all contacts."""
@@ -458,12 +305,6 @@ def _turned(ctx: Context, odd: Sequence[_Drive], among: int) -> Outcome:
     return outcome.about(first.joint)
 
 
-def _one_way(ctx: Context, drive: _Drive, most: float) -> Outcome:
-    text = ctx.named(f"tau_est is at most {most:.3f} N m in size while {drive}", drive.joint)
-    place = ctx.at(ctx.states.topic, drive.begin, drive.end)
-    return ctx.failed("one direction", text, place, tau_nm=most).about(drive.joint)
-
-
 @check("DEX3-FORCE-01")
 @with_object
 def contact(ctx: Context) -> Outcome:
@@ -487,39 +328,6 @@ def contact(ctx: Context) -> Outcome:
         return outcome.because("tau_est is not filled (0 throughout).")
     if weakest <= -ctx.tolerance("min_tau_nm"):
         return outcome.because("tau_est has the wrong sign, in some joints or on this side.")
-    return outcome
-
-
-@check("DEX5-FORCE-03")
-@with_object
-def units(ctx: Context) -> Outcome:
-    """tau_est compared with the commanded stiffness times the position error."""
-    span = squeezes(ctx)
-    if span is None:
-        return ctx.skipped("no state while it squeezed")
-    rows, given = ctx.states.between(*span), ctx.commands
-    commanded = (given.t >= span[0]) & (given.t <= span[1]) & np.isfinite(given.q).all(axis=1)
-    if not commanded.any():
-        return ctx.skipped("no command while it squeezed")
-    here, tau = np.median(ctx.states.q[rows], axis=0), np.median(ctx.states.tau[rows], axis=0)
-    due = np.median(given.kp[commanded], axis=0) * (np.median(given.q[commanded], axis=0) - here)
-    ratios = {}
-    for name, mine in (("thumb", True), ("fingers", False)):
-        pressing = [
-            float(tau[i] / due[i])
-            for i, j in enumerate(ctx.joints)
-            if j.closing and (j.finger == "thumb") is mine and abs(due[i]) > 1e-3
-        ]
-        if not pressing:
-            return ctx.skipped(f"no joint of the {name} pressed on the object")
-        ratios[name] = float(np.median(pressing))
-    text = ", ".join(f"{name} {ratio:.3g} times kp (q - q_now)" for name, ratio in ratios.items())
-    low, high = ctx.tolerance("min_ratio"), ctx.tolerance("max_ratio")
-    if all(low <= ratio <= high for ratio in ratios.values()):
-        return ctx.passed("N m, mN m", text)
-    outcome = ctx.failed("other units", text, ctx.at(ctx.states.topic, *span))
-    if low <= ratios["thumb"] <= high and low <= 1e3 * ratios["fingers"] <= high:
-        return outcome.because("The fingers' torques are in N m, as the thumb's.")
     return outcome
 
 
@@ -635,39 +443,6 @@ def _has_offset(ctx: Context, joint: int) -> bool:
     before = [s for s in stands(ctx) if s.free[joint] and s.end < gripped]
     over = [s for s in before if abs(float(s.force[-1, joint])) > limit]
     return len(over) >= FEW_STANDS
-
-
-_ALIKE = 3
-"""Fewest joints whose scales of tau_est can be compared."""
-
-
-@check("DEX3-FORCE-09")
-def one_scale(ctx: Context) -> Outcome:
-    """tau_est of each joint relative to its command in free motion, compared with the others."""
-    factors = torque_factors(ctx, ctx.tolerance("min_tau_nm"))
-    units = ctx.recording.dialect.torque_units or (1.0,) * len(ctx.joints)
-    worst: tuple[float, int, float, float] | None = None
-    for unit in dict.fromkeys(units):
-        own = [i for i, u in enumerate(units) if u == unit and np.isfinite(factors.reached[i])]
-        if len(own) < _ALIKE:
-            continue
-        usual = float(np.median(factors.reached[own]))
-        for joint in own:
-            factor = float(factors.reached[joint])
-            apart = max(factor, usual) / max(min(factor, usual), 1e-9)
-            if worst is None or apart > worst[0]:
-                worst = apart, joint, factor, usual
-    if worst is None:
-        return ctx.skipped("too few joints were driven by a torque that shows in free motion")
-    apart, joint, factor, usual = worst
-    text = ctx.named(
-        f"tau_est is {factor:.3g} times the commanded torque in free motion, and {usual:.3g} times "
-        "in most joints",
-        joint,
-    )
-    if apart <= ctx.tolerance("max_ratio"):
-        return ctx.passed(f"x {apart:.1f}", text, ratio=apart)
-    return ctx.failed(f"x {apart:.3g}", text, ratio=apart).about(joint)
 
 
 @check("H1-FORCE-01")

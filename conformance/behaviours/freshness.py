@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from dexkit.conformance.checks import Context, Late, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
-from dexkit.conformance.checks.speeds import FEW, FOUGHT_OVER, fastest_speed
 from dexkit.conformance.checks.timing import Positions, encoder_step
 from dexkit.conformance.kit.median import median, percentile
 from dexkit.conformance.kit.provenance import TIMES
@@ -113,7 +111,7 @@ def _medians(rows: Floats) -> Floats:
     return np.asarray(np.maximum(np.minimum(low, high), np.minimum(np.maximum(low, high), e)))
 
 
-@check("DEX1-FRESH-01", "DEX3-FRESH-01", "DEX1-FRESH-04", rests_on=(TIMES,))
+@check("DEX1-FRESH-01", "DEX3-FRESH-01", rests_on=(TIMES,))
 @worst("hold_s", "max_hold_s", nothing="the hand does not move in this recording")
 def fresh(ctx: Context) -> Figures:
     """Time without a new position while the hand moves."""
@@ -161,72 +159,3 @@ def _fresh(ctx: Context, joint: int) -> Iterator[Figure]:
     late = Late((max(hold - limit, 0.0),), "mean")
     shown = f"{usual * 1e3:.1f} ms" if hold <= limit else f"{hold * 1e3:.0f} ms"
     yield Figure(hold, begin, end, joint, text, met, shown=shown, late=late)
-
-
-def _noise(up: Floats, down: Floats, most: float) -> float:
-    """By how much q goes forth and back in nearly all of the cells in which the joint stays, rad.
-
-    A sensor has its noise at rest as well as in motion; old values differ from fresh ones only
-    while the joint moves, in fewer of the cells: the median and the median deviation from it tell
-    how much noise makes. 0 where it stays in fewer than half of the cells.
-
-    :param most: way in a cell, rad, up to which noise alone may have made it.
-    """
-    back = np.minimum(up, down)
-    stays = (up > 0) & (down > 0) & (np.abs(up - down) <= np.maximum(0.5 * back, most))
-    if 2 * int(stays.sum()) < len(back):
-        return 0.0
-    middle = float(np.median(back[stays]))
-    return middle + _SPREADS * float(np.median(np.abs(back[stays] - middle)))
-
-
-_SPREADS = 4.0
-"""Median deviations from the median within which 99 % of a cell's noise is."""
-
-
-@check("DEX1-FRESH-03", "DEX3-FRESH-03", rests_on=(TIMES,))
-@worst("turns", "max_turns", nothing="too few states with a position")
-def alternates(ctx: Context) -> Figures:
-    """Number of cells with a reversal of q, in the worst window."""
-    cell = ctx.tolerance("cell_s")
-    count = round(ctx.tolerance("window_s") / cell)
-    window = count * cell
-    fought = [ctx.span(p) for n in FOUGHT_OVER for p in ctx.phases(n)]
-    for joint in range(len(ctx.joints)):
-        good = ctx.known_states(joint, "q")
-        t, q = ctx.states.t[good], ctx.states.q[:, joint][good]
-        for begin, end in fought:
-            kept = (t < begin) | (t > end)
-            t, q = t[kept], q[kept]
-        if len(t) < FEW:
-            continue
-        limit = max(
-            ctx.tolerance("min_turn_stroke", joint),
-            fastest_speed(ctx, joint) * ctx.tolerance("max_age_s"),
-        )
-        change = np.diff(q)
-        rows = np.flatnonzero(~(np.abs(change) < ctx.tolerance("ignored_stroke", joint)))
-        change = change[rows]
-        cells = ((t[rows + 1] - t[0]) / cell).astype(np.intp)
-        most = max(count, int((float(t.max()) - float(t[0])) / cell) + 1)
-        up, down = (
-            np.bincount(cells, weights=np.maximum(way * change, 0.0), minlength=most)
-            for way in (1, -1)
-        )
-        back = np.minimum(up, down)
-        # even noise of +-a goes forth and back by a third of a from state to state, and in 99 % of
-        # the cells of n states by no more than a (n / 3 + 1.1 n ** 0.5)
-        states, even = len(t) / most, ctx.tolerance("min_turn_stroke", joint)
-        most_noise = even * (states / 3 + 1.1 * states**0.5)
-        ways = np.asarray(up, dtype=float), np.asarray(down, dtype=float)
-        noise = min(_noise(*ways, 2 * even), most_noise)
-        often = np.convolve(back >= limit + noise, np.ones(count), "valid")
-        i = int(np.argmax(often))
-        turns, at = int(often[i]), float(t[0]) + i * cell
-        text = (
-            f"in the worst {window:.2g} s q goes forth and back within {cell:g} s {turns} times, "
-            f"by up to {back[i : i + count].max():.3f} {ctx.unit}"
-        )
-        # a delay does not reorder states
-        shown = f"{turns} times"
-        yield Figure(turns, at, at + window, joint, text, shown=shown, late=math.inf)

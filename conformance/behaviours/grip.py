@@ -468,26 +468,6 @@ def unsigned(ctx: Context) -> Figures:
         yield Figure(-float(tau[i]), at, text=text, limit=limit, shown=shown)
 
 
-@check("DEX1-FIELD-18")
-@with_object
-@worst("part", "max_depth_part", nothing="tau_est shows no contact with the object")
-def gripper_stops_at_object(ctx: Context) -> Figures:
-    """Motion of q into the object while tau_est shows contact, as a part of the command."""
-    touch = ctx.touch
-    for piece in contacts(ctx, touch):
-        if piece.tau < ctx.tolerance("min_tau_nm"):
-            continue
-        part = max((touch - piece.q) / (touch - piece.goal), 0.0)
-        text = (
-            f"pressing on an object at {touch:.2f} {ctx.unit} with {piece.tau:.2f} N m, q was at "
-            f"{piece.q:.2f} {ctx.unit}, and {piece.goal:.2f} {ctx.unit} was commanded"
-        )
-        limit = ctx.tolerance("max_depth_part") * (touch - piece.goal)
-        measure = Measure(touch - piece.q, limit, "rad", Quantity.POSITION)
-        shown = f"{part:.0%} of the way in"
-        yield Figure(part, piece.begin, piece.end, text=text, shown=shown, measure=measure)
-
-
 @check("DEX1-FORCE-09")
 @with_object
 @worst("part", "min_part", nothing="it never pressed on the object for long enough")
@@ -507,7 +487,9 @@ def as_commanded(ctx: Context) -> Figures:
             )
 
 
-@check("DEX3-FORCE-05", "DEX3-FORCE-10")
+@check(
+    "DEX3-FORCE-05",
+)
 @with_object
 @worst("part", "max_part", nothing="no joint was held back by the object")
 def joints_as_commanded(ctx: Context) -> Figures:

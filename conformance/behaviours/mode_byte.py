@@ -314,12 +314,6 @@ def _delay(ctx: Context, begin: float, end: float) -> float:
 _MOVES = 0.01  # of the stroke
 
 
-@check("DEX3-MODE-07")
-def unknown_status(ctx: Context) -> Outcome:
-    """Commands with an undefined status in their mode bytes."""
-    return stays(ctx, "commands with an unknown status in the mode byte")
-
-
 @check("G1-MACH-01")
 def reported_machine(ctx: RobotContext) -> Outcome:
     """The values of mode_machine."""

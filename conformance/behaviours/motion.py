@@ -273,58 +273,6 @@ def speed(ctx: Context) -> Figures:
             )
 
 
-@check("DEX1-MOVE-05", "DEX3-MOVE-05")
-@worst("overshoot_rad", "max_overshoot_stroke", nothing="no step of that size")
-def overshoot(ctx: Context) -> Figures:
-    """Overshoot of q beyond the target."""
-    for step in steps(ctx):
-        if abs(step.size) >= 0.1 * step.stroke:
-            beyond = max(float(np.max((step.q - step.target) * np.sign(step.size))), 0.0)
-            yield step.figure(
-                beyond,
-                f"{beyond:.3f} {ctx.unit} beyond the target {step.target:.2f} {ctx.unit}",
-            )
-
-
-@check("DEX1-MOVE-06", "DEX3-MOVE-06")
-@worst("back_rad", "max_back_stroke", nothing="no step of that size")
-def monotonous(ctx: Context) -> Figures:
-    """Largest reversal of q on the way to the target."""
-    for step in steps(ctx):
-        if abs(step.size) < 0.1 * step.stroke:
-            continue
-        way = (step.q - step.start) * np.sign(step.size)
-        there = np.flatnonzero(way >= 0.97 * abs(step.size))
-        way = way[: int(there[0]) + 1] if len(there) else way
-        back = np.maximum.accumulate(np.maximum(way, 0.0)) - way
-        i = int(np.argmax(back))
-        text = (
-            f"on its way from {step.start:.2f} to {step.target:.2f} {ctx.unit} q went back by "
-            f"{back[i]:.3f} {ctx.unit}"
-        )
-        yield Figure(float(back[i]), float(step.t[i]), step.end, step.joint, text)
-
-
-@check("DEX1-MOVE-07", "DEX3-MOVE-07")
-@worst("settle_s", "max_settle_s", nothing="no step of that size")
-def settling(ctx: Context) -> Figures:
-    """Time from the command until q stays near the target."""
-    for step in steps(ctx):
-        if abs(step.size) < 0.1 * step.stroke:
-            continue
-        away = np.abs(step.q - step.target) > ctx.tolerance("max_error_stroke", step.joint)
-        last = np.flatnonzero(away)
-        seconds = float(step.t[last[-1]]) - step.begin if len(last) else 0.0
-        yield Figure(
-            seconds,
-            step.begin,
-            step.begin + seconds,
-            step.joint,
-            f"{step}: after {seconds:.2f} s it was still away from its target",
-            met=f"{seconds:.2f} s in the slowest step",
-        )
-
-
 @check("DEX1-MOVE-09", "DEX3-MOVE-08")
 @worst("reaction_s", "max_reaction_s", nothing="no step of that size was finished")
 def begins(ctx: Context) -> Figures:

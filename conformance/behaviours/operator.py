@@ -263,17 +263,3 @@ def stuck(ctx: Context) -> Outcome:
         lambda x: f"rests {x:.3f} {ctx.unit} off",
         "the hand came to rest after no step",
     )
-
-
-@check("DEX1-OPER-05", "DEX3-OPER-05")
-def reaction(ctx: Context) -> Outcome:
-    """Seconds until the joint begins to move."""
-    return _judge(
-        ctx,
-        "reaction_s",
-        "max_reaction_s",
-        lambda f: f.reaction_s,
-        lambda s: s.reaction_s,
-        lambda x: f"reacts after {x * 1e3:.0f} ms",
-        "it moved after no step",
-    )

@@ -16,12 +16,6 @@ from numpy.typing import NDArray
 from dexkit.conformance.behaviours.grip import finger_squeezes
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
-from dexkit.conformance.checks.members import (
-    distinct_values,
-    outside,
-    packet_paths,
-    span_text,
-)
 from dexkit.conformance.checks.steps import steps_of
 from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.stimulus_record import Phase
@@ -79,38 +73,6 @@ def _between(a: Motors, b: Motors, part: float) -> list[Motor]:
         replace(n, q=m.q + part * (n.q - m.q), kp=m.kp + part * (n.kp - m.kp))
         for m, n in zip(a, b, strict=True)
     ]
-
-
-@check("DEX3-SENS-05")
-def sensor_temperature(ctx: Context) -> Outcome:
-    """Sensor temperatures in degrees Celsius."""
-    paths = packet_paths(ctx, "temperature")
-    if not paths:
-        return ctx.absent("the states hold no sensor packets")
-    low, high = ctx.tolerance("low"), ctx.tolerance("high")
-    # a slot without an element holds the code for that in its temperature, too
-    wrong = None
-    for path in paths:
-        values = distinct_values(ctx, path)
-        good = ((values >= low) & (values <= high)) | (values == ctx.tolerance("no_value"))
-        if not good.all():
-            wrong = wrong or outside(ctx, [path], low, high)
-    figure = span_text(ctx, paths)
-    if not wrong and figure == "0":
-        return ctx.absent("sensor temperatures are not filled (0 throughout)")
-    return wrong or ctx.passed(f"{figure} C", f"sensor temperatures {figure}")
-
-
-@check("DEX3-SENS-06")
-def sensor_lost(ctx: Context) -> Outcome:
-    """The sensor packets' counts of lost packets."""
-    paths = packet_paths(ctx, "lost")
-    if not paths:
-        return ctx.absent("the states hold no sensor packets")
-    figure = span_text(ctx, paths)
-    return outside(ctx, paths, 0.0, ctx.tolerance("max_lost")) or ctx.passed(
-        figure, f"lost {figure}"
-    )
 
 
 _SLOTS = 12  # of a PressSensorState_

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
@@ -24,7 +23,7 @@ from dexkit.conformance.checks.timing import (
     survived,
     too_slow,
 )
-from dexkit.conformance.kit.median import median, percentile
+from dexkit.conformance.kit.median import median
 from dexkit.conformance.kit.provenance import TIMES
 from dexkit.conformance.kit.sums import total
 from dexkit.hand import Floats
@@ -244,44 +243,6 @@ def no_gap(ctx: Context) -> Outcome:
     ).timed(longest, limit)
 
 
-@check("DEX1-RATE-04", "DEX3-RATE-04", rests_on=(TIMES,))
-def regular(ctx: Context) -> Outcome:
-    """99th percentile of the intervals in sliding windows, by source timestamp and reception, and
-    the number of pauses.
-    """
-    intervals = np.diff(ctx.states.clock)
-    seconds = total(intervals)
-    if seconds < ctx.tolerance("min_observed_s"):
-        return _too_short(ctx)
-    p50, p99 = percentile(intervals, 50), percentile(intervals, 99)
-    text = f"p50 {p50 * 1e3:.2f} ms, p99 {p99 * 1e3:.2f} ms, longest {intervals.max() * 1e3:.1f} ms"
-    worst = max(
-        (_worst_p99(ctx, clock) for clock in state_clocks(ctx)), default=(p99, 0.0, seconds)
-    )
-    limit = ctx.tolerance("max_p99_s")
-    if max(p99, worst[0]) <= limit:
-        # at several hundred states a second, a few pauses are less than one in a hundred
-        names = ("pause_s", "pauses_window_s", "max_pauses")
-        pauses = _long_intervals(ctx, *(ctx.tolerance(name) for name in names))
-        if not pauses.met:
-            return pauses
-        met = ctx.passed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
-        return met.timed(max(p99, worst[0]), limit)
-    if p99 > limit:
-        outcome = ctx.failed(f"p99 {p99 * 1e3:.2f} ms", text, p50_s=p50, p99_s=p99)
-        outcome = outcome.timed(p99, limit)
-        return outcome.if_late(p99 - limit, how="p99")
-    late, begin, end = worst
-    outcome = ctx.failed(
-        f"p99 {late * 1e3:.2f} ms",
-        f"{text} in all; p99 {late * 1e3:.2f} ms from {begin:.1f} s to {end:.1f} s",
-        ctx.at(ctx.states.topic, begin, end),
-        p50_s=p50,
-        p99_s=late,
-    )
-    return outcome.timed(late, limit).if_late(late - limit, how="p99")
-
-
 @check("DEX1-RATE-05", "DEX3-RATE-05", rests_on=(TIMES,))
 def spread(ctx: Context) -> Outcome:
     """The largest number of long intervals in a window, as published and as received."""
@@ -328,34 +289,6 @@ def _long_intervals(ctx: Context, limit: float, window: float, allowed: float) -
         f"at most {most} intervals of more than {limit:g} s in {window:g} s",
         intervals=most,
     )
-
-
-def _worst_p99(ctx: Context, clock: Floats) -> tuple[float, float, float]:
-    """The largest 99th percentile of the intervals in a window, and the window; s."""
-    window = ctx.tolerance("window_s")
-    intervals = np.diff(clock)
-    begin, end = float(clock[0]), float(clock[-1])
-    starts = np.arange(begin, max(end - window, begin) + _STRIDE / 2, 5 * _STRIDE)
-    rows = np.searchsorted(clock[:-1], (starts, starts + window))
-    rows = rows[:, rows[1] - rows[0] >= 100]  # of fewer, one is more than 1 %
-    if not rows.shape[1]:
-        return (0.0, begin, end)
-
-    def p99(i: int, j: int) -> tuple[float, float, float]:
-        return percentile(intervals[i:j], 99), float(clock[i]), float(clock[j])
-
-    # A window cannot be worse if it has fewer intervals above the worst 99th percentile so far than
-    # lie above its own. The choice of the first window affects only how soon a high value is found.
-    worst = p99(*rows[:, np.argmax(_count(intervals >= percentile(intervals, 99), rows))].tolist())
-    above = ((rows[1] - rows[0] - 1) * 0.01).astype(np.intp)
-    left = rows[:, _count(intervals >= worst[0], rows) >= above]
-    return max([worst, *(p99(i, j) for i, j in left.T.tolist())])
-
-
-def _count(which: NDArray[np.bool_], rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Number of true values from each row in ``rows[0]`` to before that in ``rows[1]``."""
-    passed = np.concatenate(([0], np.cumsum(which)))
-    return np.asarray(passed[rows[1]] - passed[rows[0]])
 
 
 @check("H1-TICK-01")

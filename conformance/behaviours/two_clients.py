@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.obedience import arrival, unharmed
+from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.stimuli.hand import HandScript
 from dexkit.conformance.stimuli.script import Join, Leave, Moment, Role, Steps, stimulus
 
@@ -37,36 +35,6 @@ def add_company(script: HandScript) -> Steps:
     yield from script.in_turn("company", divided=several)
     script.period_ns, script.echoed, script.divided = period, False, False
     yield from script.do(Leave(Role.RIVAL))
-
-
-@check("DEX1-SAFE-08", "DEX3-SAFE-09")
-def two_writers(ctx: Context) -> Outcome:
-    """Motion while two clients command two positions, and after one of them has ended."""
-    for phase in ctx.phases():
-        begin, end = ctx.span(phase)
-        before = ctx.q(begin - 0.15, begin)
-        rows = ctx.states.between(begin, end)
-        if not len(before):
-            return ctx.skipped("no state before the second client")
-        here = np.median(before, axis=0)
-        for joint, there in phase.targets.get(ctx.side, {}).items():
-            low, high = sorted((float(here[joint]), there))
-            beyond = ctx.tolerance("max_beyond_stroke", joint)
-            q = ctx.states.q[rows, joint]
-            outside = ~((q >= low - beyond) & (q <= high + beyond))
-            if outside.any():
-                i = int(np.argmax(outside))
-                text = f"commanded to {low:.2f} and {high:.2f} {ctx.unit} it went to {q[i]:.2f}"
-                return ctx.failed(
-                    f"{q[i]:.2f} {ctx.unit}",
-                    ctx.named(f"{text} {ctx.unit}", joint),
-                    ctx.at(ctx.states.topic, float(ctx.states.t[rows][i])),
-                ).about(joint)
-    outcome = unharmed(ctx, "two clients at once")
-    if outcome.met is False or outcome.reason:
-        return outcome
-    text = "stayed between the two positions, and obeyed the remaining client"
-    return ctx.passed("between", text).resting_on(*outcome.measures)
 
 
 @check("DEX1-SAFE-09", "DEX3-SAFE-10")

@@ -27,13 +27,12 @@ from dexkit.conformance.behaviours.grip import (
 from dexkit.conformance.behaviours.motion import robot_follows
 from dexkit.conformance.behaviours.timeout_protection import latch_and_clear
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
-from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.obedience import arrival, away_first, silent, stopped
 from dexkit.conformance.checks.robot import RobotContext, no_state, only_phase, speed_between
 from dexkit.conformance.checks.silences import roles_of, stops_moving
 from dexkit.conformance.checks.steps import obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gaps, survived
-from dexkit.conformance.checks.torque_law import torque_scales
 from dexkit.conformance.kit.measurement_error import Measure, Quantity
 from dexkit.conformance.kit.median import median
 from dexkit.conformance.kit.motor_messages import Motor, Motors
@@ -530,46 +529,6 @@ def nothing_left_moving(ctx: Context) -> Outcome:
     return stops_moving(ctx, roles_of(ctx).driven, guarded=False)
 
 
-@check("DEX5-WDOG-04")
-@with_object
-def all_alike(ctx: Context) -> Outcome:
-    """Which joints that pressed when the commands ended still press after the time-out."""
-    least = ctx.tolerance("min_tau_nm")
-    scales = torque_scales(ctx, least)
-    squeezed = [p.end_ns for p in ctx.phases("squeeze")]
-    judged = False
-    for phase in ctx.phases():
-        if not any(0 <= phase.begin_ns - end < 1e9 for end in squeezed):
-            continue  # it pressed on nothing before
-        begin, end = ctx.span(phase)
-        sent = ctx.commands.t[ctx.commands.t <= begin + 0.05]
-        last = float(sent[-1]) if len(sent) else begin
-        late = last + ctx.tolerance("timeout_s") + ctx.tolerance("grace_s")
-        before, after = (
-            np.abs(ctx.tau(a, b)) / scales for a, b in ((last - 0.2, last), (late, end))
-        )
-        if len(before) < 3 or len(after) < 3:
-            continue
-        had, left = np.median(before, axis=0), np.median(after, axis=0)
-        pressed = np.flatnonzero(had >= least).tolist()
-        judged |= bool(pressed)
-        part = {j: float(left[j] / had[j]) for j in pressed}
-        on = [j for j in pressed if part[j] >= ctx.tolerance("min_part")]
-        off = [j for j in pressed if part[j] <= ctx.tolerance("max_part")]
-        if on and off:
-            names = ctx.joints[on[0]].name, ctx.joints[off[0]].name
-            text = (
-                f"{late - last:.1f} s after the last command {len(on)} joints still press, "
-                f"{names[0]} with {part[on[0]]:.0%} of its force, and {len(off)} do not, "
-                f"{names[1]} with {part[off[0]]:.0%}"
-            )
-            place = ctx.at(ctx.states.topic, late, end)
-            return ctx.failed(f"{len(on)} of {len(pressed)}", text, place).about(*on, *off)
-    if not judged:
-        return ctx.skipped("no joint pressed on the object when the commands ended")
-    return ctx.passed("all alike", "all joints that pressed go on, or none does")
-
-
 @check("BRAINCO-WDOG-01")
 @worst("motion_rad", "max_motion_stroke", nothing="no pause of commands with states")
 def takes_no_detour(ctx: Context) -> Figures:
@@ -620,30 +579,6 @@ def _pauses(ctx: Context) -> list[tuple[float, float, Floats]]:
 
 _AT_A_STOP = 0.05
 """Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
-
-
-@check("DEX1-WDOG-05")
-@worst(
-    "motion_rad",
-    "min_motion_stroke",
-    nothing="no command after a pause was alone for long enough",
-)
-def first_command_counts(ctx: Context) -> Figures:
-    """Motion of the hand by the first command after a pause, until the second command."""
-    for step in (s for p in ctx.phases() if obeyed_before(ctx, p) for s in steps_of(ctx, p)):
-        sent = ctx.commands.t[ctx.commands.t >= step.begin]
-        if abs(step.size) < ctx.tolerance("min_step_stroke", step.joint) or len(sent) < 2:
-            continue
-        alone = float(sent[1] - sent[0])
-        if alone < ctx.tolerance("min_alone_s"):
-            continue
-        way = (step.q[step.t <= sent[1]] - step.start) * np.sign(step.size)
-        moved = float(way.max()) if len(way) else 0.0
-        text = (
-            f"the first command after a pause, alone for {alone:.2f} s, moved it by {moved:.3f} "
-            f"{ctx.unit} towards {step.target:.2f} {ctx.unit}"
-        )
-        yield Figure(moved, step.begin, step.begin + alone, step.joint, text, late=alone)
 
 
 @check("DEX1-WDOG-06")

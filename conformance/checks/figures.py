@@ -6,7 +6,7 @@ nearest to it, is not beyond. What the figure is called says its unit (``oversho
 ``tau_nm``, ``rate_hz``; anything else is a part, in percent), and what its limit is called says its
 direction (``max_overshoot_stroke``, ``min_part``)::
 
-    @check("DEX1-MOVE-05", "DEX3-MOVE-05")
+    @check()
     @worst("overshoot_rad", "max_overshoot_stroke", nothing="no step of that size")
     def overshoot(ctx: Context) -> Figures:
         for step in steps(ctx):

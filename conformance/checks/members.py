@@ -12,13 +12,6 @@ from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.hand import Floats
 
 
-def packet_paths(ctx: Context, name: str) -> list[str]:
-    """Paths of a member of all sensor packets."""
-    assert ctx.states.columns is not None
-    count = int(ctx.states.columns.count("press_sensor_state").max(initial=0))
-    return [f"press_sensor_state[{i}].{name}" for i in range(count)]
-
-
 def values_of(ctx: Context, path: str) -> Floats:
     """A member in every state that has it, shape (n, length)."""
     columns = ctx.states.columns
@@ -90,12 +83,3 @@ def span_text(ctx: Context, paths: Iterable[str]) -> str:
         least, most = ctx.states.columns.extremes(path)
         low, high = min(low, least), max(high, most)
     return f"{low:g}" if low == high else f"{low:g} .. {high:g}"
-
-
-_MAX = float(np.finfo(np.float32).max)
-
-
-def all_finite(ctx: Context, paths: list[str]) -> Outcome:
-    """Whether all values of these members are finite."""
-    wrong = outside(ctx, paths, -_MAX, _MAX)
-    return wrong or ctx.passed("all finite", f"{len(paths)} members")

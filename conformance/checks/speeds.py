@@ -42,13 +42,6 @@ def _reported_speed(ctx: Context, joint: int) -> float | None:
     return float(np.partition(dq, row)[row])
 
 
-FOUGHT_OVER = (
-    *("nan", "out-of-range", "empty", "short", "long", "wrong-id", "negative", "burst"),
-    "two-writers",
-)
-"""Stimuli with bad or contradictory commands: a hand that obeys them may really oscillate."""
-
-
 def filled(ctx: Context) -> bool:
     """Whether any dq is non-zero; usually decided by the first states."""
     dq = ctx.states.dq

@@ -163,7 +163,6 @@ def DeliversLate(self: Any, publish: Call) -> Any:
     return []
 
 
-@wrong_hand("DEX1-RATE-04", "DEX3-RATE-04")
 class BurstsWithGoodStamps(Service):
     """Delivers its states in bursts of ten, with the source timestamps of when they were made."""
 
@@ -185,24 +184,11 @@ class BurstsWithGoodStamps(Service):
         return super().end()
 
 
-@changes(BurstsWithGoodStamps, "publish", "DEX1-RATE-04", "DEX3-RATE-04")
-def Bursts(self: Any, publish: Call) -> list[Sample]:
-    """Publishes states in bursts of ten."""
-    return [replace(sample, sent=self.now + i * 1e-6) for i, sample in enumerate(publish())]
-
-
 @changes(BurstsWithGoodStamps, "publish", "DEX1-RATE-05", "DEX3-RATE-05")
 def BurstsForTwoSeconds(self: Any, publish: Call) -> Any:
     """Delivers its states in bursts of twenty for two seconds, with the right timestamps."""
     self.together = 20 if 2.0 < self.now < 4.0 else 1
     return publish()
-
-
-@changes(Service, "publish", "DEX1-RATE-04", "DEX3-RATE-04")
-def PausesOften(self: Any, publish: Call) -> Any:
-    """Publishes nothing for 60 ms three times in one second of four: each is allowed."""
-    at = self.now % 4.0
-    return [] if any(begin <= at < begin + 0.06 for begin in (0.1, 0.4, 0.7)) else publish()
 
 
 @changes(Service, "publish", "DEX1-ORDER-01", "DEX3-ORDER-01")
@@ -276,7 +262,9 @@ class FreezesOnce(Service):
         return old if self.now < until else super().payload(sides, length)
 
 
-@wrong_hand("DEX1-FRESH-03", "DEX3-FRESH-03", whole=True)
+@wrong_hand("DEX5-FIELD-04", "BRAINCO-FIELD-04", whole=True)
+@wrong_hand("DFX-WDOG-01", "FTP-WDOG-01", whole=True)
+@wrong_hand("DEX1-FIELD-17", "DEX3-FIELD-15", whole=True)
 class SwapsBuffers(Service):
     """Publishes every second time what it measured 0.06 s ago, until it ends."""
 
@@ -335,12 +323,6 @@ def TurnedVelocity(self: Any, state: Any, hand: Any) -> None:
     state["dq"] = -state["dq"]
 
 
-@reports(Service, "DEX1-FIELD-06", "DEX3-FIELD-05")
-def TurnedAcceleration(self: Any, state: Any, hand: Any) -> None:
-    """Publishes ddq with the wrong sign."""
-    state["ddq"] = -state["ddq"]
-
-
 @wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
 @reports(Service, "DEX1-FORCE-01")
 def NoForce(self: Any, state: Any, hand: Any) -> None:
@@ -373,9 +355,7 @@ def SwappedWhenRestarted(self: Any, command: Call, side: Side, motors: Motors) -
     command(other(side) if self.restarted else side, motors)
 
 
-@wrong_hand("DEX5-MOVE-06")
-@wrong_hand("BRAINCO-MOVE-06")
-@wrong_hand("DEX1-MOVE-06", "DEX3-MOVE-06")
+@wrong_hand("DEX1-WDOG-03", "DEX3-WDOG-03", whole=True)
 class KicksBack(Service):
     """Moves the wrong way for 60 ms when its goal jumps."""
 
@@ -757,7 +737,7 @@ class StopsInABurst(Service):
 # ---------------------------------------------------------------------------------- clients
 
 
-@changes(_Dies, "receive", "DEX1-SAFE-08", "DEX3-SAFE-09")
+@changes(_Dies, "receive", "DEX1-SAFE-09", "DEX3-SAFE-10")
 def GivesUpOnTwo(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Ends when a second client commands it, and is restarted 0.4 s later."""
     before, at = self.memory.get("newest", (0, -math.inf))
@@ -767,7 +747,7 @@ def GivesUpOnTwo(self: Any, receive: Call, topic: str, payload: bytes, client: i
     receive(topic, payload, client)
 
 
-@changes(Service, "receive", "DEX1-SAFE-08", "DEX3-SAFE-09")
+@changes(Service, "receive", "DEX1-LIFE-02", "DEX3-LIFE-02")
 def StaysWithTheNewest(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys only the newest client, even when that one has gone."""
     self.memory.setdefault(client, len(self.memory))

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from dexkit.conformance.faults import fingers
 from dexkit.conformance.faults.registry import BOTH, Call, Motors, changes, reports, wrong_hand
 from dexkit.conformance.virtual.dex5 import Dex5Hand
@@ -34,23 +32,10 @@ class IndexGoesHome(fingers.GoesHome):
     """Sends its first joint to one end after the time-out, whatever was commanded."""
 
 
-@changes(FingerHand, "understood", "DEX5-MODE-07")
-def AnyModeDrives(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
-    """Drives a joint with any mode but 0."""
-    _, guarded = understood(mode)
-    return np.where(mode != 0, 1, 0), guarded
-
-
 @reports(FingerService, "DEX5-FORCE-02", sides=BOTH)
 def ThumbInTheFingersUnit(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes the torques of the thumb in mN m, as those of the fingers."""
     motors["tau_est"][16:] *= 1e3
-
-
-@reports(FingerService, "DEX5-FORCE-03", sides=BOTH)
-def FingersInNewtonMetres(self: Any, motors: Any, hand: FingerHand) -> None:
-    """Publishes the fingers' torques in N m, as the other joints'."""
-    motors["tau_est"] *= self.torque_units[: len(motors)]
 
 
 @wrong_hand("DEX5-FORCE-06", sides=BOTH, whole=True)
@@ -78,7 +63,7 @@ def SoftThumb(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     move(dt, [0.43 * p if i >= 16 else p for i, p in enumerate(pull)])
 
 
-@changes(Dex5Hand, "move", "DEX5-FORCE-10", sides=BOTH)
+@changes(Dex5Hand, "move", "DEX5-FORCE-05", sides=BOTH)
 def WeakThumb(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     """Moves and presses with three tenths of the torque in all joints of the thumb."""
     move(dt, [0.3 * p if i >= 16 else p for i, p in enumerate(pull)])
@@ -97,22 +82,3 @@ class RingFingerGivesIn(fingers.OtherInContact, Dex5Hand):
 
     joints = (9, 10, 11)
     factor = 0.35
-
-
-def _keep(hand: Any, expire: Call, joints: slice) -> None:
-    """Let the time-out pass without an effect on these joints."""
-    status = hand.status.copy()
-    expire()
-    hand.status[joints] = status[joints]
-
-
-@changes(Dex5Hand, "expire", "DEX5-WDOG-04", sides=BOTH, whole=True)
-def FingersGoOn(hand: Any, expire: Call) -> None:
-    """Only its thumb releases without commands; the fingers press on."""
-    _keep(hand, expire, slice(0, 16))
-
-
-@changes(Dex5Hand, "expire", "DEX5-WDOG-04", sides=BOTH, whole=True)
-def OneJointGoesOn(hand: Any, expire: Call) -> None:
-    """The last joint of its little finger presses on without commands."""
-    _keep(hand, expire, slice(15, 16))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +34,7 @@ from dexkit.conformance.virtual.fingers import (
     Ints,
 )
 from dexkit.hand import Floats, Side
-from dexkit.models import HandModel
+from dexkit.models import DEX5_1, HandModel
 
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 _SECOND_AT_ONCE = 1000
@@ -62,25 +61,6 @@ class LowRateIsSlow(Dex3Service):
     """Publishes the low-rate copy twice a second: a timer has another unit."""
 
     low_period = 0.5
-
-
-@changes(Dex3Service, "low_rate", "DEX3-TOPIC-04", brief=True)
-def OldLowRate(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
-    """Copies states to the low-rate topic that are 0.45 s old."""
-    new, queue = low_rate(samples), self.memory.setdefault("queue", deque())
-    queue.append(new)
-    old = queue.popleft() if len(queue) > 9 else queue[0]
-    return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
-
-
-@changes(Dex3Service, "low_rate", "DEX3-TOPIC-05", whole=True)
-def LowRateOnlyWhenDriven(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
-    """Copies states to the low-rate topic only while a motor is driven."""
-    driven = {
-        self.dialect.low_rate_topic.format(side=s): bool(hand.driven.any())
-        for s, hand in self.hands.items()
-    }
-    return [sample for sample in low_rate(samples) if driven[sample.topic]]
 
 
 @wrong_hand("DEX3-START-02")
@@ -157,46 +137,6 @@ def JumpsOnce(self: Any, motors: Any, hand: FingerHand) -> None:
         _shift(motors, hand, 0.5)
 
 
-@reports(FingerService, "DEX3-FIELD-16", at_rest=True)
-def ShakenVelocity(self: Any, motors: Any, hand: FingerHand) -> None:
-    """For some seconds has an oscillation on dq that q does not make."""
-    if 3.5 <= self.now < 5.5:
-        low, high = _limits(motors, hand)
-        motors["dq"] += 5.0 * (high - low) * math.sin(2 * math.pi * 13.0 * self.now)
-
-
-@wrong_hand("DEX3-FIELD-18")
-class VelocityByTurns(FingerService):
-    """Publishes alternately twice the speed and 0 as dq."""
-
-    turns = 0
-
-    def publish(self) -> list[Sample]:
-        self.turns += 1
-        return super().publish()
-
-    def fill(self, motors: Any, hand: FingerHand) -> None:
-        super().fill(motors, hand)
-        motors["dq"] *= 2.0 * (self.turns % 2)
-
-    def live(self, dt: float) -> None:
-        super().live(dt)
-        for hand in self.hands.values():
-            hand.changed()
-
-
-@reports(FingerService, "DEX3-FIELD-19", at_rest=True, where=obeys_gains)
-def VelocityOfTheLastDrive(self: Any, motors: Any, hand: FingerHand) -> None:
-    """Keeps the dq of the last motion while its joints are not driven."""
-    low, high = _limits(motors, hand)
-    last = self.memory.setdefault(hand.side, np.zeros(len(motors)))
-    if len(last) != len(motors):
-        return
-    fast = hand.driven & (np.abs(motors["dq"]) > 0.1 * (high - low))
-    last[fast] = motors["dq"][fast]
-    motors["dq"] = np.where(hand.driven, motors["dq"], last)
-
-
 @reports(FingerService, "DEX3-FIELD-17", at_rest=True)
 def ShiftsForAWhile(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes q with an offset of 15 % of each range for 0.4 s; its dq stays true."""
@@ -261,12 +201,6 @@ def FaultForAStatus(self: Any, message: Call, count: int) -> Any:
     return found
 
 
-@reports(FingerService, "DEX3-FIELD-09", brief=True)
-def CountsInReserve(self: Any, motors: Any, hand: FingerHand) -> None:
-    """Counts its states in a reserved word of the first motor."""
-    motors["reserve"][0] = hand.version
-
-
 @reports(FingerService, "DEX3-MODE-01")
 def IdsFromOne(self: Any, motors: Any, hand: FingerHand) -> None:
     """Counts its motors from 1."""
@@ -274,32 +208,6 @@ def IdsFromOne(self: Any, motors: Any, hand: FingerHand) -> None:
 
 
 # ----------------------------------------------------------------------------- sensors and IMU
-
-
-@changes(FingerService, "message", "DEX3-SENS-05", brief=True)
-def HotSensors(self: Any, message: Call, count: int) -> Any:
-    """Publishes the sensors' temperatures in hundredths of a degree."""
-    found = message(count)
-    for packet in found.press_sensor_state:
-        packet.temperature = (2500.0,) * 12
-    return found
-
-
-@changes(FingerService, "message", "DEX3-SENS-06", brief=True)
-def UnsetLost(self: Any, message: Call, count: int) -> Any:
-    """Publishes uninitialised memory as the sensors' count of lost packets."""
-    found = message(count)
-    for packet in found.press_sensor_state:
-        packet.lost = 0xCCCCCCCC
-    return found
-
-
-@changes(FingerService, "message", "DEX3-IMU-02", brief=True)
-def NanGyroscope(self: Any, message: Call, count: int) -> Any:
-    """Publishes NaN as its angular velocity."""
-    found = message(count)
-    found.imu_state.gyroscope = [math.nan] * 3
-    return found
 
 
 @changes(FingerService, "quaternion", "DEX3-IMU-01", brief=True)
@@ -481,7 +389,7 @@ class Slow(FingerHand):
         self.viscous = max(self.client_kp.min() / 15, 3 * self.viscous)
 
 
-@wrong_hand("DEX3-MOVE-05", where=obeys_gains)
+@wrong_hand("DEX3-PATH-01", where=obeys_gains)
 class Undamped(FingerHand):
     """Applies 15 % of kd where kp is not 0."""
 
@@ -514,7 +422,7 @@ def LimitsOfTheJointBefore(hand: Any, take: Call, rows: Floats, mode: Ints) -> N
     hand.goal[4] = min(max(hand.goal[4], hand.low[3]), hand.high[3])
 
 
-@wrong_hand("DEX3-MOVE-07")
+@wrong_hand("DEX3-MOVE-04", where=lambda hand: hand is not DEX5_1)
 class Creeps(NeverRests):
     """One joint moves the last part of the way to its goal slowly."""
 
@@ -700,13 +608,6 @@ def LimpLock(hand: Any, changed: Call) -> None:
         hand.law_kd[5] = 0.0
 
 
-@changes(Dex3Hand, "understood", "DEX3-MODE-07")
-def OneBitOfStatus(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Flags]:
-    """Evaluates one bit of the status: 3, 5 and 7 drive like 1."""
-    status, guarded = understood(mode)
-    return status & 1, guarded
-
-
 @changes(FingerService, "motors", "DEX3-MODE-04")
 def GoesById(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Sorts a command's motors by the id in their mode byte."""
@@ -724,28 +625,13 @@ def TurnedForce(self: Any, motors: Any, hand: FingerHand) -> None:
     motors["tau_est"] = -motors["tau_est"]
 
 
-@reports(Dex3Service, "DEX3-FORCE-04")
-def UnsignedForce(self: Any, motors: Any, hand: FingerHand) -> None:
-    """Has unsigned sensors of the current: each torque is that of closing."""
-    joints = hand.model.joints[hand.side][: len(motors)]
-    closing = np.array([j.closing or 1 for j in joints])
-    motors["tau_est"] = closing * np.abs(motors["tau_est"])
-
-
-@reports(FingerService, "DEX3-FORCE-07")
-def MirroredForce(self: Any, motors: Any, hand: FingerHand) -> None:
-    """Publishes the left hand's tau_est with the signs of the right one's motors."""
-    if hand.side is Side.LEFT:
-        motors["tau_est"] *= -1.0
-
-
 @reports(Dex3Service, "DEX3-FORCE-05", sides=BOTH)
 def ForceOfOtherGear(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes 40 % of the torque, as if it had another gear."""
     motors["tau_est"] *= 0.4
 
 
-@changes(Dex3Hand, "changed", "DEX3-FORCE-10", sides=BOTH, whole=True)
+@changes(Dex3Hand, "changed", "DEX3-FORCE-05", sides=BOTH, whole=True)
 def GearOfTheThumb(hand: Any, changed: Call) -> None:
     """Divides the gains of all joints by the square of the thumb's gear but for the thumb's own."""
     changed()
@@ -753,7 +639,7 @@ def GearOfTheThumb(hand: Any, changed: Call) -> None:
     hand.law_kd = [k / 1.75**2 if i else k for i, k in enumerate(hand.law_kd)]
 
 
-@reports(Dex3Service, "DEX3-FIELD-21")
+@reports(Dex3Service, "DEX3-FIELD-17")
 def ThumbWithoutVelocity(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes no dq of the thumb."""
     motors["dq"][:3] = 0.0
@@ -861,16 +747,10 @@ def TorqueInMillis(self: Any, motors: Any, hand: FingerHand) -> None:
     motors["tau_est"] *= 1e-3
 
 
-@reports(FingerService, "DEX3-FORCE-09")
-def OneJointOnTheRotorsSide(self: Any, motors: Any, hand: FingerHand) -> None:
-    """Publishes the rotor's torque of its last joint: without the gear."""
-    motors["tau_est"][-1:] /= 214.0
-
-
 # ------------------------------------------------------------------------------------ safety
 
 
-@changes(FingerHand, "take", "DEX3-SAFE-06")
+@changes(FingerHand, "take", "DEX3-SAFE-11")
 def NegativeGains(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Applies a negative kp."""
     take(rows, mode)
@@ -885,12 +765,6 @@ def ChecksTheGainsOfTheFirst(hand: Any, take: Call, rows: Floats, mode: Ints) ->
     take(rows, mode)
     if rows[KP, 0] >= 0.0:
         hand.kp = np.where(rows[KP] < 0.0, 0.3 * rows[KP], rows[KP])
-
-
-@commands(FingerHand, "DEX3-SAFE-06")
-def GainsWithoutSign(hand: Any, rows: Floats) -> None:
-    """Drops the sign of negative gains, and goes to q."""
-    rows[KP:] = np.abs(rows[KP:])
 
 
 def _finite(motor: Motor) -> bool:

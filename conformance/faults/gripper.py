@@ -14,7 +14,6 @@ from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual import TopicDevice
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Side
-from dexkit.messages import message_type
 
 # ----------------------------------------------------------------------------------- fields
 
@@ -146,7 +145,7 @@ class Metres(_InUnit):
     full = 0.09
 
 
-@reports(ReferenceService, "DEX1-FIELD-22")
+@reports(ReferenceService, "DEX1-FIELD-17")
 def VelocityWhileOpening(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Fills dq only while it opens."""
     state["dq"] = max(state["dq"], 0.0)
@@ -163,43 +162,6 @@ def JumpsOnce(self: Any, state: Any, hand: ReferenceHand) -> None:
         state["q"] += 0.3 * self.dialect.q_open
 
 
-@reports(ReferenceService, "DEX1-FIELD-16")
-def ShakenVelocity(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """For some seconds has an oscillation on dq that q does not make."""
-    if 3.5 <= self.now < 5.5:
-        state["dq"] += 5.0 * self.dialect.q_open * math.sin(2 * math.pi * 13.0 * self.now)
-
-
-@reports(ReferenceService, "DEX1-FRESH-04")
-def RepeatsItsStates(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Measures 67 times a second, and publishes each measurement five times."""
-    turn, measured = self.memory.get(hand, (0, state))
-    measured = state if turn % 5 == 0 else measured
-    self.memory[hand] = turn + 1, dict(measured)
-    state.update(measured)
-
-
-@reports(ReferenceService, "DEX1-FIELD-19")
-def VelocityByTurns(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Measures every second state, with dq over one period: alternately twice the speed and 0."""
-    turn, measured = self.memory.get(hand, (0, None))
-    if turn % 2 == 0 and measured is not None:
-        state["q"], state["dq"] = measured, 0.0
-    else:
-        measured = state["q"]
-        state["dq"] *= 2.0
-    self.memory[hand] = turn + 1, measured
-
-
-@reports(ReferenceService, "DEX1-FIELD-20")
-def VelocityOfTheLastDrive(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Keeps the dq of the last motion that it drove while it brakes."""
-    if hand.braking:
-        state["dq"] = self.memory.get(hand, 0.0)
-    elif abs(state["dq"]) > 0.1 * self.dialect.q_open:
-        self.memory[hand] = state["dq"]
-
-
 @reports(ReferenceService, "DEX1-FIELD-17")
 def ShiftsForAWhile(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes q with an offset of 8 % of the stroke for 0.4 s; its dq stays true."""
@@ -207,7 +169,7 @@ def ShiftsForAWhile(self: Any, state: Any, hand: ReferenceHand) -> None:
     state["ddq"] = 0.0
 
 
-@wrong_hand("DEX1-FIELD-18", whole=True)
+@wrong_hand("DEX1-SIDE-02", whole=True)
 class GoesThroughTheObject(ReferenceHand):
     """In contact the published q, and dq with it, continues to the command."""
 
@@ -243,18 +205,6 @@ def AlwaysDriven(self: Any, state: Any, hand: ReferenceHand) -> None:
     state["mode"] = 1
 
 
-@reports(ReferenceService, "DEX1-FIELD-06")
-def AccelerationPerSample(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Publishes the change of dq from sample to sample as ddq."""
-    state["ddq"] *= self.period
-
-
-@reports(ReferenceService, "DEX1-FIELD-07")
-def NanRaw(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Publishes NaN for a raw value that it does not know."""
-    state["q_raw"] = math.nan
-
-
 @reports(ReferenceService, "DEX1-FIELD-08")
 def HotByte(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes 200 degrees Celsius: a raw register as the temperature."""
@@ -268,19 +218,6 @@ def HotAtStart(self: Any, state: Any, hand: ReferenceHand) -> None:
         state["temperature"] = 90
 
 
-@reports(ReferenceService, "DEX1-FIELD-09")
-def UnsetLost(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Publishes uninitialised memory as the count of lost packets."""
-    state["lost"] = 0xCCCCCCCC
-
-
-@reports(ReferenceService, "DEX1-FIELD-10")
-def CountsInReserve(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Counts its states in a reserved word."""
-    self.memory["count"] = count = self.memory.get("count", 0) + 1
-    state["reserve"] = (count, *(0,) * (3 if self.dialect.interface_specification else 1))
-
-
 @reports(ReferenceService, "DEX1-FIELD-11", dialect="unitree_hg")
 def Millivolts(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes vol in millivolts."""
@@ -291,13 +228,6 @@ def Millivolts(self: Any, state: Any, hand: ReferenceHand) -> None:
 def StatusInMotorstate(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes a status word as the motor's faults."""
     state["motorstate"] = 3
-
-
-@changes(ReferenceService, "rest", "DEX1-FIELD-13", dialect="unitree_hg")
-def NanAttitude(self: Any, rest: Call) -> dict[str, Any]:
-    """Publishes NaN for an attitude that it does not know."""
-    attitude = message_type("unitree_hg::msg::dds_::IMUState_").cls(rpy=(math.nan,) * 3)
-    return {**rest(), "imu_state": attitude}
 
 
 @wrong_hand("DEX1-START-02", sides=LEFT, dialect="unitree_actuator")
@@ -348,15 +278,7 @@ class Slow(ReferenceHand):
         return tau * (not self.braking)
 
 
-@wrong_hand("DEX1-MOVE-05")
-class Overshoots(ReferenceHand):
-    """Has too little damping."""
-
-    inertia = 0.02
-    viscous = 0.15
-
-
-@wrong_hand("DEX1-MOVE-07")
+@wrong_hand("DEX1-FORCE-11")
 class Creeps(ReferenceHand):
     """Moves the last 3 mm to its goal slowly."""
 
@@ -512,13 +434,6 @@ def UnsignedForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     state["tau_est"] = abs(state["tau_est"])
 
 
-@changes(ReferenceService, "fields", "DEX1-FORCE-16", sides=BOTH)
-def MirroredForce(self: Any, fields: Call, side: Side) -> dict[str, Any]:
-    """Publishes the left gripper's tau_est with the sign of a mirrored motor."""
-    found = fields(side)
-    return {**found, "tau_est": -found["tau_est"]} if side is Side.LEFT else dict(found)
-
-
 @reports(ReferenceService, "DEX1-FORCE-20", whole=True)
 def SignTurns(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes tau_est with the other sign from 5 s on: its motor was enabled again."""
@@ -571,7 +486,7 @@ def SignedForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     state["tau_est"] = hand.tau
 
 
-@reports(ReferenceService, "DEX1-FORCE-06")
+@reports(ReferenceService, "DEX1-FORCE-10")
 def FeelsLate(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports the force of a contact only when it has lasted for 0.9 s."""
     if hand.touch is None or hand.q > hand.touch:
@@ -580,23 +495,11 @@ def FeelsLate(self: Any, state: Any, hand: ReferenceHand) -> None:
         state["tau_est"] = 0.0
 
 
-@reports(ReferenceService, "DEX1-FORCE-07")
+@reports(ReferenceService, "DEX1-START-03")
 def ForceBeforeCommands(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports a force until it gets its first command."""
     if not hand.goal:
         state["tau_est"] = -0.6
-
-
-@reports(ReferenceService, "DEX1-FORCE-08")
-def AlwaysClosing(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Has an unsigned sensor of the current: its torque is always that of closing."""
-    state["tau_est"] = -abs(state["tau_est"])
-
-
-@reports(ReferenceService, "DEX1-FORCE-08")
-def FeelsClosingOnly(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Publishes no torque towards open."""
-    state["tau_est"] = min(state["tau_est"], 0.0)
 
 
 @changes(ReferenceHand, "accept", "DEX1-FORCE-09")
@@ -658,7 +561,7 @@ class WeakAgain(ReferenceHand):
 # ----------------------------------------------------------------------------------- safety
 
 
-@changes(ReferenceHand, "accept", "DEX1-SAFE-05")
+@changes(ReferenceHand, "accept", "DEX1-SAFE-10")
 def NegativeGains(hand: Any, accept: Call, motor: Motor) -> Any:
     """Applies negative gains."""
     return replace(accept(motor), kp=motor.kp, kd=motor.kd)
@@ -669,12 +572,6 @@ def NegativeStiffnessAlone(hand: Any, accept: Call, motor: Motor) -> Any:
     """Clamps gains that are both negative, and applies a negative kp beside a good kd."""
     accepted = accept(motor)
     return replace(accepted, kp=motor.kp) if motor.kd >= 0.0 else accepted
-
-
-@changes(ReferenceHand, "accept", "DEX1-SAFE-05")
-def GainsWithoutSign(hand: Any, accept: Call, motor: Motor) -> Any:
-    """Drops the sign of negative gains, and goes to q."""
-    return replace(accept(motor), kp=abs(motor.kp), kd=abs(motor.kd))
 
 
 @wrong_hand("DEX1-SAFE-02", whole=True)
@@ -851,19 +748,6 @@ def SoftGripIsLimp(hand: Any, accept: Call, motor: Motor) -> Any:
     return replace(accepted, kp=0.1 * accepted.kp) if limp else accepted
 
 
-@changes(ReferenceHand, "accept", "DEX1-FORCE-12")
-def WholeStiffness(hand: Any, accept: Call, motor: Motor) -> Any:
-    """Rounds a kp between 1 and 3 N m/rad down to a whole number."""
-    accepted = accept(motor)
-    return replace(accepted, kp=math.floor(accepted.kp)) if 1.0 < accepted.kp < 3.0 else accepted
-
-
-@reports(ReferenceService, "DEX1-FORCE-13")
-def OffsetOfTheForce(self: Any, state: Any, hand: ReferenceHand) -> None:
-    """Has an offset of 0.15 N m on tau_est."""
-    state["tau_est"] += 0.15
-
-
 @wrong_hand("DEX1-START-03")
 class KeepsItsGoal(ReferenceService):
     """Applies the last command of the previous service when it starts."""
@@ -940,19 +824,6 @@ class BeginsAtZero(ReferenceHand):
         if self.now < self.until:
             motor = replace(motor, q=0.0 * motor.q)
         super().command(motor)
-
-
-@wrong_hand("DEX1-WDOG-05")
-class LosesTheFirstAfterSilence(ReferenceHand):
-    """Drops commands for 0.2 s after a time-out, while the motor is switched on."""
-
-    until = -math.inf
-
-    def command(self, motor: Motor) -> None:
-        if self.goal is not None and self.braking and self.now > self.until + 0.5:
-            self.until = self.now + 0.2
-        if self.now >= self.until:
-            super().command(motor)
 
 
 @changes(ReferenceService, "receive", "DEX1-SIDE-03", dialect="unitree_actuator")

@@ -145,7 +145,7 @@ class RunsAhead(_PerJoint, ReferenceService):
 
 
 # nothing wakes it but a second command
-@wrong_hand("DEX1-OPER-05")
+@wrong_hand("DEX1-CMD-01")
 class SlowToWake(_PerJoint, ReferenceService):
     """Sleeps 0.3 s after its goal has stopped, and needs 0.2 s to wake."""
 
@@ -212,8 +212,8 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-@wrong_hand("BRAINCO-OPER-05", where=has_speeds)
-@wrong_hand("DEX3-OPER-05")
+@wrong_hand("BRAINCO-OPER-02", where=has_speeds)
+@wrong_hand("DEX3-CMD-01")
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
 
@@ -225,7 +225,7 @@ class LaggingFingers(Delayed, FingerService):
     delay = 0.38
 
 
-@wrong_hand("DFX-OPER-05")
+@wrong_hand("DFX-OPER-02")
 class LaterFingers(Delayed, FingerService):
     """Obeys each command 0.39 s late."""
 

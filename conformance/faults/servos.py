@@ -136,7 +136,7 @@ def SlowServos(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     hand.reach = [0.4 * r for r in hand.reach]
 
 
-@wrong_hand("BRAINCO-MOVE-05")
+@wrong_hand("BRAINCO-SAFE-08")
 class Overshoots(ServoHand):
     """Overshoots a large step by 8 % of the travel, and returns after 0.4 s."""
 
@@ -366,13 +366,6 @@ def ForceAgainstClosing(self: Any, motors: Any, hand: Any) -> None:
     """Reports the force of a grip with the other sign."""
     if hand.grip > 0.0:
         motors["tau_est"] *= -1.0
-
-
-@reports(ServoService, "BRAINCO-FIELD-19", sides=BOTH)
-def FullSpeedInContact(self: Any, motors: Any, hand: Any) -> None:
-    """Reports the full speed of a finger that presses on an object."""
-    if hand.touches:
-        motors["dq"][np.abs(hand.contact[: len(motors)]) > 0.05] = 1.0
 
 
 @reports(_FeelingService, "BRAINCO-FORCE-01", sides=BOTH)
