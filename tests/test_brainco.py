@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.conformance.behaviours.stillness import _repeats, _turns
+from dexkit.conformance.behaviours.stillness import _repeats
 from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.servos import StatesSwapped, Vibrates
@@ -26,7 +26,6 @@ from dexkit.hand import Floats, HandCommand, HandState, Side
 from dexkit.messages import message_type, unitree_go
 from dexkit.models import BRAINCO_REVO2, dialect
 from dexkit.service.dialects import DialectMap, Fill, StateView, dialect_map
-from dexkit.service.hand_core import HandCore
 from dexkit.teleop import Operator, client_for, profile
 from tests.each import each
 
@@ -85,16 +84,6 @@ def test_speed_of_the_command_is_the_speed() -> None:
     assert (hand.mechanics.q == before).all()
 
 
-def test_object_stops_the_fingers_and_draws_the_current_limit() -> None:
-    hand, clock = opened(RIGHT, object_at=50.0)
-    state = hold(hand, clock, 0.9, 1.0)
-    assert np.allclose(state.q, 0.5)
-    assert np.allclose(state.tau_est, 1.0, atol=0.01)
-    state = hand.exchange(HandCommand.brake(N))
-    clock.advance(0.1)
-    assert np.allclose(hand.exchange(HandCommand.brake(N)).q, 0.5)  # a brake does not let go
-
-
 # --------------------------------------------------------------------------------------- dialect
 
 
@@ -112,15 +101,6 @@ def test_dq_is_a_part_of_the_full_speed(dq: float, part: float) -> None:
     assert command is not None
     assert np.allclose(command.dq, part * FULL)
     assert not command.is_limp  # though the client sends no gains
-
-
-@each(("field", "value"), [(f, v) for f in ("q", "dq") for v in (math.nan, math.inf, -math.inf)])
-def test_core_rejects_values_that_are_not_finite(field: str, value: float) -> None:
-    core = HandCore(BRAINCO_REVO2.spec(LEFT, io_rate=500.0), BRAINCO_REVO2, ManualClock())
-    core.opened(core.spec)
-    command = mapping().command(message(**{"q": 0.5, "dq": 1.0, field: value}), LEFT)
-    assert command is not None
-    assert not core.submit(command)
 
 
 def test_five_joints_hold_no_command_and_more_than_six_do() -> None:
@@ -168,20 +148,6 @@ def test_vibration_and_swapped_states_are_found_and_reported_in_parts_of_the_tra
         assert all(not RADIANS.search(r.observed) for r in result.results)
         assert all(not RADIANS.search(name) for r in result.results for name in r.values)
     assert any("full travel" in r.observed for r in result.results)
-
-
-@each(
-    ("q", "turns"),
-    [
-        ([0.0, 0.5, 1.0], 0),
-        ([0.0, 0.01, 0.0, 0.01, 0.0], 3),
-        ([0.0, 0.001, 0.0, 0.001], 0),
-        ([0.5, 0.52, 0.51, 0.53, 0.4], 3),
-        ([], 0),
-    ],
-)
-def test_turns_are_counted_by_their_size(q: list[float], turns: int) -> None:
-    assert _turns(np.array(q), 0.005) == turns
 
 
 @each("states_hz", [100.0, 500.0])

@@ -120,6 +120,7 @@ def check_wiring(seed: int, tmp: Path) -> None:
     assert all(travel.confirmed for travel in bring.session.findings.travel.values())
 
 
+@pytest.mark.slow
 @each("seed", [0])
 def test_bringup_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
     check_wiring(seed, tmp_path)

@@ -305,6 +305,7 @@ def _run(script: str, *arguments: str, quiet: bool = True) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_domain_configured_by_other_code_is_used_and_kept() -> None:
     script = f"""
 import logging
@@ -325,6 +326,7 @@ print(len(foreign.get_participants()))
     assert _run(script, quiet=False) == "True 1\nTrue 2\n1\n"
 
 
+@pytest.mark.slow
 def test_participants_of_other_code_outlive_our_domain() -> None:
     script = f"""
 from cyclonedds.domain import DomainParticipant
@@ -394,6 +396,7 @@ except DdsUnavailable as error:
     assert _run("import sys, dexkit.dds; print('cyclonedds' in sys.modules)") == "False\n"
 
 
+@pytest.mark.slow
 def test_two_libraries_in_one_process_are_refused(tmp_path: Path) -> None:
     """As where ROS 2's library is preloaded, or came with rclpy; it hung."""
     script = """
@@ -412,6 +415,7 @@ except ImportError as error:
     assert _run(script, str(tmp_path / "libddsc.so.0")) == "True True True\n"
 
 
+@pytest.mark.slow
 def test_cyclonedds_11_is_refused() -> None:
     script = """
 from importlib import metadata
@@ -425,6 +429,7 @@ except ImportError as error:
     assert _run(script) == "CycloneDDS 11.0.1 is installed, dexkit needs 0.10.x\n"
 
 
+@pytest.mark.slow
 def test_the_log_goes_to_a_file_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "dds.log"
     script = f"""
@@ -468,6 +473,7 @@ assert inside.wait(60)
 """
 
 
+@pytest.mark.slow
 def test_a_callback_that_never_returns_does_not_keep_the_process() -> None:
     done = subprocess.run(
         [sys.executable, "-c", STUCK, str(free_domain())],

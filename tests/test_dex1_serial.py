@@ -23,7 +23,7 @@ from click.testing import CliRunner
 from dexkit.backends import BackendOptions
 from dexkit.backends import backend as find_backend
 from dexkit.cli.calibrate import command as calibrate_command
-from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings, discovery, find_motor
+from dexkit.drivers.dex1_serial import Dex1Serial, Dex1Settings, find_motor
 from dexkit.drivers.dex1_serial import line as line_module
 from dexkit.drivers.dex1_serial.line import MotorLine, acquire, is_shared
 from dexkit.emulators.m4010 import Dex1Motors, Dex1Process, Firmware
@@ -36,7 +36,6 @@ from tests.patience import PATIENCE, waits_of
 BRAKE = HandCommand.brake(1)
 OPEN = HandCommand.position(5.4)
 CLOSE = HandCommand.position(0.3)
-LIMP = HandCommand.position(5.0, kp=0.0, kd=0.0)
 TIMEOUT = 1.0  # s, the longest; this machine may be busy with other tests
 SEARCH_TIMEOUT = 0.3  # s, where most ids and ports do not answer
 
@@ -131,16 +130,6 @@ def test_driver_moves_measures_and_brakes_on_close() -> None:
         hand.close()
         with pytest.raises(HandLost, match="not connected"):
             hand.exchange(BRAKE)
-
-
-def test_open_close_and_limp_do_not_move_the_hand() -> None:
-    with Dex1Motors() as motors:
-        before = motors.motor.mechanics.joint.q
-        with opened(motors) as hand:
-            hand.open()  # again: nothing happens
-            for _ in range(50):
-                exchange(hand, LIMP)
-        assert motors.motor.mechanics.joint.q == before
 
 
 def test_two_hands_share_one_line() -> None:
@@ -265,19 +254,6 @@ def test_port_used_by_another_program_is_refused(tmp_path: Path) -> None:
             holder.communicate()
 
 
-def test_open_retries_three_times_like_the_vendor_service() -> None:
-    pauses: list[float] = []
-    with Dex1Motors((Side.RIGHT,)) as motors:
-        with pytest.raises(HandNotFound):
-            find_motor(Dex1Settings(device=motors.path, timeout=0.01), 1, pauses.append)
-        assert pauses == [discovery.PAUSE] * 2 == [0.05] * 2
-
-
-def test_motor_that_answers_late_is_found() -> None:
-    with Dex1Motors(faults=("silent:for=100ms",)) as motors, opened(motors, timeout=0.1) as hand:
-        exchange(hand, BRAKE)
-
-
 # --- what goes wrong on the line
 
 
@@ -330,23 +306,6 @@ def test_a_damaged_answer_costs_its_own_exchange_only(
         drive(hand, OPEN, arrived)
         for command, mode in ((BRAKE, 0), (OPEN, 1)) * 5:
             assert exchange(hand, command).mode[0] == mode
-
-
-def test_late_answer_is_not_taken_for_the_next_one() -> None:
-    with Dex1Motors() as motors, opened(motors) as hand:
-        patient = hand.configuration
-        hand.configuration = replace(patient, timeout=0.03)
-        motors.inject("delay:ms=300")
-        schedule = motors.bus(Side.LEFT).schedule
-        wait_for(lambda: schedule.active)
-        with pytest.raises(HandTimeout, match="motor 1 on"):
-            hand.exchange(BRAKE)
-        hand.configuration = patient
-        assert hand._line is not None
-        assert hand._line._port is not None
-        port = hand._line._port
-        wait_for(lambda: port.in_waiting)  # the driver itself waits for LATE only
-        assert exchange(hand, LIMP).mode[0] == JointMode.FOC  # and not that of the brake
 
 
 def test_an_exchange_is_bounded_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -452,24 +411,6 @@ def test_motor_stops_after_the_driver_is_killed() -> None:
 
 
 # --- the cable
-
-
-def test_unplugged_in_motion_and_plugged_in_again() -> None:
-    with Dex1Motors() as motors, opened(motors) as hand:
-        drive_until_moving(hand, OPEN)
-        motors.inject("unplug:for=300ms")
-        with pytest.raises(HandLost, match="gone away"):
-            drive(hand, OPEN, lambda s: False)
-        with pytest.raises(HandLost):
-            hand.exchange(OPEN)
-        hand.close()
-        with pytest.raises((HandNotFound, HandLost)):
-            hand.open()
-        wait_for(lambda: os.path.exists(motors.path))
-        hand.open()
-        assert motors.motor.mechanics.mode is JointMode.BRAKE
-        drive(hand, OPEN, arrived)
-    assert line_module._lines == {}
 
 
 def test_both_hands_recover_a_lost_shared_line() -> None:
@@ -583,23 +524,6 @@ def test_the_backend_reads_its_settings() -> None:
     spec = Dex1Serial(Side.LEFT).spec
     assert (spec.io_rate, spec.simulated) == (500.0, False)
     assert spec.exchange_timeout <= 0.1
-
-
-@each(
-    "wrong",
-    [
-        {"ports": ""},
-        {"id": "15"},
-        {"id": "left"},
-        {"baudrate": "0"},
-        {"protect": "yes"},
-        {"timeout": "0"},
-        {"speed": "1"},
-    ],
-)
-def test_invalid_settings_are_refused(wrong: dict[str, str]) -> None:
-    with pytest.raises(UsageError):
-        find_backend("dex1-serial").create(BackendOptions(Side.LEFT, None, wrong))
 
 
 def test_unusable_serial_port_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

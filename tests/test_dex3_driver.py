@@ -23,10 +23,10 @@ from hypothesis import strategies as st
 from usb.core import USBError, USBTimeoutError
 
 from dexkit.backends import BackendOptions
-from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb, Server, backend, discovery, find_hand
+from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb, Server, discovery, find_hand
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.drivers.dex3_usb.link import UsbLink
-from dexkit.drivers.dex3_usb.settings import default_path, from_options, parse_places
+from dexkit.drivers.dex3_usb.settings import from_options, parse_places
 from dexkit.errors import (
     HandError,
     HandLost,
@@ -95,11 +95,6 @@ def _to_the_deadline(connection: Connection, deadline: float) -> float:
     return max(1e-3, deadline - time.monotonic())
 
 
-def exchange_often(hand: Dex3Usb) -> None:
-    for _ in range(1000):
-        hand.exchange(GO)
-
-
 class TestAddress:
     def test_usbip_address_has_host_and_optional_port_and_serial_number(self) -> None:
         assert parse_server("usbip://robot") == (Server("robot", 3240), None)
@@ -129,9 +124,6 @@ class TestAddress:
 class TestSettings:
     def options(self, device: str | None = None, **settings: str) -> BackendOptions:
         return BackendOptions(Side.LEFT, device, settings)
-
-    def test_settings_have_their_defaults(self) -> None:
-        assert from_options(self.options()) == Dex3Settings(config=default_path())
 
     def test_all_settings_are_read(self) -> None:
         found = from_options(
@@ -185,52 +177,6 @@ class TestSettings:
         found = from_options(self.options(device, **settings))
         assert (found.server, found.serial, found.local) == (server, serial, local)
 
-    @each(
-        ("device", "settings"),
-        [
-            (None, {"timeout": "0"}),
-            (None, {"timeout": "x"}),
-            (None, {"timeout": "nan"}),
-            (None, {"protect": "yes"}),
-            (None, {"frame": "1000"}),
-            (None, {"head": "f"}),
-            (None, {"head": "fcfdfe"}),
-            (None, {"motors": "0.0"}),
-            (None, {"motors": "0.0,0.0,0.2,1.0,1.1,2.0,2.1"}),
-            (None, {"motors": "0.15,0.1,0.2,1.0,1.1,2.0,2.1"}),
-            (None, {"motors": "0/1"}),
-            (None, {"sensors": "9.0"}),
-            (None, {"sensors": "0.0"}),
-            (None, {"in_endpoint": "0x181"}),
-            (None, {"usb": "tcp://h"}),
-            ("usbip://h", {"usb": "usbip://other"}),
-            ("usbip://h", {"usb": "system"}),
-            ("S1", {"usb": "usbip://h/S2"}),
-        ],
-    )
-    def test_invalid_values_are_refused(self, device: str | None, settings: dict[str, str]) -> None:
-        with pytest.raises(UsageError):
-            backend.create(self.options(device, **settings))
-
-    @each(
-        ("name", "text", "expected"),
-        [
-            ("motors", "0.0", "motors: the hand has 7, here are 1"),
-            ("sensors", "0.0,0.1", "sensors: the hand has 9, here are 2"),
-            ("head", "fe", "head is two bytes"),
-        ],
-    )
-    def test_refused_setting_is_named_with_a_hint(
-        self, name: str, text: str, expected: str
-    ) -> None:
-        with pytest.raises(UsageError, match=expected) as caught:
-            backend.create(self.options(**{name: text}))
-        assert caught.value.hint
-
-    def test_an_unknown_setting_is_refused(self) -> None:
-        with pytest.raises(UsageError, match="no setting 'baud'"):
-            backend.create(self.options(baud="1"))
-
     @given(st.text(max_size=20))
     def test_any_bus_map_is_read_or_refused(self, text: str) -> None:
         try:
@@ -238,13 +184,6 @@ class TestSettings:
         except ValueError:
             return
         assert all(bus >= 0 and number >= 0 for bus, number in places)
-
-    def test_the_model_and_its_rate(self) -> None:
-        hand = backend.create(self.options())
-        assert backend.model == DEX3_1.name
-        assert hand.spec.io_rate == 1000.0
-        assert hand.spec.exchange_timeout <= 0.3
-        assert not hand.spec.simulated
 
 
 class TestDiscovery:
@@ -294,11 +233,6 @@ class TestDiscovery:
             Dex3Usb(Side.LEFT).open()
         for word in ("powered", "lsusb -d 34b7:", "dexkit emulate dex3-usb --side left"):
             assert word in caught.value.hint
-
-    def test_missing_usbip_server_is_reported(self, no_usb: None) -> None:
-        with pytest.raises(HandNotFound, match="no USB/IP server at usbip://127") as caught:
-            Dex3Usb(Side.LEFT, Dex3Settings(server=discovery.LOCAL_SERVER)).open()
-        assert "dexkit emulate dex3-usb" in caught.value.hint
 
     def test_missing_libusb_is_reported_with_a_hint(
         self, no_usb: None, monkeypatch: pytest.MonkeyPatch
@@ -445,15 +379,6 @@ class TestOpening:
         assert "udevadm" in caught.value.hint
         assert ("close_device" in fake.calls) == (call != "open_device")
 
-    def test_missing_permission_is_reported_with_a_given_serial_number(
-        self, no_usb: None, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        fake = FakeBackend(FakeHand())
-        fake.fail["open_device"] = usb_error(errno.EACCES)
-        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: fake)
-        with pytest.raises(HandRefused, match="no permission"):
-            Dex3Usb(Side.LEFT, Dex3Settings(serial="SN1")).open()
-
     def test_interface_that_another_program_claims_is_refused(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -484,32 +409,12 @@ class TestOpening:
             fake_hand(fake, monkeypatch).open()
         assert fake.calls[-1] == "close_device"
 
-    def test_a_system_without_kernel_drivers(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        fake = FakeBackend(FakeHand())
-        fake.fail["is_kernel_driver_active"] = NotImplementedError("as on other systems")
-        with fake_hand(fake, monkeypatch) as hand:
-            hand.exchange(GO)
-
-    def test_missing_serial_number_is_accepted(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        fake = FakeBackend(FakeHand())
-        fake.fail["ctrl_transfer"] = usb_error(errno.EPIPE)
-        with fake_hand(fake, monkeypatch) as hand:
-            assert hand.serial == ""
-
     def test_the_rule_is_for_both_hands(self) -> None:
         path = Path(__file__).parents[1] / "packaging" / "70-dexkit-dex3.rules"
         active = re.findall(
             r'^SUB.*idVendor}=="(\w+)".*idProduct}=="(\w+)"', path.read_text(), re.M
         )
         assert active == [(f"{VENDOR_ID:04x}", f"{PRODUCT_ID[side]:04x}") for side in Side]
-
-    def test_hand_that_failed_to_open_logs_no_close(self, caplog: pytest.LogCaptureFixture) -> None:
-        caplog.set_level(logging.INFO)
-        with serving(RawDevice(lambda data: [])) as server:
-            for _ in range(2):
-                with pytest.raises(HandTimeout):
-                    hand_on(server, SHORT).open()
-        assert "closed" not in caplog.text
 
     def test_silent_device_is_a_timeout_on_open(self, monkeypatch: pytest.MonkeyPatch) -> None:
         device = RawDevice(lambda data: [])
@@ -617,13 +522,6 @@ class TestExchange:
             assert again.timeout.all()
             assert hand.statistics.trips == 1
 
-    def test_error_bits_come_through(self) -> None:
-        fake = FakeHand()
-        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
-            fake.fault[3] = int(MotorError.OVERCURRENT | MotorError.CASE_TEMPERATURE)
-            state = hand.exchange(GO)
-            assert state.fault.tolist() == [0, 0, 0, 0x81, 0, 0, 0]
-
     def test_silent_motor_keeps_its_last_state_and_is_reported(self) -> None:
         fake = FakeHand()
         lost = int(MotorError.HOST_SAW_MOTOR_TIMEOUT)
@@ -644,26 +542,6 @@ class TestExchange:
             assert not state.fault.any()
             assert state.q[0] != before.q[0]
             assert hand.exchange(GO).q[0] != state.q[0]
-
-    def test_a_damaged_packet_is_lost_alone(self) -> None:
-        from dexkit.wire.crc32 import crc32_words
-
-        def spoil(answer: bytes) -> bytes:
-            data = bytearray(answer)
-            data[26 + 10] ^= 0x40  # position of the first motor on bus 0
-            data[1266:] = crc32_words(bytes(data[2:1266])).to_bytes(4, "little")
-            return bytes(data)
-
-        fake = FakeHand()
-        with serving(RawDevice(fake)) as server, hand_on(server) as hand:
-            before = hand.exchange(GO)
-            fake.spoil = spoil
-            state = hand.exchange(GO)
-            assert state.q[0] == before.q[0]
-            assert hand.statistics.damaged_packets == 1
-            assert hand.statistics.damaged_frames == 0
-            fake.spoil = lambda answer: answer
-            assert hand.exchange(GO).q[0] != before.q[0]
 
     @each(
         "damage",
@@ -689,10 +567,6 @@ class TestExchange:
             fake.spoil = lambda answer: answer
             state = hand.exchange(GO)
             assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
-
-    def test_exchange_before_open_is_refused(self) -> None:
-        with pytest.raises(HandLost, match="not connected"):
-            Dex3Usb(Side.LEFT).exchange(GO)
 
 
 class LateHand(FakeHand):
@@ -810,13 +684,6 @@ class TestTroubleOnTheWay:
                 hand.exchange(GO)
             assert type(caught.value) is expected
 
-    def test_usb_error_without_errno_is_a_hand_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        fake = FakeBackend(FakeHand())
-        with fake_hand(fake, monkeypatch) as hand:
-            fake.fail["bulk_write"] = USBError("Unknown error", -99, None)
-            with pytest.raises(HandError, match="Unknown error"):
-                hand.exchange(GO)
-
     @pytest.mark.parametrize("call", ["bulk_write", "bulk_read"])
     def test_a_stalled_endpoint_is_cleared(
         self, call: str, monkeypatch: pytest.MonkeyPatch
@@ -830,27 +697,6 @@ class TestTroubleOnTheWay:
             fake.fail.clear()
             hand.exchange(GO)
             assert hand.statistics.link.stalls == 1
-
-    @pytest.mark.parametrize("which", ["out", "into"])
-    def test_stalled_endpoint_over_usbip_is_cleared(self, which: str) -> None:
-        fake = FakeHand()
-        device = RawDevice(fake)
-        with serving(device) as server, hand_on(server) as hand:
-            hand.exchange(GO)
-            server.call(getattr(device.pipes, which).stall)
-            with pytest.raises(HandTimeout, match="stalled its"):
-                exchange_often(hand)
-            for _ in range(5):
-                state = hand.exchange(GO)
-                assert state.q[0] == pytest.approx(fake.q(fake.count), abs=1e-4)
-
-    def test_failed_clear_halt_is_a_lost_hand(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        fake = FakeBackend(FakeHand())
-        with fake_hand(fake, monkeypatch) as hand:
-            fake.fail["bulk_read"] = usb_error(errno.EPIPE)
-            fake.fail["clear_halt"] = usb_error(errno.ENODEV)
-            with pytest.raises(HandLost):
-                hand.exchange(GO)
 
     def test_partially_written_command_is_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
         fake = FakeBackend(FakeHand())
@@ -924,25 +770,6 @@ class TestTroubleOnTheWay:
         assert fake.calls[-1] == "close_device"
         with pytest.raises(HandLost):
             hand.exchange(GO)
-
-    def test_unplugged_hand_is_found_again(self) -> None:
-        device = RawDevice(FakeHand())
-        with serving(device) as server:
-            hand = hand_on(server)
-            hand.open()
-            hand.exchange(GO)
-            device.plugged = False
-            with pytest.raises(HandLost):
-                exchange_often(hand)
-            with pytest.raises(HandLost):
-                hand.exchange(GO)  # it does not come back by itself
-            hand.close()
-            with pytest.raises(HandNotFound):
-                hand.open()
-            device.plugged = True
-            hand.open()
-            assert hand.exchange(GO).q.shape == (7,)
-            hand.close()
 
     def test_server_that_stops_answering_is_a_timeout(
         self, monkeypatch: pytest.MonkeyPatch
@@ -1049,16 +876,6 @@ class TestUsbIpClient:
         assert self.exchange(connection, 2000) == (0, 0, b"right")
         connection.close()
         server.close()
-
-    def test_a_broken_connection_stays_broken(self) -> None:
-        connection, server = self.connected()
-        server.close()
-        for _ in range(2):
-            with pytest.raises(USBError) as caught:
-                self.exchange(connection)
-            assert caught.value.errno == errno.ENODEV
-        connection.close()
-        connection.close()
 
     @given(
         st.lists(

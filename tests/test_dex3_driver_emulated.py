@@ -20,7 +20,7 @@ from dexkit.drivers.dex3_usb import Dex3Settings, Dex3Usb
 from dexkit.drivers.dex3_usb.discovery import parse_server
 from dexkit.drivers.dex3_usb.settings import format_places
 from dexkit.emulators.dex3_mcu import Dex3Hands, emulated_dex3
-from dexkit.errors import HandError, HandLost, HandNotFound, HandRefused, HandTimeout
+from dexkit.errors import HandNotFound, HandRefused, HandTimeout
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
 from dexkit.service import HandService
@@ -171,18 +171,6 @@ class TestFaults:
 
 
 class TestTimeoutProtection:
-    def test_tripped_motors_are_reported_and_restarted(self) -> None:
-        with emulated_dex3() as emulated, hand_at(emulated.url, **PATIENT) as hand:
-            assert isinstance(emulated, Dex3Hands)
-            device = emulated.device()
-            hand.exchange(go(GOAL[Side.LEFT]))
-            wait_until(lambda: all(device.tripped), what="the motors to stop")
-            state = hand.exchange(go(GOAL[Side.LEFT]))
-            assert (state.fault & TRIPPED).all()
-            drive(hand, go(GOAL[Side.LEFT]), lambda s: not s.fault.any())
-            drive(hand, go(GOAL[Side.LEFT]), lambda s: np.abs(s.q - GOAL[Side.LEFT]).max() < 0.02)
-            assert hand.statistics.trips == 1
-
     def test_motors_stop_after_the_driver_is_killed(self) -> None:
         code = f"""
 import sys, numpy as np
@@ -215,31 +203,6 @@ for count in range(10**9):
             # the next driver works
             with hand_at(emulated.url, **PATIENT) as hand:
                 assert not hand.exchange(HandCommand.brake(7)).fault.any()
-
-
-class TestCable:
-    def test_lost_cable_is_detected_and_recovered(self) -> None:
-        with emulated_dex3() as emulated:
-            hand = hand_at(emulated.url, **PATIENT)
-            hand.open()
-            hand.exchange(go(GOAL[Side.LEFT]))
-            emulated.inject("unplug:for=300ms")
-            with pytest.raises(HandLost):
-                drive(hand, go(GOAL[Side.LEFT]), lambda s: False)
-            assert not hand.statistics.link.timeouts
-            deadline = time.monotonic() + PATIENCE
-            hand.close()
-            with pytest.raises(HandNotFound):
-                hand.open()
-            while True:
-                try:
-                    hand.open()
-                    break
-                except HandError:
-                    assert time.monotonic() < deadline
-                    time.sleep(0.01)
-            assert np.isfinite(hand.exchange(HandCommand.brake(7)).q).all()
-            hand.close()
 
 
 class TestService:

@@ -36,7 +36,6 @@ STATES, COMMANDS = message_type(DEX5.state_type), message_type(DEX5.cmd_type)
 LEFT, RIGHT = Side.LEFT, Side.RIGHT
 N, THUMB = 20, slice(16, 20)
 KP, KD = np.array(DEX5_1.gains).T
-CLOSING = {s: np.array([j.closing for j in DEX5_1.joints[s]]) for s in Side}
 
 EPOCH_NS = 1_795_000_000_000_000_000
 PROFILE = "sine"
@@ -77,36 +76,6 @@ def test_thumb_has_other_gains_and_outer_joints_share_motors() -> None:
     assert KD.tolist() == [0.001] * 16 + [0.02] * 4
     assert len(DEX5_1.motors) == 16
     assert sorted(i for group in DEX5_1.motors for i in group) == list(range(N))
-
-
-# --------------------------------------------------------------------------------- simulated hand
-
-
-def opened(side: Side = LEFT, **options: float) -> tuple[SimDex5, ManualClock]:
-    clock = ManualClock()
-    hand = SimDex5(side, clock=clock, **options)
-    hand.open()
-    return hand, clock
-
-
-def hold(hand: SimDex5, clock: ManualClock, command: HandCommand, seconds: float) -> HandState:
-    state = hand.exchange(command)
-    for _ in range(int(seconds * 100)):
-        clock.advance(0.01)
-        state = hand.exchange(command)
-    return state
-
-
-def test_joints_press_on_object_towards_closing() -> None:
-    hand, clock = opened(RIGHT, object_at=50.0)
-    closed = np.where(CLOSING[RIGHT] > 0, hand.spec.q_max, hand.spec.q_min)
-    goal = np.where(CLOSING[RIGHT] != 0, closed, 0.0)
-    state = hold(hand, clock, HandCommand.position(goal, kp=KP, kd=KD), 2.0)
-    felt = state.tau_est * CLOSING[RIGHT]
-    presses = CLOSING[RIGHT] != 0
-    assert (felt[presses] > 0.05).all()
-    assert felt[THUMB].max() > 5 * felt[:16].max()
-    assert np.abs(state.q[presses] - 0.5 * closed[presses]).max() < 0.02
 
 
 # --------------------------------------------------------------------------------------- dialect

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
 from dexkit.child_processes import Tool
@@ -119,6 +120,7 @@ def test_g1_with_two_dex3_moves_and_stops_cleanly(dds_domain: int, dds_node: Dds
     assert not any("Traceback" in line for line in whole.lines)
 
 
+@pytest.mark.slow
 def test_program_ends_when_one_of_its_processes_dies() -> None:
     with whole_robot("--robot", "h1", "--hands", "dex1", "--domain", free_domain()) as whole:
         parts = children(whole.pid)
@@ -134,6 +136,7 @@ def test_no_process_outlives_the_program() -> None:
         wait_until(lambda: all(gone(pid) for pid in parts), 10.0)
 
 
+@pytest.mark.slow
 def test_topics_with_another_publisher_are_refused(dds_domain: int, dds_node: DdsNode) -> None:
     topic = "rt/dex1/right/state"
     with (
@@ -147,6 +150,7 @@ def test_topics_with_another_publisher_are_refused(dds_domain: int, dds_node: Dd
         assert "another --domain" in whole.lines[whole.lines.index(error) + 1]
 
 
+@pytest.mark.slow
 def test_program_ends_after_its_duration_with_a_hint() -> None:
     domain = str(free_domain())
     result = CliRunner().invoke(

@@ -66,7 +66,6 @@ from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1
 from dexkit.wire import dynamixel, mx64
 from tests.dds_helpers import wait_until
-from tests.each import each
 from tests.ezgripper_helpers import (
     BRAKE,
     CLOSE,
@@ -247,52 +246,7 @@ def test_backend_reads_its_settings(tmp_path: Path) -> None:
     assert hand.spec.side is Side.LEFT
 
 
-@each(
-    "wrong",
-    [
-        {"id": "one"},
-        {"id": "253"},
-        {"baudrate": "12345"},
-        {"calibrate": "maybe"},
-        {"effort": "101"},
-        {"effort": "nan"},
-        {"effort": "0"},
-        {"force_table": "/does/not/exist"},
-        {"force_table": "/dev/null"},
-        {"speed": "1"},
-        {"retries": "-1"},
-        {"colour": "red"},
-    ],
-)
-def test_invalid_settings_are_refused(wrong: dict[str, str]) -> None:
-    with pytest.raises(UsageError):
-        find_backend("ezgripper").create(BackendOptions(Side.LEFT, "/dev/null", wrong))
-
-
 # --- moving
-
-
-def test_gripper_follows_reports_state_and_switches_torque_off(tmp_path: Path) -> None:
-    with emulated(start=20.0) as gripper:
-        with gripper_on(gripper.path, configured(tmp_path)) as hand:
-            start = exchange(hand, BRAKE)
-            assert float(start.q[0]) == pytest.approx(0.2 * 5.4, abs=0.03)
-            assert start.measured
-            moving = drive(hand, OPEN, lambda s: float(s.dq[0]) > 1.0)
-            assert float(moving.tau_est[0]) == 0.0
-            before = time.monotonic()
-            opened = drive(hand, OPEN, at(5.4))
-            assert travel(gripper) == pytest.approx(2500, abs=30)
-            assert float(opened.voltage[0]) == pytest.approx(12.0, abs=0.3)
-            assert 20 <= float(opened.temperature[0]) <= 40
-            assert opened.fault[0] == 0
-            assert before <= opened.stamp <= time.monotonic()
-            drive(hand, CLOSE, lambda s: float(s.dq[0]) < -1.0)
-            drive(hand, HALF, at(2.7))
-            assert gripper.servo.torque
-            assert hand.servo_statistics.lost_writes == 0
-        assert not gripper.servo.torque
-        hand.close()
 
 
 @pytest.mark.parametrize("where", ["write", "read"])
@@ -517,35 +471,6 @@ def test_low_voltage_is_reported_and_exchange_continues(tmp_path: Path) -> None:
         assert float(low.voltage[0]) < 9.5
         drive(hand, HALF, lambda s: not s.fault[0])
         drive(hand, HandCommand.position(3.5), at(3.5))
-
-
-def test_unplugged_in_motion_reconnects_without_motion(tmp_path: Path) -> None:
-    with emulated(start=100.0) as gripper:
-        hand = EZGripper(gripper.path, configuration=configured(tmp_path))
-        hand.open()
-        slow = HandCommand.position(0.0)
-        drive(hand, slow, lambda s: float(s.dq[0]) < -1.0)
-        gripper.inject("unplug:for=1s")
-        deadline = time.monotonic() + LONG
-        with pytest.raises(HandLost):
-            drive(hand, slow, lambda s: False)
-        with pytest.raises(HandLost):
-            hand.exchange(slow)
-        hand.close()
-        hand.close()
-        # the servo gets no packets any more: its watchdog stops it
-        while gripper.servo.get(mx64.BUS_WATCHDOG) != mx64.WATCHDOG_TRIPPED:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        while not os.path.exists(gripper.path):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        stopped = travel(gripper)
-        hand.open()
-        drive_for(hand, BRAKE, 0.2)
-        assert travel(gripper) == pytest.approx(stopped, abs=20)
-        drive(hand, HALF, at(2.7))
-        hand.close()
 
 
 _DRIVER = """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,6 @@ from dexkit.backends import backend
 from dexkit.cli import cli
 from dexkit.clock import ManualClock
 from dexkit.conformance.faults import plan_for, run_mutant
-from dexkit.conformance.faults.registry import mix
-from dexkit.conformance.faults.servos import ReversedScale
 from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
 from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.inspire import FtpHand, FtpService
@@ -245,14 +242,6 @@ def test_kit_encodes_and_reads_for_itself() -> None:
 
 
 # ------------------------------------------------------------------------------------ conformance
-
-
-def test_reversed_scale_is_found() -> None:
-    phases = frozenset(["listen", "joint", "short"])
-    plan = replace(plan_for("inspire_ftp", sides=(LEFT,)), phases=phases)
-    result = run_mutant(mix(ReversedScale, FtpService), plan)
-    failed = {r.requirement.id for r in result.results if r.verdict is Verdict.FAIL}
-    assert "FTP-MOVE-01" in failed
 
 
 @pytest.mark.soak

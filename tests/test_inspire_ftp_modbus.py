@@ -14,7 +14,7 @@ from dexkit.drivers import inspire_ftp_modbus
 from dexkit.drivers.inspire_ftp_modbus import InspireFtpModbus, InspireFtpModbusSettings
 from dexkit.drivers.inspire_modbus import InspireModbus, InspireModbusSettings
 from dexkit.emulators.rh56 import Rh56TcpHand
-from dexkit.errors import HandTimeout, UsageError
+from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, JointMode, MotorError, Side
 from dexkit.models import INSPIRE_FTP
 from dexkit.wire.rh56 import Register
@@ -141,21 +141,6 @@ def test_a_locked_joint_is_reported_at_once(emulated: Rh56TcpHand) -> None:
         emulated.inject("locked")
         state = until(hand, HandCommand.brake(N), lambda s: bool(s.fault.any()))
         assert set(state.fault) == {MotorError.LOCKED}
-
-
-def test_lost_answers_cost_an_exchange(emulated: Rh56TcpHand) -> None:
-    with driver(emulated.path) as hand:
-        hand._line.timeout = 0.05  # not of opening it, on a busy machine
-        emulated.inject("drop:p=1,for=200ms")
-        with pytest.raises(HandTimeout):
-            until(hand, HandCommand.brake(N), lambda s: False)
-        ends = time.monotonic() + PATIENCE
-        while True:
-            try:
-                assert felt(hand.exchange(HandCommand.brake(N))) == {}
-                break
-            except HandTimeout:
-                assert time.monotonic() < ends
 
 
 def test_hand_without_tactile_areas_reports_no_pressure() -> None:

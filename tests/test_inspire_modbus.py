@@ -28,9 +28,8 @@ from dexkit.errors import (
     HandTimeout,
     UsageError,
 )
-from dexkit.hand import Hand, HandCommand, MotorError, Side
+from dexkit.hand import HandCommand, MotorError, Side
 from dexkit.wire.modbus import TcpParser
-from dexkit.wire.rh56 import Register
 from tests.dds_helpers import wait_until
 from tests.each import each
 from tests.patience import PATIENCE
@@ -56,22 +55,6 @@ def until_lost(hand: InspireModbus) -> None:
         hand.exchange(HandCommand.position([0.0] * N))
 
 
-def test_driver_moves_the_emulated_hand_and_holds(emulated: Rh56TcpHand) -> None:
-    with driver(emulated.path) as hand:
-        assert isinstance(hand, Hand)
-        assert emulated.device.words[Register.SPEED_SET] == [1000] * N
-        assert emulated.device.goals == [None] * N  # no motion
-        state = hand.exchange(HandCommand.brake(N))
-        assert np.allclose(state.q, 1.0)
-        ends = time.monotonic() + 60.0
-        while np.abs(state.q - 0.5).max() > 0.002 and time.monotonic() < ends:
-            state = hand.exchange(HandCommand.position([0.5] * N))
-        assert np.allclose(state.q, 0.5, atol=0.002)
-        assert state.temperature.tolist() == [35.0] * N
-        hand.exchange(HandCommand.brake(N))
-    assert all(abs((goal or 0) - 500) <= 2 for goal in emulated.device.goals)
-
-
 def test_locked_hand_is_cleared_and_does_not_continue_to_its_old_goal(
     emulated: Rh56TcpHand,
 ) -> None:
@@ -95,25 +78,6 @@ def test_locked_hand_is_cleared_and_does_not_continue_to_its_old_goal(
         assert not emulated.device.errors[0]
         assert np.allclose([(goal or 0) / 1000 for goal in emulated.device.goals], stood, atol=0.3)
         wait_until(lambda: emulated.device.resting)  # each joint ends at its own angle
-
-
-def test_lost_and_late_answers_cost_one_exchange() -> None:
-    with Rh56TcpHand() as emulated, driver(emulated.path) as hand:
-        hand._line.timeout = 0.05  # not of opening it, on a busy machine
-        for fault in ("drop:p=0.3,for=300ms", "delay:p=0.3,ms=70,for=300ms"):
-            emulated.inject(fault)
-            failed = 0
-            ends = time.monotonic() + 60.0
-            while failed < 2 and time.monotonic() < ends:
-                try:
-                    hand.exchange(HandCommand.brake(N))
-                except HandTimeout:
-                    failed += 1
-                if not emulated.port.line.schedule.active and not failed:
-                    emulated.inject(fault)
-            assert failed
-        assert hand.statistics.timeouts >= 2
-        assert hand.statistics.exchanges
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
 from dexkit.backends import BackendOptions, backend
@@ -15,16 +14,13 @@ from dexkit.emulators.faults import RH56_FAULTS, parse_fault
 from dexkit.emulators.rh56 import Rh56, Rh56Hand, rh56_bus
 from dexkit.errors import (
     EncodeError,
-    HandLost,
     HandNotFound,
-    HandTimeout,
     UsageError,
     WireError,
 )
-from dexkit.hand import Hand, HandCommand, HandState, MotorError, Side
+from dexkit.hand import HandCommand, MotorError, Side
 from dexkit.wire import rh56
 from dexkit.wire.rh56 import Error, Frame, Operation, Register, Status
-from tests.each import each
 
 N = rh56.JOINTS
 PATIENT = 1.0  # s; a busy machine answers late
@@ -147,40 +143,6 @@ def driver(hand: Rh56Hand, **change: object) -> InspireSerial:
     return InspireSerial(Side.RIGHT, InspireSerialSettings(**values))  # type: ignore[arg-type]
 
 
-def until(hand: InspireSerial, command: HandCommand, q: float) -> HandState:
-    """Exchange until every joint is at q."""
-    ends = time.monotonic() + 60.0
-    while True:
-        state = hand.exchange(command)
-        if np.abs(state.q - q).max() < 0.002 or time.monotonic() > ends:
-            return state
-
-
-def test_driver_moves_the_emulated_hand_and_holds(emulated: Rh56Hand) -> None:
-    with driver(emulated) as hand:
-        assert isinstance(hand, Hand)
-        assert emulated.device.words[Register.SPEED_SET] == [1000] * N
-        state = hand.exchange(HandCommand.brake(N))
-        assert np.allclose(state.q, 1.0)
-        assert state.mode.tolist() == [0] * N
-        state = until(hand, HandCommand.position([0.5] * N, dq=[1.0] * N), 0.5)
-        assert np.allclose(state.q, 0.5, atol=0.002)
-        assert state.mode.tolist() == [1] * N
-        assert state.temperature.tolist() == [35.0] * N
-        assert np.allclose(until(hand, HandCommand.position([0.0] * N), 0.4).q, 0.4, atol=0.002)
-        for _ in range(2):
-            state = hand.exchange(HandCommand.brake(N))
-        holds = list(emulated.device.goals)
-        assert all(abs((goal or 0) - 400) <= 2 for goal in holds)  # where it was
-        before = hand.statistics.exchanges
-        hand.exchange(HandCommand.brake(N))
-        assert hand.statistics.exchanges - before <= 2  # goals that stay are not written again
-        assert emulated.device.goals == holds
-    assert all(abs((goal or 0) - 400) <= 2 for goal in emulated.device.goals)
-    with pytest.raises(HandLost):
-        hand.exchange(HandCommand.brake(N))
-
-
 def test_driver_reports_errors_and_clears_them_when_it_opens(emulated: Rh56Hand) -> None:
     with driver(emulated) as hand:
         emulated.inject("locked")
@@ -192,47 +154,6 @@ def test_driver_reports_errors_and_clears_them_when_it_opens(emulated: Rh56Hand)
         assert not hand.exchange(HandCommand.brake(N)).fault.any()
         assert emulated.device.words[Register.SPEED_SET] == [300] * N
         assert emulated.device.words[Register.FORCE_SET] == [200] * N
-
-
-@each("fault", ["drop:p=0.3", "corrupt:p=0.3"])
-def test_lost_and_damaged_answers_cost_one_exchange(fault: str) -> None:
-    with Rh56Hand() as emulated, driver(emulated) as hand:
-        hand._line.timeout = 0.05  # not of opening it, on a busy machine
-        emulated.inject(fault)
-        before = hand.statistics.timeouts
-        good = failed = 0
-        ends = time.monotonic() + 60.0
-        while (good < 5 or failed < 2) and time.monotonic() < ends:
-            try:
-                hand.exchange(HandCommand.brake(N))
-                good += 1
-            except HandTimeout:
-                failed += 1
-        assert good >= 5
-        assert failed >= 2
-        assert hand.statistics.timeouts - before == failed
-
-
-def test_a_port_that_goes_away_is_reported_and_found_again(emulated: Rh56Hand) -> None:
-    with driver(emulated) as hand:
-        hand.exchange(HandCommand.brake(N))
-        emulated.inject("unplug:for=200ms")
-        ends, lost = time.monotonic() + 60.0, False
-        while not lost and time.monotonic() < ends:
-            try:
-                hand.exchange(HandCommand.brake(N))
-            except HandTimeout:
-                continue
-            except HandLost:
-                lost = True
-        assert lost
-        while True:
-            try:
-                hand.open()
-                break
-            except (HandNotFound, HandLost):
-                assert time.monotonic() < ends
-        hand.exchange(HandCommand.brake(N))
 
 
 def test_missing_hand_is_reported() -> None:

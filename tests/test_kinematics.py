@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
-from dexkit.kinematics import BASE, Box, Segment, Skeleton, quaternions, rotation, turned_to
+from dexkit.kinematics import BASE, Box, Segment, Skeleton, quaternions, rotation
 from dexkit.models import DEX1_1, DEX3_1, DEX5_1, MODELS
 from dexkit.robots import ROBOTS
 from dexkit.urdf import read_urdf
@@ -38,15 +38,6 @@ def test_quaternions_are_the_rotations(rpy: tuple[float, float, float]) -> None:
         u = np.array([x, y, z])
         turned = vector + 2 * np.cross(u, np.cross(u, vector) + w * vector)
         np.testing.assert_allclose(turned, turn @ vector, atol=1e-9)
-
-
-@FEW
-@given(direction=st.tuples(*3 * [st.floats(-1, 1)]).filter(lambda v: math.hypot(*v) > 1e-3))
-def test_turned_to_is_a_rotation_to_the_direction(direction: tuple[float, float, float]) -> None:
-    turn = turned_to(direction)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
-    assert np.linalg.det(turn) == pytest.approx(1.0)
-    np.testing.assert_allclose(turn[:, 0], np.array(direction) / math.hypot(*direction), atol=1e-6)
 
 
 def test_skeletons_have_the_joints_of_their_models() -> None:

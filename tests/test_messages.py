@@ -99,16 +99,6 @@ def test_message_types_are_found_by_each_of_their_names() -> None:
     assert len(message_types()) == 21
 
 
-def test_hostile_sequence_length_allocates_nothing() -> None:
-    mt = message_type("unitree_go/msg/MotorCmds")
-    with pytest.raises(OversizeError):
-        mt.decode(b"\x00\x01\x00\x00\xff\xff\xff\xff")
-    with pytest.raises(TruncatedError):
-        mt.decode(b"\x00\x01\x00\x00\x02\x00\x00\x00" + bytes(36))
-    with pytest.raises(OversizeError):
-        mt.decode(b"\x00\x01\x00\x00" + bytes(mt.max_size))
-
-
 def test_other_representations_are_refused_by_name() -> None:
     mt = message_type("unitree_go/msg/MotorCmds")
     with pytest.raises(WireError, match="XCDR2"):
@@ -163,8 +153,3 @@ def test_trailing_bytes_are_refused() -> None:
 def test_values_that_do_not_fit_their_type_are_refused(message: object, text: str) -> None:
     with pytest.raises(EncodeError, match=text):
         encode(message)
-
-
-def test_another_class_is_refused() -> None:
-    with pytest.raises(EncodeError, match="HandCmd_ is not a unitree_go"):
-        message_type("unitree_go/msg/MotorCmds").encode(hg.HandCmd_())

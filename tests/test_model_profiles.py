@@ -228,6 +228,7 @@ def test_a_model_of_another_package_is_listed(example: Packages) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_reference_of_the_example_meets_every_requirement(example: Packages) -> None:
     result = run_mutant(under_test(NAME).reference.load(), plan_for(DIALECT))
     bad = [r.explain() for r in result.results if str(r.verdict) not in ("pass", "n/a")]
@@ -235,6 +236,7 @@ def test_the_reference_of_the_example_meets_every_requirement(example: Packages)
     assert {r.requirement.id for r in result.results} == {r.id for r in catalogue(NAME)}
 
 
+@pytest.mark.slow
 def test_every_requirement_of_the_example_has_a_wrong_hand(example: Packages) -> None:
     requirements, trials = chosen(NAME)
     assert {r.id for r in requirements} <= {t.kills for t in trials}

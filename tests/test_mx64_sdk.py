@@ -274,19 +274,6 @@ def test_easy_sdk_example_runs(pair: EmulatedProcess) -> None:
     connector.closePort()
 
 
-@pytest.mark.realtime
-def test_sdk_transaction_is_not_faster_than_the_line(port: sdk.PortHandler) -> None:
-    """A write and a read at 1 Mbaud with a 1 ms latency timer: each ends at a separate tick."""
-    PACKETS.write1ByteTxRx(port, 1, mx64.RETURN_DELAY_TIME.address, 2)
-    count = 50
-    started = time.monotonic()
-    for _ in range(count):
-        assert PACKETS.write4ByteTxRx(port, 1, mx64.GOAL_POSITION.address, 2000) == OK
-        assert PACKETS.readTxRx(port, 1, 126, 21)[1:] == OK
-    # 27 bytes are the write and its status
-    assert time.monotonic() - started >= 0.274e-3 + (2 * count - 1) * 1e-3
-
-
 def test_robotis_read_write_example_finishes_with_a_bare_servo() -> None:
     """What ``read_write.py`` of DynamixelSDK does, with the range that it has for an MX-64.
 

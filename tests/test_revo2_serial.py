@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
 from dexkit.backends import BackendOptions, backend
@@ -14,12 +11,11 @@ from dexkit.clock import ManualClock
 from dexkit.drivers import revo2_serial
 from dexkit.drivers.revo2_serial import Revo2Serial, Revo2Settings
 from dexkit.emulators.revo2 import Revo2, Revo2Hand
-from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout, UsageError
-from dexkit.hand import Hand, HandCommand, Side
+from dexkit.errors import HandNotFound, HandRefused, HandTimeout, UsageError
+from dexkit.hand import HandCommand, Side
 from dexkit.models import BRAINCO_REVO2
 from dexkit.wire.modbus import Function
 from dexkit.wire.revo2 import Holding, Input, MotorStatus
-from tests.each import each
 
 N = 6
 PATIENT = 1.0  # s; a busy machine answers late
@@ -41,13 +37,6 @@ def to(q: float, part: float = 1.0) -> HandCommand:
     return HandCommand.position([q] * N, dq=[part * speed for speed in FULL_SPEED])
 
 
-def until_lost(hand: Revo2Serial) -> None:
-    ends = time.monotonic() + 60.0
-    while time.monotonic() < ends:
-        with contextlib.suppress(HandTimeout):
-            hand.exchange(to(0.0))
-
-
 def test_device_reports_a_joint_that_is_held_back() -> None:
     device = Revo2(Side.LEFT, start=0.0, object_at=60.0)
     device.write_registers(Holding.POSITION_AND_SPEED, (1000, 500) * N)
@@ -62,30 +51,19 @@ def test_device_reports_a_joint_that_is_held_back() -> None:
     assert status == [MotorStatus.STALLED] * N
 
 
-def test_driver_moves_the_emulated_hand_and_holds(emulated: Revo2Hand) -> None:
+def test_speed_of_a_command_is_the_devices_and_0_is_no_motion(emulated: Revo2Hand) -> None:
     with driver(emulated, speed=0.5) as hand:
-        assert isinstance(hand, Hand)
-        assert emulated.device.goals == [None] * N  # no motion
-        state = hand.exchange(HandCommand.brake(N))
-        assert not state.q.any()
-        ends = time.monotonic() + 60.0
-        while np.abs(state.q - 0.5).max() > 0.002 and time.monotonic() < ends:
-            state = hand.exchange(to(0.5))
+        hand.exchange(to(0.5))
         assert emulated.device.speeds == [500] * N
-        assert state.mode.tolist() == [1] * N
         hand.exchange(to(0.5, part=0.1))
         assert emulated.device.speeds == [100] * N
-        # a speed of 0 is no motion, and not the device's highest
-        hand.exchange(to(0.0, part=0.0))
-        assert all(abs((goal or 0) - 500) <= 2 for goal in emulated.device.goals)
+        hand.exchange(to(0.0, part=0.0))  # and not the device's highest
+        assert emulated.device.goals != [0] * N
         for _ in range(2):
             hand.exchange(HandCommand.brake(N))
         before = hand.statistics.exchanges
         hand.exchange(HandCommand.brake(N))
         assert hand.statistics.exchanges - before == 1  # goals that stay are not written again
-    assert all(abs((goal or 0) - 500) <= 2 for goal in emulated.device.goals)
-    with pytest.raises(HandLost):
-        hand.exchange(HandCommand.brake(N))
 
 
 def test_wrong_hand_is_refused_and_missing_hand_is_not_found(emulated: Revo2Hand) -> None:
@@ -97,40 +75,6 @@ def test_wrong_hand_is_refused_and_missing_hand_is_not_found(emulated: Revo2Hand
         Revo2Serial(Side.LEFT).open()
     with driver(emulated) as hand:
         assert hand.spec.side is Side.RIGHT
-
-
-@each("fault", ["drop:p=0.3", "corrupt:p=0.3"])
-def test_lost_and_damaged_answers_cost_one_exchange(fault: str) -> None:
-    with Revo2Hand() as emulated, driver(emulated) as hand:
-        hand._line.timeout = 0.05  # not of opening it, on a busy machine
-        emulated.inject(fault)
-        good = failed = 0
-        ends = time.monotonic() + 60.0
-        while (good < 5 or failed < 2) and time.monotonic() < ends:
-            try:
-                hand.exchange(HandCommand.brake(N))
-                good += 1
-            except HandTimeout:
-                failed += 1
-        assert good >= 5
-        assert failed >= 2
-
-
-def test_a_port_that_goes_away_comes_back_without_motion(emulated: Revo2Hand) -> None:
-    with driver(emulated) as hand:
-        hand.exchange(to(0.0))
-        emulated.inject("unplug:for=200ms")
-        ends = time.monotonic() + 60.0
-        with pytest.raises(HandLost):
-            until_lost(hand)
-        while True:
-            try:
-                hand.open()
-                break
-            except (HandNotFound, HandLost):
-                assert time.monotonic() < ends
-        assert not hand.exchange(HandCommand.brake(N)).q.any()
-        assert emulated.device.goals == [0] * N
 
 
 def test_nothing_is_written_after_a_pause(emulated: Revo2Hand) -> None:

@@ -90,6 +90,7 @@ def test_emulated_robot_serves_until_it_is_stopped(node: DdsNode) -> None:
         process.wait()
 
 
+@pytest.mark.slow
 def test_two_robots_on_one_domain(node: DdsNode) -> None:
     arguments = ["h1", "--domain", str(node.domain), "--set", "real-time=no"]
     stop, ready = threading.Event(), threading.Event()
@@ -136,16 +137,3 @@ def test_failure_is_reported(node: DdsNode, monkeypatch: pytest.MonkeyPatch) -> 
     with robot:
         wait_until(lambda: robot.failure)
         assert str(robot.failure) == "out of joint"
-
-
-@pytest.mark.parametrize("name", ["h1", "g1"])
-def test_help_of_robots_shows_their_options(name: str) -> None:
-    result = CliRunner().invoke(command, [name, "--help"])
-    assert result.exit_code == 0
-    assert f"dexkit emulate {name} --remote A,R1,lx=0.5" in result.output
-    assert ("mode-machine=N" in result.output) == (name == "g1")
-
-
-def test_unknown_key_of_the_remote_is_refused() -> None:
-    result = CliRunner().invoke(command, ["h1", "--remote", "Z"], standalone_mode=False)
-    assert "no key 'Z'" in str(result.exception)

@@ -34,6 +34,7 @@ def positions(model: RobotModel, motors: int, by: float) -> list[float]:
     return q
 
 
+@pytest.mark.slow
 def test_unitree_sdk_moves_the_emulated_h1(
     dds_domain: int, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -68,6 +68,7 @@ def test_unitree_sdk_moves_a_hand_in_unitree_go(
         until(sdk, state, lambda m: m.states[0].mode == 0)  # silence: it brakes
 
 
+@pytest.mark.slow
 def test_unitree_sdk_moves_a_hand_in_unitree_hg(sdk: SdkClient, dds_domain: int) -> None:
     d = dialect("unitree_hg")
     cmd, state = d.topics(Side.LEFT)
@@ -84,6 +85,7 @@ def test_unitree_sdk_moves_a_hand_in_unitree_hg(sdk: SdkClient, dds_domain: int)
         sdk.stop(cmd)
 
 
+@pytest.mark.slow
 def test_unitree_sdk_moves_hands_in_unitree_actuator(sdk: SdkClient, dds_domain: int) -> None:
     d = dialect("unitree_actuator")
     cmd, state = d.topics(Side.LEFT)

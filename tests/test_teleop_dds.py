@@ -88,23 +88,6 @@ def test_missing_side_is_named_with_a_hint() -> None:
         assert alone.exit_code == 0, alone.output
 
 
-def test_hint_is_printed_once_after_five_seconds(capsys: pytest.CaptureFixture[str]) -> None:
-    from dexkit.cli.teleop import _WaitReport
-
-    with DdsNode(domain=free_domain(), interface="lo") as node:
-        waiting = _WaitReport(node, DIALECTS["unitree_go"], None)
-        for seconds in (0.0, 1.0, 4.9):
-            waiting({LEFT: "", RIGHT: "every q is exactly 0"}, seconds)
-        assert capsys.readouterr().err == (
-            "waiting for state of left, right (every q is exactly 0) ...\n"
-        )
-        waiting({LEFT: ""}, 5.0)
-        waiting({LEFT: ""}, 60.0)
-        said = capsys.readouterr().err
-        assert said.count("waiting for state of left ...") == 1
-        assert said.count(f"'dexkit doctor --domain {node.domain}' reports what is wrong") == 1
-
-
 def test_profiles_are_listed_without_a_hand() -> None:
     result = teleop()
     assert result.exit_code == 0
