@@ -329,23 +329,18 @@ def _x_ticks(
 
 
 def _band_labels(bands: Sequence[Band], axes: _Axes) -> list[tuple[str, str, str]]:
-    """Names above the bands, where they fit on wide pages and on phones."""
-    order = sorted(enumerate(bands), key=lambda item: (item[1].begin, item[1].css == "band"))
-
-    def placed(width: float) -> dict[int, float]:
-        chosen: dict[int, float] = {}
-        free_from = 0.0
-        for i, band in order:
-            a, b = (axes.across(v) / 100 * width for v in (band.begin, band.end))
-            label_width = _LETTER * len(band.label)
-            at = max(a, free_from)
-            if band.label and at <= max(b, a + 12) and at + label_width <= width:
-                chosen[i] = 100 * at / width
-                free_from = at + label_width + 5
-        return chosen
-
-    phone = placed(_PHONE)
-    return [
-        ("b" if i in phone else "b wide", f"left:{at:.2f}%", bands[i].label)
-        for i, at in placed(_DESK).items()
-    ]
+    """Names above the bands, where they fit on wide pages, and of those what fits on phones."""
+    found = []
+    free_desk = free_phone = 0.0  # pixels from which there is room
+    for band in sorted(bands, key=lambda b: (b.begin, b.css == "band")):
+        a, b = (axes.across(v) / 100 * _DESK for v in (band.begin, band.end))
+        at, width = max(a, free_desk), _LETTER * len(band.label)
+        if not band.label or at > max(b, a + 12) or at + width > _DESK:
+            continue
+        free_desk = at + width + 5
+        on_phone = at / _DESK * _PHONE
+        css = "b wide"
+        if free_phone <= on_phone <= _PHONE - width:
+            css, free_phone = "b", on_phone + width + 5
+        found.append((css, f"left:{100 * at / _DESK:.2f}%", band.label))
+    return found

@@ -5,7 +5,8 @@ Most are curves over time: what each shows stands in a table, :data:`_CURVES`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +23,10 @@ from dexkit.conformance.report.labels import whose
 from dexkit.conformance.report.pages import fill
 from dexkit.conformance.report.usb_plots import usb_plots
 from dexkit.errors import UsageError
-from dexkit.hand import Floats, JointSpec, Side, Subject
+from dexkit.hand import Floats, Side, Subject
 from dexkit.pressure import known, resting_pressure
 
-__all__ = ["command_and_state", "operated", "phase_bands", "plots_of"]
+__all__ = ["command_and_state", "followed", "phase_bands", "plots_of"]
 
 _PHASES = {
     "approach": "to mid",
@@ -47,8 +48,8 @@ _PHASES = {
     "guard-clear": "cleared",
 }
 """Names of phases in reports; other phases appear under their own name."""
-_LONGEST = 8.0
-"""Seconds of a plot about a place in the recording."""
+_LONGEST = 32.0
+"""Seconds of a plot that is about no place."""
 _MOST_ROWS = 24
 _MOST_ELEMENTS = 12  # of an array, in one plot
 _FIELDS = {"dq": "rad/s", "ddq": "rad/s²", "tau_est": "N m"}
@@ -117,8 +118,8 @@ class _Scene:
             return self.whole
         begin, end = min(a for a, _ in spans), max(b for _, b in spans)
         begin, end = max(0.0, begin - pad), min(self.view.duration, end + pad)
-        if not self.places and end - begin > 4 * _LONGEST:
-            end = begin + 4 * _LONGEST
+        if not self.places:
+            end = min(end, begin + _LONGEST)
         return begin, max(end, begin + 0.1)
 
     def bands(self, span: Span, *, phases: bool = True) -> list[Band]:
@@ -128,19 +129,17 @@ class _Scene:
         shown = [b for b in alarms if b.end - b.begin < 0.85 * (span[1] - span[0])]
         return [*_busy(self.view, span), *named, *shown]
 
-    def joints(self, span: Span, most: int = 2) -> list[int]:
-        """The joints that the finding is about, or those that move most in ``span``."""
+    def joints(self, span: Span) -> list[int]:
+        """Two joints that the finding is about, or that move most in ``span``."""
         joints = self.hand.joints
-        if len(joints) == 1:
-            return [0]
-        if self.result.joints:
-            return [j for j in self.result.joints if j < len(joints)][:most]
+        if self.result.joints or len(joints) == 1:
+            return [j for j in self.result.joints or (0,) if j < len(joints)][:2]
         q = self.hand.states.q[self.hand.states.between(*span)]
         if not len(q):
             return [0]
         filled = np.where(np.isfinite(q), q, 0.0)
         moved = np.ptp(filled, axis=0) / np.array([j.stroke for j in joints])
-        return [int(i) for i in np.argsort(-moved, kind="stable")[:most]]
+        return [int(i) for i in np.argsort(-moved, kind="stable")[:2]]
 
 
 # ------------------------------------------------------------------------ curves over time
@@ -172,6 +171,7 @@ _TORQUES = (
     _Limit("max_tau_nm", "at most {0:g} N m in size"),
     _Limit("max_tau_nm", "at most {0:g} N m in size", float.__neg__),
 )
+_OVERSHOOT = (_Limit("max_overshoot_stroke", "overshoot allowed", lambda part: 100 * part),)
 
 
 def _levels(need: Requirement, limits: tuple[_Limit, ...]) -> list[Level]:
@@ -181,11 +181,13 @@ def _levels(need: Requirement, limits: tuple[_Limit, ...]) -> list[Level]:
 
 @dataclass(frozen=True)
 class _Curves:
-    """Curves over time, with 0 in the plot.
+    """Curves over time.
 
-    :param title: what they show; ``{member}`` is the member that the plot names.
+    :param title: what they show; ``{name}`` is the name of the first one.
     :param lines: the curves; no plot if there are none.
+    :param unit: ``position``, ``torque`` or ``member`` for that of the hand.
     :param pad: seconds shown before and after the place; None for the whole run.
+    :param zero: whether 0 is in the plot.
     """
 
     title: str
@@ -193,27 +195,27 @@ class _Curves:
     unit: str = ""
     pad: float | None = None
     limits: tuple[_Limit, ...] = ()
+    zero: bool = True
 
     def charts(self, scene: _Scene, member: str) -> Iterator[Chart]:
         """The chart, if there is something to draw."""
         span = scene.whole if self.pad is None else scene.window(self.pad)
         if lines := self.lines(scene, member):
-            units = {"torque": scene.view.model.torque_unit, "member": _unit(scene, member)}
-            title = self.title.format(member=lines[0].label)
+            units = {
+                "position": scene.view.unit,
+                "torque": scene.view.model.torque_unit,
+                "member": _FIELDS.get(member, "").replace("rad", scene.view.unit),
+            }
             yield Chart(
-                f"{whose(scene.hand.side)}: {title}",
+                f"{whose(scene.hand.side)}: {self.title.format(name=lines[0].label)}",
                 lines,
                 span,
                 units.get(self.unit, self.unit),
                 bands=scene.bands(span, phases=self.pad is not None),
                 levels=_levels(scene.need, self.limits),
-                include=(0.0,),
+                include=(0.0,) if self.zero else (),
                 height=150,
             )
-
-
-def _unit(scene: _Scene, member: str) -> str:
-    return _FIELDS.get(member, "").replace("rad", scene.view.unit)
 
 
 def _periods(label: str, css: str, t: Floats, draw: str) -> list[Line]:
@@ -224,14 +226,29 @@ def _periods(label: str, css: str, t: Floats, draw: str) -> list[Line]:
 def _rate(scene: _Scene, _: str) -> list[Line]:
     """Rate in windows of half a second; none where the longest intervals are what is limited."""
     clock = scene.hand.states.clock
-    if len(clock) < 2 or "max_p99_s" in scene.need.tolerances:
-        return []
     edges = np.arange(float(clock[0]), float(clock[-1]), 0.5)
-    if len(edges) < 3:
+    if len(edges) < 3 or "max_p99_s" in scene.need.tolerances:
         return []
     counts, _edges = np.histogram(clock, edges)
     middles = np.asarray((edges[1:] + edges[:-1]) / 2)
     return [Line("rate, each half second", "state", middles, np.asarray(counts / 0.5))]
+
+
+def _samples(scene: _Scene, _: str) -> list[Line]:
+    """Single samples, which show values that are sent again."""
+    states, joint = scene.hand.states, scene.joints(scene.window())[0]
+    return [Line(_called(scene.hand, joint), "state", states.t, states.q[:, joint], "dots")]
+
+
+def _both_sides(scene: _Scene, _: str) -> list[Line]:
+    lines, joint = [], scene.joints(scene.window())[0]
+    for view in scene.view.sides.values():
+        command, state = command_and_state(view, joint)
+        mine, name = view.side is scene.hand.side, whose(view.side)
+        lines.append(Line(name, "state" if mine else "other", state.x, state.y))
+        if not mine:
+            lines.append(Line(f"command to the {name}", "cmd", command.x, command.y))
+    return lines
 
 
 def _torque(scene: _Scene, _: str) -> list[Line]:
@@ -257,37 +274,28 @@ def _member(scene: _Scene, member: str) -> list[Line]:
     """A member of the state."""
     states = scene.hand.states
     by_joint = {"dq": states.dq, "ddq": states.ddq, "tau_est": states.tau, "mode": states.mode}
-    values: Floats | None
     if member == "length":
-        values, member = np.asarray(states.length, dtype=np.float64), "motors in the sequence"
-    elif member in by_joint:
-        values = by_joint[member][:, scene.joints(scene.window(), 1)[0]]
+        length = np.asarray(states.length, dtype=np.float64)
+        return [Line("motors in the sequence", "force", states.t, length)]
+    if member in by_joint:
+        values = by_joint[member][:, [scene.joints(scene.window())[0]]]
     else:
         values = _column(scene, member)
-    if values is None:
-        return []
-    table = values.reshape(len(values), -1)[:, :_MOST_ELEMENTS]
-    return [Line(member, "force", states.t, column) for column in table.T]
+    return [Line(member, "force", states.t, column) for column in values.T[:_MOST_ELEMENTS]]
 
 
-def _column(scene: _Scene, path: str) -> Floats | None:
-    """A member of every state, or one element of it; None if the states have no such member."""
+def _column(scene: _Scene, path: str) -> Floats:
+    """A member of every state, or one element of it; a table without columns if there is none."""
     columns = scene.hand.states.columns
-    if columns is None:
-        return None
-    try:
-        return columns[path]
-    except UsageError:
-        pass
     head, _, index = path.removesuffix("]").rpartition("[")
-    try:
-        values = columns[head] if head and index.isdecimal() else None
-    except UsageError:
-        return None
-    if values is None:
-        return None
-    table = values.reshape(len(values), -1)
-    return table[:, int(index)] if int(index) < table.shape[1] else None
+    if columns is not None:
+        with suppress(UsageError):
+            values = columns[path]
+            return values.reshape(len(values), -1)
+        with suppress(UsageError, ValueError):
+            values = columns[head]
+            return values.reshape(len(values), -1)[:, int(index) :][:, :1]
+    return np.empty((0, 0))
 
 
 _INTERVALS = "time from each state to the next"
@@ -312,11 +320,21 @@ _CURVES: Mapping[PlotKind, _Curves] = {
         "ms",
         limits=_PERIODS,
     ),
+    PlotKind.SAMPLES: _Curves(
+        "each sample of the state while it moves", _samples, "position", pad=0.1, zero=False
+    ),
+    PlotKind.BOTH_SIDES: _Curves(
+        "both hands, while only the other one is to move",
+        _both_sides,
+        "position",
+        pad=0.6,
+        zero=False,
+    ),
     PlotKind.TORQUE: _Curves("torque (tau_est)", _torque, "torque", pad=0.6, limits=_TORQUES),
     PlotKind.PRESSURE: _Curves(
         "change of pressure since rest, summed over each sensor packet", _pressure, pad=0.6
     ),
-    PlotKind.MEMBER: _Curves("{member}", _member, "member", pad=0.3),
+    PlotKind.MEMBER: _Curves("{name}", _member, "member", pad=0.3),
 }
 
 
@@ -357,136 +375,63 @@ def _busy(view: Recording, span: Span) -> list[Band]:
 
 
 def command_and_state(hand: SideView, joint: int) -> list[Line]:
-    """Two curves of a joint: commanded and reported position."""
-    commands, states = hand.commands, hand.states
+    """Two curves of a joint: commanded and reported position.
+
+    Commands far outside the joint's range, which would flatten the rest, are cut off.
+    """
+    commands, states, spec = hand.commands, hand.states, hand.joints[joint]
+    margin = 0.1 * spec.stroke
+    sent = np.asarray(np.clip(commands.q[:, joint], spec.q_min - margin, spec.q_max + margin))
     return [
-        Line("command", "cmd", commands.t, _clipped(commands.q[:, joint], hand.joints[joint])),
+        Line("command", "cmd", commands.t, sent),
         Line("state", "state", states.t, states.q[:, joint]),
     ]
-
-
-def _clipped(values: Floats, joint: JointSpec) -> Floats:
-    """``values`` limited to the joint's range and a tenth of it: commands far outside would flatten
-    the rest of the plot.
-    """
-    margin = 0.1 * joint.stroke
-    return np.asarray(np.clip(values, joint.q_min - margin, joint.q_max + margin))
 
 
 def _called(hand: SideView, joint: int) -> str:
     return "position" if len(hand.joints) == 1 else hand.joints[joint].name
 
 
-def _room(hand: SideView, joint: int, span: Span) -> list[float]:
-    """Values that make a plot at least a tenth of the stroke high, so noise does not fill it."""
+def followed(
+    view: Recording, hand: SideView, joint: int, span: Span, bands: Sequence[Band]
+) -> Chart:
+    """Command and state of a joint, and what the modelled operator wants where there is one.
+
+    The plot is at least a tenth of the stroke high, so that noise does not fill it.
+    """
     q = hand.states.q[hand.states.between(*span), joint]
     q = q[np.isfinite(q)]
-    middle = float(np.median(q)) if len(q) else 0.0
-    return [middle - 0.05 * hand.joints[joint].stroke, middle + 0.05 * hand.joints[joint].stroke]
-
-
-def _position(scene: _Scene, span: Span | None = None) -> Iterator[Chart]:
-    """Command and state about the place."""
-    hand = scene.hand
-    span = span or scene.window()
-    for joint in scene.joints(span):
-        yield Chart(
-            f"{whose(hand.side)}, {_called(hand, joint)}: command and state, "
-            f"{span[0]:.1f} to {span[1]:.1f} s",
-            command_and_state(hand, joint),
-            span,
-            scene.view.unit,
-            bands=scene.bands(span),
-            include=_room(hand, joint, span),
-            height=180,
-        )
-
-
-def _session(scene: _Scene) -> Iterator[Chart]:
-    """The whole replayed session, and the first place closer."""
-    t = scene.hand.commands.t
-    spans = [scene.span_of(p) for p in scene.view.phases("replay", scene.hand.side)]
-    span = spans[0] if spans else (float(t[0]), float(t[-1])) if len(t) else scene.window()
-    yield from _position(scene, span)
-    for a, b in scene.places[:1]:
-        if b - a < 0.5 * (span[1] - span[0]):
-            yield from _position(scene, (max(span[0], a - 1.5), min(span[1], b + 1.5)))
-
-
-def operated(view: Recording, hand: SideView, joint: int, span: Span) -> Chart:
-    """The operator's target, the client's commands, and the hand's position."""
+    middle, room = float(np.median(q)) if len(q) else 0.0, 0.05 * hand.joints[joint].stroke
     return Chart(
-        f"{whose(hand.side)}, {_called(hand, joint)}: driven by Unitree's teleoperation client",
-        [*_wish(view, hand, joint), *command_and_state(hand, joint)],
+        f"{whose(hand.side)}, {_called(hand, joint)}: command and state, "
+        f"{span[0]:.1f} to {span[1]:.1f} s",
+        [*_wish(view, hand, joint, span), *command_and_state(hand, joint)],
         span,
         view.unit,
-        bands=_busy(view, span),
-        include=_room(hand, joint, span),
-        height=190,
+        bands=bands,
+        include=(middle - room, middle + room),
+        height=180,
     )
 
 
-def _wish(view: Recording, hand: SideView, joint: int) -> Iterator[Line]:
-    """The modelled operator's target for a joint, if there was one."""
+def _wish(view: Recording, hand: SideView, joint: int, span: Span) -> Iterator[Line]:
+    """The modelled operator's target for a joint, in a plot of that phase."""
     side = hand.side
-    phases = view.phases(OPERATOR, side)
-    if phases and isinstance(side, Side):
-        begin, end = view.seconds(phases[0].begin_ns), view.seconds(phases[0].end_ns)
-        operator = operator_of(phases[0], view.dialect)
-        t = np.asarray(np.arange(begin, end, 0.01), dtype=np.float64)
-        poses = [operator.intent(float(x) - begin, side) for x in t]
-        q = np.array([np.nan if pose is None else pose[joint] for pose in poses])
-        yield Line("where the operator wants it", "other", t, q)
+    for phase in view.phases(OPERATOR, side)[:1]:
+        begin, end = view.seconds(phase.begin_ns), view.seconds(phase.end_ns)
+        if isinstance(side, Side) and begin < span[1] and end > span[0]:
+            operator = operator_of(phase, view.dialect)
+            t = np.asarray(np.arange(begin, end, 0.01), dtype=np.float64)
+            poses = [operator.intent(float(x) - begin, side) for x in t]
+            q = np.array([np.nan if pose is None else pose[joint] for pose in poses])
+            yield Line("where the operator wants it", "other", t, q)
 
 
-def _operator(scene: _Scene) -> Iterator[Chart]:
-    span = scene.window(0.3)
+def _position(scene: _Scene) -> Iterator[Chart]:
+    """Command and state about the place."""
+    span = scene.window()
     for joint in scene.joints(span):
-        yield operated(scene.view, scene.hand, joint, span)
-
-
-def _samples(scene: _Scene) -> Iterator[Chart]:
-    """Single samples, which show values that are sent again."""
-    hand = scene.hand
-    dq = hand.states.dq[:, 0]
-    fastest = float(hand.states.t[int(np.argmax(np.abs(np.where(np.isfinite(dq), dq, 0.0))))])
-    begin, end = scene.places[0] if scene.places else (fastest, fastest)
-    span = (max(0.0, begin - 0.05), end + 0.25)
-    joint = scene.joints(span, 1)[0]
-    yield Chart(
-        f"{whose(hand.side)}, {_called(hand, joint)}: each sample of the state while it moves",
-        [Line("each state", "state", hand.states.t, hand.states.q[:, joint], "dots")],
-        span,
-        scene.view.unit,
-        bands=scene.bands(span),
-    )
-
-
-def _both_sides(scene: _Scene) -> Iterator[Chart]:
-    """Both hands, while only the other one is to move."""
-    hand = scene.hand
-    phases = [p for p in scene.view.phases(scene.need.phase or "") if hand.side not in p.sides]
-    spans = scene.places[:1] or [scene.span_of(p) for p in phases[:1]]
-    if not spans:
-        yield from _position(scene)
-        return
-    span = (max(0.0, spans[0][0] - 0.6), spans[0][1] + 0.6)
-    lines = []
-    joint = scene.joints(span)[0]
-    for view in scene.view.sides.values():
-        command, state = command_and_state(view, joint)
-        mine, name = view.side is hand.side, whose(view.side)
-        if not mine:
-            lines.append(Line(f"command to the {name}", "cmd", command.x, command.y))
-        lines.append(Line(name, "state" if mine else "other", state.x, state.y))
-    yield Chart(
-        f"both hands, {_called(hand, joint)}, while only the other one is to move",
-        lines,
-        span,
-        scene.view.unit,
-        bands=scene.bands(span),
-        include=_room(hand, joint, span),
-    )
+        yield followed(scene.view, scene.hand, joint, span, scene.bands(span))
 
 
 # ------------------------------------------------------------------------ not over the time
@@ -501,7 +446,7 @@ def _histogram(scene: _Scene) -> Iterator[Chart]:
 
 def _torque_by_position(scene: _Scene) -> Iterator[Chart]:
     hand, span = scene.hand, scene.window(0.0)
-    joint = scene.joints(span, 1)[0]
+    joint = scene.joints(span)[0]
     spec, here = hand.joints[joint], hand.states.between(*span)
     q, tau = hand.states.q[:, joint], hand.states.tau[:, joint]
     if (np.isfinite(q) & np.isfinite(tau)).sum() < 5:
@@ -534,7 +479,7 @@ def _steps(scene: _Scene) -> Iterator[Chart]:
         before = hand.states.q[hand.states.between(begin - 0.1, begin)]
         longest = max(longest, end - begin)
         guilty = any(a < end and b > begin for a, b in scene.places)
-        named = scene.joints((begin, end), 1)[0] if guilty else -1
+        named = scene.joints((begin, end))[0] if guilty else -1
         for joint, target in phase.targets.get(hand.side, {}).items():
             t, q = hand.states.t[rows], hand.states.q[rows, joint]
             if len(t) < 2 or not np.isfinite(q).any():
@@ -565,20 +510,15 @@ def _steps(scene: _Scene) -> Iterator[Chart]:
             for name, size in half.items()
             if name in limits
         ],
-        levels=_levels(scene.need, (_OVERSHOOT,)),
+        levels=_levels(scene.need, _OVERSHOOT),
         include=(0.0,),
         height=230,
     )
 
 
-_OVERSHOOT = _Limit("max_overshoot_stroke", "overshoot allowed", lambda part: 100 * part)
 _OTHERS: Mapping[PlotKind, Callable[[_Scene], Iterator[Chart]]] = {
     PlotKind.POSITION: _position,
-    PlotKind.BOTH_SIDES: _both_sides,
     PlotKind.STEPS: _steps,
-    PlotKind.SESSION: _session,
-    PlotKind.OPERATOR: _operator,
-    PlotKind.SAMPLES: _samples,
     PlotKind.INTERVAL_HISTOGRAM: _histogram,
     PlotKind.TORQUE_BY_POSITION: _torque_by_position,
 }

@@ -12,7 +12,7 @@ from dexkit.conformance.kit.recording import Recording, SideView
 from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.report.charts import Band, Chart, Level, Line, histogram
 from dexkit.conformance.report.labels import whose
-from dexkit.conformance.report.result_plots import command_and_state, operated, phase_bands
+from dexkit.conformance.report.result_plots import command_and_state, followed, phase_bands
 from dexkit.hand import JointSpec
 
 __all__ = ["run_plots"]
@@ -124,7 +124,7 @@ def _operator(view: Recording, hand: SideView) -> Iterator[Chart]:
         sent = hand.commands.q[(hand.commands.t >= begin) & (hand.commands.t <= end)]
         if len(sent) > 1:
             moved = np.ptp(np.where(np.isfinite(sent), sent, 0.0), axis=0)
-            yield operated(view, hand, int(np.argmax(moved)), (begin, end))
+            yield followed(view, hand, int(np.argmax(moved)), (begin, end), ())
 
 
 def _timing(view: Recording, hand: SideView) -> Iterator[Chart]:
