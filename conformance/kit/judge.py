@@ -21,6 +21,7 @@ from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.kit.results import Result, RunResult, Stage
 from dexkit.conformance.kit.run_record import recorded_subject
 from dexkit.conformance.kit.stimulus_record import CALIBRATION_TOPIC
+from dexkit.conformance.kit.stories import stories_of
 from dexkit.conformance.kit.verdicts import Judgement, excuse
 from dexkit.conformance.layers import ContextT, Layer, RecordingT, ViewT, layer
 from dexkit.hand import Side, Subject
@@ -57,7 +58,9 @@ def judge(
         "sides": ", ".join(str(s) for s in recording.judged),
     }
     when = datetime.fromtimestamp(recording.origin_ns / 1e9, tz=timezone.utc)
+    stories = stories_of(recording, chosen, lambda part, names: results_of(part, claims, names)[1])
     return RunResult(
+        stories=stories,
         subject={
             **claims.subject,
             **about,

@@ -26,6 +26,7 @@ from dexkit.conformance.kit.results import (
     Result,
     RunResult,
     Stage,
+    Story,
     Verdict,
     counts_of,
     overall_of,
@@ -165,6 +166,7 @@ class ResultFile(_Record):
         was.
     :param sentence: the verdict in one sentence.
     :param counts: requirements by verdict, sides taken together.
+    :param stories: what failed, put together; files that were written before have none.
     :param recorded_at: UTC, ISO 8601.
     :param catalogue: how many requirements there are for such a run, selected or not.
     :param client: null where the kit was the client, or nobody commanded the hands.
@@ -188,6 +190,7 @@ class ResultFile(_Record):
     notes: tuple[str, ...]
     results: tuple[ResultRecord, ...]
     client: ClientRecord | None
+    stories: tuple[Story, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("model", "dialect", "sides"):
@@ -230,6 +233,7 @@ def as_document(result: RunResult) -> dict[str, Any]:
         notes=tuple(result.notes),
         results=_records(result.results),
         client=client,
+        stories=tuple(result.stories),
     )
     found: dict[str, Any] = as_plain(record)
     return found
@@ -291,4 +295,5 @@ def parse_result(data: Any, path: object) -> RunResult:
         catalogue=file.catalogue,
         client=[from_object(each, Result) for each in file.client.results] if file.client else [],
         run=file.run,
+        stories=list(file.stories),
     )

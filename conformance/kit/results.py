@@ -43,6 +43,7 @@ __all__ = [
     "Result",
     "RunResult",
     "Stage",
+    "Story",
     "Verdict",
     "counts_of",
     "environment",
@@ -244,6 +245,24 @@ class Result:
         return Card.from_results([self]).as_text()
 
 
+class Story(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A fault, and the requirements that are not met because of it; :mod:`~.stories` tells them.
+
+    :param sentence: what was seen, with its figures.
+    :param sides: whose.
+    :param shown_by: id of the requirement whose finding it is; empty for what the states show by
+        themselves.
+    :param explains: ids of the requirements, ``shown_by`` first.
+    :param evidence: the first places in the recording.
+    """
+
+    sentence: str
+    sides: tuple[str, ...]
+    shown_by: str
+    explains: tuple[str, ...]
+    evidence: tuple[Evidence, ...]
+
+
 def environment() -> dict[str, str]:
     """Versions and machine, for the report."""
     return {
@@ -343,6 +362,7 @@ class RunResult:
     :param client: results of the requirements about the client that commands the hands, each for
         the hand of that side. They do not count in the verdict on the hands. Empty in a run of
         the kit, which is its own client.
+    :param stories: what failed, put together; empty where nothing did.
     :param run: the run record (:mod:`~.run_record`); empty where no live run was made.
     """
 
@@ -358,6 +378,7 @@ class RunResult:
     catalogue: int = 0
     client: list[Result] = field(default_factory=list)
     run: dict[str, str] = field(default_factory=dict)
+    stories: list[Story] = field(default_factory=list)
 
     @property
     def hands(self) -> tuple[Side, ...]:

@@ -1,0 +1,208 @@
+"""One bug, one story: what a run shows first, and what follows from it.
+
+One bug often fails many requirements. After all of them are judged, the failures are put together:
+
+* A fault that the states show by themselves (:mod:`~.repairs`: all-zero states, a frozen joint) is
+  taken out of the recording, and what failed is judged again. What is met then follows from it.
+* Of the other failures, the one whose check looks most closely comes first (:data:`ORDER`). What is
+  seen at the same time and joint, or is only a sum of everything, is listed under it.
+
+No verdict changes: a failure stays one, whatever it follows from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from dexkit.conformance.checks import check_of
+from dexkit.conformance.kit.recording import Recording, SideView
+from dexkit.conformance.kit.repairs import Fault, faults
+from dexkit.conformance.kit.requirements import Level
+from dexkit.conformance.kit.results import Evidence, Result, Story, Verdict
+
+__all__ = ["ORDER", "stories_of"]
+
+ORDER = (
+    *("discovery", "start_up", "fields.length", "fields.finite", "checksums", "order.order"),
+    *("freshness.fresh", "rate.rate", "freshness.alternates", "position.in_stroke"),
+    *("motion.order", "sides.independent", "sides.by_its_own", "mode_byte.locked", "gains"),
+    *("motion.direction", "motion.begins", "motion.every_command", "motion.arrives"),
+    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.monotonous"),
+    *("motion.overshoot", "motion.settling", "motion.dead_zones", "motion.ends"),
+    *("bad_commands.unchanged", "speed", "motion.speed", "sides", "watchdog.state_in_silence"),
+    *("load.load", "stillness.still", "two_clients", "order.old_stamps"),
+    *("life_cycle.restarted_client", "life_cycle.restarted_service", "watchdog.resumes"),
+    *("mode_byte", "bad_commands", "watchdog", "timeout_protection", "life_cycle", "rate"),
+    *("grip.stops_at_object", "grip.gripper_stops_at_object", "position.not_the_command"),
+    *("velocity.keeps_up", "freshness", "position", "velocity", "stillness", "force.unit"),
+    *("grip.keeps_gripping", "grip.lasts", "force", "grip", "touch", "pressure", "attitude"),
+    *("motion", "load", "motion.path", "tracking", "operator", "fields", "robot_state"),
+)
+"""Checks, by behaviour or singly, from that which looks most closely at one thing. Others last."""
+_SUMS = ("motion.path", "stillness.still", "tracking", "operator", "bad_commands.unchanged", "load")
+"""Checks that many faults fail, whichever is first."""
+_ALL_VALUES = ("freshness.fresh", "freshness.alternates", "rate.rate", "position.in_stroke")
+"""Checks of faults that spoil every later value of a position."""
+_CONTACT = ("force", "grip", "touch", "pressure")
+_FAMILIES = {
+    **dict.fromkeys(_CONTACT, "contact"),
+    **dict.fromkeys(("watchdog", "timeout_protection"), "silence"),
+    **dict.fromkeys(("bad_commands.negative_gains", "bad_commands.driven_away"), "gains"),
+}
+"""Behaviours and checks of one thing, beside those of one behaviour."""
+_ANY_STEP = ("motion", "stillness.still", "bad_commands.unchanged", "speed")
+"""Checks of motion as it always is, by any step ..."""
+_SPECIAL_STEP = (
+    *("bad_commands", "life_cycle", "watchdog", "two_clients", "order", "sides"),
+    *("mode_byte.own_mode", "gains.soft_commands", "gains.soft_steps"),
+)
+"""... and of steps in special circumstances, which cannot go better than any other."""
+_NEAR_S = 0.3
+"""Seconds by which places in the recording may be apart that show the same."""
+_PLACES = 5
+"""Places that a story names."""
+
+Again = Callable[[Recording, Collection[str]], Sequence[Result]]
+"""Judges a recording by the requirements of these ids."""
+
+
+def stories_of(recording: Recording, results: Iterable[Result], again: Again) -> list[Story]:
+    """The stories of a run, that which explains most first; none where nothing failed.
+
+    :param results: of all requirements about the hands.
+    """
+    failed = sorted((r for r in results if r.verdict in (Verdict.FAIL, Verdict.WARN)), key=_rank)
+    shown = _of_states(recording, failed, again) if failed else []
+    if failed and _among(_check(failed[0]), _ALL_VALUES):
+        # what spoils all values is what a part of them shows, too
+        shown = [story for story in shown if failed[0].id in story.explains]
+    explained = {name for story in shown for name in story.explains}
+    found = _of_findings([r for r in failed if r.id not in explained])
+    weight = {r.id: 2 if r.requirement.level is Level.MUST else 1 for r in failed}
+    most = max((_weight(story, weight) for story in found), default=0)
+    before = [story for story in shown if _weight(story, weight) >= most]
+    return [*before, *found, *(story for story in shown if story not in before)]
+
+
+def _weight(story: Story, weights: Mapping[str, int]) -> int:
+    return sum(weights[name] for name in story.explains)
+
+
+# --------------------------------------------------------------------------- faults of states
+
+
+def _of_states(recording: Recording, failed: Sequence[Result], again: Again) -> list[Story]:
+    """Stories of faults that the states show by themselves."""
+    kinds: dict[str, list[tuple[SideView, Fault, set[str]]]] = {}
+    for subject, view in recording.sides.items():
+        mine = {r.id for r in failed if r.side == str(subject)}
+        for fault, names in _without_faults(recording, view, mine, again):
+            kinds.setdefault(fault.kind, []).append((view, fault, names))
+    stories = []
+    for found in kinds.values():
+        met = {(name, str(view.side)) for view, _, some in found for name in some}
+        left = {r.id for r in failed if (r.id, str(r.side)) not in met}
+        explained = tuple(dict.fromkeys(r.id for r in failed if r.id not in left))
+        if explained:
+            view, fault, _ = max(found, key=lambda f: (len(f[2]), len(f[1].spans)))
+            places = tuple(
+                Evidence(view.states.topic, round(a, 4), recording.log_time(a), round(b, 4))
+                for a, b in fault.spans[:_PLACES]
+            )
+            sides = tuple(str(view.side) for view, _, _ in found)
+            stories.append(Story(fault.sentence, sides, "", explained, places))
+    return stories
+
+
+def _without_faults(
+    recording: Recording, view: SideView, failed: set[str], again: Again
+) -> Iterator[tuple[Fault, set[str]]]:
+    """The faults of one hand, and what is met without each: first that without which most is."""
+    while failed:
+        tried = []
+        for fault in faults(recording, view):
+            without = replace(view, states=fault.states, known={})
+            sides = {**recording.sides, view.side: without}
+            judged = again(replace(recording, sides=sides, judged=(view.side,)), failed)
+            met = {r.id for r in judged if r.verdict is Verdict.PASS} & failed
+            tried.append((fault, met))
+        if not any(met for _, met in tried):
+            return
+        fault, met = max(tried, key=lambda t: len(t[1]))
+        yield fault, met
+        # other faults are looked for in what is left without it
+        view, failed = replace(view, states=fault.states, known={}), failed - met
+
+
+# ------------------------------------------------------------------------------ other findings
+
+
+def _of_findings(failed: Sequence[Result]) -> list[Story]:
+    """Stories of what the checks found, in the order of :data:`ORDER`."""
+    groups: dict[str, list[Result]] = {}
+    for result in sorted(failed, key=_rank):
+        groups.setdefault(result.id, []).append(result)
+    stories = []
+    while groups:
+        root = groups.pop(next(iter(groups)))
+        under = [name for name, group in groups.items() if _follows(group, root)]
+        for name in under:
+            del groups[name]
+        shown = root[0]
+        stories.append(
+            Story(
+                shown.observed or shown.requirement.title,
+                tuple(r.side for r in root),
+                shown.id,
+                (shown.id, *under),
+                shown.evidence,
+            )
+        )
+    return stories
+
+
+def _check(result: Result) -> tuple[str, str]:
+    """The behaviour that the check of a result belongs to, and the check's full name."""
+    check = check_of(result.requirement)
+    behaviour = check.__module__.rpartition(".")[2]
+    return behaviour, f"{behaviour}.{check.__name__}"
+
+
+def _rank(result: Result) -> tuple[int, bool]:
+    behaviour, name = _check(result)
+    at = next((ORDER.index(n) for n in (name, behaviour) if n in ORDER), len(ORDER))
+    return at, result.verdict is not Verdict.FAIL
+
+
+def _follows(group: Sequence[Result], root: Sequence[Result]) -> bool:
+    """Whether what a requirement shows is what another one shows more closely."""
+    it, of = _check(group[0]), _check(root[0])
+    general = (
+        _family(it) == _family(of)
+        or _among(it, _SUMS)
+        or (_among(of, _ANY_STEP) and _among(it, _SPECIAL_STEP))
+        or (_among(of, _ALL_VALUES) and it[0] not in _CONTACT)
+    )
+    return any(a.side == b.side and (general or _at_once(a, b)) for a in group for b in root)
+
+
+def _among(check: tuple[str, str], names: Sequence[str]) -> bool:
+    return check[0] in names or check[1] in names
+
+
+def _family(check: tuple[str, str]) -> str:
+    behaviour, name = check
+    return _FAMILIES.get(name) or _FAMILIES.get(behaviour) or behaviour
+
+
+def _at_once(one: Result, other: Result) -> bool:
+    return any(
+        a.time_s - _NEAR_S <= _end(b) and b.time_s - _NEAR_S <= _end(a)
+        for a in one.evidence
+        for b in other.evidence
+    )
+
+
+def _end(place: Evidence) -> float:
+    return place.time_s if place.end_s is None else place.end_s
