@@ -101,7 +101,7 @@ class Outcome:
     """Result of a check.
 
     :param met: whether the requirement is met; None when it could not be judged.
-    :param cause: the likely cause, where the check can determine it; else the requirement's.
+    :param cause: the cause, where the check can determine it.
     :param late: the delay of a conforming hand that would cause this failure, where the check can
         determine it; else the duration of the failure.
     :param absent: nothing in the recording fills this unit: a failure if the vendor claims the

@@ -86,7 +86,7 @@ def _all_zero(view: SideView) -> Fault | None:
     """States in which q, dq and tau_est are exactly 0, between others."""
     states = view.states
     zero = ~(states.q.any(axis=1) | states.dq.any(axis=1) | states.tau.any(axis=1))
-    runs = [(a, b) for a, b in _runs(zero) if states.t[b - 1] - states.t[a] <= _AWAY_S]
+    runs = [(a, b) for a, b in _runs(np.asarray(zero)) if states.t[b - 1] - states.t[a] <= _AWAY_S]
     if not runs or not states.q[~zero].any():
         return None
     what = f"q, dq and tau_est{_of(view, range(len(view.joints)))}"

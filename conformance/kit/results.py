@@ -179,7 +179,7 @@ class Result:
     :param observed: what was seen, in words.
     :param reason: why it was not judged, or empty.
     :param values: measured figures by name.
-    :param cause: the likely cause of a failure.
+    :param cause: the cause of a failure, where its check could determine it.
     :param blocked_by: id of the requirement that failed first, or empty.
     :param joints: indices of the joints that the finding is about; empty if it is about none in
         particular.

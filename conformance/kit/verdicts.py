@@ -190,7 +190,6 @@ class Judgement:
         measure: Measure | None = None,
     ) -> Result:
         """The result of that verdict."""
-        cause = outcome.cause or self.requirement.cause
         return Result(
             requirement=self.requirement,
             side=str(self.subject),
@@ -200,7 +199,7 @@ class Judgement:
             reason=outcome.reason,
             evidence=outcome.evidence[:MOST_PLACES],
             values={name: float(value) for name, value in outcome.values.items()},
-            cause=cause if verdict in (Verdict.FAIL, Verdict.WARN) else "",
+            cause=outcome.cause if verdict in (Verdict.FAIL, Verdict.WARN) else "",
             blocked_by=blocked_by,
             joints=outcome.joints,
             disturbance=disturbance,

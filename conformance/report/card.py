@@ -12,10 +12,28 @@ from dataclasses import dataclass
 from enum import Enum
 
 from dexkit.conformance.kit.requirements import Kind, Requirement
-from dexkit.conformance.kit.results import Evidence, Result, RunResult, Verdict, grouped, worst
+from dexkit.conformance.kit.results import (
+    Evidence,
+    Result,
+    RunResult,
+    Story,
+    Verdict,
+    grouped,
+    worst,
+)
 from dexkit.escaping import REMARK, one_line
 
-__all__ = ["Blocked", "Card", "Fact", "Item", "blocked_groups", "cards", "near_limits"]
+__all__ = [
+    "Blocked",
+    "Card",
+    "Fact",
+    "Item",
+    "Told",
+    "blocked_groups",
+    "cards",
+    "near_limits",
+    "told",
+]
 
 
 class Item(str, Enum):
@@ -29,6 +47,7 @@ class Item(str, Enum):
     REASON = "reason"
     WHERE = "where"
     CAUSE = "cause"
+    USUALLY = "usually"
     TRY = "try"
     SOURCE = "source"
 
@@ -40,7 +59,7 @@ class Item(str, Enum):
         """Its label on a page, of up to two words."""
         labels = {
             Item.ORIGINAL: "the original",
-            Item.CAUSE: "likely cause",
+            Item.USUALLY: "usual cause",
             Item.TRY: "what to try",
         }
         return labels.get(self, self.value)
@@ -98,12 +117,18 @@ class Card:
 
     @property
     def causes(self) -> list[tuple[str, str]]:
-        """(sides, likely cause), one entry for each cause."""
+        """(sides, cause), one entry for each cause that a check determined."""
         found: dict[str, list[str]] = {}
         for result in self.results:
             if result.cause:
                 found.setdefault(result.cause, []).append(result.side)
         return [(", ".join(sides), cause) for cause, sides in found.items()]
+
+    @property
+    def figures(self) -> str:
+        """What was measured where it is not met, in a few characters."""
+        shown = [r.figure for r in self.results if r.verdict is self.verdict and r.figure]
+        return ", ".join(dict.fromkeys(shown))
 
     @property
     def source(self) -> str:
@@ -124,6 +149,8 @@ class Card:
         causes = self.causes
         for sides, cause in causes:
             yield Fact(Item.CAUSE, cause, sides if len(causes) > 1 else "")
+        if self.verdict in (Verdict.FAIL, Verdict.WARN) and not causes and need.cause:
+            yield Fact(Item.USUALLY, need.cause)
         if any(r.retry for r in self.results):
             yield Fact(Item.TRY, "Run it again on a machine that does nothing else.")
         blocked_by_load = any(
@@ -163,19 +190,59 @@ def _described(place: Evidence) -> str:
 
 def cards(result: RunResult, verdicts: Sequence[Verdict]) -> list[Card]:
     """A card for each requirement with one of ``verdicts`` that no other requirement blocked, about
-    the hands or their client.
+    the hands or their client. What follows from another failure has none: :func:`told` lists it.
 
     In the order of ``verdicts``; among equals, the one that blocks most others comes first.
     """
+    follow = {name for story in result.stories for name in story.explains} - {
+        story.shown_by for story in result.stories
+    }
     blocks = Counter(r.blocked_by for r in result.results)
     found = [
         Card.from_results(group)
         for _, every in [*result.by_requirement(), *grouped(result.client)]
         if (group := [r for r in every if r.verdict in verdicts and not r.blocked_by])
+        and group[0].id not in follow
     ]
     return sorted(
         found, key=lambda card: (verdicts.index(card.verdict), -blocks[card.requirement.id])
     )
+
+
+@dataclass(frozen=True)
+class Told:
+    """A story with the cards of what it explains.
+
+    :param own: the card of the requirement that shows it; None for what the states show.
+    :param also: the cards of the requirements that are not met because of it, too.
+    """
+
+    story: Story
+    own: Card | None
+    also: tuple[Card, ...]
+
+    @property
+    def whose(self) -> str:
+        """Sides, requirement and first place, in brackets behind the sentence."""
+        parts = [" and ".join(self.story.sides)]
+        if self.own is not None:
+            parts.append(self.own.requirement.id)
+        if self.story.evidence:
+            parts.append(f"first at {self.story.evidence[0].time_s:.2f} s")
+        return ", ".join(parts)
+
+
+def told(result: RunResult) -> list[Told]:
+    """The stories of a run, that which explains most first."""
+    of = {need.id: Card.from_results(group) for need, group in result.by_requirement()}
+    return [
+        Told(
+            story,
+            of.get(story.shown_by),
+            tuple(of[name] for name in story.explains if name in of and name != story.shown_by),
+        )
+        for story in result.stories
+    ]
 
 
 def near_limits(result: RunResult) -> list[str]:

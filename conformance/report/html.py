@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 from markupsafe import Markup
 
 from dexkit.conformance.behaviours.operator import OPERATOR
+from dexkit.conformance.kit.plots import Plot, PlotKind
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.requirements import CAPABILITIES, Kind
 from dexkit.conformance.kit.results import (
@@ -28,7 +30,7 @@ from dexkit.conformance.kit.results import (
     overall_of,
     worst,
 )
-from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits
+from dexkit.conformance.report.card import Card, Told, blocked_groups, cards, near_limits, told
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -122,7 +124,13 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         facts=_facts(result),
         areas=(areas := _areas(result)),
         most=max((sum(n for _, n in counts) for counts in areas.values()), default=0),
-        # the cards
+        # what is wrong
+        stories=[(each, _shown(each, view)) for each in told(result)],
+        follows={
+            card.requirement.id: number
+            for number, each in enumerate(told(result), 1)
+            for card in each.also
+        },
         cards=list(_with_plots(troubles, view)),
         blocked=[group for group in blocked_groups(result.results) if group.before],
         trouble=_TROUBLES.get(
@@ -143,7 +151,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         ],
         anchor=_anchor,
         card_of=Card.from_results,
-        has_card=lambda group: any(r.verdict in _TROUBLE and not r.blocked_by for r in group),
+        has_card=lambda group: any(r.id == group[0].id for card in troubles for r in card.results),
         quantity=quantity,
         utc_date=utc_date,
         whose=whose,
@@ -229,6 +237,15 @@ def _with_plots(
             elif view is not None:
                 figures.append(None)
         yield card, figures
+
+
+def _shown(each: Told, view: Recording | None) -> list[Markup]:
+    """A plot of what the states show by themselves; a finding's are on its card."""
+    if view is None or each.own is not None or not each.story.evidence:
+        return []
+    of_side = next(r for r in each.also[0].results if r.side in each.story.sides)
+    samples = (Plot(PlotKind.SAMPLES),)
+    return plots_of(replace(of_side, evidence=each.story.evidence[:1], plots=samples), view)
 
 
 def _operator(result: RunResult) -> list[tuple[str, str]]:

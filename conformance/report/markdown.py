@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Result, RunResult, Verdict, grouped, worst
-from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards, near_limits
+from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards, near_limits, told
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -82,6 +82,7 @@ def render_markdown(result: RunResult) -> str:
         lines.append(f"- test machine: {harness}")
     lines += ["", plain(catch_sentence(result))]
     lines += ["", *_areas(result), ""]
+    lines += _stories(result)
     lines += _troubles(result)
     lines += _folded("Every requirement", _every(result.results)) if result.results else []
     if result.client:
@@ -104,6 +105,16 @@ def _areas(result: RunResult) -> list[str]:
         for area, verdicts in groups.items()
     ]
     return table(["area", *(VERDICTS[v].text for v in shown)], rows) if groups else []
+
+
+def _stories(result: RunResult) -> list[str]:
+    lines = []
+    for number, each in enumerate(told(result)[:MOST_CARDS], 1):
+        lines.append(f"{number}. **{plain(each.story.sentence)}** ({plain(each.whose)})")
+        if each.also:
+            names = ", ".join(code(card.requirement.id) for card in each.also)
+            lines.append(f"   also seen because of it: {names}")
+    return ["### What is wrong", "", *lines, ""] if lines else []
 
 
 def _troubles(result: RunResult) -> list[str]:

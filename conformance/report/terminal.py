@@ -11,7 +11,7 @@ from rich.text import Text
 
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Overall, Result, RunResult, Verdict, grouped, worst
-from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits
+from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits, told
 from dexkit.conformance.report.labels import about_harness, catch_sentence
 from dexkit.console import Console
 from dexkit.console import markup as escape
@@ -36,7 +36,8 @@ _STYLE = {Overall.PASS: "green", Overall.FAIL: "red", Overall.INCONCLUSIVE: "mag
 def print_result(
     result: RunResult, console: Console, *, verbose: bool = False, more: str = ""
 ) -> None:
-    """Print the table, then the failures with advice, the two grades, and the verdict of the run.
+    """Print the table, then the failures with advice, what is wrong in a few sentences, the two
+    grades, and the verdict of the run.
 
     :param verbose: also list what could not be judged here, and why.
     :param more: where else the reasons are written.
@@ -77,6 +78,7 @@ def print_result(
         console.print(f"[dim]{escape(text)}[/dim]", highlight=False, soft_wrap=True)
     for note in result.notes:
         console.print(f"[dim]note: {escape(note)}[/dim]", highlight=False)
+    _print_stories(result, console)
     console.print()
     # one line each at any width, so that logs can be searched for them
     console.print(f"[dim]{escape(catch_sentence(result))}[/dim]", highlight=False, soft_wrap=True)
@@ -150,6 +152,22 @@ def _hung(console: Console, head: str, text: str) -> str:
         break_on_hyphens=False,
     )
     return rich.markup.escape(filled)
+
+
+def _print_stories(result: RunResult, console: Console) -> None:
+    """Print what is wrong, what explains most first, and what follows from it."""
+    stories = told(result)
+    if stories:
+        several = ", what explains most first" if len(stories) > 1 else ""
+        console.print(f"\n[bold]What is wrong{several}:[/bold]", highlight=False)
+    for number, each in enumerate(stories, 1):
+        text = _hung(console, f"{number:>3}. ", f"{each.story.sentence} ({each.whose})")
+        style = "bold red" if number == 1 and result.overall is Overall.FAIL else "default"
+        console.print(f"[{style}]{text}[/]", highlight=False, soft_wrap=True)
+        if each.also:
+            names = "; ".join(f"{c.requirement.id} {c.figures}".strip() for c in each.also)
+            text = _hung(console, "     ", f"also seen because of it: {names}")
+            console.print(f"[dim]{text}[/]", highlight=False, soft_wrap=True)
 
 
 def _print_blocked(result: RunResult, console: Console) -> None:
