@@ -351,25 +351,6 @@ def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
     assert "8.0 h" in page
 
 
-def test_the_summary_page_counts_a_file_once_and_does_not_pass_a_part() -> None:
-    summary = Summary()
-    summary.add(FileRecord("a.mcap", state=State.UNREADABLE, error="no recording"))
-    summary.add(
-        FileRecord(
-            "b.mcap",
-            state=State.JUDGED,
-            overall="pass",
-            error="damaged: cut",
-            facts={"damage": ["cut"], "truncated": True},
-        )
-    )
-    page = render(summary, locations=["archive"])
-    assert "1 unreadable" in page
-    assert "0 Inconclusive" in page  # an unreadable file is not counted again
-    assert "Pass, of its readable part" in page
-    assert page.count("white-space:nowrap") >= 2  # "unreadable" is not broken
-
-
 def test_command_writes_tables_page_and_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
@@ -417,24 +398,3 @@ def test_a_generated_archive_is_scored(tmp_path: Path) -> None:
     found = score(archive, tmp_path / "out")
     assert (found.text(), found.perfect) == (found.text(), True)
     assert (found.good, found.found) == (1, len(FAULTS))
-
-
-def test_score_lists_missed_faults_and_wrongly_failed_sessions(tmp_path: Path) -> None:
-    from tools.generate_archive import generate
-    from tools.generate_archive.score import score
-
-    archive = tmp_path / "archive"
-    answers = generate(archive, 2, 1, seconds=1, samples=["dex1_pick_place"])
-    again = generate(tmp_path / "again", 2, 1, seconds=1, samples=["dex1_pick_place"])
-    assert again == answers
-    for answer in answers:
-        twins = [(folder / answer.file).read_bytes() for folder in (archive, tmp_path / "again")]
-        assert twins[0] == twins[1]
-    for answer in answers:  # the faulty file is good, and the other way round
-        copied(archive, answer.file, "dex1_legacy_v1_1" if answer.fault else "dex1_hand_dropout")
-    audited(archive, tmp_path / "out")
-    found = score(archive, tmp_path / "out")
-    assert (found.found, len(found.missed), found.unread) == (0, 1, [])
-    assert len(found.blamed) == 1
-    assert "DEX1-RATE-03 left" in found.blamed[0]
-    assert not found.perfect

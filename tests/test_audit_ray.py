@@ -145,26 +145,6 @@ def test_a_node_is_killed_and_nothing_is_lost_or_done_twice(
 
 
 @pytest.mark.soak
-def test_stopped_audit_keeps_results_and_the_next_one_continues(
-    tmp_path: Path, two_nodes: tuple[Any, Any]
-) -> None:
-    files = archive(tmp_path / "archive")
-    stop: list[bool] = []
-
-    def after_four(outcome: AuditProgress) -> None:
-        if outcome.done == 4:
-            stop.append(True)
-
-    audit = Audit([str(files)], tmp_path / "ray", parquet=False)
-    outcome = audit.run(RayCluster(two_nodes[0].address, Limits()).run, stop, after_four)
-    assert (outcome.done, outcome.stopped) == (4, True)
-    assert len((tmp_path / "ray/files.jsonl").read_text().splitlines()) == 4
-    outcome = audit.run(RayCluster(two_nodes[0].address, Limits()).run)
-    assert (outcome.done, outcome.reused, outcome.stopped) == (FILES + 1, 4, False)
-    assert len(records(tmp_path / "ray")) == FILES + 1
-
-
-@pytest.mark.soak
 def test_file_that_exceeds_the_time_limit_becomes_a_row(
     tmp_path: Path, two_nodes: tuple[Any, Any]
 ) -> None:

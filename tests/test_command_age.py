@@ -280,7 +280,7 @@ def test_nothing_sent_before_a_pause_ends_moves_the_hand_after_it(data: st.DataO
     rate=st.floats(50.0, 500.0),
     suspended=st.booleans(),
 )
-@settings(max_examples=15)
+@settings(max_examples=6)
 def test_steady_client_is_obeyed_0_2_s_after_a_pause(
     offset: float, drift: float, latency: float, pause: float, rate: float, suspended: bool
 ) -> None:
@@ -344,7 +344,7 @@ def test_single_command_after_a_pause_is_obeyed_if_its_age_is_known() -> None:
     least=latencies,
     lags=st.lists(st.tuples(st.floats(1.0, 5.0), st.floats(0.0, 2.5)), min_size=1, max_size=4),
 )
-@settings(max_examples=15)
+@settings(max_examples=6)
 def test_late_command_is_not_obeyed(
     offset: float, drift: float, least: float, lags: list[tuple[float, float]]
 ) -> None:
@@ -368,20 +368,6 @@ def test_late_command_is_not_obeyed(
     assert program.core.counters.accepted == len(sent) - stale >= in_time
 
 
-def test_commands_over_a_slow_network_are_ignored_until_it_is_fast_again() -> None:
-    program = Program()
-    slow = stream(
-        1,
-        Source(),
-        every(0.01, 0.5, 10.0),
-        lambda i: 2.5 if 100 <= i < 600 else 0.003,  # 1.5 to 6.5 s
-    )
-    program.run(slow, 10.0)
-    assert not [t for t, _ in program.driven if 2.6 + DEX1_1.command_timeout < t < 6.5]
-    assert program.core.counters.stale >= 400
-    assert program.driven[-1][0] > 9.9
-
-
 @each("size", [-7200.0, -5.0, -0.4, -0.1, 0.1, 0.4, 5.0, 7200.0])
 def test_client_whose_clock_is_set_is_obeyed(size: float) -> None:
     program = Program()
@@ -391,30 +377,6 @@ def test_client_whose_clock_is_set_is_obeyed(size: float) -> None:
     assert max(age for t, age in ages) < SETTLE + 0.05  # for so long the last one was in force
     assert max(age for t, age in ages if t > 2.3) < 0.02
     assert not [t for t in program.braked if t > 0.6]
-
-
-def test_client_with_a_jumping_clock_is_obeyed_again() -> None:
-    jumps = tuple((1.0 + i * 0.05, 3.0 if i % 2 else -3.0) for i in range(100))
-    program = Program()
-    program.run(stream(1, Source(jumps=jumps), every(0.01, 0.2, 6.0), lambda i: 0.001), 6.0)
-    assert max(t - s.at for t, s in program.driven if t > 2.5) < 0.05
-
-
-@pytest.mark.parametrize("drift", [-0.5, 3.0], ids=["slow", "fast"])
-def test_client_with_a_drifting_clock_is_obeyed(drift: float) -> None:
-    """Timestamps in other units, for example: obeyed at least after a time that no network lags."""
-    program = Program()
-    program.run(stream(1, Source(drift=drift), every(0.1, 0.5, 40.0), lambda i: 0.001), 40.0)
-    assert max(t - s.at for t, s in program.driven if t > 38.0) < 0.13
-
-
-def test_clock_drift_is_compensated_for_hours() -> None:
-    for drift in (-DRIFT, DRIFT):
-        ages = SampleAges()
-        source = Source(5.0, drift)
-        for i in range(20_000):
-            at = i * 0.5
-            assert ages.age(1, source.stamp(at), at + 0.002) < 0.01
 
 
 class TestLongSilence:

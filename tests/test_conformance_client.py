@@ -317,10 +317,14 @@ MODES = {"dex3": ("DEX3", 1), "dex5": ("DEX5", 0)}
 """A byte for all motors that is wrong by the documents, and that some real hands move by."""
 
 
+@cache
+def session_of_good_hands(name: str) -> Recording:
+    return recording_of(run_client(ReferenceClient, dialect(name)), None, ())
+
+
 def with_mode(name: str, *, follows: bool, value: int) -> RunResult:
     """A session of good hands whose client sends one mode byte to every motor."""
-    trace = run_client(ReferenceClient, dialect(name))
-    recording = recording_of(trace, None, ())
+    recording = session_of_good_hands(name)
     sides = {}
     for side, view in recording.sides.items():
         states, commands = view.states, view.commands

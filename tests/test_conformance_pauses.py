@@ -41,6 +41,7 @@ def without(trace: MemoryTrace, commands: str, at: float) -> MemoryTrace:
     return replace(trace, rows=rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "places"),
     [

@@ -9,7 +9,6 @@ from dexkit.conformance.faults import plan_for, run_mutant
 from dexkit.conformance.faults.any_model import WaitsForRest
 from dexkit.conformance.faults.gripper import Slow
 from dexkit.conformance.faults.registry import mix
-from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import Verdict
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.hand import Side
@@ -44,17 +43,6 @@ def test_a_gripper_that_is_as_fast_as_required_follows_a_session(top: float) -> 
     assert verdicts(service) == [Verdict.PASS] * 3
 
 
-def test_a_gripper_that_is_too_slow_is_caught_by_both() -> None:
-    service = type("TooSlow", (SlowGripper,), {"top": 2.0})
-    assert verdicts(service)[:2] == [Verdict.WARN, Verdict.FAIL]
-
-
 def test_a_slow_gripper_that_waits_for_rest_does_not_follow_a_session() -> None:
     service = mix(WaitsForRest, type("AsFastAsRequired", (SlowGripper,), {"top": 3.6}))
     assert verdicts(service)[:2] == [Verdict.PASS, Verdict.FAIL]
-
-
-def test_the_required_speed_is_stated_once() -> None:
-    by_id = {r.id: r for r in catalogue("dex1-1")}
-    for name in ("min_speed_rad_s", "min_step_stroke"):
-        assert len({by_id[i].tolerances[name] for i in JUDGED}) == 1

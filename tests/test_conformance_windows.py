@@ -6,10 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from dexkit.conformance.checks.timing import Positions
 from dexkit.conformance.kit.decoding import recording_of
 from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.motor_messages import MotorCodec
@@ -93,19 +90,3 @@ def test_four_long_intervals_in_a_second_are_no_bursts() -> None:
         times = times[(times < begin) | (times > begin + 0.06)]
     result = _result(_recorded(times.tolist()), "DEX1-RATE-05")
     assert (result.verdict, result.values["intervals"]) == (Verdict.PASS, 4)
-
-
-@given(
-    st.lists(st.integers(-40, 40), min_size=12, max_size=120),
-    st.floats(1e-5, 1e-2),
-    st.floats(0.0, 0.6),
-    st.floats(1e-6, 1e-1),
-)
-def test_encoder_found_finer_than_a_step_has_no_larger_step(
-    counts: list[int], step: float, noise: float, limit: float
-) -> None:
-    rng = np.random.default_rng(len(counts))
-    q = step * (np.cumsum(counts) + noise * rng.normal(size=len(counts)))
-    course = Positions.of(np.arange(len(q)) * 0.002, q)
-    for bound in (limit, step, 2 * step):
-        assert not course.is_finer_than(bound) or course.encoder_step(0.03) <= bound

@@ -18,7 +18,7 @@ from dexkit.conformance.kit.result_file import write_json
 from dexkit.conformance.report.curves import page, recorded
 from dexkit.digests import sha256_of_file
 from dexkit.messages import message_type
-from dexkit.sparkline import ASCII, resampled, sparkline
+from dexkit.sparkline import ASCII, sparkline
 from dexkit.traces import Recorder, Trace, open_trace
 from tests.watch_helpers import COMMAND, STATE, dex3_command, dex3_state, ns
 
@@ -27,14 +27,6 @@ def test_sparkline_shows_values_on_their_scale() -> None:
     values = np.array([0.0, 0.5, 1.0, np.nan, 2.0, -1.0])
     assert sparkline(values, 0.0, 1.0, ASCII) == "_+@ @_"
     assert sparkline(np.array([3.0]), 3.0, 3.0, ASCII) == "_"
-
-
-def test_resampling_takes_means_and_leaves_gaps() -> None:
-    t = np.array([0.0, 0.1, 1.5, 1.6, 4.0, 9.0])
-    found = resampled(t, np.array([1.0, 3.0, 5.0, np.nan, 7.0, 9.0]), 4, 0.0, 4.0)
-    assert found.tolist()[:2] == [2.0, 5.0]
-    assert np.isnan(found[2])
-    assert found[3] == 7.0
 
 
 def trace_of(path: Path, shift: float, reach: float) -> Trace:
@@ -138,11 +130,6 @@ def test_diff_of_recordings_years_apart_draws_each_on_its_own_time(
     )
     assert "no joint could be compared" in result.output
     assert out.stat().st_size < 1_000_000
-
-
-def test_compare_of_recordings_names_diff(traces: tuple[Trace, Trace]) -> None:
-    result = CliRunner().invoke(cli, ["compare", *(str(t.path) for t in traces)])
-    assert "is a recording, not a result" in str(result.exception)
 
 
 def test_compare_draws_recordings_that_were_judged(

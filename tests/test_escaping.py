@@ -170,9 +170,8 @@ def test_recording_with_escape_sequences_prints_none(
         ["replay", path],
         ["publish", path],
         ["publish", path, "--topic", f"/{NASTY[:40]}"],
-        ["check", path],
         ["check", path, "-v", "--dialect", "unitree_go", "--side", "both"],
-        *(["check", path, "--dialect", d, "-v"] for d in ("unitree_hg", "dex3", "g1")),
+        ["check", path, "-v", "--dialect", "g1"],
         ["teleop", path],
     ):
         code, out, err = hostile.run_command(arguments)

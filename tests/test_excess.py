@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dexkit.conformance.behaviours.tracking import _best_delay
 from dexkit.conformance.kit.excess import Course, Excess
 from dexkit.conformance.kit.row_selection import SomeTimes, Times
 from dexkit.hand import Floats
@@ -82,15 +81,6 @@ def test_the_largest_excess_is_that_of_all_windows(kind: str) -> None:
         assert rough.worst(seconds, -np.inf) == rough.worst(seconds, wanted.rad) == wanted
 
 
-def test_a_course_of_few_or_rare_measurements_has_its_windows() -> None:
-    slow = a_course("slow", 1)
-    assert slow.worst(1.0, -np.inf) is None  # each step is longer than it may be
-    two = SomeTimes(Times(np.array([0.0, 0.01])), np.arange(2))
-    nothing = np.zeros(2)
-    course = Course(two, nothing, nothing, nothing, lag=LAG, part=PART, longest=1.0, barred=[])
-    assert course.worst(0.05, -np.inf) is None
-
-
 def delayed(kind: str) -> tuple[Floats, Floats]:
     rng = np.random.default_rng(3)
     asked = np.cumsum(rng.normal(size=9100)) / 30
@@ -101,15 +91,3 @@ def delayed(kind: str) -> tuple[Floats, Floats]:
         "constant": (np.zeros(9000), np.zeros(9100)),
         "huge": (seen * 1e200, asked * 1e200),
     }[kind]
-
-
-@pytest.mark.parametrize("kind", ["delayed", "still", "constant", "huge"])
-@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
-def test_best_delay_equals_that_of_a_search_over_all_delays(kind: str) -> None:
-    seen, asked = delayed(kind)
-    for free in (np.ones(9000, np.bool_), np.arange(9000) % 7 > 1):
-        here = np.where(free, seen, 0.0)
-        errors = [float(((here - asked[100 - k : 9100 - k])[free] ** 2).sum()) for k in range(101)]
-        same = min(errors) + 1e-9 * float((here**2).sum())
-        wanted = next(k for k, error in enumerate(errors) if not error > same)
-        assert _best_delay(here, asked, free) == wanted

@@ -1,4 +1,4 @@
-"""Test the tactile areas of Inspire's FTP hands, and what the doctor says of these hands."""
+"""Test the tactile areas of Inspire's FTP hands."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from dexkit.conformance.faults import plan_for
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.virtual.inspire import FtpService
 from dexkit.conformance.virtual.topic_run import run_virtual
-from dexkit.doctor.observations import DomainView, Endpoint, Observations, Participant, Stream
-from dexkit.doctor.rules import diagnose
 from dexkit.emulators.sim_inspire import SimInspireFtp
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, Side
 from dexkit.messages import message_type
 from dexkit.messages.inspire import inspire_hand_touch
 from dexkit.messages.integer_lists import IntegerLists
-from dexkit.models import INSPIRE_FTP, Dialect, dialect
+from dexkit.models import INSPIRE_FTP, dialect
 from dexkit.monitor.bars import UNICODE
 from dexkit.monitor.json_lines import json_line
 from dexkit.monitor.screen import hand_lines
@@ -36,7 +34,6 @@ from dexkit.traces.watched import feed
 from dexkit.view.html_tables import hand_table
 from dexkit.watch import Collector, Picture, SubjectView
 from dexkit.watch.fields import parts_of
-from tests.each import each
 from tests.service_helpers import FakeNode, wait_until
 
 FTP = dialect("inspire_ftp")
@@ -199,89 +196,3 @@ def test_viewers_show_the_most_that_each_finger_counts() -> None:
     assert "index 812 · thumb 0" in hand_table(view, "right")
     shown = json.loads(json_line(Picture(0.1, (), (view,)), (), 0))["subjects"][0]["touch"]
     assert dict(zip([a.place for a in FTP.areas], shown, strict=True))["index top"] == 812
-
-
-# ----------------------------------------------------------------------------------------- doctor
-
-
-def ends(spoken: Dialect, who: str, *, hand: bool) -> list[Endpoint]:
-    """The endpoints of a hand, or of its client."""
-    found = {}
-    for side in Side:
-        cmd, state = spoken.topics(side)
-        for topic, kind, writes in (
-            (cmd, spoken.cmd_type, not hand),
-            (state, spoken.state_type, hand),
-        ):
-            key = f"{who} {topic}"
-            found[key] = Endpoint(topic, kind, "writer" if writes else "reader", key, who)
-    return list(found.values())
-
-
-def found_in(*endpoints: Endpoint, streams: tuple[Stream, ...] = ()) -> dict[str, str]:
-    people = tuple(
-        Participant(key, version="0.10.5", process=f"{key}.py") for key in ("hand", "client")
-    )
-    flowing = streams or tuple(
-        Stream(e.topic, e.key, 2.0, 200, 100.0, nonzero=True)
-        for e in endpoints
-        if e.kind == "writer"
-    )
-    view = DomainView(1, people, endpoints, flowing)
-    return {f.id: f"{f.seen} | {f.fix}" for f in diagnose(Observations((view,)))}
-
-
-@each(
-    ("served", "asked", "option"),
-    [
-        ("inspire_ftp", "inspire_dfx", "inspire_ftp"),
-        ("inspire_dfx", "inspire_ftp", "inspire_dfx"),
-        ("brainco", "inspire_ftp", "brainco"),
-        ("inspire_ftp", "dex3", "inspire_ftp"),
-    ],
-)
-def test_doctor_reports_a_hand_of_another_model(served: str, asked: str, option: str) -> None:
-    found = found_in(
-        *ends(dialect(served), "hand", hand=True), *ends(dialect(asked), "client", hand=False)
-    )
-    assert f"--ee={option})" in found["DDS-OTHER-HAND"]
-    assert dialect(served).topics(LEFT)[1] in found["DDS-OTHER-HAND"]
-    assert not {"DDS-UNPUBLISHED", "DDS-NOBODY", "DDS-OTHER-STACK"} & set(found)
-
-
-def test_doctor_reports_no_finding_for_a_matching_client() -> None:
-    spoken = ends(FTP, "hand", hand=True), ends(FTP, "client", hand=False)
-    assert not found_in(*spoken[0], *spoken[1])
-    # a client of each: the hand that is missing is not taken for the one that is there
-    both = found_in(*spoken[0], *spoken[1], *ends(dialect("inspire_dfx"), "client", hand=False))
-    assert "DDS-OTHER-HAND" not in both
-    assert "rt/inspire/state" in both["DDS-UNPUBLISHED"]
-
-
-@each(
-    ("state", "expected"),
-    [
-        # each from right to left, as both are commanded from 0.9 to 0.1 and from 0.3 to 0.7
-        ((0.9, 0.3, 0.1, 0.7), set()),
-        ((0.1, 0.7, 0.9, 0.3), {"DDS-REVERSED"}),
-        ((0.3, 0.9, 0.7, 0.1), {"DDS-SIDES-SWAPPED"}),
-    ],
-)
-def test_doctor_sees_swapped_sides_and_a_reversed_scale(
-    state: tuple[float, float, float, float], expected: set[str]
-) -> None:
-    every = [*ends(FTP, "hand", hand=True), *ends(FTP, "client", hand=False)]
-    values = {"state": state, "ctrl": (0.9, 0.3, 0.1, 0.7)}
-    streams = []
-    for end in every:
-        if end.kind != "writer":
-            continue
-        right, left, now_right, now_left = values[end.topic.split("/")[2]]
-        began, q = (right, now_right) if end.topic.endswith("/r") else (left, now_left)
-        streams.append(
-            Stream(
-                end.topic, end.key, 2.0, 200, 100.0, q=(q,) * N, began=(began,) * N, nonzero=True
-            )
-        )
-    found = found_in(*every, streams=tuple(streams))
-    assert set(found) & {"DDS-REVERSED", "DDS-SIDES-SWAPPED"} == expected

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 from dexkit.conformance.checks import REGISTRY, check_of
 from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.layers import LAYERS, layer
-from dexkit.models import BUILT_IN
-from dexkit.robots import ROBOTS
-
-GLOSSARY = Path(__file__).parent.parent / "docs" / "glossary.md"
 
 
 def test_every_layer_is_complete() -> None:
@@ -50,9 +44,3 @@ def test_requirements_are_read_without_checks() -> None:
     parts = ("checks", "recording", "stimuli", "virtual", "faults", "usb")
     unwanted = [m for m in loaded if m.split(".")[2] in parts]
     assert not unwanted
-
-
-def test_glossary_names_every_layer_and_model() -> None:
-    rows = dict(re.findall(r"^\| ([a-z ]+) \| (.*?) \|", GLOSSARY.read_text(), re.MULTILINE))
-    assert re.findall(r"`([a-z]+)` \(", rows["layer"]) == list(LAYERS)
-    assert re.findall(r"`([a-z0-9-]+)`", rows["model"]) == [*(m.name for m in BUILT_IN), *ROBOTS]

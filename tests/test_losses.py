@@ -18,10 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode, Writer
-from dexkit.messages import message_type
 from dexkit.socket_losses import ReceiveBuffers
 from dexkit.traces import Recorder, open_trace
-from dexkit.traces.dds_recording import DdsRecording, _tick_of
+from dexkit.traces.dds_recording import DdsRecording
 from dexkit.traces.losses import PAUSE, Losses
 from tests.dds_helpers import free_domain, wait_until
 from tests.each import each
@@ -128,17 +127,6 @@ def test_loss_that_dds_reports_is_a_loss() -> None:
     assert not losses.update(1.0, 0, {}, {"rt/a/state": 3})
 
 
-@each("name", ["unitree_go::msg::dds_::LowState_", "unitree_hg::msg::dds_::LowState_"])
-def test_clock_in_a_message_is_read_from_its_bytes(name: str) -> None:
-    kind = message_type(name)
-    message = kind.cls()
-    message.tick = 123_456
-    data = kind.encode(message)
-    assert _tick_of(name)(data) == 123_456 * MS
-    assert _tick_of(name)(data[:10]) == 0
-    assert _tick_of(STATE_TYPE)(state(1.0)) == 0
-
-
 def test_gaps_of_a_writer_are_in_the_file_and_in_the_status(tmp_path: Path) -> None:
     """The time at which a sample is written is given, so that a busy machine changes nothing."""
     path = tmp_path / "a.mcap"
@@ -150,21 +138,6 @@ def test_gaps_of_a_writer_are_in_the_file_and_in_the_status(tmp_path: Path) -> N
     about = open_trace(path).metadata["dexkit_recorder"]
     assert about["missing about"] == "40"
     assert about[f"gaps {STATE}"] == "1, about 40 samples, longest 0.082 s"
-
-
-def test_pauses_are_reported_with_their_time() -> None:
-    losses = Losses()
-    assert losses.note_loop(10.0, T0) is None
-    assert losses.note_loop(10.0 + PAUSE - 0.01, T0) is None
-    pause = losses.note_loop(13.5, T0)
-    assert pause is not None
-    assert "did not run for 3.0 s from 2026-11-21 08:57:05 UTC" in str(pause)
-    assert not losses  # a pause in which nothing was lost
-    for n in range(100):
-        losses.note_loop(20.0 + n, T0)
-    assert losses.paused == 101
-    assert len(losses.describe()) == 21
-    assert losses.metadata()["pauses"].endswith("101 in all")
 
 
 # -- a reader that is full -------------------------------------------------------------------------

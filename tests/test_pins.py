@@ -131,9 +131,7 @@ def test_a_digest_has_what_is_named_and_nothing_else(
 # ------------------------------------------------------------------------------------- keys
 
 EDITS = [
-    # what plays: the stimulus, the reference, the player, the facts of the model, the codec
-    ("dexkit/conformance/stimuli/fingers.py", "0.5", "0.51", True, None),
-    ("dexkit/conformance/stimuli/script.py", "3_000_000_000", "3_100_000_000", True, None),
+    # a phase, a check beside a phase, a check, the facts of the model, a rule of all verdicts
     (
         "dexkit/conformance/behaviours/motion.py",
         "(joints, CLOSED)",
@@ -142,19 +140,6 @@ EDITS = [
         None,
     ),
     ("dexkit/conformance/behaviours/load.py", "count = 40", "count = 41", False, None),
-    ("dexkit/conformance/virtual/fingers.py", "- 0.03", "- 0.04", True, None),
-    ("dexkit/conformance/virtual/topic_run.py", "_STARTS_S = 2.0", "_STARTS_S = 2.1", True, None),
-    ("dexkit/conformance/virtual/service.py", "self.now += dt", "self.now += 2 * dt", True, None),
-    ("dexkit/models/dex3.py", "1.5", "1.6", True, True),
-    (
-        "dexkit/conformance/kit/motor_messages.py",
-        "class MotorCodec:",
-        "class MotorCodec(object):",
-        True,
-        True,
-    ),
-    ("dexkit/messages/codec.py", "import struct", "import struct, math", True, True),
-    # what judges
     (
         "dexkit/conformance/behaviours/fields.py",
         "return c.passed",
@@ -162,17 +147,10 @@ EDITS = [
         False,
         None,
     ),
-    ("dexkit/conformance/checks/__init__.py", "ROUNDING = 1e-3", "ROUNDING = 2e-3", False, None),
+    ("dexkit/models/dex3.py", "1.5", "1.6", True, True),
     ("dexkit/conformance/kit/verdicts.py", "LARGER = 4.0", "LARGER = 5.0", False, True),
-    ("dexkit/conformance/kit/judge.py", "1e6", "1e7", False, True),
-    ("dexkit/conformance/kit/recording.py", "_SOME = 50", "_SOME = 51", False, True),
-    ("dexkit/conformance/layers/hand.py", "_SILENT = 0.5", "_SILENT = 0.6", False, True),
-    ("dexkit/conformance/kit/measurement_error.py", "class Measure", "class Measure_", False, True),
-    ("dexkit/traces/reader.py", "1024", "1025", None, True),
     # neither
-    ("dexkit/conformance/report/html.py", "import html", "import html, math", False, False),
     ("dexkit/conformance/faults/robot.py", "class ", "class X", False, False),
-    ("dexkit/dds/node.py", "import threading", "import threading, math", False, False),
 ]
 
 
@@ -220,11 +198,9 @@ def test_a_changed_check_is_judged_anew_and_no_other() -> None:
     assert len(changed) < len(places)
 
 
-@each("kind", ["class", "def"])
-def test_a_changed_wrong_hand_is_played_anew_and_no_other(kind: str) -> None:
+def test_a_changed_wrong_hand_is_played_anew_and_no_other() -> None:
     given = [m for m in mutants("dds") if m.model == "dex1-1"]
-    name = {"class": "BrakesEarly", "def": "NoDeadZones"}[kind]
-    (chosen,) = (m for m in given if m.name == name)
+    (chosen,) = (m for m in given if m.name == "BrakesEarly")
     module = next(c.__module__ for c in chosen.made.__mro__ if ".faults." in c.__module__)
     name = str(sys.modules[module].__file__).removeprefix(f"{ROOT}/")
     first = "from __future__ import annotations\n"
@@ -232,7 +208,7 @@ def test_a_changed_wrong_hand_is_played_anew_and_no_other(kind: str) -> None:
     keys = [(m, played_by(m)) for m in given]
     added = {m.name for m, p in keys if sources().digest(p) != after.digest(p)}
     assert not added  # a wrong hand beside it
-    (head,) = re.findall(rf"{kind} {chosen.name}\(.*?:\n", (ROOT / name).read_text())
+    (head,) = re.findall(rf"class {chosen.name}\(.*?:\n", (ROOT / name).read_text())
     after = EditedHere((name, head, f"{head}    more = 1\n"))
     without = JUDGES_ONLY
     changed = {m.name for m, p in keys if sources().digest(p, without) != after.digest(p, without)}
@@ -393,9 +369,7 @@ def task_for(folder: Path, layer_name: str = "usb", model: str = "dex3-1") -> Ta
     return task
 
 
-@pytest.mark.parametrize(
-    ("layer_name", "model"), [("usb", "dex3-1"), ("dds", "dex1-1"), ("client", "dex1-1")]
-)
+@pytest.mark.parametrize(("layer_name", "model"), [("usb", "dex3-1"), ("client", "dex1-1")])
 def test_what_is_kept_gives_the_same_verdicts(tmp_path: Path, layer_name: str, model: str) -> None:
     task = task_for(tmp_path, layer_name, model)
     first = work(task)

@@ -335,17 +335,6 @@ def test_command_finds_removed_failures(result: Path, session: Path) -> None:
     assert "\n  grades.drop-in.sentence: " in out
 
 
-def test_command_names_an_honest_part(tmp_path: Path, session: Path) -> None:
-    part = tmp_path / "part.json"
-    words = ["check", str(session), "--require", "DEX1-TOPIC", "--result", str(part)]
-    assert hostile.run_command(words)[0] == 0
-    code, out, _ = against(session, part)
-    assert code == 0
-    assert "a part only: " in out
-    assert "all requirements together: FAIL" in out
-    assert "PASS:" not in out
-
-
 def test_command_refuses_another_recording(result: Path) -> None:
     other = sample_path("dex3_pinch")
     code, out, err = against(other, result)

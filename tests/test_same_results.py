@@ -8,7 +8,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.conformance.behaviours import freshness
 from dexkit.conformance.kit.median import median, medians, percentile
 from dexkit.conformance.kit.row_selection import finite_rows
 
@@ -42,13 +41,6 @@ def test_medians_of_ranges_equal_those_of_single_ranges() -> None:
     rows[0] = 5, 5  # no values
     one_by_one = [median(column[first:last]) for first, last in rows]
     assert all(_same(*both) for both in zip(medians(column, rows), one_by_one, strict=True))
-
-
-def test_medians_of_rows() -> None:
-    random = np.random.default_rng(2)
-    for width in (1, 2, 4, 5):
-        rows = random.integers(0, 9, (2000, width)) / 7
-        assert np.array_equal(freshness._medians(rows), np.median(rows, axis=1)), width
 
 
 def test_rows_without_a_number_are_left_out() -> None:

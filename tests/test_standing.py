@@ -46,14 +46,3 @@ def test_slow_drift_is_no_standing_and_its_end_is_seen_at_once() -> None:
     for i in range(100, 120):
         still.add(i * 1_000_000, [2.0])
     assert still.lasts(119_000_000) == pytest.approx(0.025, abs=0.002)
-
-
-def test_restart_forgets_what_was() -> None:
-    still = Standing([1.0])
-    assert still.lasts(7) == 0.0
-    still.add(0, [0.0])
-    assert still.lasts(2_000_000_000) == 2.0
-    still.restart()
-    assert still.lasts(2_000_000_000) == 0.0
-    still.add(3_000_000_000, [9.0])
-    assert still.lasts(4_000_000_000) == 1.0
