@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.kit.claims import Claims
@@ -15,7 +12,6 @@ from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.measurement_error import Measure, weigh
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.requirements import catalogue
-from dexkit.conformance.kit.result_file import MeasureRecord, as_document, read_json, write_json
 from dexkit.conformance.kit.results import Evidence, Result, RunResult, Verdict
 from dexkit.conformance.kit.stimulus_record import RECORD, Calibration, Stimulus
 from dexkit.conformance.kit.verdicts import Excuse, Judgement
@@ -24,7 +20,6 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.virtual import MemoryTrace
 from dexkit.errors import TraceUnsupported
 from dexkit.hand import Side
-from dexkit.records import as_plain, from_object, to_record
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
 from tests.each import each
 
@@ -117,24 +112,6 @@ def test_pass_within_the_kits_error_is_shown_on_card_and_page() -> None:
     assert "Nearer to a limit than the kit can measure" in render(result)
 
 
-@given(
-    value=st.floats(-1e3, 1e3),
-    limit=st.floats(-1e3, 1e3),
-    error=st.floats(1e-9, 1e3),
-    worse=st.booleans(),
-)
-def test_margin_is_positive_on_the_side_that_passes(
-    value: float, limit: float, error: float, worse: bool
-) -> None:
-    measure = Measure(value, limit, larger_is_worse=worse, error=error)
-    assert (measure.margin >= 0) is (value <= limit if worse else value >= limit)
-    assert measure.margin_in_errors is not None
-    assert measure.margin_in_errors * error == pytest.approx(measure.margin)
-    assert measure.uncertain is (abs(measure.margin) < error)
-    record = as_plain(from_object(measure, MeasureRecord))
-    assert from_object(to_record(record, MeasureRecord, "it"), Measure) == measure
-
-
 def with_gap(seconds: float) -> Recording:
     """A short run with one gap, on a machine whose timer was always 1 ms late."""
     trace = copy_of(short_run())
@@ -190,13 +167,3 @@ def test_damaged_calibration_is_refused(text: str) -> None:
     record = {**short_run().metadata[RECORD], "calibration": text}
     with pytest.raises(TraceUnsupported):
         Stimulus.from_metadata(record)
-
-
-def test_result_file_keeps_measures(tmp_path: Path) -> None:
-    result = judge(with_gap(0.2))
-    write_json(result, tmp_path / "r.json")
-    again = read_json(tmp_path / "r.json")
-    assert [r["measure"] for r in as_document(again)["results"]] == [
-        r["measure"] for r in as_document(result)["results"]
-    ]
-    assert any(r.measure for r in again.results)

@@ -334,7 +334,7 @@ def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
         list(outsiders.try_all(str(path), 1, jobs=1))
 
 
-# ------------------------------------------------------------------------------------ soak
+# -------------------------------------------------------------------- good hands, many hands
 
 
 @pytest.mark.slow

@@ -357,7 +357,7 @@ def test_a_dex3_may_lose_its_state_for_a_second(seconds: float, verdict: Verdict
         assert "A client that waits for it stands still" in found.cause
 
 
-# ------------------------------------------------------------------------------------ sources
+# ------------------------------------------------------------------------------ own sessions
 
 
 def pressed_softly(grams: int) -> MemoryTrace:
