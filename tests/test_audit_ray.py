@@ -144,22 +144,6 @@ def test_a_node_is_killed_and_nothing_is_lost_or_done_twice(
     assert records(tmp_path / "ray") == records(tmp_path / "one")
 
 
-@pytest.mark.soak
-def test_file_that_exceeds_the_time_limit_becomes_a_row(
-    tmp_path: Path, two_nodes: tuple[Any, Any]
-) -> None:
-    files = archive(tmp_path / "archive")
-    for path in sorted(files.iterdir())[2:]:
-        path.unlink()
-    audit = Audit([str(files)], tmp_path / "ray", parquet=False)
-    outcome = audit.run(RayCluster(two_nodes[0].address, Limits(seconds=1e-3)).run)
-    found = records(tmp_path / "ray").values()
-    assert outcome.done == 2
-    assert {(str(r.state), r.error) for r in found} == {
-        ("too large", "it took longer than 0.001 s")
-    }
-
-
 def test_missing_ray_cluster_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", ModuleType("ray"))
     with socket.create_server(("127.0.0.1", 0)) as server:

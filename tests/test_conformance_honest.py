@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -13,15 +12,20 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.behaviours.bad_commands import fastest
 from dexkit.conformance.checks.steps import Step
-from dexkit.conformance.faults import gripper, plan_for
+from dexkit.conformance.faults import any_model, gripper, plan_for, run_mutant
+from dexkit.conformance.faults.generated import parse
+from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.kit.claims import Claims
 from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.recording import Recording
+from dexkit.conformance.kit.requirements import catalogue, select
 from dexkit.conformance.kit.results import Load, Overall, RunResult, Verdict
-from dexkit.conformance.virtual import MemoryTrace, Service, run_virtual
+from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.virtual import MemoryTrace, Sample, Service, run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceHand, ReferenceService
 from dexkit.hand import Floats, Side
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
+from tests.each import each
 
 PHASES = frozenset(
     {"step", "ends", "nan", "out-of-range", "limp", "silence", "resume", "load", "burst"}
@@ -114,27 +118,6 @@ class CoarseAndStale(Coarse):
         return self.measured[side][1]
 
 
-class _Capped(ReferenceHand):
-    inertia = 0.0015
-
-    def step(self, dt: float) -> None:
-        before = self.q
-        super().step(dt)
-        if abs(self.dq) > 3.4:
-            self.dq = math.copysign(3.4, self.dq)
-            self.q = before + dt * self.dq
-
-
-class Capped(ReferenceService):
-    """Moves at 3.4 rad/s at most, which a subclass sets after the reference's step."""
-
-    hand = _Capped
-
-
-class CappedAndCoarse(Capped, Coarse):
-    """Shows this motion in steps of 1.5 % of the range."""
-
-
 class Unhurried(ReferenceService):
     """Takes four and a half seconds from one end to the other."""
 
@@ -210,6 +193,140 @@ def test_restart_of_the_service_by_the_kit_is_not_a_gap() -> None:
     gap = result_of(found, "DEX1-RATE-03")
     assert gap.verdict is Verdict.PASS
     assert gap.values["max_gap_s"] < 0.1  # nor is it reported as the longest
+
+
+# ------------------------------------------------------------- what a few requirements say of one
+
+
+class InContact(ReferenceService):
+    """Publishes a torque on the object alone."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        found, hand = super().fields(side), self.hands[side]
+        return {**found, "tau_est": found["tau_est"] if hand.contact() else 0.0}
+
+
+class Turned(ReferenceService):
+    """Publishes every torque with the other sign."""
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        found = super().fields(side)
+        return {**found, "tau_est": -found["tau_est"]}
+
+
+class Stiff(ReferenceService):
+    """Is four times as stiff as it is commanded."""
+
+    class hand(ReferenceHand):
+        """Its motor."""
+
+        tau_max = 20.0
+
+        def accept(self, motor: Any) -> Any:
+            """The command with other gains."""
+            accepted = super().accept(motor)
+            return replace(accepted, kp=4.0 * accepted.kp)
+
+
+class OpensOnly(ReferenceService):
+    """Takes a commanded torque only if it opens."""
+
+    class hand(ReferenceHand):
+        """Its motor."""
+
+        def accept(self, motor: Any) -> Any:
+            """The command with another torque."""
+            return replace(super().accept(motor), tau=max(motor.tau, 0.0))
+
+
+class Pauses(ReferenceService):
+    """Publishes nothing for 72 ms in every 0.45 s, and so at the end of a step."""
+
+    def publish(self) -> list[Sample]:
+        samples = super().publish()
+        return [] if self.now > 1.0 and (self.now + 0.15) % 0.45 < 0.072 else samples
+
+
+class AsFastAsRequired(ReferenceService):
+    """Moves at :attr:`top` rad/s at most."""
+
+    top = 3.1
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)  # type: ignore[arg-type]
+        for side, hand in self.hands.items():
+            hand = gripper.Slow.hand(hand.stroke, hand.touch)
+            hand.top = self.top  # type: ignore[attr-defined]
+            self.hands[side] = hand
+
+
+class Faster(AsFastAsRequired):
+    """Moves a little faster."""
+
+    top = 3.6
+
+
+class Saturated(ReferenceService):
+    """Publishes its largest torque, which float32 rounds up, or a part of it."""
+
+    part = 1.0
+
+    def fields(self, side: Side) -> dict[str, Any]:
+        tau = float(np.nextafter(np.float32(15.0), np.float32(16.0)))
+        return {**super().fields(side), "tau_est": -self.part * tau}
+
+
+class NearlySaturated(Saturated):
+    """A tenth more is allowed."""
+
+    part = 1.09
+
+
+class TooMuch(Saturated):
+    """And no more."""
+
+    part = 1.11
+
+
+STRONGER = parse("dex1-1/unitree_go:stronger+latency-20").service()
+LEFT, RIGHT, BOTH = (Side.LEFT,), (Side.RIGHT,), (Side.LEFT, Side.RIGHT)
+PASS, WARN, FAIL = Verdict.PASS, Verdict.WARN, Verdict.FAIL
+
+
+@each(
+    ("service", "sides", "expected"),
+    [
+        # tau_est may have either sign
+        (Turned, RIGHT, {"FORCE-01": PASS}),
+        (InContact, RIGHT, {"FORCE-01": PASS}),
+        (Stiff, RIGHT, {"FORCE-09": PASS}),
+        (OpensOnly, RIGHT, {"GAIN-03": PASS}),
+        (Pauses, BOTH, {"SIDE-03": PASS}),
+        # what is asked for is the largest of the goals that it may follow
+        (STRONGER, RIGHT, {"FORCE-18": PASS}),
+        # TRACK allows for the top speed of a hand that meets MOVE-04
+        (AsFastAsRequired, LEFT, {"MOVE-04": PASS, "TRACK-01": PASS, "TRACK-02": PASS}),
+        (Faster, LEFT, {"MOVE-04": PASS, "TRACK-01": PASS, "TRACK-02": PASS}),
+        (mix(any_model.WaitsForRest, Faster), LEFT, {"MOVE-04": PASS, "TRACK-01": FAIL}),
+        (Saturated, LEFT, {"FORCE-04": PASS}),
+        (NearlySaturated, LEFT, {"FORCE-04": PASS}),
+        (TooMuch, LEFT, {"FORCE-04": WARN}),
+    ],
+)
+def test_requirement_allows_what_it_should(
+    service: type[Service], sides: tuple[Side, ...], expected: dict[str, Verdict]
+) -> None:
+    wanted = select(catalogue("dex1-1"), prefixes=[f"DEX1-{name}" for name in expected])
+    plan = replace(plan_for(sides=sides), phases=phases_for(wanted) | {"step", "fingerprint"})
+    ids = {r.id for r in wanted}
+    found = [r for r in run_mutant(service, plan).results if r.requirement.id in ids]
+    assert len(found) == len(expected) * len(sides)
+    for result in found:
+        verdict = expected[result.requirement.id.removeprefix("DEX1-")]
+        assert result.verdict is verdict, result.explain()
+
+
+# ------------------------------------------------------------------------------- a busy machine
 
 
 @pytest.mark.parametrize(

@@ -58,22 +58,6 @@ def rows_of(trace: MemoryTrace, topic: str) -> tuple[str, str]:
 
 
 @both
-def test_states_and_commands_have_a_row_for_each_message(case: Case) -> None:
-    trace = case.trace()
-    recording = case.recording(trace)
-    view = recording.sides[case.subject]
-    joints = len(view.joints)
-    for part, topic in ((view.states, case.state_topic), (view.commands, case.cmd_topic)):
-        rows = trace.rows[rows_of(trace, topic)]
-        assert part.topic == topic
-        assert [recording.log_time(t) for t in part.t] == [log for log, _, _ in rows]
-        assert [recording.log_time(t) for t in part.sent] == [sent for _, sent, _ in rows]
-        assert part.q.shape == part.dq.shape == part.mode.shape == (len(rows), joints)
-        assert set(part.length) == {recording.dialect.length}
-    assert np.isfinite(view.states.q).all()
-
-
-@both
 def test_time_of_publication_may_be_unknown(case: Case) -> None:
     trace = case.trace()
     key = rows_of(trace, case.state_topic)

@@ -28,7 +28,7 @@ from dexkit.conformance.kit.requirements import catalogue as requirements
 from dexkit.conformance.kit.results import Overall, RunResult
 from dexkit.conformance.kit.selection import length, quick
 from dexkit.conformance.kit.suite_run import SuiteOptions
-from dexkit.conformance.stimuli import phases_for
+from dexkit.conformance.stimuli import CommandSession, phases_for
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.on_dds import ServiceOnDds
@@ -190,6 +190,14 @@ def test_quick_run_has_musts_of_its_phases(name: str) -> None:
     musts = [r for r in every if r.level is Level.MUST and r.layer != "usb"]
     assert {r.id for r in musts if phases_for([r]) <= planned} == {r.id for r in chosen}
     assert quick([r for r in every if r.level is not Level.MUST]) == ()
+
+
+@pytest.mark.parametrize("name", [m.name for m in BUILT_IN])
+def test_a_default_run_of_hands_is_short_enough(name: str) -> None:
+    """90 s, less 4 s for start and judgement, and 9 s in which the slowest hand arrives."""
+    stimuli = length(name, phases_for(requirements(name)))
+    session = CommandSession.default(name).duration if under_test(name).session else 0.0
+    assert stimuli + session <= 77.0
 
 
 def test_length_of_stimulus_equals_length_of_run() -> None:

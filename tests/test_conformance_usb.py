@@ -342,11 +342,6 @@ def test_missing_device_is_a_clear_error(where: str, expected: str) -> None:
         open_device(where, Side.LEFT)
 
 
-def test_unknown_serial_number_is_a_clear_error(hands: str) -> None:
-    with pytest.raises(ConformanceError, match="no left Dex3-1"):
-        open_device(f"{hands}/0000", Side.LEFT)
-
-
 def test_device_in_use_is_an_error_and_connections_are_closed(
     hands: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -42,13 +42,6 @@ def test_each_leaves_fixtures_and_instances_to_pytest(tmp_path: Path) -> None:
     Example().check(tmp_path=tmp_path)  # type: ignore[call-arg]
 
 
-@each("letter", ["a", "b"])
-@each("number, more", [(1, "x"), (2, "y")])
-def test_decorator_each_can_be_stacked(letter: str, number: int, more: str, tmp_path: Path) -> None:
-    assert not list(tmp_path.iterdir())
-    (tmp_path / f"{letter}{number}{more}").touch()
-
-
 def test_each_without_cases_is_an_error() -> None:
     with pytest.raises(AssertionError, match="no case for value"):
         each("value", [])

@@ -240,17 +240,6 @@ def test_a_speed_that_is_too_high_is_not_a_stall() -> None:
         assert e.q == true
 
 
-def test_without_a_command_there_is_no_prediction() -> None:
-    e = JointEstimator(JOINT, (5.0, 5.0))
-    e.measure(1.0, 0.0)
-    e.follow(5.0, 0.0)
-    e.predict(0.1)
-    e.follow(None, 0.1)
-    e.measure(1.4, 0.1)
-    assert e.predict(0.5) == pytest.approx(1.4)
-    assert e.predict(9.0) == pytest.approx(1.4)
-
-
 @given(st.lists(st.floats(0.0, STROKE), min_size=5, max_size=5))
 def test_estimate_converges_on_a_hand_at_rest(start: list[float]) -> None:
     assume(abs(start[0] - start[1]) > 0.01)

@@ -68,11 +68,11 @@ BY_ID = {r.id: r for r in catalogue(None, None)}
 
 
 def one_of_each_check() -> list[Mutant]:
-    """Of each layer a wrong hand for each check, if possible one that a short run shows; all of
-    every model are tried by ``make pins``.
+    """Of each layer a wrong hand for each check of a MUST, if possible one that a short run shows;
+    ``make pins`` tries all of every model.
     """
     found: dict[tuple[str, object], Mutant] = {}
-    for mutant in sorted(mutants(), key=lambda m: (m.whole, cost(m))):
+    for mutant in essential(mutants()):
         found.setdefault((mutant.layer, check_of(BY_ID[mutant.kills])), mutant)
     # not those that need a whole run of a hand of many joints
     return [m for m in found.values() if not (m.whole and cost(m) >= 6)]

@@ -26,7 +26,7 @@ from dexkit.messages import unitree_hg
 from dexkit.models import DEX3_1, dialect
 from dexkit.monitor.bars import UNICODE
 from dexkit.monitor.screen import hand_lines
-from dexkit.pressure import NO_VALUE, RestingPressure, resting_pressure
+from dexkit.pressure import NO_VALUE, resting_pressure
 from dexkit.service import HandService
 from dexkit.view.drawing import Drawing
 from dexkit.watch import Collector
@@ -142,27 +142,6 @@ def test_rest_at_zero_as_of_older_emulators_is_a_rest() -> None:
     t = np.arange(0.0, 4.0, 0.01)
     values = np.where(t > 2.0, 5e4, 0.0)[:, None] * [1.0, 0.0] + [0.0, NO_VALUE]
     assert resting_pressure(t, values)[0] == 0.0
-
-
-def test_rest_is_found_whatever_the_portions_are() -> None:
-    t, values = readings(3.0)
-    values[t > 2.0] += 5e4
-    whole, parts = RestingPressure(12), RestingPressure(12)
-    whole.take(t, values)
-    for i in range(0, len(t), 7):
-        parts.take(t[i : i + 7], values[i : i + 7])
-    np.testing.assert_allclose(whole.level, parts.level)
-
-
-def test_rest_of_restless_values_is_the_lowest() -> None:
-    t = np.arange(0.0, 4.0, 0.01)
-    values = (1e5 + 2e3 * np.sin(20 * t))[:, None]
-    assert resting_pressure(t, values)[0] == values.min()
-    for strange in (np.inf, -np.inf, np.nan):
-        odd = values.copy()
-        odd[5] = strange
-        assert resting_pressure(t, odd)[0] == values.min()
-    assert np.isnan(resting_pressure(t[:0], values[:0])).all()
 
 
 # -- the tools -------------------------------------------------------------------------------
