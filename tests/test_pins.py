@@ -23,8 +23,7 @@ from dexkit.conformance.kit import judge as judge_module
 from dexkit.conformance.kit.judge import judge_layer
 from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
-from dexkit.conformance.stimuli import script_class
-from dexkit.conformance.stimuli.script import parts_of
+from dexkit.conformance.stimuli.phases import parts_of
 from tests.each import each
 from tools.pins.__main__ import main
 from tools.pins.keys import (
@@ -180,9 +179,12 @@ def test_a_key_changes_with_the_code_that_it_is_about(
     assert judges is None or (sources().digest(judged) != after.digest(judged)) == judges
 
 
-@each("name", ["dex1-1", "dex3-1", "brainco-revo2", "g1"])
-def test_no_phase_depends_on_a_check(name: str) -> None:
-    phases = parts_of(script_class(name))
+@each(
+    ("layer_name", "model"),
+    [("dds", "dex1-1"), ("dds", "dex3-1"), ("robot", "g1"), ("usb", "dex3-1")],
+)
+def test_no_phase_depends_on_a_check(layer_name: str, model: str) -> None:
+    phases = parts_of(layer(layer_name).script(model))
     places = [sources().place(p.play.__module__, p.play.__qualname__) for p in phases]
     reached = sources().reached(places, JUDGES_ONLY)
     assert not {place for place in reached if place[0].startswith("dexkit.conformance.checks")}

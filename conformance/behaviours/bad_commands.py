@@ -22,18 +22,16 @@ from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS, HandScript
+from dexkit.conformance.stimuli.phases import Moment, Place, stimulus
 from dexkit.conformance.stimuli.robot import STEP, RobotScript
 from dexkit.conformance.stimuli.script import (
     NOT_FINITE,
     Join,
     Leave,
-    Moment,
     Payloads,
-    Place,
     Role,
     Send,
     Steps,
-    stimulus,
     with_gains,
 )
 from dexkit.hand import Side

@@ -9,8 +9,9 @@ import numpy as np
 from dexkit.conformance.checks import Outcome, check
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.kit.robot import WRONG_CRCS
+from dexkit.conformance.stimuli.phases import Place, stimulus
 from dexkit.conformance.stimuli.robot import RobotScript
-from dexkit.conformance.stimuli.script import Place, Steps, stimulus
+from dexkit.conformance.stimuli.script import Steps
 from dexkit.conformance.usb.context import UsbContext, all_frames
 
 

@@ -41,8 +41,9 @@ from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.hand import ASIDE
+from dexkit.conformance.stimuli.phases import Place, stimulus
 from dexkit.conformance.stimuli.robot import SPEED, RobotScript
-from dexkit.conformance.stimuli.script import Place, Steps, stimulus, with_gains, without_gains
+from dexkit.conformance.stimuli.script import Steps, with_gains, without_gains
 from dexkit.hand import Side
 
 _PUSH = (0.25, 1.0)

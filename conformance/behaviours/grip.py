@@ -48,14 +48,8 @@ from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.fingers import BEYOND, CLOSED, OPEN, FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS
-from dexkit.conformance.stimuli.script import (
-    Moment,
-    Plan,
-    Steps,
-    of_position_servos,
-    stimulus,
-    without_gains,
-)
+from dexkit.conformance.stimuli.phases import Moment, stimulus
+from dexkit.conformance.stimuli.script import Plan, Steps, of_position_servos, without_gains
 from dexkit.hand import Floats, Side
 
 # of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)

@@ -17,18 +17,16 @@ from dexkit.conformance.kit.motor_messages import MotorCodec
 from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.phases import Moment, Place, stimulus
 from dexkit.conformance.stimuli.robot import RobotScript
 from dexkit.conformance.stimuli.script import (
     Join,
     Leave,
-    Moment,
-    Place,
     Restart,
     StartService,
     Steps,
     StopService,
     of_position_servos,
-    stimulus,
 )
 from dexkit.hand import ROBOT, JointMode
 

@@ -10,7 +10,8 @@ from dexkit.conformance.checks.obedience import silent
 from dexkit.conformance.checks.steps import obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gaps, least_rate, slow, too_slow
 from dexkit.conformance.stimuli.hand import HandScript
-from dexkit.conformance.stimuli.script import Join, Leave, Place, Role, Steps, stimulus
+from dexkit.conformance.stimuli.phases import Place, stimulus
+from dexkit.conformance.stimuli.script import Join, Leave, Role, Steps
 
 _LOADS = ((400.0, 1.2, 1), (2500.0, 0.8, 10))
 """Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation

@@ -17,9 +17,12 @@ from dexkit.conformance.checks.silences import mode_bytes, roles_of
 from dexkit.conformance.checks.steps import not_driven, own_speed, steps_of
 from dexkit.conformance.kit.motor_messages import MotorCodec, Motors
 from dexkit.conformance.stimuli.fingers import CLOSED, SPLITS, FingerScript
+from dexkit.conformance.stimuli.phases import Moment, Place, stimulus
 from dexkit.conformance.stimuli.robot import RobotScript
-from dexkit.conformance.stimuli.script import Moment, Place, Steps, stimulus
+from dexkit.conformance.stimuli.script import Steps
+from dexkit.conformance.stimuli.usb import UsbScript, UsbSteps
 from dexkit.conformance.usb.context import UsbContext, quiet_motors
+from dexkit.conformance.usb.frames import Motor
 from dexkit.hand import Floats, JointMode, Side
 from dexkit.models import ModeByte
 
@@ -89,6 +92,16 @@ def _locked_motors(
 def switch_off_robot_joint(script: RobotScript) -> Steps:
     """Mode 0, and a command that asks to move."""
     yield from script.refused("off", mode=0)
+
+
+@stimulus("lock", UsbScript, after="move")
+def lock_usb_joints(script: UsbScript) -> UsbSteps:
+    """Position commands with status 0: nothing may move."""
+    locked = [replace(m, status=0) for m in script.goals_inward(script.hold_commands())]
+    yield from script.send_for(0.05, script.frame(Motor(protect=True)))
+    phase = script.begin("lock", status=0)
+    yield from script.send_for(0.2, script.frame(locked))
+    script.end(phase)
 
 
 @check("DEX3-MODE-01", rests_on=("mode",))

@@ -19,17 +19,27 @@ from dexkit.conformance.kit.sums import mean
 from dexkit.conformance.stimuli.fingers import CLOSED, FEW_MOTORS, OPEN, FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.hand import ASIDE, HandScript
+from dexkit.conformance.stimuli.phases import Moment, Place, stimulus
 from dexkit.conformance.stimuli.robot import STEP, RobotScript
-from dexkit.conformance.stimuli.script import (
-    Moment,
-    Place,
-    Pose,
-    Steps,
-    of_position_servos,
-    stimulus,
-)
+from dexkit.conformance.stimuli.script import Pose, Steps, of_position_servos
+from dexkit.conformance.stimuli.usb import UsbScript, UsbSteps
 from dexkit.conformance.usb.context import UsbContext, moves, named_joints, part_of_way, travel_of
 from dexkit.hand import Floats, Side
+
+
+@stimulus("move", UsbScript, after="exchange")
+def move_usb_joints(script: UsbScript) -> UsbSteps:
+    """Each motor in turn to a new position, by 0.2 rad; the others hold."""
+    script.report("moving one joint at a time by 0.2 rad")
+    hold = script.hold_commands()
+    yield from script.send_for(0.05, script.frame(hold))
+    for joint in range(len(script.joints)):
+        target = script.goal_inward(joint)
+        phase = script.begin("move", joint=joint, begin=script.q[joint], target=target, status=1)
+        hold[joint] = replace(hold[joint], q=target)
+        yield from script.send_for(0.2, script.frame(hold))
+        script.end(phase)
+
 
 _CLOSES, _OPENS = 0.09, 6.02
 """rad, just within the zones that mean fully closed and open in the gripper's DDS interface
@@ -588,7 +598,7 @@ def robot_independent(ctx: RobotContext) -> Figures:
 
 
 _USB_MOVE_S = 0.2
-"""Seconds that each motor has to move (``conformance/stimuli/usb.py``, phase "move")."""
+"""Seconds that each motor has to move (:func:`move_usb_joints`)."""
 
 
 @check("DEX3USB-MOVE-01")

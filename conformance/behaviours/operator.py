@@ -21,7 +21,8 @@ from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.hand import HandScript
-from dexkit.conformance.stimuli.script import Moment, Plan, Send, Steps, stimulus
+from dexkit.conformance.stimuli.phases import Moment, stimulus
+from dexkit.conformance.stimuli.script import Plan, Send, Steps
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, client_for, profile

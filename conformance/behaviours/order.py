@@ -10,7 +10,8 @@ from dexkit.conformance.kit.provenance import TIMES
 from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
 from dexkit.conformance.stimuli.hand import HandScript
-from dexkit.conformance.stimuli.script import Place, Steps, stimulus
+from dexkit.conformance.stimuli.phases import Place, stimulus
+from dexkit.conformance.stimuli.script import Steps
 
 
 @stimulus("old-stamps", GripperScript, after="load")

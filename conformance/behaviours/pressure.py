@@ -20,7 +20,8 @@ from dexkit.conformance.checks.steps import steps_of
 from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.fingers import BEYOND, FingerScript
-from dexkit.conformance.stimuli.script import Steps, stimulus
+from dexkit.conformance.stimuli.phases import stimulus
+from dexkit.conformance.stimuli.script import Steps
 from dexkit.hand import Floats, Side, Subject
 from dexkit.models import HandModel
 from dexkit.pressure import NO_VALUE, known

@@ -10,7 +10,8 @@ from dexkit.conformance.checks import Context, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.steps import Step, steps_of
 from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
-from dexkit.conformance.stimuli.script import Steps, stimulus
+from dexkit.conformance.stimuli.phases import stimulus
+from dexkit.conformance.stimuli.script import Steps
 from dexkit.hand import Side
 
 _SPEEDS = ((0.0, 0.1, 0.2, 0.3, 0.4, 0.15), (0.2, 0.4, -0.2, 0.15, 0.1, 0.3))

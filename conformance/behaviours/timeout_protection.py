@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,11 +16,69 @@ from dexkit.conformance.checks.steps import not_driven
 from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS
-from dexkit.conformance.stimuli.script import Steps, stimulus
-from dexkit.conformance.stimuli.usb import DRIVEN, FREE
+from dexkit.conformance.stimuli.phases import stimulus
+from dexkit.conformance.stimuli.script import Steps
+from dexkit.conformance.stimuli.usb import _KD, DRIVEN, FREE, UsbScript, UsbSteps
 from dexkit.conformance.usb.context import UsbContext, named_joints, part_of_way
+from dexkit.conformance.usb.frames import Motor
 from dexkit.conformance.usb.recording import Answer
 from dexkit.hand import Side
+
+_SPEED = 0.4  # rad/s
+
+
+@stimulus("pause drive silence tripped clear", UsbScript, after="short")
+def stop_usb_commands(script: UsbScript) -> UsbSteps:
+    """A pause that is too short to trip; then 1.5 s without a command while a finger is driven.
+
+    Afterwards position commands with the protection still enabled, and the same without it.
+    """
+    script.report("time-out protection: a pause, then 1.5 s of silence while a finger moves")
+    spec = script.joints[DRIVEN]
+    hold = script.hold_commands()
+    yield from script.exchange(script.frame(script.hold_commands(protect=False)))
+    # a place with room for what an unprotected hand would do in the silence
+    open_end = spec.q_min if spec.closing > 0 else spec.q_max
+    start = open_end + spec.closing * 0.25
+    hold[DRIVEN] = replace(hold[DRIVEN], q=start)
+    yield from script.send_for(0.35, script.frame(hold))
+
+    yield from script.send_for(0.03, script.frame(script.hold_commands()))
+    phase = script.begin("pause", seconds=0.6)
+    yield from script.wait(0.6)
+    yield from script.exchange(script.frame(script.hold_commands()))
+    script.end(phase)
+    yield from script.exchange(script.frame(script.hold_commands(protect=False)))
+
+    motors = script.hold_commands()
+    motors[DRIVEN] = Motor(1, dq=spec.closing * _SPEED, kd=_KD, protect=True)
+    motors[FREE] = Motor(1, dq=script.joints[FREE].closing * _SPEED / 2, kd=_KD)
+    phase = script.begin("drive")
+    yield from script.send_for(0.4, script.frame(motors))
+    script.end(phase)
+
+    phase = script.begin("silence", seconds=1.5)
+    yield from script.wait(1.5)
+    script.end(phase)
+
+    # the first answer has the positions; goals elsewhere come after it
+    phase = script.begin("tripped")
+    yield from script.exchange(script.frame(motors))
+    motors = script.hold_commands()
+    motors[FREE] = replace(motors[FREE], protect=False)
+    for joint in (DRIVEN, FREE):
+        motors[joint] = replace(motors[joint], q=script.goal_inward(joint))
+    phase.params["begin"] = list(script.q)
+    phase.params["targets"] = [m.q for m in motors]
+    yield from script.send_for(0.25, script.frame(motors))
+    script.end(phase)
+
+    free = [replace(m, protect=False) for m in script.hold_commands()]
+    free[DRIVEN] = replace(free[DRIVEN], q=script.goal_inward(DRIVEN))
+    phase = script.begin("clear", begin=script.q[DRIVEN], target=free[DRIVEN].q)
+    yield from script.send_for(0.25, script.frame(free))
+    script.end(phase)
+
 
 _STAYS = 3.0
 """Seconds after the time-out in which a hand must do what its protection says: a client that has

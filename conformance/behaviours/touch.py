@@ -13,7 +13,8 @@ from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.kit.motor_messages import Motors
 from dexkit.conformance.kit.touch import Touch
 from dexkit.conformance.stimuli.fingers import BEYOND, FingerScript
-from dexkit.conformance.stimuli.script import Steps, stimulus
+from dexkit.conformance.stimuli.phases import stimulus
+from dexkit.conformance.stimuli.script import Steps
 from dexkit.hand import Floats, Side
 
 _TOUCH_SECONDS = 0.22

@@ -16,8 +16,9 @@ from dexkit.conformance.checks.steps import own_speed, speed_of, steps_of
 from dexkit.conformance.kit.row_selection import Selected, finite_rows
 from dexkit.conformance.kit.sums import mean
 from dexkit.conformance.stimuli.hand import HandScript
+from dexkit.conformance.stimuli.phases import stimulus
 from dexkit.conformance.stimuli.recorded_session import CommandSession
-from dexkit.conformance.stimuli.script import Send, Steps, stimulus
+from dexkit.conformance.stimuli.script import Send, Steps
 from dexkit.hand import Floats
 
 

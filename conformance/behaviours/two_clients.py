@@ -5,7 +5,8 @@ from __future__ import annotations
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.stimuli.hand import HandScript
-from dexkit.conformance.stimuli.script import Join, Leave, Moment, Role, Steps, stimulus
+from dexkit.conformance.stimuli.phases import Moment, stimulus
+from dexkit.conformance.stimuli.script import Join, Leave, Role, Steps
 
 
 @stimulus("two-writers restart", HandScript, moment=Moment.CLIENTS, after="operator")

@@ -5,8 +5,76 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
+from dexkit.conformance.stimuli.phases import stimulus
+from dexkit.conformance.stimuli.usb import Alone, In, Out, Reopen, UsbScript, UsbSteps
 from dexkit.conformance.usb.context import UsbContext, ordinary, quiet_motors
+from dexkit.conformance.usb.frames import Motor
 from dexkit.conformance.usb.record import UsbPhase
+
+
+@stimulus("quiet probe exchange pair", UsbScript)
+def exchange_frames(script: UsbScript) -> UsbSteps:
+    """No command; 20 commands to lock, at 100 Hz; a burst; then two at once."""
+    script.report("exchanging frames without motion")
+    yield from script.count_silent_frames(0.1)  # reads what another program has left unread
+    phase = script.begin("quiet")
+    yield from script.count_silent_frames(0.15)
+    script.end(phase)
+    yield from _probe(script)
+
+    frame = script.frame(Motor())
+    phase = script.begin("exchange", status=0, size=script.size)
+    yield from script.send_for(20 * script.plan.period, frame)
+    yield from script.count_silent_frames(0.05)
+    script.end(phase)
+
+    yield from exchange_burst(script)
+    phase = script.begin("pair")
+    for _ in range(2):
+        yield from script.do(Out(frame))
+    phase.params["answers"] = yield from script.count_silent_frames(0.1)
+    script.end(phase)
+    yield from script.exchange(frame)
+
+
+def _probe(script: UsbScript) -> UsbSteps:
+    """Find the size of command frame that the hand answers."""
+    for size in (1234, 734):
+        script.size = size
+        phase = script.begin("probe", size=size)
+        yield from script.do(Out(script.frame(Motor())))
+        seen = yield from script.do(In())
+        script.end(phase)
+        if not seen.status:
+            return
+    script.size = 1234
+
+
+@stimulus("burst", UsbScript, after="lock", before="malformed")
+@stimulus("burst", UsbScript, after="clear", before="reopen")
+def exchange_burst(script: UsbScript) -> UsbSteps:
+    """Commands to lock as fast as they are answered; three times, at different moments."""
+    frame = script.frame(Motor())
+    yield from script.do(Alone(True))
+    phase = script.begin("burst", status=0)
+    for _ in range(script.plan.burst):
+        yield from script.exchange(frame)
+    script.end(phase)
+    yield from script.do(Alone(False))
+
+
+@stimulus("reopen", UsbScript, after="clear")
+def reopen(script: UsbScript) -> UsbSteps:
+    """The interface is released and claimed again; the hand holds."""
+    script.report("releasing the interface and claiming it again")
+    hold = script.frame(script.hold_commands())
+    yield from script.exchange(hold)
+    phase = script.begin("reopen")
+    yield from script.do(Reopen())
+    for _ in range(5):
+        yield from script.exchange(hold)
+        yield from script.wait_for_tick()
+    script.end(phase)
 
 
 @check("DEX3USB-XCHG-01")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
 from dexkit.conformance.kit.sums import total
-from dexkit.conformance.stimuli.usb import BUSES
+from dexkit.conformance.stimuli.phases import stimulus
+from dexkit.conformance.stimuli.usb import BUSES, Out, UsbScript, UsbSteps
 from dexkit.conformance.usb.context import (
     UsbContext,
     all_frames,
@@ -21,6 +23,23 @@ from dexkit.conformance.usb.context import (
 )
 from dexkit.conformance.usb.frames import NO_VALUES, STATE_SIZE, Scale, read_command
 from dexkit.conformance.usb.recording import Answer
+
+
+@stimulus("short", UsbScript, after="broadcast")
+def send_other_size(script: UsbScript) -> UsbSteps:
+    """The other size of the command frame, with a small step of the index finger."""
+    size = 734 if script.size == 1234 else 1234
+    joint = len(script.joints) - 1
+    yield from script.hold_still(0.05)
+    hold = script.hold_commands()
+    target = script.goal_inward(joint)
+    phase = script.begin("short", size=size, joint=joint, begin=script.q[joint], target=target)
+    hold[joint] = replace(hold[joint], q=target)
+    yield from script.do(Out(script.frame(hold, size=size)))
+    phase.params["answers"] = yield from script.count_silent_frames(0.2)
+    yield from script.exchange(script.frame(script.hold_commands()))
+    script.end(phase)
+
 
 _COARSEST = 0.03
 """s between two answers over which a speed is integrated; most of a move takes 0.1 s."""

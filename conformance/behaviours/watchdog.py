@@ -40,8 +40,9 @@ from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
 from dexkit.conformance.stimuli.gripper import NEARLY, GripperScript
 from dexkit.conformance.stimuli.hand import ASIDE_SECONDS
+from dexkit.conformance.stimuli.phases import Moment, Place, stimulus
 from dexkit.conformance.stimuli.robot import SPEED, RobotScript
-from dexkit.conformance.stimuli.script import Moment, Place, Pose, Steps, stimulus, with_gains
+from dexkit.conformance.stimuli.script import Pose, Steps, with_gains
 from dexkit.hand import Floats, Side
 
 _SILENCE, _LONG_SILENCE = 3.8, 67.0

@@ -1,11 +1,10 @@
-"""The stimuli for hands and robots on DDS topics, as scripts (see
-:mod:`dexkit.conformance.kit.phased_script`).
+"""The stimuli as scripts (see :mod:`dexkit.conformance.kit.phased_script`).
 
 The phases are beside the checks that judge by them, in :mod:`dexkit.conformance.behaviours`. Here
-is what they are written with, and what puts them in order (:mod:`~.stimuli.script`): for grippers
-:mod:`~.stimuli.gripper`, for hands of several joints :mod:`~.stimuli.fingers`, for both
-:mod:`~.stimuli.hand`, for robots :mod:`~.stimuli.robot`. USB has a script of its own,
-:mod:`~.stimuli.usb`.
+is what puts them in order (:mod:`~.stimuli.phases`), and what they are written with: for DDS topics
+:mod:`~.stimuli.script`, with :mod:`~.stimuli.hand` for hands, :mod:`~.stimuli.gripper` for
+grippers, :mod:`~.stimuli.fingers` for hands of several joints and :mod:`~.stimuli.robot` for
+robots; for hands on USB :mod:`~.stimuli.usb`.
 """
 
 from __future__ import annotations

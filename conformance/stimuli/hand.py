@@ -10,16 +10,8 @@ from dexkit.command_age import PAUSE
 from dexkit.conformance.kit.motor_messages import MotorCodec, Motors
 from dexkit.conformance.kit.recording import joints_of
 from dexkit.conformance.kit.stimulus_record import Phase
-from dexkit.conformance.stimuli.script import (
-    Moment,
-    Payloads,
-    Plan,
-    Pose,
-    Role,
-    Script,
-    Send,
-    Steps,
-)
+from dexkit.conformance.stimuli.phases import Moment
+from dexkit.conformance.stimuli.script import Payloads, Plan, Pose, Role, Script, Send, Steps
 from dexkit.conformance.stimuli.standing import Standing
 from dexkit.hand import Side
 from dexkit.models import HandModel, model

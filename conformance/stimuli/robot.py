@@ -15,13 +15,8 @@ from dexkit.command_age import PAUSE
 from dexkit.conformance.kit.motor_messages import Motor, Motors
 from dexkit.conformance.kit.robot import RobotMotorCodec
 from dexkit.conformance.kit.stimulus_record import Phase
-from dexkit.conformance.stimuli.script import (
-    Moment,
-    Plan,
-    Script,
-    Send,
-    Steps,
-)
+from dexkit.conformance.stimuli.phases import Moment
+from dexkit.conformance.stimuli.script import Plan, Script, Send, Steps
 from dexkit.hand import ROBOT, RobotSubject
 from dexkit.robots import robot
 

@@ -32,10 +32,11 @@ from dexkit.conformance.checks import check_of
 from dexkit.conformance.faults import Mutant, trials
 from dexkit.conformance.faults.trials import run_of
 from dexkit.conformance.kit.judge import deciding
+from dexkit.conformance.kit.phased_script import PhasedScript
 from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.layers import layer
-from dexkit.conformance.stimuli import Plan, script_class
-from dexkit.conformance.stimuli.script import parts_of
+from dexkit.conformance.stimuli import Plan
+from dexkit.conformance.stimuli.phases import parts_of
 from tools.pins.sources import WHOLE, Place, Sources
 
 __all__ = [
@@ -167,13 +168,18 @@ def _class_places(made: type[Any]) -> Iterable[Place]:
 def played_by(mutant: Mutant) -> frozenset[Place]:
     """The places of the code that plays a wrong hand; all that plays it is reached from them."""
     run = run_of(mutant)
-    named = layer("dds").reference if mutant.layer == "client" else layer(mutant.layer).script
-    classes = (mutant.made, named(mutant.model))
-    found = {place for made in classes for place in _class_places(made)}
     functions: list[Any] = [run.play]
-    if isinstance(run.about, Plan):
-        parts = parts_of(script_class(mutant.model))
-        functions += [part.play for part in parts if part.wanted(run.about)]
+    drives: type[Any]
+    if mutant.layer == "client":
+        drives = layer("dds").reference(mutant.model)
+    else:
+        script: type[PhasedScript[Any, Any, Any]] = layer(mutant.layer).script(mutant.model)
+        parts = parts_of(script)
+        if isinstance(run.about, Plan):
+            parts = tuple(part for part in parts if part.wanted(run.about))
+        functions += [part.play for part in parts]
+        drives = script
+    found = {place for made in (mutant.made, drives) for place in _class_places(made)}
     found |= {sources().place(f.__module__, f.__qualname__) for f in functions}
     return frozenset(found | _messages())
 
