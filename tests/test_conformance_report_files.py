@@ -32,7 +32,8 @@ from dexkit.conformance.report.compare import (
 from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import VERDICTS, catch_sentence
-from dexkit.conformance.report.markdown import MOST_CARDS, plain, render_markdown
+from dexkit.conformance.report.markdown import MOST_CARDS, render_markdown
+from dexkit.conformance.report.pages import plain
 from dexkit.conformance.report.terminal import MARKS
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual

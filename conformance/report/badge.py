@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Overall, RunResult
 from dexkit.conformance.report.labels import (
@@ -10,7 +12,7 @@ from dexkit.conformance.report.labels import (
     device_kind,
     model_title,
 )
-from dexkit.escaping import html as escape
+from dexkit.conformance.report.pages import fill
 
 __all__ = ["badge_text", "badges", "render_badge"]
 
@@ -60,41 +62,36 @@ def _width(text: str) -> int:
     return round(sum(4.2 if c in _NARROW else 9.6 if c in _WIDE else 6.9 for c in text))
 
 
+@dataclass(frozen=True)
+class _Badge:
+    """A badge in an image.
+
+    :param x: its left edge, pixels, and ``split`` the width of its left part.
+    """
+
+    left: str
+    right: str
+    colour: str
+    x: int
+    split: int
+    width: int
+
+
 def render_badge(result: RunResult) -> str:
     """Return the badges as one SVG, side by side; its title also says what a run catches."""
-    x, titles, drawn = 0, [], []
-    for number, grade in enumerate(badges(result)):
+    x, drawn = 0, []
+    for grade in badges(result):
         left, right = badge_text(result, grade)
-        titles.append(f"{left}: {right}")
-        width, content = _badge(left, right, _colour(result, grade), x, number)
-        drawn.append(content)
-        x += width + _GAP
-    title = escape("; ".join([*titles, catch_sentence(result)]))
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{x - _GAP}" height="20" role="img" '
-        f'aria-label="{title}"><title>{title}</title>{"".join(drawn)}</svg>\n'
-    )
+        split = _width(left) + 14
+        drawn.append(
+            _Badge(left, right, _colour(result, grade), x, split, split + _width(right) + 14)
+        )
+        x += drawn[-1].width + _GAP
+    texts = [f"{badge.left}: {badge.right}" for badge in drawn]
+    title = "; ".join([*texts, catch_sentence(result)])
+    return fill("badge.svg", badges=drawn, title=title, width=x - _GAP)
 
 
 def _colour(result: RunResult, kind: Kind) -> str:
     overall = result.grade(kind).overall
     return _PARTIAL if result.partial and overall is Overall.PASS else _COLOURS[overall]
-
-
-def _badge(left: str, right: str, colour: str, x: int, number: int) -> tuple[int, str]:
-    """Width and SVG elements of one badge at ``x``, pixels.
-
-    :param number: makes the id of its clip path unique in the image.
-    """
-    a, b = _width(left) + 14, _width(right) + 14
-
-    def text(words: str, at: int, width: int) -> str:
-        return f'<text x="{at}" y="14" textLength="{width}">{escape(words)}</text>'
-
-    return a + b, (
-        f'<clipPath id="r{number}"><rect x="{x}" width="{a + b}" height="20" rx="4"/></clipPath>'
-        f'<g clip-path="url(#r{number})"><rect x="{x}" width="{a}" height="20" fill="#3b424c"/>'
-        f'<rect x="{x + a}" width="{b}" height="20" fill="{colour}"/></g>'
-        '<g fill="#fff" font-family="Verdana,DejaVu Sans,sans-serif" font-size="11">'
-        f"{text(left, x + 7, a - 14)}{text(right, x + a + 7, b - 14)}</g>"
-    )

@@ -17,8 +17,7 @@ from dexkit.conformance.report.labels import (
     hand_name,
     model_title,
 )
-from dexkit.conformance.report.markdown import code, plain, table
-from dexkit.conformance.report.pages import fill
+from dexkit.conformance.report.pages import code, fill
 from dexkit.errors import UsageError
 
 __all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
@@ -160,7 +159,7 @@ def _change_text(comparison: Comparison, change: Change) -> str:
     )
 
 
-# ----------------------------------------------------------------------------------- HTML
+# ------------------------------------------------------------------------ HTML and Markdown
 
 
 def render_comparison(
@@ -189,52 +188,43 @@ def render_comparison(
     )
 
 
-# ------------------------------------------------------------------------------- Markdown
-
-
 def render_comparison_markdown(comparison: Comparison) -> str:
     """The comparison as Markdown: regressions, differences, all other requirements folded away."""
-    runs, names = comparison.runs, comparison.names
-    lines = [f"## Comparison: {len(runs)} runs as {model_title(runs[0])}", ""]
-    rows = []
-    for run, name in zip(runs, names, strict=True):
-        answer, found = ANSWERS[run.overall], count_verdicts(run)
-        real = device_kind(run)
-        rows.append(
-            [
-                plain(name) + (f" ({real})" if real else ""),
-                f"{answer.mark} {answer.text}",
-                f"{found.passed} of {found.applicable}",
-                plain(run.recorded_at),
-            ]
-        )
-    lines += [*table(["run", "verdict", "passed", "recorded"], rows), ""]
-    for title, changes in (
-        ("Regressions", comparison.regressions),
-        ("Became better", comparison.improvements),
-    ):
-        if changes:
-            lines += [f"### {title}", ""]
-            lines += [
-                f"- {code(c.requirement.id)} {plain(_change_text(comparison, c))}" for c in changes
-            ]
-            lines.append("")
-    lines += [f"### Where they differ ({len(comparison.differing)})", ""]
-    lines += _markdown_matrix(comparison.differing, names) or ["Nowhere: all verdicts agree."]
-    lines += ["", "<details>", f"<summary>Where they agree ({len(comparison.agreeing)})</summary>"]
-    lines += ["", *_markdown_matrix(comparison.agreeing, names), "", "</details>"]
-    return "\n".join(lines) + "\n"
+    return fill(
+        "comparison.md",
+        about=f"{len(comparison.runs)} runs as {model_title(comparison.runs[0])}",
+        comparison=comparison,
+        runs=[
+            _about_run(run, name)
+            for run, name in zip(comparison.runs, comparison.names, strict=True)
+        ],
+        heads=["requirement", "what", *comparison.names],
+        matrix=_matrix,
+        change_text=_change_text,
+    )
 
 
-def _markdown_matrix(rows: Sequence[Row], names: Sequence[str]) -> list[str]:
+def _about_run(run: RunResult, name: str) -> list[str]:
+    """Its line in the table of runs."""
+    answer, found, real = ANSWERS[run.overall], count_verdicts(run), device_kind(run)
+    return [
+        name + (f" ({real})" if real else ""),
+        f"{answer.mark} {answer.text}",
+        f"{found.passed} of {found.applicable}",
+        run.recorded_at,
+    ]
+
+
+def _matrix(rows: Sequence[Row]) -> list[list[str]]:
+    """A line for each requirement, with the verdict or figure of each run."""
+
     def cell(group: Sequence[Result]) -> str:
         if not group:
             return "not asked"
         word = VERDICTS[worst(r.verdict for r in group)]
-        return f"{word.mark} {plain(_figure(group) or word.text)}"
+        return f"{word.mark} {_figure(group) or word.text}"
 
-    lines = [
-        [code(row.requirement.id), plain(row.requirement.title), *(cell(g) for g in row.found)]
+    return [
+        [code(row.requirement.id), row.requirement.title, *(cell(g) for g in row.found)]
         for row in rows
     ]
-    return table(["requirement", "what", *(plain(n) for n in names)], lines) if rows else []

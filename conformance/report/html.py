@@ -36,6 +36,7 @@ from dexkit.conformance.report.labels import (
     VERDICTS,
     about_harness,
     answer_of,
+    capital,
     catch_sentence,
     device_kind,
     hand_name,
@@ -44,6 +45,7 @@ from dexkit.conformance.report.labels import (
     quantity,
     subject,
     utc_date,
+    verdicts_by_area,
     whose,
 )
 from dexkit.conformance.report.pages import fill
@@ -144,7 +146,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         link=link,
         file=Path(link).name,
         clients=grouped(result.client),
-        client_sentence=_capital(result.client_sentence()),
+        client_sentence=capital(result.client_sentence()),
         made_with=[
             *result.environment.items(),
             *((f"recorded with {k}", result.run[k]) for k in _RECORDED_WITH if k in result.run),
@@ -209,12 +211,9 @@ def utc(text: str) -> str:
 
 def _areas(result: RunResult) -> dict[str, list[tuple[Verdict, int]]]:
     """How often each verdict is in each area, from that which counts most."""
-    groups: dict[str, list[Verdict]] = {}
-    for requirement, group in result.by_requirement():
-        groups.setdefault(requirement.area, []).append(worst(r.verdict for r in group))
     return {
         area: [(v, verdicts.count(v)) for v in SEVERITY if v in verdicts]
-        for area, verdicts in groups.items()
+        for area, verdicts in verdicts_by_area(result).items()
     }
 
 
@@ -255,7 +254,3 @@ def _operator(result: RunResult) -> list[tuple[str, str]]:
         for need, group in result.by_requirement()
         if need.phase == OPERATOR and any(r.verdict.judged for r in group)
     ]
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

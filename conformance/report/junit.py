@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from xml.etree import ElementTree
 
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Result, RunResult, Verdict
 from dexkit.conformance.report.labels import catch_sentence, hand_name
+from dexkit.conformance.report.pages import fill
 from dexkit.documents import write_file
-from dexkit.escaping import visible
 
 __all__ = ["write_junit"]
 
@@ -30,56 +28,28 @@ def write_junit(result: RunResult, path: Path) -> None:
     What the client does wrong is skipped, too: it fails no hand. Where only requirements about the
     client were selected, it fails.
     """
-    entries = [*result.results, *result.client]
-    verdicts = [_counted(r, result) for r in entries]
-    suite = ElementTree.Element(
-        "testsuite",
-        name=f"dexkit conformance: {hand_name(result)}",
-        tests=str(len(verdicts)),
-        failures=str(verdicts.count(Verdict.FAIL)),
-        errors=str(verdicts.count(Verdict.ERROR) + verdicts.count(Verdict.BLOCKED)),
-        skipped=str(sum(v in _SKIPPED for v in verdicts)),
-        time=f"{result.duration_s:.3f}",
-        timestamp=result.recorded_at,
+    cases = [(entry, _counted(entry, result)) for entry in [*result.results, *result.client]]
+    verdicts = [counted for _, counted in cases]
+    text = fill(
+        "junit.xml",
+        result=result,
+        hand=hand_name(result),
+        counts={
+            "tests": len(verdicts),
+            "failures": verdicts.count(Verdict.FAIL),
+            "errors": verdicts.count(Verdict.ERROR) + verdicts.count(Verdict.BLOCKED),
+            "skipped": sum(v in _SKIPPED for v in verdicts),
+        },
+        properties={
+            **result.subject,
+            **result.environment,
+            **{f"stage.{side}": stage for side, stage in result.stage.items()},
+            **{f"harness.{name}": f"{value:g}" for name, value in result.harness.items()},
+            "overall": result.overall,
+            **{f"grade.{kind}": result.grade(kind).sentence() for kind in Kind},
+            "catch-rate": catch_sentence(result),
+        },
+        cases=cases,
+        SKIPPED=_SKIPPED,
     )
-    properties = ElementTree.SubElement(suite, "properties")
-    for name, value in {
-        **result.subject,
-        **result.environment,
-        **{f"stage.{side}": str(stage) for side, stage in result.stage.items()},
-        **{f"harness.{name}": f"{value:g}" for name, value in result.harness.items()},
-        "overall": str(result.overall),
-        **{f"grade.{kind}": result.grade(kind).sentence() for kind in Kind},
-        "catch-rate": catch_sentence(result),
-    }.items():
-        ElementTree.SubElement(properties, "property", name=name, value=value)
-    for entry, verdict in zip(entries, verdicts, strict=True):
-        case = ElementTree.SubElement(
-            suite,
-            "testcase",
-            classname=f"{entry.requirement.model}.{entry.requirement.area}",
-            name=f"{entry.requirement.id}-{entry.side}",
-            time="0",
-        )
-        if verdict is Verdict.FAIL:
-            failure = ElementTree.SubElement(case, "failure", message=entry.observed)
-            failure.text = entry.explain()
-        elif verdict in (Verdict.ERROR, Verdict.BLOCKED):
-            error = ElementTree.SubElement(case, "error", message=entry.reason)
-            error.text = entry.explain()
-        elif verdict is not entry.verdict:
-            message = f"a fault of the client, not of the hand: {entry.observed or entry.reason}"
-            ElementTree.SubElement(case, "skipped", message=message).text = entry.explain()
-        elif verdict in _SKIPPED:
-            ElementTree.SubElement(case, "skipped", message=entry.reason)
-        else:
-            out = ElementTree.SubElement(case, "system-out")
-            out.text = entry.explain()
-    for element in suite.iter():
-        element.attrib = {name: visible(value) for name, value in element.attrib.items()}
-        element.text = visible(element.text or "") or None
-    tree = ElementTree.ElementTree(suite)
-    ElementTree.indent(tree)
-    content = io.BytesIO()
-    tree.write(content, encoding="utf-8", xml_declaration=True)
-    write_file(path, content.getvalue())
+    write_file(path, text)

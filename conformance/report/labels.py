@@ -19,6 +19,7 @@ __all__ = [
     "Word",
     "about_harness",
     "answer_of",
+    "capital",
     "catch_sentence",
     "count_verdicts",
     "device_kind",
@@ -28,6 +29,7 @@ __all__ = [
     "quantity",
     "subject",
     "utc_date",
+    "verdicts_by_area",
     "whose",
 ]
 
@@ -119,6 +121,14 @@ def count_verdicts(result: RunResult, kind: Kind | None = None) -> Tally:
     )
 
 
+def verdicts_by_area(result: RunResult) -> dict[str, list[Verdict]]:
+    """The verdicts of the requirements of each area, sides together."""
+    found: dict[str, list[Verdict]] = {}
+    for requirement, group in result.by_requirement():
+        found.setdefault(requirement.area, []).append(worst(r.verdict for r in group))
+    return found
+
+
 def model_title(result: RunResult) -> str:
     """``Dex1-1``, or ``hand`` where the model is not known."""
     name = result.subject.get("model", "")
@@ -196,6 +206,11 @@ def about_harness(result: RunResult) -> str:
             f"{figures['longest_wait_ms']:.3g} ms at once"
         )
     return "; ".join(parts)
+
+
+def capital(text: str) -> str:
+    """``text`` with a capital letter at its beginning."""
+    return text[:1].upper() + text[1:]
 
 
 def utc_date(time_ns: int) -> datetime:
