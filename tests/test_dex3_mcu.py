@@ -112,20 +112,6 @@ def packet(number: int, *, status: int = 1, timeout: bool = True, q: int = 0) ->
 # --- frames
 
 
-@each("side", SIDES)
-@each("layout", [COMMAND_1234, COMMAND_734])
-def test_one_send_one_receive(side: Side, layout: CommandLayout) -> None:
-    bench = Bench(side)
-    bench.codec = HandCodec(DEX3_1.joints[side], layout=layout)
-    goal = bench.away()
-    state = bench.run(1.5, bench.frame(goal))
-    assert state.q == pytest.approx(goal, abs=0.02)
-    assert state.mode.tolist() == [1] * 7
-    assert not state.fault.any()
-    assert bench.mcu.counters.frames == bench.mcu.counters.answers == 150
-    assert bench.codec.problems == []
-
-
 def test_hand_at_rest_reports_its_initial_state() -> None:
     bench = Bench()
     raw = bench.mcu.exchange(empty())
@@ -256,13 +242,6 @@ def test_invalid_frame_is_answered_and_moves_nothing(
     assert f"30 {counter.replace('_', ' ')}" in bench.mcu.counters.summary()
 
 
-def test_any_frame_header_is_accepted() -> None:
-    bench = Bench()
-    frame = bench.frame(bench.away())
-    state = bench.run(0.2, b"\xeb\x90" + frame[2:])
-    assert state.mode.tolist() == [1] * 7
-
-
 def test_a_damaged_packet_leaves_its_motor_with_its_last_command() -> None:
     bench = Bench()
     bench.ask(single(0, packet(0), packet(1, q=56_000)))
@@ -314,16 +293,6 @@ def test_damage_inside_a_good_frame_reaches_no_motor(bit: int, sizes: list[int])
 
 
 # --- modes
-
-
-def test_lock_status_brakes_and_foc_status_drives() -> None:
-    bench = Bench()
-    goal = bench.away()
-    locked = dataclasses.replace(
-        HandCommand.position(goal, kp=1.5, kd=0.2), mode=np.zeros(7, np.uint8)
-    )
-    assert bench.run(0.3, bench.codec.encode(locked, True)).q == pytest.approx(bench.rest, abs=1e-4)
-    assert np.abs(bench.run(0.3, bench.frame(goal)).q - bench.rest).max() > 0.1
 
 
 @each("status", [2, 5, 6, 7])
@@ -530,15 +499,6 @@ def test_bad_faults_name_what_a_hand_can_have(text: str) -> None:
         parse_fault(text, DEX3_FAULTS)
     assert caught.value.hint == grammar(DEX3_FAULTS)
     assert all(kind.name in caught.value.hint for kind in DEX3_FAULTS.kinds)
-
-
-@each(
-    "wrong",
-    [{"queue": 0}, {"command_timeout": 0.0}, {"answer_time": -1.0}, {"model_code": 256}],
-)
-def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(UsageError):
-        Firmware(**wrong)  # type: ignore[arg-type]
 
 
 def test_the_same_seed_gives_the_same_run() -> None:

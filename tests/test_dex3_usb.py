@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.errors import (
-    ChecksumError,
     EncodeError,
     OversizeError,
     WireError,
@@ -185,11 +184,6 @@ def test_value_that_does_not_fit_its_field_is_refused(packet: Any, what: str) ->
         packet.pack()
 
 
-def test_wrong_header_is_reported() -> None:
-    with pytest.raises(WireError, match="starts with fc ee, these bytes with fe ee"):
-        d.MotorState.parse(d.MotorCmd(0, 0, False, 0, 0, 0, 0, 0).pack() + bytes(6))
-
-
 # --- bus buffers
 
 
@@ -215,18 +209,6 @@ def test_one_damaged_packet_is_lost_alone(packets: list[Any], data: st.DataObjec
     assert len(problems) >= 1
     assert all(p.bus == 3 for p in problems)
     assert problems[0].offset == sum(map(len, parts[:which]))
-
-
-def test_wrong_crc_is_one_problem_with_its_place() -> None:
-    bad = bytearray(MOTOR.pack())
-    bad[12] ^= 0x80
-    found, problems = d.parse_bus(SENSOR.pack() + bytes(bad) + bytes(bad) + MOTOR.pack())
-    assert found == [SENSOR, MOTOR]
-    assert [(type(p.error), p.offset) for p in problems] == [
-        (ChecksumError, 44),
-        (ChecksumError, 70),
-    ]
-    assert "bus 0, offset 44: MotorState_t: CRC is 0x9C8D9944" in str(problems[0])
 
 
 @settings(deadline=None)
@@ -290,14 +272,6 @@ def test_bus_size_beyond_its_buffer_is_reported() -> None:
     assert (problem.bus, type(problem.error)) == (1, OversizeError)
     data[10:14] = b"\xff" * 4
     assert len(d.parse_state(reseal(data)).problems) == 1
-
-
-def test_damaged_packet_in_a_valid_frame_is_reported() -> None:
-    data = bytearray(d.pack_state(a_state()))
-    data[26 + 26 + 10] ^= 1
-    frame = d.parse_state(reseal(data))
-    assert [m.id for _, m in frame.motors] == [0, 2, 0, 1]
-    assert [(p.bus, p.offset) for p in frame.problems] == [(0, 26)]
 
 
 @given(

@@ -199,18 +199,6 @@ def test_a_transfer_ends_with_a_short_packet() -> None:
         exchange(device)
 
 
-def test_endpoint_numbers_and_serial_are_options() -> None:
-    with (
-        emulated_dex3(out_endpoint=0x01, in_endpoint=0x83, serials=["X7"]) as hands,
-        host(inside(hands).port) as computer,
-    ):
-        device = computer.find()
-        assert [e.bEndpointAddress for e in device[0][(0, 0)]] == [0x01, 0x83]
-        assert usb.util.get_string(device, device.ctrl_transfer(0x80, 6, 0x0100, 0, 18)[16]) == "X7"
-        device.write(0x01, brake(), LONG)
-        assert len(device.read(0x83, STATE.size, LONG)) == STATE.size
-
-
 @each(
     "wrong",
     [
@@ -376,18 +364,6 @@ def test_unlinks_of_transfers_that_never_come_are_limited() -> None:
             exchange(computer.find())
 
 
-def test_read_and_write_sent_together_are_both_answered() -> None:
-    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
-        submit(sock, 1, IN, 1, b"")  # a read that waits is answered by the write behind it
-        submit(sock, 2, OUT, 2, brake())
-        seen = {}
-        for _ in range(2):
-            _, seqnum, status, actual = reply(sock)
-            assert status == 0
-            seen[seqnum] = protocol._recvall(sock, actual) if seqnum == 1 else b""
-        assert len(seen[1] or b"") == STATE.size
-
-
 def test_hand_has_one_client_at_a_time() -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
@@ -404,10 +380,6 @@ def test_hand_has_one_client_at_a_time() -> None:
 
 
 # --- what a client can make it hold
-
-
-def broken(*_: object) -> None:
-    raise IndexError("a mistake")
 
 
 def held(hands: Dex3Hands) -> int:
@@ -435,13 +407,6 @@ def test_pending_reads_are_limited() -> None:
         assert held(inside(hands)) == 0
         with host(port) as computer:
             exchange(computer.find())
-
-
-def test_duplicate_sequence_number_ends_the_connection() -> None:
-    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
-        submit(sock, 7, IN, 1, b"")
-        submit(sock, 7, IN, 1, b"")
-        assert protocol._recvall(sock, 1) is None
 
 
 def test_a_reply_never_claims_more_than_it_carries() -> None:
@@ -509,19 +474,6 @@ def test_server_does_not_spin_without_file_descriptors(monkeypatch: pytest.Monke
             submit(sock, 1, OUT, 2, brake())
             assert reply(sock)[:3] == (protocol.RET_SUBMIT, 1, 0)
         assert len(tries) <= 5  # one for each pause, not thousands
-
-
-def test_exception_in_the_device_ends_one_connection_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    with emulated_dex3(BOTH) as hands:
-        port = inside(hands).port
-        monkeypatch.setattr(inside(hands).device(Side.LEFT), "exchange", broken)
-        with imported(port) as sock:
-            submit(sock, 1, OUT, 2, brake())
-            assert protocol._recvall(sock, 1) is None
-        with host(port) as computer:
-            exchange(computer.find(Side.RIGHT), side=Side.RIGHT)
-        assert isinstance(inside(hands).failure, IndexError)
-        assert inside(hands).error is None
 
 
 @pytest.mark.parametrize(

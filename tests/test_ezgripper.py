@@ -32,8 +32,8 @@ from dexkit.drivers.ezgripper import (
     servo_registers,
 )
 from dexkit.drivers.ezgripper import gripper as gripper_module
-from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus, ServoError
-from dexkit.drivers.ezgripper.calibration import CalibrationFailed, measure_speed
+from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus
+from dexkit.drivers.ezgripper.calibration import CalibrationFailed
 from dexkit.drivers.ezgripper.control import Phase
 from dexkit.drivers.ezgripper.discovery import (
     find_device,
@@ -42,8 +42,6 @@ from dexkit.drivers.ezgripper.discovery import (
     latency_warning,
 )
 from dexkit.drivers.ezgripper.gripper import ZeroGains
-from dexkit.drivers.ezgripper.register_block import Goal, Sample
-from dexkit.drivers.ezgripper.scaling import STROKE
 from dexkit.emulators.mx64 import (
     Bus,
     Firmware,
@@ -63,8 +61,7 @@ from dexkit.errors import (
     UsageError,
 )
 from dexkit.hand import HandCommand, HandState, MotorError, Side
-from dexkit.models import DEX1_1
-from dexkit.wire import dynamixel, mx64
+from dexkit.wire import mx64
 from tests.dds_helpers import wait_until
 from tests.ezgripper_helpers import (
     BRAKE,
@@ -607,25 +604,6 @@ def test_missing_answer_times_out_within_documented_time(
         hand.close()
 
 
-def test_refused_register_is_clear_error(tmp_path: Path) -> None:
-    with emulated() as gripper:
-        bus = ServoBus(gripper.path, 1_000_000, timeout=0.2)
-        bus.open()
-        try:
-            with pytest.raises(ServoError, match="Operating Mode") as refused:
-                bus.write(1, mx64.OPERATING_MODE.address, b"\x07")
-            assert refused.value.number == dynamixel.ErrorNumber.DATA_RANGE
-            bus.write_item(1, mx64.TORQUE_ENABLE, 1)
-            with pytest.raises(ServoError) as locked:
-                bus.write_item(1, mx64.OPERATING_MODE, 5)
-            assert locked.value.number == dynamixel.ErrorNumber.ACCESS
-            # no data, not the CRC's bytes as in the SDK
-            with pytest.raises(ServoError):
-                bus.read(1, 14, 2)
-        finally:
-            bus.close()
-
-
 # --- calibration
 
 
@@ -670,57 +648,6 @@ def test_calibration_on_the_command_line(tmp_path: Path, monkeypatch: pytest.Mon
             assert opening == pytest.approx(min(speeds["opening"], 150) * 0.054)
             assert closing == pytest.approx(min(speeds["closing"], 150) * 0.054)
             assert float(exchange(hand, BRAKE).q[0]) >= -0.05
-
-
-def test_estimator_uses_servo_limit_without_measured_speed() -> None:
-    hand = EZGripper("/dev/nothing", Side.LEFT, GripperSettings())
-    limit = 1.5 * DEX1_1.joints[Side.LEFT][0].stroke  # 150 % of the stroke a second
-    assert hand.joint_speeds == ((pytest.approx(limit), pytest.approx(limit)),)
-
-
-class _SteadyDrive:
-    """Fingers of 150 % of the stroke a second, whose answers come late in the first strokes.
-
-    The clock is virtual: 5 ms from one exchange to the next.
-    """
-
-    def __init__(self, late: int) -> None:
-        self.late = late
-        self.strokes = 0
-        self.now = 0.0
-        self.goal = Goal(0, 0, 1)
-        self.position = 0.0
-
-    def exchange(self, goal: Goal) -> Sample:
-        self.strokes += abs(goal.position - self.goal.position) > STROKE / 2
-        self.goal = goal
-        return self.sample()
-
-    def sample(self) -> Sample:
-        self.now += 0.005
-        step = 1.5 * STROKE * 0.005
-        self.position += min(max(self.goal.position - self.position, -step), step)
-        late = 0.05 if 0 < self.strokes <= self.late else 0.0
-        place = round(self.position)
-        rest = (0, place, True, 0, 0, 0, 0, 0, place, 120, 30)
-        return Sample(self.now, self.now + late, *rest)
-
-    def engage(self, goal: Goal) -> None:
-        self.exchange(goal)
-
-    def rearm_watchdog(self) -> None: ...
-
-
-def test_a_speed_is_measured_again_where_answers_come_late() -> None:
-    lines: list[str] = []
-    found = measure_speed(_SteadyDrive(late=2), 0, runs=1, progress=lines.append)
-    assert found.opening == pytest.approx(150.0, rel=0.02)
-    assert found.closing == pytest.approx(150.0, rel=0.02)
-    again, done = lines
-    assert "answers came late" in again
-    assert done.startswith("run 1 of 1: opens 150 %/s")
-    with pytest.raises(CalibrationFailed, match="too few samples"):
-        measure_speed(_SteadyDrive(late=1000), 0, runs=1)
 
 
 @pytest.mark.usefixtures("_patient_servo")

@@ -33,14 +33,6 @@ def three(**options: object) -> Host:
 # --- order of answers
 
 
-def test_group_read_with_missing_servo_stops_or_continues() -> None:
-    params = READ_POSITION + bytes([1, 9, 2])
-    assert [p.id for p in three().send(254, Instruction.SYNC_READ, params)] == [1]
-    skips = dataclasses.replace(QUIET, missing_id_stalls=False)
-    host = Host(servo(1, firmware=skips), servo(2, firmware=skips))
-    assert [p.id for p in host.send(254, Instruction.SYNC_READ, params)] == [1, 2]
-
-
 @each(
     ("code", "params"),
     [
@@ -80,26 +72,6 @@ def test_malformed_group_writes_change_nothing(code: int, params: bytes) -> None
     host.send(254, code, params)
     host.send(1, code, b"\x41\0\1\0\1\1")
     assert [read(s, mx64.LED) for s in host.bus.servos] == [0, 0, 0]
-
-
-def test_out_of_limit_goals_in_a_sync_write_are_ignored_or_clamped() -> None:
-    params = b"\x66\0\2\0\1" + (1800).to_bytes(2, "little")
-    for clamps, expected in ((False, 1000), (True, 1600)):
-        target = servo(firmware=dataclasses.replace(QUIET, sync_write_clamps=clamps))
-        write(target, mx64.CURRENT_LIMIT, 1600)
-        write(target, mx64.GOAL_CURRENT, 1000)
-        Host(target).send(254, Instruction.SYNC_WRITE, params)
-        assert read(target, mx64.GOAL_CURRENT) == expected
-
-
-def test_a_fast_read_with_a_missing_servo_is_never_complete() -> None:
-    fast = dataclasses.replace(QUIET, fast_reads=True)
-    host = Host(servo(3, firmware=fast), servo(4, firmware=fast))
-    params = READ_POSITION + bytes([3, 7, 4])
-    raw = host.exchange_raw(dxl.encode(254, Instruction.FAST_SYNC_READ, params))
-    assert raw[5:7] == (25).to_bytes(2, "little")
-    assert len(raw) == 8 + 8
-    assert dxl.PacketParser().feed(raw) == []
 
 
 def test_two_servos_with_one_id_answer_at_the_same_time() -> None:
@@ -339,31 +311,12 @@ def test_corrupt_damages_given_part_of_answers() -> None:
     assert all(not dxl.PacketParser().feed(raw) for raw in raws if raw != good)
 
 
-def test_delay_fault_delays_answers_until_it_ends() -> None:
-    host = Host(servo(), faults=("delay:ms=30,for=1s",), latency_timer=0.0)
-    assert transaction(host, PING) == pytest.approx(0.03, abs=0.002)
-    host.wait(1.0)
-    assert transaction(host, PING) < 0.002
-
-
 def test_random_faults_repeat_with_same_seed() -> None:
     def answers(seed: int) -> list[bytes]:
         host = Host(servo(), faults=("drop:p=0.5", "corrupt:p=0.5"), seed=seed)
         return [host.exchange_raw(PING) for _ in range(40)]
 
     assert answers(1) == answers(1) != answers(2)
-
-
-def test_stuck_fault_holds_for_its_duration() -> None:
-    target = servo()
-    host = Host(target, faults=("stuck:for=1s",))
-    write(target, mx64.OPERATING_MODE, 5)
-    write(target, mx64.TORQUE_ENABLE, 1)
-    write(target, mx64.GOAL_POSITION, 3500)
-    host.wait(0.9)
-    assert read(target, mx64.PRESENT_POSITION) == 2760
-    host.wait(1.5)
-    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(3500, abs=20)
 
 
 def test_deep_brown_out_restarts_the_servo() -> None:
@@ -389,22 +342,6 @@ def test_unplugged_bus_loses_pending_bytes() -> None:
 
 
 # --- Protocol 1.0 firmware
-
-
-def test_protocol_1_servo_answers_its_own_protocol_only() -> None:
-    host = Host.__new__(Host)
-    host.bus = Bus([], protocol_1=[Protocol1Servo(1)])
-    host.now = host.at = 0.0
-    assert host.exchange_raw(PING) == b""
-    host.wait(0.01)
-    ping_1 = bytes.fromhex("ffff010201fb")
-    assert host.exchange_raw(b"\0\xff" + ping_1) == bytes.fromhex("ffff010200fc")
-    read_model = bytes.fromhex("ffff0104020002f6")
-    assert host.exchange_raw(read_model)[5:7] == b"\x36\x01"
-    assert host.exchange_raw(bytes.fromhex("fffffe0201fe")) == bytes.fromhex("ffff010200fc")
-    assert host.exchange_raw(bytes.fromhex("ffff010201fa")) == b""  # wrong checksum
-    write_led = bytes.fromhex("ffff01040319 01 dd".replace(" ", ""))
-    assert host.exchange_raw(write_led)[4] == 0x40
 
 
 @given(st.binary(max_size=200))

@@ -127,12 +127,6 @@ def test_squeezed_object_pushes_back_when_torque_goes() -> None:
     assert target.drive.resting
 
 
-def test_springs_do_not_back_drive_the_gears() -> None:
-    target = servo(start=10.0)
-    run(target, 5.0)
-    assert target.drive.opening == pytest.approx(10.0, abs=0.1)
-
-
 # --- modes
 
 
@@ -143,18 +137,6 @@ def test_position_mode_reaches_its_goal() -> None:
         write(target, mx64.GOAL_POSITION, goal)
         run(target, 1.5)
         assert read(target, mx64.PRESENT_POSITION) == pytest.approx(goal, abs=25)
-
-
-def test_velocity_mode_holds_its_speed() -> None:
-    target = servo(start=0.0)
-    ready(target, OperatingMode.VELOCITY)
-    write(target, mx64.GOAL_VELOCITY, 100)
-    run(target, 0.8)
-    assert read(target, mx64.PRESENT_VELOCITY) == pytest.approx(100, abs=5)
-    assert read(target, mx64.VELOCITY_TRAJECTORY) == 100
-    write(target, mx64.GOAL_VELOCITY, 0)
-    run(target, 0.5)
-    assert read(target, mx64.PRESENT_VELOCITY) == pytest.approx(0, abs=5)
 
 
 def test_current_mode_moves_until_blocked() -> None:
@@ -170,21 +152,6 @@ def test_current_mode_moves_until_blocked() -> None:
     write(weak, mx64.GOAL_CURRENT, -20)
     run(weak, 0.5)
     assert weak.drive.opening == pytest.approx(50.0, abs=0.1)
-
-
-def test_pwm_mode_sets_the_duty() -> None:
-    target = servo(start=0.0)
-    ready(target, OperatingMode.PWM)
-    write(target, mx64.GOAL_PWM, 300)
-    run(target, 0.3)
-    assert read(target, mx64.PRESENT_PWM) == pytest.approx(300, abs=1)
-    assert read(target, mx64.PRESENT_VELOCITY) > 50
-    limited = servo(start=0.0)
-    write(limited, mx64.PWM_LIMIT, 100)
-    ready(limited, OperatingMode.POSITION)
-    write(limited, mx64.GOAL_POSITION, 4000)
-    run(limited, 0.3)
-    assert read(limited, mx64.PRESENT_PWM) == 100
 
 
 # --- profiles
@@ -250,19 +217,6 @@ def test_time_based_profile_ends_on_time(total: int, ramp: int) -> None:
     assert time == pytest.approx(total * 1e-3, abs=0.012)
 
 
-def test_new_goal_keeps_the_speed() -> None:
-    profile = Profile()
-    profile.hold(0.0)
-    profile.start(2000.0, 200, 50)
-    for _ in range(150):
-        profile.step(PERIOD)
-    before = profile.velocity
-    profile.start(-2000.0, 200, 50)
-    profile.step(PERIOD)
-    assert 0 < profile.velocity < before
-    assert before - profile.velocity < 50 * mx64.ACCELERATION_UNIT / mx64.TICK * PERIOD * 1.01
-
-
 # --- heat and supply
 
 
@@ -317,16 +271,6 @@ def test_overload_needs_load_and_time(units: int, trips: bool) -> None:
     run(target, 6.0)
     assert target.hardware_error == (HardwareError.OVERLOAD if trips else HardwareError.NONE)
     assert target.torque is not trips
-
-
-def test_overload_can_be_masked() -> None:
-    target = servo(start=1.0)
-    write(target, mx64.SHUTDOWN, HardwareError.OVERHEATING)
-    ready(target, EZ)
-    write(target, mx64.GOAL_POSITION, -15000)
-    run(target, 8.0)
-    assert target.hardware_error == HardwareError.OVERLOAD
-    assert target.torque
 
 
 def test_supply_sags_under_load() -> None:

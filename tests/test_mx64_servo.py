@@ -12,11 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.mx64 import Firmware, Servo
-from dexkit.errors import UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import ErrorNumber, Instruction, Packet
-from dexkit.wire.mx64 import HardwareError, Item, MovingStatus, OperatingMode
+from dexkit.wire.mx64 import HardwareError, Item, OperatingMode
 from tests.each import each
 from tests.mx64_helpers import QUIET, error_of, read, ready, run, servo, write
 
@@ -55,13 +54,6 @@ def test_read_answers_data_or_access_error(address: int, length: int) -> None:
         assert (error, len(data)) == (0, length)
     else:
         assert (error, data) == (ErrorNumber.ACCESS, b"")
-
-
-def test_reading_across_a_gap_can_be_allowed() -> None:
-    # what SAKE's driver does: 70 with length 2, where 71 is nothing
-    assert servo().read_block(70, 2) == (ErrorNumber.ACCESS, b"")
-    lenient = servo(firmware=with_firmware(read_across_gaps=True))
-    assert lenient.read_block(70, 2) == (0, b"\0\0")
 
 
 # --- writes
@@ -152,14 +144,6 @@ def test_goal_beyond_limit_is_refused(limit: Item, at: int, goal: Item, most: in
         assert write(target, goal, -most - 1) == ErrorNumber.DATA_LIMIT
 
 
-def test_position_limits_count_in_mode_3_only() -> None:
-    target = servo()
-    assert write(target, mx64.GOAL_POSITION, -1) == ErrorNumber.DATA_LIMIT
-    assert write(target, mx64.GOAL_POSITION, 4096) == ErrorNumber.DATA_LIMIT
-    assert write(target, mx64.OPERATING_MODE, OperatingMode.CURRENT_BASED_POSITION) == 0
-    assert write(target, mx64.GOAL_POSITION, -15000) == 0
-
-
 # --- mode changes, folding
 
 
@@ -214,38 +198,6 @@ def test_goal_follows_the_position_at_torque_on() -> None:
     assert read(keeps, mx64.PRESENT_POSITION) == pytest.approx(2000, abs=20)
 
 
-def test_homing_offset_is_added_and_limited_in_mode_3() -> None:
-    target = servo()
-    at = read(target, mx64.PRESENT_POSITION)
-    write(target, mx64.HOMING_OFFSET, -2000)
-    assert read(target, mx64.PRESENT_POSITION) == at - 1024
-    write(target, mx64.OPERATING_MODE, OperatingMode.EXTENDED_POSITION)
-    assert read(target, mx64.PRESENT_POSITION) == at - 2000
-    ready(target, OperatingMode.EXTENDED_POSITION)
-    write(target, mx64.GOAL_POSITION, at - 2000 + 500)
-    run(target, 1.0)
-    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at - 1500, abs=10)
-
-
-def test_reverse_mode_mirrors_everything() -> None:
-    target = servo()
-    normal = read(target, mx64.PRESENT_POSITION)
-    write(target, mx64.DRIVE_MODE, mx64.DriveMode.REVERSE)
-    send(target, Instruction.REBOOT)
-    run(target, 0.5)
-    at = read(target, mx64.PRESENT_POSITION)
-    assert at == 4096 - normal
-    ready(target, OperatingMode.CURRENT_BASED_POSITION)
-    opening = target.drive.opening
-    write(target, mx64.GOAL_POSITION, at + 500)
-    run(target, 0.1)
-    assert read(target, mx64.PRESENT_VELOCITY) > 0
-    assert read(target, mx64.PRESENT_CURRENT) > 0
-    run(target, 1.0)
-    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at + 500, abs=10)
-    assert target.drive.opening == pytest.approx(opening - 20, abs=1)
-
-
 # --- status policy
 
 
@@ -298,54 +250,6 @@ def test_invalid_instructions_return_error(code: int, params: bytes, error: int)
     assert error_of(servo().handle(Packet(1, code, params))) == error
 
 
-# --- registered writes, clear, factory reset, backup
-
-
-def test_clear_folds_position_only_at_rest() -> None:
-    target = servo(closed_at=3010, start=90.0)
-    ready(target, OperatingMode.CURRENT_BASED_POSITION)
-    target.drive.counter -= 8192
-    target.drive.reset_control()
-    write(target, mx64.GOAL_POSITION, read(target, mx64.PRESENT_POSITION) - 1000)
-    run(target, 0.1)
-    assert send(target, Instruction.CLEAR, dxl.CLEAR_POSITION_KEY).error == ErrorNumber.RESULT_FAIL
-    run(target, 1.5)
-    assert send(target, Instruction.CLEAR, dxl.CLEAR_POSITION_KEY).error == 0
-    at = read(target, mx64.PRESENT_POSITION)
-    assert 0 <= at <= 4095
-    run(target, 0.5)  # and it stays there
-    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at, abs=3)
-
-
-@each(("option", "servo_id", "baud"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 2_000_000)])
-def test_factory_reset_keeps_what_its_option_says(option: int, servo_id: int, baud: int) -> None:
-    target = servo(7, baudrate=2_000_000)
-    write(target, mx64.CURRENT_LIMIT, 100)
-    status = send(target, Instruction.FACTORY_RESET, bytes([option]))
-    assert (status.id, status.error) == (7, 0)
-    assert target.silent
-    run(target, 0.5)
-    assert (target.id, target.baudrate) == (servo_id, baud)
-    assert read(target, mx64.CURRENT_LIMIT) == 1941
-
-
-def test_backup_and_restore_when_switched_on() -> None:
-    target = servo(firmware=with_firmware(backup=True))
-    write(target, mx64.CURRENT_LIMIT, 111)
-    backup = Instruction.CONTROL_TABLE_BACKUP
-    assert send(target, backup, b"\x02CTRL").error == ErrorNumber.RESULT_FAIL
-    write(target, mx64.TORQUE_ENABLE, 1)
-    assert send(target, backup, b"\x01CTRL").error == ErrorNumber.RESULT_FAIL
-    write(target, mx64.TORQUE_ENABLE, 0)
-    assert send(target, backup, b"\x01CTRX").error == ErrorNumber.DATA_RANGE
-    assert send(target, backup, b"\x01").error == ErrorNumber.DATA_LENGTH
-    assert send(target, backup, b"\x01CTRL").error == 0
-    write(target, mx64.CURRENT_LIMIT, 222)
-    assert send(target, backup, b"\x02CTRL").error == 0
-    run(target, 0.5)
-    assert read(target, mx64.CURRENT_LIMIT) == 111
-
-
 # --- reboot
 
 
@@ -396,21 +300,6 @@ def test_indirect_data_read_and_write_their_targets(first: int) -> None:
     assert read(target, mx64.GOAL_CURRENT) == 320
     assert read(target, mx64.GOAL_POSITION) == -777
     assert target.read_block(at, 6) == (0, block)
-
-
-def test_indirect_inherits_size_range_and_access() -> None:
-    target = servo()
-    at = mx64.indirect_data(1).address
-    map_bytes(target, 1, [102, 103])
-    assert target.write_block(at, b"\0") == ErrorNumber.DATA_LENGTH
-    assert target.write_block(at, mx64.GOAL_CURRENT.encode(2000)) == ErrorNumber.DATA_RANGE
-    map_bytes(target, 1, [103, 102])
-    assert target.write_block(at, b"\0\0") == ErrorNumber.DATA_LENGTH
-    map_bytes(target, 1, [126, 127])
-    assert target.write_block(at, b"\0\0") == ErrorNumber.ACCESS
-    map_bytes(target, 1, [71, 72])
-    assert target.write_block(at, b"\0\0") == ErrorNumber.ACCESS
-    assert target.read_block(at, 2) == (ErrorNumber.ACCESS, b"")
 
 
 # --- bus watchdog
@@ -493,61 +382,6 @@ def test_shutdown_drops_torque_until_reboot_and_alerts() -> None:
     assert read(target, mx64.HARDWARE_ERROR_STATUS) == 0
     assert write(target, mx64.TORQUE_ENABLE, 1) == 0
     assert read(target, mx64.TORQUE_ENABLE) == 1
-
-
-# --- persistence and set-up
-
-
-def test_eeprom_survives_into_another_run() -> None:
-    target = servo()
-    saved: list[bytes] = []
-    target.on_eeprom = lambda: saved.append(target.eeprom)
-    write(target, mx64.LED, 1)
-    assert saved == []
-    write(target, mx64.CURRENT_LIMIT, 1600)
-    write(target, mx64.CURRENT_LIMIT, 1600)
-    assert len(saved) == 1
-    again = servo(eeprom=saved[-1])
-    assert read(again, mx64.CURRENT_LIMIT) == 1600
-    assert read(again, mx64.LED) == 0
-
-
-def test_wrong_values_in_eeprom_are_refused() -> None:
-    good = bytearray(servo().eeprom)
-    for item, value in ((mx64.BAUD_RATE, 9), (mx64.OPERATING_MODE, 2)):
-        bad = good[:]
-        bad[item.address] = value
-        with pytest.raises(UsageError):
-            servo(eeprom=bytes(bad))
-
-
-# --- moving status
-
-
-def test_moving_status_reports_profile_type() -> None:
-    target = servo(start=10.0)
-    ready(target, OperatingMode.EXTENDED_POSITION)
-    at = read(target, mx64.PRESENT_POSITION)
-    shapes = {}
-    for name, velocity, acceleration, distance in (
-        ("rectangle", 50, 0, 500),
-        ("trapezoid", 50, 50, 500),
-        ("triangle", 400, 20, 300),
-    ):
-        write(target, mx64.PROFILE_VELOCITY, velocity)
-        write(target, mx64.PROFILE_ACCELERATION, acceleration)
-        at += distance
-        write(target, mx64.GOAL_POSITION, at)
-        run(target, 0.1)
-        assert read(target, mx64.MOVING) == 1
-        status = MovingStatus(read(target, mx64.MOVING_STATUS))
-        assert status & MovingStatus.PROFILE_ONGOING
-        shapes[name] = int(status) & 0x30
-        run(target, 4.0)
-        status = MovingStatus(read(target, mx64.MOVING_STATUS))
-        assert status == MovingStatus.IN_POSITION
-        assert read(target, mx64.MOVING) == 0
-    assert shapes == {"rectangle": 0x10, "trapezoid": 0x30, "triangle": 0x20}
 
 
 # --- any instructions keep registers within limits
