@@ -364,12 +364,12 @@ def test_command_writes_tables_page_and_exit_code(
             main(["audit", *arguments])
         return ended.value.code, "".join(capsys.readouterr())
 
-    code, text = run("archive", "--jobs", "1", "--format", "jsonl")
+    code, text = run("archive", "--jobs", "1", "--set", "format=jsonl")
     assert code == 1
     assert "2 of 2 files" in text
     lines = (tmp_path / "audit-out/files.jsonl").read_text().splitlines()
     assert [json.loads(line)["file"] for line in lines] == ["archive/a.mcap", "archive/b.mcap"]
-    code, text = run("archive", "--format", "jsonl", "--fail-on", "never")
+    code, text = run("archive", "--set", "format=jsonl", "--fail-on", "never")
     assert (code, "2 unchanged" in text) == (0, True)
     (tmp_path / "none").mkdir()
     code, text = run("none")

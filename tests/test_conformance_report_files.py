@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -360,6 +361,9 @@ def test_badge_and_comparison_on_the_command_line(judged: Path, tmp_path: Path) 
     assert done.exit_code == 1
     assert "1 regression: DEX1-TOPIC-01" in done.output
     assert "Regressions (1)" in (tmp_path / "c.html").read_text()
+    found = json.loads(run("compare", a, b, "--json").stdout)
+    assert [c["id"] for c in found["regressions"]] == ["DEX1-TOPIC-01"]
+    assert found["requirements"][0]["verdicts"] == ["pass", "fail"]
     same = run("compare", a, a)
     assert same.exit_code == 0
     assert "Nowhere: all verdicts agree" in same.output

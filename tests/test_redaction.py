@@ -200,7 +200,7 @@ def test_no_path_of_any_command_is_a_url(
         ("view", "--rerun", "rerun+http://user:secret@h:1/proxy?token=secret"),
         ("serve", "sim-dex1", "--set", "usb=usbip://user:secret@host:1/x?secret"),
         ("check", f"--require={URL}", URL),
-        ("audit", ".", "--format", URL),
+        ("audit", ".", "--set", f"format={URL}"),
         ("audit", ".", "--ray", "ray://user:secret@127.0.0.1:1"),
         (URL,),
         ("info", f"--{URL}"),

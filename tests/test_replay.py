@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dexkit.cli import cli
 from dexkit.command_age import PAUSE, SETTLE
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.errors import SessionError, UsageError
@@ -793,6 +795,11 @@ def test_a_refused_session_is_rehearsed_nevertheless(tmp_path: Path) -> None:
     assert "--accept zero-gains" in output
     assert "cured by" not in output
     assert "It is refused" in page.read_text()
+    told = CliRunner().invoke(cli, ["rehearse", str(tmp_path / "session.mcap"), "--json"])
+    found = json.loads(told.stdout)
+    assert [f["name"] for f in found["findings"] if f["level"] == "refused"] == ["zero-gains"]
+    assert found["refused"]
+    assert {joint["side"] for joint in found["joints"]} <= {"left", "right"}
 
 
 def test_options_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from click.testing import CliRunner
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
+from dexkit.cli import cli
 from dexkit.messages import message_type
 from dexkit.robots import ROBOTS, RobotModel
 from dexkit.traces import Recorder, open_trace, sample_path
@@ -57,6 +59,22 @@ def test_tables_give_the_recording_back(tmp_path: Path, part: Path, form: str) -
     about = json.loads((tmp_path / "t" / "session.json").read_text())
     assert any("padding" in text for text in about["lost"])
     assert dexkit("export", part, "--to", form, "--out", tmp_path / "t")[0] == 2  # it exists
+
+
+def test_programs_read_what_became_of_each_session(tmp_path: Path, part: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"nothing")
+    run = CliRunner().invoke
+    there = run(
+        cli, ["export", str(part), str(bad), *f"--to csv --out {tmp_path}/t --json".split()]
+    )
+    found = json.loads(there.stdout)
+    assert [one["recording"] for one in found["exported"]] == [str(part)]
+    assert [one["recording"] for one in found["refused"]] == [str(bad)]
+    back = run(cli, ["import", found["exported"][0]["folder"], f"{tmp_path}/b.mcap", "--json"])
+    (one,) = json.loads(back.stdout)["imported"]
+    assert one["messages"] == found["exported"][0]["messages"]
+    assert Path(one["recording"]).is_file()
 
 
 @settings(max_examples=10, deadline=None, phases=[Phase.explicit, Phase.generate])

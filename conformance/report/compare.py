@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 from dexkit.conformance.kit.requirements import Requirement
 from dexkit.conformance.kit.results import Result, RunResult, Verdict, worst
@@ -20,7 +21,13 @@ from dexkit.conformance.report.labels import (
 from dexkit.conformance.report.pages import code, fill
 from dexkit.errors import UsageError
 
-__all__ = ["Change", "Comparison", "render_comparison", "render_comparison_markdown"]
+__all__ = [
+    "Change",
+    "Comparison",
+    "comparison_data",
+    "render_comparison",
+    "render_comparison_markdown",
+]
 
 _BADNESS = {Verdict.PASS: 0, Verdict.WARN: 1, Verdict.FAIL: 2}
 """Rank of a verdict. A verdict without a finding about the hand has none; the requirement that
@@ -202,6 +209,40 @@ def render_comparison_markdown(comparison: Comparison) -> str:
         matrix=_matrix,
         change_text=_change_text,
     )
+
+
+def comparison_data(comparison: Comparison) -> dict[str, Any]:
+    """The comparison for programs, as data for JSON: names and order as in the other forms."""
+
+    def changes(found: Sequence[Change]) -> list[dict[str, str]]:
+        return [
+            {
+                "id": c.requirement.id,
+                "from": comparison.names[c.before],
+                "to": comparison.names[c.after],
+                "was": str(c.was),
+                "now": str(c.now),
+            }
+            for c in found
+        ]
+
+    return {
+        "runs": [
+            {"name": name, "verdict": str(run.overall), "recorded_at": run.recorded_at}
+            for run, name in zip(comparison.runs, comparison.names, strict=True)
+        ],
+        "regressions": changes(comparison.regressions),
+        "improvements": changes(comparison.improvements),
+        "requirements": [
+            {
+                "id": row.requirement.id,
+                "differs": row.differs,
+                "verdicts": [None if v is None else str(v) for v in row.verdicts],
+                "figures": [_figure(group) for group in row.found],
+            }
+            for row in comparison.rows
+        ],
+    }
 
 
 def _about_run(run: RunResult, name: str) -> list[str]:

@@ -12,6 +12,7 @@ import click
 
 from dexkit.cli.command_help import Command
 from dexkit.cli.options import Number, jobs_option, out_option
+from dexkit.cli.settings import Setting, Settings, settings_option
 from dexkit.cli.status_line import StatusLine
 from dexkit.console import Console
 from dexkit.errors import ConformanceError
@@ -22,6 +23,18 @@ if TYPE_CHECKING:
 
 _STATUS_PERIOD = 0.2  # seconds
 _FAIL_ON = ("never", "fail", "unusable", "warn")
+_PARQUET = {"auto": None, "parquet": True, "jsonl": False}
+_SETTINGS = (
+    Setting(
+        "format",
+        "|".join(_PARQUET),
+        click.Choice([*_PARQUET]),
+        "Format of the tables; auto is Parquet if pyarrow is installed.",
+        "auto",
+    ),
+    Setting("timeout", "S", Number(min=1), "Seconds for one file.", 600.0),
+    Setting("memory", "MIB", click.IntRange(256, 2**24), "Memory for one file.", 4096),
+)
 
 
 @click.command(
@@ -45,14 +58,6 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     show_default=True,
     help="Which findings make the exit code non-zero; each level includes those before it.",
 )
-@click.option(
-    "--format",
-    "table_format",
-    type=click.Choice(["auto", "parquet", "jsonl"]),
-    default="auto",
-    show_default=True,
-    help="Format of the tables; auto is Parquet if pyarrow is installed.",
-)
 @jobs_option()
 @click.option(
     "--ray",
@@ -62,31 +67,14 @@ _FAIL_ON = ("never", "fail", "unusable", "warn")
     help="Judge on a Ray cluster (extra [ray]): at HOST:PORT, the running one of this machine "
     "(auto, the default without ADDRESS), or a new one for this audit only (local).",
 )
-@click.option(
-    "--timeout",
-    type=Number(min=1),
-    default=600.0,
-    show_default=True,
-    metavar="S",
-    help="Seconds for one file.",
-)
-@click.option(
-    "--memory",
-    type=click.IntRange(256, 2**24),
-    default=4096,
-    show_default=True,
-    metavar="MIB",
-    help="Memory for one file.",
-)
+@settings_option(_SETTINGS)
 def command(
     locations: tuple[str, ...],
     out: Path,
     fail_on: str,
-    table_format: str,
     jobs: int | None,
     ray: str | None,
-    timeout: float,
-    memory: int,
+    settings: Settings,
 ) -> None:
     """Judge every recorded session (mcap file) in folders or behind URLs, as 'dexkit check' does.
 
@@ -103,12 +91,12 @@ def command(
         raise click.UsageError(
             "--jobs counts processes on this machine; it cannot be combined with --ray"
         )
-    limits = Limits(seconds=timeout, memory=memory * 2**20)
+    limits = Limits(seconds=settings["timeout"], memory=settings["memory"] * 2**20)
     audit = Audit(
         locations,
         out.absolute(),
         limits=limits,
-        parquet=None if table_format == "auto" else table_format == "parquet",
+        parquet=_PARQUET[settings["format"]],
         working_folder=Path.cwd(),
     )
     # Python's worker processes begin with the working folder in front of their import path

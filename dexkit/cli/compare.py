@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from dexkit.cli.command_help import Command
 from dexkit.cli.options import (
     LocalPath,
     html_option,
+    json_option,
 )
 from dexkit.cli.report import recording_beside, write_text
 from dexkit.digests import sha256_of_file
@@ -39,7 +41,8 @@ if TYPE_CHECKING:
     metavar="A.json B.json ...",
 )
 @html_option()
-def command(results: tuple[Path, ...], html_path: Path | None) -> None:
+@json_option("Print JSON instead of Markdown.")
+def command(results: tuple[Path, ...], html_path: Path | None, as_json: bool) -> None:
     """Compare results of several hands, or of several versions of one; prints Markdown.
 
     Runs of the same hand (its name in capabilities.toml, else the backend) are compared in order of
@@ -49,6 +52,7 @@ def command(results: tuple[Path, ...], html_path: Path | None) -> None:
     from dexkit.conformance.kit.result_file import read_json
     from dexkit.conformance.report.compare import (
         Comparison,
+        comparison_data,
         render_comparison,
         render_comparison_markdown,
     )
@@ -64,7 +68,9 @@ def command(results: tuple[Path, ...], html_path: Path | None) -> None:
     if html_path:
         write_text(html_path, render_comparison(comparison, *_recordings(comparison, results)))
         click.echo(f"report: {html_path}", err=True)
-    else:
+    if as_json:
+        click.echo(json.dumps(comparison_data(comparison), indent=1))
+    elif not html_path:
         click.echo(render_comparison_markdown(comparison), nl=False)
     regressions = comparison.regressions
     if regressions:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import FILE, out_option
+from dexkit.cli.options import FILE, json_option, out_option
 from dexkit.cli.remarks import remark, remarks
 from dexkit.cli.settings import Setting, Settings, settings_option
 from dexkit.errors import DexkitError, SessionError, UsageError
 from dexkit.escaping import REMARK, one_line
+
+if TYPE_CHECKING:
+    from dexkit.traces import Trace
 
 __all__ = ["command"]
 
@@ -60,12 +66,14 @@ _SETTINGS = (
     help="The folder that was imported, for lerobot and episodes: pictures that are not in the "
     "recordings are read below it, and nowhere else.",
 )
+@json_option("Print JSON: what became of each recording.")
 def command(
     sessions: tuple[Path, ...],
     form: str,
     out: Path,
     settings: Settings,
     pictures: Path | None,
+    as_json: bool,
 ) -> int:
     """Write the recordings SESSION... to the folder DIR in another format.
 
@@ -81,13 +89,15 @@ def command(
     if form in ("lerobot", "episodes"):
         # bytes of the command line that are no UTF-8 are escaped, as those of recordings are
         text = None if task is None else task.encode("utf-8", "backslashreplace").decode()
-        return _frames(sessions, form, out, fps, text, pictures)
+        return _frames(sessions, form, out, fps, text, pictures, as_json)
     if fps is not None or task is not None or pictures is not None:
         raise UsageError(f"fps, task and --pictures are for lerobot and episodes, not {form}")
     several = len(sessions) > 1
     if several and len({p.stem for p in sessions}) < len(sessions):
         raise UsageError("two of the recordings have the same name", hint="export them one by one")
-    done, trouble = 0, False
+    trouble = False
+    done: list[dict[str, Any]] = []
+    refused: list[dict[str, str]] = []
     for path in sessions:
         target = out / path.stem if several else out
         try:
@@ -102,12 +112,17 @@ def command(
                 raise
             trouble = True
             remark("warning", f"refused: {error}", path)
+            refused.append({"recording": str(path), "why": str(error)})
             continue
-        done += 1
+        about = {"recording": str(path), "folder": str(target), "messages": written}
+        done.append({**about, "lost": lost, "problems": trace.warnings})
         trouble |= bool(trace.damage)
         remarks("warning", trace.warnings, path)
         remarks(f"not in {form}", lost)
-        click.echo(one_line(f"{target}: {written} of {trace.message_count} messages", REMARK))
+        if not as_json:
+            click.echo(one_line(f"{target}: {written} of {trace.message_count} messages", REMARK))
+    if as_json:
+        click.echo(json.dumps({"exported": done, "refused": refused}, indent=1))
     if not done:
         raise SessionError("none of the recordings could be exported")
     return 1 if trouble else 0
@@ -120,25 +135,32 @@ def _frames(
     fps: int | None,
     task: str | None,
     pictures: Path | None,
+    as_json: bool,
 ) -> int:
     from dexkit.traces import open_trace
     from dexkit.traces.sessions import episodes_out, lerobot_out
 
-    traces, refused = [], []
+    traces: list[Trace] = []
+    refused: list[dict[str, str]] = []
     for path in sessions:
         try:
             traces.append(open_trace(path))
         except DexkitError as error:
             if len(sessions) == 1:
                 raise
-            refused.append(f"{path}: refused: {error}")
+            remark("warning", f"refused: {error}", path)
+            refused.append({"recording": str(path), "why": str(error)})
     if not traces:
         raise SessionError("none of the recordings could be exported")
     export = lerobot_out.export_dataset if form == "lerobot" else episodes_out.export_episodes
     result = export(traces, out, fps=fps, task=task, pictures=pictures)
     for trace in traces:
         remarks("warning", trace.warnings, trace.path)
-    remarks("warning", (*refused, *result.problems))
+    remarks("warning", result.problems)
     remarks(f"not in {form}", result.lost)
-    click.echo(f"{out}: {lerobot_out.describe(result)}")
+    if as_json:
+        done = {"recordings": [str(t.path) for t in traces], "folder": str(out), **asdict(result)}
+        click.echo(json.dumps({"exported": [done], "refused": refused}, indent=1))
+    else:
+        click.echo(f"{out}: {lerobot_out.describe(result)}")
     return 1 if refused or result.problems or any(t.damage for t in traces) else 0

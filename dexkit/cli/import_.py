@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import FILE, Number, overwrite_option
+from dexkit.cli.options import FILE, Number, json_option, overwrite_option
 from dexkit.cli.remarks import remark, remarks
 from dexkit.cli.settings import YES_OR_NO, Setting, Settings, settings_option
 from dexkit.errors import DexkitError, SessionError, UsageError
@@ -74,6 +75,7 @@ _SETTINGS = (
     help="A recording (.mcap) of the same session; the frames get the times of its messages.",
 )
 @overwrite_option("existing recordings")
+@json_option("Print JSON: what became of each session.")
 def command(
     source: Path,
     out: Path,
@@ -82,6 +84,7 @@ def command(
     settings: Settings,
     wire: Path | None,
     overwrite: bool,
+    as_json: bool,
 ) -> int:
     """Write the sessions of SOURCE as recordings.
 
@@ -108,7 +111,9 @@ def command(
             f"{source} has {len(entries)} sessions, which do not fit into one recording",
             hint=f"name a folder (OUT without .mcap), or one of them: --episode {entries[0].name}",
         )
-    done, trouble = 0, False
+    trouble = False
+    done: list[dict[str, Any]] = []
+    refused: list[dict[str, str]] = []
     written: dict[Path, str] = {}
     for entry in entries:
         *folders, name = (file_name(part, 200) for part in entry.name.split("/"))
@@ -122,13 +127,18 @@ def command(
             if len(entries) == 1:
                 raise
             trouble = True
-            remark("warning", f"refused: {str(error) or 'out of memory'}", entry.name)
+            why = str(error) or "out of memory"
+            remark("warning", f"refused: {why}", entry.name)
+            refused.append({"session": entry.name, "why": why})
             continue
-        done += 1
+        done.append({"session": entry.name, "recording": str(target), **asdict(report)})
         trouble |= bool(report.problems)
         remarks("corrected", report.corrections, entry.name)
         remarks("warning", report.problems, entry.name)
-        click.echo(one_line(f"{target}: {report.messages} messages ({report.form})", REMARK))
+        if not as_json:
+            click.echo(one_line(f"{target}: {report.messages} messages ({report.form})", REMARK))
+    if as_json:
+        click.echo(json.dumps({"imported": done, "refused": refused}, indent=1))
     if not done:
         raise SessionError(f"none of the {len(entries)} sessions of {source} can be imported")
     return 1 if trouble else 0

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from dexkit.cli.command_help import Command
-from dexkit.cli.options import html_option
+from dexkit.cli.options import html_option, json_option
 from dexkit.cli.replay_session import checked_session, guards, print_refusal, session_to_play
 from dexkit.cli.settings import Settings
 from dexkit.errors import UsageError
@@ -33,7 +35,8 @@ __all__ = ["command"]
 )
 @session_to_play()
 @click.option("--check", "check_only", is_flag=True, help="Only check the session.")
-@html_option("Where to write the page.  [default: SOURCE-rehearsal.html]")
+@html_option("Where to write the page.  [default: SOURCE-rehearsal.html; with --json, none]")
+@json_option("Print JSON: the findings, and the figures of each joint.")
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -42,6 +45,7 @@ def command(
     check_only: bool,
     html_path: Path | None,
     settings: Settings,
+    as_json: bool,
     **given: Any,
 ) -> int:
     """Rehearse a replay: nothing is published, and no hand moves.
@@ -53,10 +57,22 @@ def command(
     """
     if check_only and html_path is not None:
         raise UsageError("the page is of a rehearsal", hint="leave out --check")
-    session, prepared = checked_session(source, settings=settings, **given)
+    from dexkit.traces.replay.machine import End
+
+    session, prepared = checked_session(source, settings=settings, quiet=as_json, **given)
     code = 1 if session.damage else 0
+    rehearsal = None
     if not check_only:
-        code = _rehearse(prepared, guards(settings), source, session.name, html_path, ctx) or code
+        if html_path is None and not as_json:
+            html_path = Path(f"{Path(session.name).name.removesuffix('.mcap')}-rehearsal.html")
+        rehearsal = _rehearse(prepared, guards(settings), source, html_path, ctx)
+        if rehearsal is None or rehearsal.machine.end is not End.DONE:
+            code = 1
+    if as_json:
+        click.echo(json.dumps(_data(prepared, rehearsal), indent=1))
+    elif rehearsal is not None:
+        _print_rehearsal(rehearsal)
+        click.echo(f"page: {html_path}")
     if prepared.refused:
         print_refusal(prepared)
         return 1
@@ -64,29 +80,33 @@ def command(
 
 
 def _rehearse(
-    prepared: Prepared,
-    guards: Guards,
-    source: Path,
-    name: str,
-    page: Path | None,
-    ctx: click.Context,
-) -> int:
-    """Rehearse, print a summary, write the page; the exit code."""
+    prepared: Prepared, guards: Guards, source: Path, page: Path | None, ctx: click.Context
+) -> Rehearsal | None:
+    """Rehearse and write the page; None if nothing is left to be played."""
     from dexkit.conformance.report.rehearsal import render
     from dexkit.conformance.virtual.rehearsal import rehearse
     from dexkit.documents import check_output_paths, write_file
-    from dexkit.traces.replay.machine import End
 
     if prepared.plan is None:
-        return 1
-    if page is None:
-        page = Path(f"{Path(name).name.removesuffix('.mcap')}-rehearsal.html")
+        return None
     check_output_paths([source], [page])
     rehearsal = rehearse(prepared.plan, guards)
-    _print_rehearsal(rehearsal)
-    write_file(page, render(prepared, rehearsal, source=str(source), options=_options(ctx)))
-    click.echo(f"page: {page}")
-    return 0 if rehearsal.machine.end is End.DONE else 1
+    if page is not None:
+        write_file(page, render(prepared, rehearsal, source=str(source), options=_options(ctx)))
+    return rehearsal
+
+
+def _data(prepared: Prepared, rehearsal: Rehearsal | None) -> dict[str, Any]:
+    """Findings and figures as data for JSON."""
+    figures = rehearsal.figures() if rehearsal else {}
+    return {
+        "findings": [{**asdict(f), "level": str(f.level)} for f in prepared.findings],
+        "refused": bool(prepared.refused),
+        "ended": rehearsal.machine.reason if rehearsal else "not rehearsed",
+        "joints": [
+            {"side": str(side), **asdict(f)} for side, some in figures.items() for f in some
+        ],
+    }
 
 
 def _options(ctx: click.Context) -> str:

@@ -158,9 +158,11 @@ def checked_session(
     pace: float,
     accept: tuple[str, ...],
     settings: Settings,
+    quiet: bool = False,
 ) -> tuple[RecordedCommands, Prepared]:
     """Read a session, check it and print what was found.
 
+    :param quiet: print nothing.
     :raises DexkitError: it cannot be read.
     """
     from dexkit.traces.replay.commands import read_session
@@ -184,7 +186,8 @@ def checked_session(
             accept=accept,
         ),
     )
-    _print_session(session, prepared)
+    if not quiet:
+        _print_session(session, prepared)
     return session, prepared
 
 

@@ -69,12 +69,6 @@ __all__ = ["command", "recorded"]
     help="Open the page in a browser.  [default: where there is a display]",
 )
 @click.option(
-    "--judge/--no-judge",
-    default=True,
-    show_default=True,
-    help="Judge recordings, to mark what fails on the time line.",
-)
-@click.option(
     "--urdf",
     "urdfs",
     multiple=True,
@@ -104,7 +98,6 @@ def command(
     port: int | None,
     origins: tuple[str, ...],
     open_browser: bool | None,
-    judge: bool,
     urdfs: tuple[str, ...],
     foxglove: bool,
     rerun: str | None,
@@ -138,7 +131,7 @@ def command(
 
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
-        sources: list[Source] = [recorded(path, judge and on_page) for path in recordings]
+        sources: list[Source] = [recorded(path, on_page) for path in recordings]
         if live or not recordings:
             sources.insert(0, _live(stack, domain, interface, topics))
         skeletons = _skeletons(urdfs)
