@@ -41,10 +41,6 @@ _FLOOD = 500
 """Commands of a burst."""
 _BETWEEN = 0.3
 """Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
-_STATUSES = range(2, 8)
-"""Values of the three status bits without a meaning in a command to a hand. A status
-of 6 calibrates a motor only with a certain torque, which these commands do not have
-(docs/sources/unitree-dex.md#g)."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -52,7 +48,6 @@ _BAD = {
     "short": "commands for a motor too few: nothing may move",
     "long": "commands for more motors than there are: nothing may move",
     "negative": "negative gains: nothing may run away",
-    "status": "mode bytes with an unknown status: nothing may move",
     "wrong-id": "mode bytes with each other's id: the wrong joint must not move",
 }
 
@@ -94,10 +89,10 @@ def send_other_type(script: GripperScript) -> Steps:
     yield from _send_and_recover(script, "foreign", most=1.5)
 
 
-@stimulus("foreign empty short long negative status wrong-id", FingerScript, after="out-of-range")
+@stimulus("foreign empty short long negative wrong-id", FingerScript, after="out-of-range")
 def send_malformed(script: FingerScript) -> Steps:
     """Every other kind, with one step after them, to save time."""
-    yield from _send_and_recover(script, "foreign empty short long negative status wrong-id")
+    yield from _send_and_recover(script, "foreign empty short long negative wrong-id")
 
 
 def _send_and_recover(script: HandScript, kinds: str, *, most: float | None = None) -> Steps:
@@ -178,12 +173,7 @@ def _gripper_far(script: GripperScript, side: Side) -> float:
 
 
 def _send_to_fingers(script: FingerScript, name: str) -> Steps:
-    if name == "status":
-        kinds = [
-            {s: _with_status(script, s, first) for s in script.plan.sides} for first in _STATUSES
-        ]
-        yield from _send_bad(script, name, script.plan.sides, kinds, 0.1)
-    elif name == "out-of-range":
+    if name == "out-of-range":
         far = [
             {s: _at(script, s, [end] * len(script.joints[s])) for s in script.plan.sides}
             for end in (1000.0, -1000.0)
@@ -237,15 +227,6 @@ def _malformed(
             },
         ]
     return [{s: _crossed(script, s, motors) for s, motors in good.items()}]
-
-
-def _with_status(script: FingerScript, side: Side, first: int) -> Motors:
-    """Far goals with statuses that have no meaning, another one in each joint."""
-    count = len(_STATUSES)
-    return [
-        replace(m, mode=script.codec.mode(i, _STATUSES[(first + i) % count]))
-        for i, m in enumerate(script.motors(side, script.other_place()[side]))
-    ]
 
 
 def _crossed(script: FingerScript, side: Side, motors: Motors) -> Motors:

@@ -87,9 +87,7 @@ def push_held(script: GripperScript, sides: Sequence[Side]) -> Steps:
     """Push hands that are held without contact by a torque."""
     if not sides or not script.gains_used or "stiffness" not in script.plan.phases:
         return
-    phase = script.begin("stiffness", sides)
-    yield from script.hold(NUDGE_SECONDS, nudged(script, sides))
-    script.end(phase)
+    yield from script.hold_as("stiffness", sides, NUDGE_SECONDS, nudged(script, sides))
     yield from script.hold(_BACK_SECONDS)
 
 
@@ -127,10 +125,10 @@ def _feed_forward(script: GripperScript, sides: Sequence[Side]) -> Steps:
     """The way back to the middle, with a feed-forward that hardly changes it."""
     script.report("a velocity and a torque beside a position: it must be reached all the same")
     goals = {s: script.home(s) for s in sides}
-    phase = script.begin("fed", sides, targets={s: {0: q} for s, (q,) in goals.items()})
     fed = {s: (Motor(q=q, dq=_FED_DQ, tau=_FED_TAU),) for s, (q,) in goals.items()}
-    yield from script.hold(_FED_SECONDS, fed)
-    script.end(phase)
+    yield from script.hold_as(
+        "fed", sides, _FED_SECONDS, fed, targets={s: {0: q} for (s, (q,)) in goals.items()}
+    )
     script.goal.update(goals)
 
 
@@ -144,7 +142,7 @@ def _gripper_limp(script: GripperScript, side: Side) -> Steps:
         ends = [phase]
         if others:
             script.goal.update({s: script.aside(s, 0.4 * ASIDE) for s in others})
-            targets = {s: dict(enumerate(script.goal[s])) for s in others}
+            targets = {s: script.goal[s] for s in others}
             ends.append(script.begin("unlike", others, targets=targets))
         yield from script.hold(_LIMP_SECONDS, {side: (Motor(q=q, kp=0.0, kd=0.0),)})
         for ended in ends:
@@ -230,9 +228,13 @@ def step_softly(script: GripperScript, sides: Sequence[Side]) -> Steps:
     if not script.gains_used or "soft" not in script.plan.phases:
         return
     goals = {s: script.aside(s, _SOFT_STEP) for s in sides}
-    phase = script.begin("soft", sides, targets={s: {0: q} for s, (q,) in goals.items()})
-    yield from script.hold(0.8, {s: (Motor(q=q, kp=_SOFTEST),) for s, (q,) in goals.items()})
-    script.end(phase)
+    yield from script.hold_as(
+        "soft",
+        sides,
+        0.8,
+        {s: (Motor(q=q, kp=_SOFTEST),) for (s, (q,)) in goals.items()},
+        targets={s: {0: q} for (s, (q,)) in goals.items()},
+    )
     script.goal.update(goals)
 
 
@@ -246,14 +248,11 @@ def step_stiff_and_soft(script: FingerScript) -> Steps:
         kinds.append(("mild", CLOSED - 5.0, _MILD))
     for name, percent, part in kinds:
         poses = {s: script.pose(s, percent) for s in script.plan.sides}
-        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
-        phase = script.begin(name, script.plan.sides, targets=targets)
         motors = {
             s: [replace(m, kp=part * m.kp) for m in script.motors(s, pose)]
             for s, pose in poses.items()
         }
-        yield from script.hold(0.6, motors)
-        script.end(phase)
+        yield from script.hold_as(name, script.plan.sides, 0.6, motors, targets=poses)
         script.goal.update(poses)
     if "soft" in script.plan.phases:
         yield from _step_unevenly(script)
@@ -267,7 +266,6 @@ def _step_unevenly(script: FingerScript) -> Steps:
         splits = script.next_splits()
         poses = {s: script.pose(s, percent) for s in sides}
         targets = {s: {i: poses[s][i] for i in sorted(splits[s])} for s in sides}
-        phase = script.begin("soft", sides, targets=targets)
         motors = {
             s: [
                 replace(m, kp=_SOFTER * m.kp) if i in splits[s] else m
@@ -275,8 +273,7 @@ def _step_unevenly(script: FingerScript) -> Steps:
             ]
             for s, pose in poses.items()
         }
-        yield from script.hold(0.5, motors)
-        script.end(phase)
+        yield from script.hold_as("soft", sides, 0.5, motors, targets=targets)
         script.goal.update(poses)
 
 
@@ -288,10 +285,10 @@ def limp_fingers(script: FingerScript) -> Steps:
     yield from script.hold(0.1)
     # what moves by its weight moves the same way whatever q is
     for percent in (CLOSED, 0.0):
-        targets = {s: dict(enumerate(script.pose(s, percent))) for s in sides}
-        phase = script.begin("limp", sides, targets=targets)
-        yield from script.hold(0.2, script.all(percent, kp=0.0, kd=0.0))
-        script.end(phase)
+        targets = {s: script.pose(s, percent) for s in sides}
+        yield from script.hold_as(
+            "limp", sides, 0.2, script.all(percent, kp=0.0, kd=0.0), targets=targets
+        )
 
 
 @stimulus("push", FingerScript, after="mixed", leaves=Place.AWAY)
@@ -366,9 +363,7 @@ def drive_fingers(
             motors[i] = _slowly(script, motors[i], far[i])
         hands[s] = motors
         targets[s] = {i: far[i] for i in script.roles.slow}
-    phase = script.begin(name, sides, targets=targets)
-    yield from script.hold(0.3, hands)
-    script.end(phase)
+    yield from script.hold_as(name, sides, 0.3, hands, targets=targets)
 
 
 def _slowly(script: FingerScript, motor: Motor, q: float) -> Motor:

@@ -123,15 +123,11 @@ def squeeze_gripper(script: GripperScript) -> Steps:
         script.report("squeezing the object")
         script.grip = dict(gripper_squeeze(script, pressing))
         beyond = {s: {0: motors[0].q} for s, motors in script.grip.items()}
-        phase = script.begin("squeeze", pressing, targets=beyond)
-        yield from script.hold(_SQUEEZE)
-        script.end(phase)
+        yield from script.hold_as("squeeze", pressing, _SQUEEZE, targets=beyond)
         if script.gains_used and "release" in phases:
-            phase = script.begin("release", pressing)
             grip = dict(script.grip)
             script.grip = {s: (replace(m[0], kp=0.0, kd=0.0),) for s, m in grip.items()}
-            yield from script.hold(_RELEASE)
-            script.end(phase)
+            yield from script.hold_as("release", pressing, _RELEASE)
             script.grip = grip
 
 
@@ -151,9 +147,7 @@ def _hold_long(script: GripperScript, pressing: Sequence[Side], free: Sequence[S
     yield from script.hold(NUDGE_SECONDS)
     for seconds in (_LONG_GRIP if script.patient else _GRIP, 0.1):
         if push:
-            phase = script.begin("nudge", free)
-            yield from script.hold(NUDGE_SECONDS, pushed)
-            script.end(phase)
+            yield from script.hold_as("nudge", free, NUDGE_SECONDS, pushed)
         yield from script.hold(seconds)
     for phase in gripping:
         script.end(phase)
@@ -199,10 +193,8 @@ def grip_softly(script: GripperScript, pressing: Sequence[Side]) -> Steps:
     grips.append((below, script.model.command_timeout + _BEYOND_AFTER))
     for soft, seconds in grips:
         targets = {s: {0: motor.q} for s, motor in soft.items()}
-        phase = script.begin("soft-grip", pressing, targets=targets)
         script.grip.update({s: (motor,) for s, motor in soft.items()})
-        yield from script.hold(seconds)
-        script.end(phase)
+        yield from script.hold_as("soft-grip", pressing, seconds, targets=targets)
 
 
 @stimulus("grip", GripperScript, moment=Moment.NEW_CLIENT, applies=without_gains)
@@ -217,9 +209,7 @@ def grip_again(script: GripperScript) -> Steps:
         return
     script.report("squeezing the object again")
     script.grip = dict(gripper_squeeze(script, pressing))
-    phase = script.begin("regrip", pressing)
-    yield from script.hold(_SQUEEZE)
-    script.end(phase)
+    yield from script.hold_as("regrip", pressing, _SQUEEZE)
     script.grip = {}
     yield from script.turn("center", {s: (script.high(),) for s in pressing}, least=0.5)
 
@@ -283,7 +273,7 @@ def step_beside_grip(script: FingerScript, pressing: Sequence[Side]) -> list[Pha
     if not (free and pressing and "beside-grip" in script.plan.phases):
         return []
     script.goal.update({s: script.pose(s, CLOSED - 5.0) for s in free})
-    targets = {s: dict(enumerate(script.goal[s])) for s in free}
+    targets = {s: script.goal[s] for s in free}
     return [script.begin("beside-grip", free, targets=targets)]
 
 

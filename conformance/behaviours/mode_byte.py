@@ -51,11 +51,11 @@ def lock_again(script: FingerScript) -> Steps:
 def _lock(script: FingerScript, percent: float, seconds: float) -> Steps:
     """All motors locked, with a q that is so far closed."""
     sides = script.plan.sides
-    targets = {s: dict(enumerate(script.pose(s, percent))) for s in sides}
-    phase = script.begin("lock", sides, targets=targets)
+    targets = {s: script.pose(s, percent) for s in sides}
     every = {s: frozenset(range(len(script.joints[s]))) for s in sides}
-    yield from script.hold(seconds, _locked_motors(script, script.all(percent), every))
-    script.end(phase)
+    yield from script.hold_as(
+        "lock", sides, seconds, _locked_motors(script, script.all(percent), every), targets=targets
+    )
 
 
 @stimulus("mixed", FingerScript, after="lock", leaves=Place.AWAY)
@@ -69,9 +69,9 @@ def lock_some(script: FingerScript) -> Steps:
         hands = script.all(percent)
         splits = script.next_splits()
         yield from script.hold(_UNDER_WAY, hands)
-        phase = script.begin("mixed", sides, targets={s: dict(enumerate(poses[s])) for s in sides})
-        yield from script.hold(0.35, _locked_motors(script, hands, splits))
-        script.end(phase)
+        yield from script.hold_as(
+            "mixed", sides, 0.35, _locked_motors(script, hands, splits), targets=poses
+        )
         script.goal.update(poses)
 
 

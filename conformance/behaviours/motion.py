@@ -152,9 +152,8 @@ def move_fingers_to_ends(script: FingerScript) -> Steps:
     sides = script.plan.sides
     for thumb in (False, True):
         poses = {s: _end_pose(script, s, thumb=thumb) for s in sides}
-        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
         script.goal.update(poses)
-        phase = script.begin("ends", sides, targets=targets)
+        phase = script.begin("ends", sides, targets=poses)
         free = [s for s in sides if script.reachable(s)]
         # an object holds some joints back until the end
         yield from script.until_settled(
@@ -188,8 +187,7 @@ def send_once(script: HandScript) -> Steps:
         if i % 3 == 2:  # a newer command replaces one that has just arrived
             yield from script.send(encode({s: script.motors(s, q) for s, q in decoy.items()}))
         script.goal.update(goal)
-        targets = {s: dict(enumerate(pose)) for s, pose in goal.items()}
-        phase = script.begin("single", script.plan.sides, targets=targets)
+        phase = script.begin("single", script.plan.sides, targets=goal)
         yield from script.command()
         yield from script.through(phase, seconds, lambda: script.wait(0.01))
 

@@ -28,7 +28,6 @@ def move_at_own_speeds(script: FingerScript) -> Steps:
     for speeds in _SPEEDS:
         yield from script.to("center", OPEN)
         poses = {s: script.pose(s, CLOSED) for s in sides}
-        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
         hands = {
             s: [
                 replace(m, dq=speeds[(i + 3 * (s is Side.RIGHT)) % len(speeds)])
@@ -36,9 +35,7 @@ def move_at_own_speeds(script: FingerScript) -> Steps:
             ]
             for s, pose in poses.items()
         }
-        phase = script.begin("speeds", sides, targets=targets)
-        yield from script.hold(_SPEEDS_SECONDS, hands)
-        script.end(phase)
+        yield from script.hold_as("speeds", sides, _SPEEDS_SECONDS, hands, targets=poses)
     yield from script.back()
 
 

@@ -124,11 +124,8 @@ def _protected_step(
     """A step in which some joints have time-out protection: it changes nothing until then."""
     sides = script.plan.sides
     poses = {s: script.pose(s, percent) for s in sides}
-    targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
-    phase = script.begin("guarded-step", sides, targets=targets)
     hands = {s: script.guarded(script.motors(s, pose), s, guarded) for s, pose in poses.items()}
-    yield from script.hold(0.45, hands)
-    script.end(phase)
+    yield from script.hold_as("guarded-step", sides, 0.45, hands, targets=poses)
     script.goal.update(poses)
 
 
@@ -137,10 +134,8 @@ def latch_and_clear(script: FingerScript, guarded: Mapping[Side, frozenset[int]]
     sides = script.plan.sides
     poses = {s: script.pose(s, CLOSED - 5.0) for s in sides}
     targets = {s: {i: poses[s][i] for i in sorted(guarded[s])} for s in sides}
-    phase = script.begin("guard-latch", sides, targets=targets)
     hands = {s: script.guarded(script.motors(s, poses[s]), s, guarded) for s in sides}
-    yield from script.hold(0.35, hands)
-    script.end(phase)
+    yield from script.hold_as("guard-latch", sides, 0.35, hands, targets=targets)
     yield from script.everyone("guard-clear", poses, most=1.5)
 
 

@@ -16,9 +16,8 @@ def add_rival(script: HandScript) -> Steps:
     yield from script.hold(0.1)
     there = script.other_place()
     rival = script.codec.encode({s: script.motors(s, pose) for s, pose in there.items()})
-    targets = {s: dict(enumerate(pose)) for s, pose in there.items()}
     yield from script.do(Join(Role.RIVAL))
-    phase = script.begin("two-writers", script.plan.sides, targets=targets)
+    phase = script.begin("two-writers", script.plan.sides, targets=there)
     yield from script.beside(phase, rival, Role.RIVAL, 0.5)
     script.end(phase)
     yield from script.do(Leave(Role.RIVAL))

@@ -134,10 +134,8 @@ def _silent_and_rejected(
     yield from script.hold(timeout + 0.6)
     script.end(both)
     # they must not wake it, either
-    rejected = script.begin("rejected", (first,))
     script.grip[first] = (Motor(q=math.nan),)
-    yield from script.hold(0.8 * timeout)
-    script.end(rejected)
+    yield from script.hold_as("rejected", (first,), 0.8 * timeout)
     del script.grip[first]
     yield from _resume(script, {first: script.other_place()[first]})
     yield from step_softly(script, (first,))
@@ -150,8 +148,7 @@ def _silent_and_rejected(
 def _resume(script: GripperScript, goals: Mapping[Side, Pose]) -> Steps:
     """A step after a silence, whose first command is alone for a while: it counts as it is."""
     script.goal.update(goals)
-    targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
-    phase = script.begin("resume", tuple(goals), targets=targets)
+    phase = script.begin("resume", tuple(goals), targets=goals)
     yield from script.command()
     yield from script.through(phase, _ALONE_SECONDS, lambda: script.wait(0.01))
     yield from script.until_settled(

@@ -132,6 +132,20 @@ class HandScript(Script[Side]):
         """Every side holds its goal for so long, but for those with other commands."""
         yield from self.repeat(seconds, lambda: self.command(motors))
 
+    def hold_as(
+        self,
+        name: str,
+        sides: Sequence[Side],
+        seconds: float,
+        motors: Mapping[Side, Motors] | None = None,
+        *,
+        targets: Mapping[Side, Mapping[int, float] | Pose] | None = None,
+    ) -> Steps:
+        """The same as a phase of these sides."""
+        phase = self.begin(name, sides, targets=targets)
+        yield from self.hold(seconds, motors)
+        self.end(phase)
+
     def until_settled(
         self,
         phase: Phase | None,
@@ -193,8 +207,7 @@ class HandScript(Script[Side]):
         # a center is no step to be judged: a hand that is there already is not held
         least = self.standing + 0.1 if name == "center" else self.least
         self.goal.update(poses)
-        targets = {s: dict(enumerate(pose)) for s, pose in poses.items()}
-        phase = self.begin(name, self.plan.sides, targets=targets, **params)
+        phase = self.begin(name, self.plan.sides, targets=poses, **params)
         yield from self.until_settled(
             phase, self.plan.sides, least=least, most=most, stand=self.standing
         )
@@ -235,8 +248,7 @@ class HandScript(Script[Side]):
     ) -> Steps:
         """A step of some sides while the others rest, as a phase."""
         self.goal.update(goals)
-        targets = {s: dict(enumerate(pose)) for s, pose in goals.items()}
-        phase = self.begin(name, tuple(goals), targets=targets)
+        phase = self.begin(name, tuple(goals), targets=goals)
         yield from self.until_settled(phase, tuple(goals), least=least, most=1.5, stand=stand)
 
     def approach(self) -> Steps:
@@ -272,9 +284,7 @@ class HandScript(Script[Side]):
         if not others or self.codec.shared or seconds < ASIDE_SECONDS:
             return []
         self.goal.update({s: self.aside(s) for s in others})
-        return [
-            self.begin("beside", (s,), targets={s: dict(enumerate(self.goal[s]))}) for s in others
-        ]
+        return [self.begin("beside", (s,), targets={s: self.goal[s]}) for s in others]
 
     def aside(self, side: Side, part: float = ASIDE) -> Pose:
         """A part of each joint's range from its goal, away from the nearer end."""

@@ -263,12 +263,16 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
         name: str,
         sides: Sequence[S],
         *,
-        targets: Mapping[S, Mapping[int, float]] | None = None,
+        targets: Mapping[S, Mapping[int, float] | Pose] | None = None,
         **params: str,
     ) -> Phase:
-        """Begin a phase; ``targets`` are its moving joints."""
+        """Begin a phase.
+
+        :param targets: q of the joints that move, by their index, or of all joints.
+        """
         goals: dict[Subject, dict[int, float]] = {
-            s: dict(joints) for s, joints in (targets or {}).items()
+            s: dict(q if isinstance(q, Mapping) else enumerate(q))
+            for s, q in (targets or {}).items()
         }
         begin_ns = self.obs.now_ns
         return self.mark(Phase(name, tuple(sides), begin_ns, targets=goals, params=params))
