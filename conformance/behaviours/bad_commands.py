@@ -692,7 +692,7 @@ def _durations(ctx: Context, first: list[Step]) -> Figures:
             yield step.figure(
                 seconds / (max(known) + slack),
                 f"{seconds:.2f} s from 10 to 90 % at {step.begin:.1f} s, {max(known):.2f} s in the "
-                "same step before any bad command",
+                "same step at first",
                 late=seconds - longest,
                 measure=Measure(seconds, longest, span=(step.begin, step.end)),
             )
@@ -732,7 +732,7 @@ def _speeds(ctx: Context, first: list[Step]) -> Figures:
             yield step.figure(
                 now,
                 f"{now:.1f} {ctx.unit}/s at its fastest in a step at {step.begin:.1f} s, "
-                f"{min(known):.1f} {ctx.unit}/s in the same step before any bad command",
+                f"{min(known):.1f} {ctx.unit}/s in the same step at first",
                 limit=least,
                 late=0.8 * abs(step.size) * (1.0 / max(now, 1e-3) - 1.0 / least),
             )
@@ -771,7 +771,7 @@ def _other_stiffness(ctx: Context) -> Outcome | None:
         if not is_alike(first, nudge, parts, noise):
             text = (
                 f"a torque displaced it by {nudge.way:.3f} {ctx.unit} at {nudge.begin:.1f} s, and "
-                f"by {first.way:.3f} {ctx.unit} before any bad command"
+                f"by {first.way:.3f} {ctx.unit} at first"
             )
             place = ctx.at(ctx.states.topic, nudge.begin, nudge.end)
             figure = f"{nudge.way:.3f} {ctx.unit}"

@@ -357,6 +357,8 @@ def brakes(ctx: Context) -> Outcome:
     0.
     """
     timeout = ctx.tolerance("timeout_s")
+    rejected = ctx.requirement.phase == "rejected"
+    after = "good command, while rejected ones arrive" if rejected else "command"
     states, stroke = ctx.states, ctx.joints[0].stroke
     proofs: list[str] = []
     values: dict[str, float] = {}
@@ -372,7 +374,8 @@ def brakes(ctx: Context) -> Outcome:
         rows = states.between(last, end)
         stop = stopped(states.t[rows], states.q[rows, 0], last, still, due - last)
         if moved > still:
-            text = f"moved by {moved:.2f} {ctx.unit} more than {timeout:g} s after the last command"
+            late = f"more than {timeout:g} s after the last {after}"
+            text = f"moved by {moved:.2f} {ctx.unit} {late}"
             outcome = ctx.failed(f"{moved:.2f} {ctx.unit}", text, place, motion_rad=moved)
             return outcome.resting_on(stop)
         jump, allowed = _jump(ctx, last + timeout, q_late)

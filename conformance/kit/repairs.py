@@ -218,13 +218,8 @@ def _bridged(states: States, wrong: Flags) -> States:
             values[bad, joint] = np.interp(states.t[bad], states.t[~bad], values[~bad, joint])
         return values
 
-    return replace(
-        states,
-        q=bridge(states.q),
-        dq=bridge(states.dq),
-        ddq=bridge(states.ddq),
-        tau=bridge(states.tau),
-    )
+    states = replace(states, q=bridge(states.q), ddq=bridge(states.ddq), tau=bridge(states.tau))
+    return replace(states, dq=np.where(wrong, _slope(states), states.dq))
 
 
 # -------------------------------------------------------------------------------- all states
@@ -266,7 +261,7 @@ def _slope(states: States) -> Floats:
     last = np.minimum(np.searchsorted(t, t + _SLOPE_S / 2), len(t) - 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         found = (states.q[last] - states.q[first]) / (t[last] - t[first])[:, np.newaxis]
-    return np.asarray(found)
+    return np.asarray(np.nan_to_num(found, posinf=0.0, neginf=0.0))
 
 
 # -------------------------------------------------------------------------------------- words

@@ -12,6 +12,7 @@ No verdict changes: a failure stays one, whatever it follows from.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -21,20 +22,21 @@ from dexkit.conformance.kit.repairs import Fault, faults
 from dexkit.conformance.kit.requirements import Level
 from dexkit.conformance.kit.results import Evidence, Result, Story, Verdict
 
-__all__ = ["ORDER", "stories_of"]
+__all__ = ["FAMILIES", "ORDER", "stories_of"]
 
 ORDER = (
     *("discovery", "start_up", "fields.length", "fields.finite", "checksums", "order.order"),
-    *("freshness.fresh", "rate.rate", "freshness.alternates", "position.in_stroke"),
-    *("motion.order", "sides.independent", "sides.by_its_own", "mode_byte.locked", "gains"),
+    *("freshness.fresh", "rate.rate", "position.in_stroke"),
+    *("sides.independent", "sides.by_its_own", "motion.order", "mode_byte.locked"),
     *("motion.direction", "motion.begins", "motion.every_command", "motion.arrives"),
-    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.monotonous"),
-    *("motion.overshoot", "motion.settling", "motion.dead_zones", "motion.ends"),
+    *("mode_byte.own_mode", "sides.beside_grip", "gains"),
+    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.dead_zones"),
+    *("motion.ends",),
     *("bad_commands.unchanged", "speed", "motion.speed", "sides", "watchdog.state_in_silence"),
-    *("load.load", "stillness.still", "two_clients", "order.old_stamps"),
+    *("load.load", "load.late_under_load", "stillness.still", "two_clients", "order.old_stamps"),
     *("life_cycle.restarted_client", "life_cycle.restarted_service", "watchdog.resumes"),
     *("mode_byte", "bad_commands", "watchdog", "timeout_protection", "life_cycle", "rate"),
-    *("grip.stops_at_object", "grip.gripper_stops_at_object", "position.not_the_command"),
+    *("grip.stops_at_object", "position.not_the_command"),
     *("velocity.keeps_up", "freshness", "position", "velocity", "stillness", "force.unit"),
     *("grip.keeps_gripping", "grip.lasts", "force", "grip", "touch", "pressure", "attitude"),
     *("motion", "load", "motion.path", "tracking", "operator", "fields", "robot_state"),
@@ -42,13 +44,15 @@ ORDER = (
 """Checks, by behaviour or singly, from that which looks most closely at one thing. Others last."""
 _SUMS = ("motion.path", "stillness.still", "tracking", "operator", "bad_commands.unchanged", "load")
 """Checks that many faults fail, whichever is first."""
-_ALL_VALUES = ("freshness.fresh", "freshness.alternates", "rate.rate", "position.in_stroke")
+_ALL_VALUES = ("freshness.fresh", "rate.rate", "position.in_stroke")
 """Checks of faults that spoil every later value of a position."""
+_VALUES = ("position", "velocity", "freshness")
+"""Behaviours of measured values, which no command has a part in."""
 _CONTACT = ("force", "grip", "touch", "pressure")
-_FAMILIES = {
+FAMILIES = {
     **dict.fromkeys(_CONTACT, "contact"),
     **dict.fromkeys(("watchdog", "timeout_protection"), "silence"),
-    **dict.fromkeys(("bad_commands.negative_gains", "bad_commands.driven_away"), "gains"),
+    "bad_commands.driven_away": "gains",
 }
 """Behaviours and checks of one thing, beside those of one behaviour."""
 _ANY_STEP = ("motion", "stillness.still", "bad_commands.unchanged", "speed")
@@ -58,8 +62,15 @@ _SPECIAL_STEP = (
     *("mode_byte.own_mode", "gains.soft_commands", "gains.soft_steps"),
 )
 """... and of steps in special circumstances, which cannot go better than any other."""
+_PROVOCATIONS = (
+    *("nan", "empty", "short", "long", "negative", "out-of-range", "foreign", "rejected", "burst"),
+    *("silence", "restart", "service-restart", "two-writers", "load"),
+)
+"""Phases of which a story says that something is seen only right after them."""
 _NEAR_S = 0.3
 """Seconds by which places in the recording may be apart that show the same."""
+_SOON_S = 0.5
+"""Seconds after a phase in which something is seen right after it."""
 _PLACES = 5
 """Places that a story names."""
 
@@ -78,7 +89,7 @@ def stories_of(recording: Recording, results: Iterable[Result], again: Again) ->
         # what spoils all values is what a part of them shows, too
         shown = [story for story in shown if failed[0].id in story.explains]
     explained = {name for story in shown for name in story.explains}
-    found = _of_findings([r for r in failed if r.id not in explained])
+    found = _of_findings(recording, [r for r in failed if r.id not in explained])
     weight = {r.id: 2 if r.requirement.level is Level.MUST else 1 for r in failed}
     most = max((_weight(story, weight) for story in found), default=0)
     before = [story for story in shown if _weight(story, weight) >= most]
@@ -98,7 +109,8 @@ def _of_states(recording: Recording, failed: Sequence[Result], again: Again) -> 
     for subject, view in recording.sides.items():
         mine = {r.id for r in failed if r.side == str(subject)}
         for fault, names in _without_faults(recording, view, mine, again):
-            kinds.setdefault(fault.kind, []).append((view, fault, names))
+            there = {r.id for r in failed if r.side == str(subject) and _lies_in(r, fault)}
+            kinds.setdefault(fault.kind, []).append((view, fault, names | there))
     stories = []
     for found in kinds.values():
         met = {(name, str(view.side)) for view, _, some in found for name in some}
@@ -113,6 +125,14 @@ def _of_states(recording: Recording, failed: Sequence[Result], again: Again) -> 
             sides = tuple(str(view.side) for view, _, _ in found)
             stories.append(Story(fault.sentence, sides, "", explained, places))
     return stories
+
+
+def _lies_in(result: Result, fault: Fault) -> bool:
+    """Whether a finding about measured values is where the fault is."""
+    places = [(e.time_s, _end(e)) for e in result.evidence]
+    return _check(result)[0] in _VALUES and any(
+        begin <= b and a <= end for a, b in fault.spans for begin, end in places
+    )
 
 
 def _without_faults(
@@ -138,7 +158,7 @@ def _without_faults(
 # ------------------------------------------------------------------------------ other findings
 
 
-def _of_findings(failed: Sequence[Result]) -> list[Story]:
+def _of_findings(recording: Recording, failed: Sequence[Result]) -> list[Story]:
     """Stories of what the checks found, in the order of :data:`ORDER`."""
     groups: dict[str, list[Result]] = {}
     for result in sorted(failed, key=_rank):
@@ -152,7 +172,7 @@ def _of_findings(failed: Sequence[Result]) -> list[Story]:
         shown = root[0]
         stories.append(
             Story(
-                shown.observed or shown.requirement.title,
+                _sentence(shown) + _after(recording, root),
                 tuple(r.side for r in root),
                 shown.id,
                 (shown.id, *under),
@@ -160,6 +180,26 @@ def _of_findings(failed: Sequence[Result]) -> list[Story]:
             )
         )
     return stories
+
+
+def _sentence(result: Result) -> str:
+    seen = result.observed or result.requirement.title
+    return f"{seen}. {result.cause.rstrip('.')}" if result.cause else seen
+
+
+def _after(recording: Recording, root: Sequence[Result]) -> str:
+    """After which provocation all of it is seen, where it is not seen otherwise."""
+    places = [e.time_s for r in root for e in r.evidence]
+    waits = {}
+    for name in _PROVOCATIONS:
+        ends = [recording.seconds(p.end_ns) for p in recording.phases(name)]
+        # how long after the last such phase each place is, at most
+        since = [min((at - end for end in ends if end <= at), default=math.inf) for at in places]
+        waits[name] = max(since, default=math.inf)
+    name = min(waits, key=lambda name: waits[name])
+    if waits[name] > _SOON_S or root[0].requirement.phase == name:
+        return ""
+    return f", right after the phase '{name}'"
 
 
 def _check(result: Result) -> tuple[str, str]:
@@ -193,7 +233,7 @@ def _among(check: tuple[str, str], names: Sequence[str]) -> bool:
 
 def _family(check: tuple[str, str]) -> str:
     behaviour, name = check
-    return _FAMILIES.get(name) or _FAMILIES.get(behaviour) or behaviour
+    return FAMILIES.get(name) or FAMILIES.get(behaviour) or behaviour
 
 
 def _at_once(one: Result, other: Result) -> bool:
