@@ -13,7 +13,7 @@ from dexkit.conformance.kit.requirements import Level
 from dexkit.conformance.layers import layer
 from dexkit.conformance.virtual import Service
 from dexkit.hand import Side
-from dexkit.models import DEX1_1, DEX3_1, HandModel
+from dexkit.models import DEX1_1, model
 from tools.consequences.kinds import KINDS, Consequence, consequences
 from tools.consequences.sessions import grasp
 from tools.consequences.stage import Figure
@@ -74,22 +74,24 @@ def test_every_limit_has_a_reason() -> None:
 
 
 @functools.cache
-def reference(hand: HandModel) -> dict[Figure, float]:
-    return grasp(layer("dds").reference(hand.name), hand.dialects[0], (Side.LEFT,)).figures
+def reference(name: str) -> dict[Figure, float]:
+    return grasp(layer("dds").reference(name), model(name).dialects[0], (Side.LEFT,)).figures
 
 
-@pytest.mark.parametrize("hand", [DEX1_1, DEX3_1], ids=lambda hand: hand.name)
-def test_a_client_grasps_with_the_reference(hand: HandModel) -> None:
-    figures = reference(hand)
+@pytest.mark.parametrize("name", ["dex1-1", "dex3-1"])
+def test_a_client_grasps_with_the_reference(name: str) -> None:
+    figures = reference(name)
+    # without its protection, a Dex3-1 holds an object when its client has gone
+    least, most = (0.0, 0.3) if name == "dex1-1" else (0.9, 1.1)
     held = figures[Figure("drops", "xr_teleoperate", "lift", "left", 0)]
-    left = figures[Figure("left pressing", "xr_teleoperate", "stopped in a grip", "left", 0)]
+    left = figures[Figure("lets go", "xr_teleoperate", "stopped in a grip", "left", 0)]
     assert held > 0.3
-    assert left < 0.3
+    assert least <= left <= most
 
 
 def of(made: type[Service]) -> dict[str, Consequence]:
     spoken = DEX1_1.dialects[0]
-    return consequences(grasp(made, spoken, (Side.LEFT,)).figures, reference(DEX1_1))
+    return consequences(grasp(made, spoken, (Side.LEFT,)).figures, reference("dex1-1"))
 
 
 def made(name: str) -> type[Service]:
@@ -104,7 +106,7 @@ def test_the_reference_has_no_consequence() -> None:
 def test_obvious_faults_have() -> None:
     assert "starts" in of(made("OldTopic"))
     assert {"ends", "drops"} <= set(of(made("Inverted")))
-    assert "moves" in of(made("NanIsZero"))
+    assert "left pressing" in of(made("FedByRejected"))
     assert "reads" in of(made("Percent"))
 
 

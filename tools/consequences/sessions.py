@@ -219,6 +219,16 @@ class Session:
             self.add("left pressing", task, side, force / known)
             self.add("lets go", task, side, [force.sum() / max(grip.sum(), _NO_GRIP)])
 
+    def seen(self) -> dict[Side, Pose]:
+        """The last q that a client has read of each side; where nothing was read, where it is."""
+        found = {}
+        for side in self.sides:
+            low, stroke = self.stage.limits[side]
+            _, shown = self.stage.shown(side)
+            places = shown[-1] if len(shown) else self.stage.places(side)[-1]
+            found[side] = tuple((places * stroke + low).tolist())
+        return found
+
     def records(self) -> None:
         """What the client has read, against what was true within the last 0.1 s."""
         times = np.array(self.stage.times)
@@ -365,6 +375,13 @@ def _events(s: Session, client: Teleoperation) -> None:
     s.move("close after NaN", _both(s, _SHUT), stroke)
     s.move("open after NaN", _both(s, _OPEN), stroke)
 
+    if len(s.sides) > 1:
+        mixed = {side: hold.motors(side, q) for side, q in _both(s, _SHUT).items()}
+        mixed[s.sides[0]] = bad[s.sides[0]]
+        _burst(s, mixed, round(100 * stroke))
+        s.add("ends", "NaN for the other side", s.sides[1], stage.places(s.sides[1])[-1])
+        s.move("half way after NaN for one side", mid, _HALF)
+
     # a script sends degrees, then radians again; or beyond the range a little
     far = {side: [replace(m, q=m.q * 57.3 + 300.0) for m in ms] for side, ms in good.items()}
     near = _beyond(s, good)
@@ -403,6 +420,15 @@ def _events(s: Session, client: Teleoperation) -> None:
         stage.run(0.01)
     s.move("half way when the second client has gone", mid, _HALF)
     s.move("close when the second client has gone", _both(s, _SHUT), stroke)
+
+    twin = codec.encode({side: other.motors(side, q) for side, q in _both(s, _OPEN).items()})
+    client.goals = _both(s, _OPEN)
+    for _ in range(round(100 * stroke)):
+        stage.send(twin, RIVAL)
+        stage.run(0.01)
+    for side in s.sides:
+        s.add("ends", "open with two clients that agree", side, stage.places(side)[-1])
+    s.move("half way with one of them", mid, _HALF)
 
     # stopped in a move, and started again
     client.goals = _both(s, _OPEN)
@@ -477,11 +503,18 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     s.move("let go", _both(s, 0.1), _HALF)
     s.move("grasp again", deep, _HALF)
     s.hold("lift again", 1.0)
+    if len(sides) > 1:  # one side works while the other one holds
+        for part, task in ((0.1, "let go with one side"), (0.95, "grasp with one side")):
+            s.move(task, {sides[0]: closed(spoken, sides[0], (part,))}, _HALF)
+            s.feel(task)
     hold = Script(spoken, sides)
     good = {side: hold.motors(side, q) for side, q in deep.items()}
     bad = {side: [replace(m[0], q=math.nan), *m[1:]] for side, m in good.items()}
     stage.send(stage.codec.encode(bad), 0)
     s.held_through("NaN in a grip", 0.3)
+    _burst(s, bad, 220)
+    s.left("two seconds of NaN in a grip")
+    s.move("grasp after NaN", deep, _HALF)
     stage.connected = False
     s.held_through("network away for 0.9 s in a grip", 0.9)
     stage.connected = True
@@ -496,13 +529,25 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     s.hold("lift once more", 0.4)
     stage.connect(None)
     stage.restart()
-    s.still("the service restarts in a grip", 2.6, kind="left moving")
-    s.left("the service restarts")
+    s.still("the service has ended in a grip", 1.9, kind="left moving")
+    s.left("the service has ended in a grip")
+    s.still("the service starts in a grip", 0.9, kind="left moving")
+    s.left("the service starts in a grip")
     third = Teleoperation(spoken, sides, 2)
     third.goals = deep
     s.start(third, "a client after a restart in a grip")
     s.hold("lift after the restart", 0.6)
     s.move("let go after the restart", _both(s, 0.1), _HALF)
+    s.move("grasp after the restart", deep, _HALF)
+    # LeRobot disconnects: one command without gains, where the hand is (docs/sources/lerobot.md#a1)
+    stage.connect(None)
+    limp = {
+        side: [replace(m, kp=0.0, kd=0.0) for m in hold.motors(side, q)]
+        for side, q in s.seen().items()
+    }
+    stage.send(stage.codec.encode(limp), 2)
+    stage.run(0.6)
+    s.left("disconnected without gains")
     s.records()
     return s
 
@@ -513,8 +558,13 @@ def example(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sess
     stage = s.stage
     stage.run(0.8)
     s.other_readers()
-    client = Example(spoken, sides[:1])
-    client.goals = {sides[0]: closed(spoken, sides[0], (_OPEN,))}
+    used = sides if spoken.commands_both else sides[:1]
+    client = Example(spoken, used)
+
+    def every(part: float) -> dict[Side, Pose]:
+        return {side: closed(spoken, side, (part,)) for side in used}
+
+    client.goals = every(_OPEN)
     stage.connect(client)
     if spoken.is_gripper:
         stage.run(_stroke(spoken))
@@ -522,13 +572,13 @@ def example(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sess
     else:
         client.gains, client.period = client.TURN, client.fast
         for i, part in enumerate((0.3, 0.7, 0.3, 0.7)):
-            s.move(f"turn {i}", {sides[0]: closed(spoken, sides[0], (part,))}, 0.5, settles=False)
+            s.move(f"turn {i}", every(part), 0.5, settles=False)
         client.gains, client.period, client.timeout = client.GRIP, 1.0, True
-        s.move("grip", {sides[0]: closed(spoken, sides[0], (0.5,))}, 2.5)
+        s.move("grip", every(0.5), 2.5)
         client.gains, client.status = client.STOP, int(JointMode.FOC)
         s.still("stop", 2.2)
         client.gains, client.timeout, client.period = client.TURN, False, client.fast
-        s.move("turn again", {sides[0]: closed(spoken, sides[0], (0.3,))}, 1.0)
+        s.move("turn again", every(0.3), 1.0)
     s.gone("ended")
     s.low_rate()
     return s

@@ -104,8 +104,7 @@ class Stage:
         self._q_true: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
         self._shown: dict[Side, list[tuple[float, Sequence[float]]]] = {s: [] for s in self.sides}
         self._down_until: float | None = None
-        self._waiting: list[tuple[str, bytes]] = []
-        self._waiting_since = 0.0
+        self._waiting: list[tuple[float, list[tuple[str, bytes]]]] = []
         self._low_topics = {s: spoken.low_rate_topic.format(side=s) for s in self.sides}
         self.limits = {
             s: np.array([(j.q_min, j.stroke) for j in joints_of(spoken, s)]).T for s in self.sides
@@ -242,14 +241,13 @@ class Stage:
                 client.began = self.now
             payloads = self._encode(commands)
             if self.connected:
-                if self._waiting:  # the network is back: of what was sent meanwhile the last comes
-                    age = self.now - self._waiting_since
-                    self.send(self._waiting, client.number, age)
+                if self._waiting:  # the network is back: what was sent meanwhile comes at once
+                    for then, waiting in self._waiting:
+                        self.send(waiting, client.number, self.now - then)
                     self._waiting = []
                 self.send(payloads, client.number, client.stamp_age)
             else:
-                self._waiting_since = self._waiting_since if self._waiting else self.now
-                self._waiting = payloads
+                self._waiting.append((self.now, payloads))
 
     def _encode(self, commands: Mapping[Side, Sequence[Motor]]) -> list[tuple[str, bytes]]:
         key = tuple((s, tuple(m)) for s, m in commands.items())
