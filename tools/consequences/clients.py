@@ -55,9 +55,9 @@ class Teleoperation(Client):
         self.period = self.client.period
         self._input = (-1, self.goals)
 
-    def receive(self, now: float, side: Side, q: Sequence[float]) -> None:
+    def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
         """Take a state: reads of both sides take turns."""
-        self.client.receive(now, {side: q})
+        self.client.receive(now, states)
 
     def commands(self, now: float) -> Mapping[Side, Sequence[Motor]]:
         """A turn of its control loop."""

@@ -65,8 +65,8 @@ class Client(ABC):
         """What its user wants of each side, in q."""
         return self.course(now) if self.course else self.goals
 
-    def receive(self, now: float, side: Side, q: Sequence[float]) -> None:
-        """Take the q of a state; not every client looks at it."""
+    def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
+        """Take a state: q of the sides in it. Not every client looks at it."""
         return
 
     @abstractmethod
@@ -175,30 +175,34 @@ class Stage:
             self._newest[sample.topic] = sample.payload
             if sample.type_name != self.dialect.state_type:
                 continue
+            sides = [side for side in self.sides if self.codec.state_topics[side] == sample.topic]
+            if sides:
+                self.published = True
+                self._show(sides, sample.payload)
             for side in self.sides:
-                if self.codec.state_topics[side] == sample.topic:
-                    self.published = True
-                    self._show(side, sample.payload)
-                elif self._low_topics[side] == sample.topic:
+                if self._low_topics[side] == sample.topic:
                     q = self._q(side, sample.payload)
                     if q is not None:
                         self.low.setdefault(side, []).append((self.now, self.part(side, q)))
 
-    def _show(self, side: Side, payload: bytes) -> None:
-        """A state arrives at the client."""
+    def _show(self, sides: Sequence[Side], payload: bytes) -> None:
+        """A state of these sides arrives at the client."""
         client = self.client
         if client is None or client.crashed or not self.connected:
             return
         if client.number and not self.service.serves_late_readers:
             return
-        read = self._read.get(side)
-        if read is None or read[0] is not payload:
-            read = self._read[side] = payload, self._q(side, payload)
-        if read[1] is None:
-            client.crashed = True
-            return
-        client.receive(self.now, side, read[1])
-        self._shown[side].append((self.now, read[1]))
+        states = {}
+        for side in sides:
+            read = self._read.get(side)
+            if read is None or read[0] is not payload:
+                read = self._read[side] = payload, self._q(side, payload)
+            if read[1] is None:
+                client.crashed = True
+                return
+            states[side] = read[1]
+            self._shown[side].append((self.now, read[1]))
+        client.receive(self.now, states)
 
     def _q(self, side: Side, payload: bytes) -> Sequence[float] | None:
         """Q in a state; None if it cannot be read, or is too short."""
