@@ -48,7 +48,7 @@ def main(
 
     Figures are kept, and not measured again after Ctrl-C. With --only the table is not written.
 
-    Exit code: 0 done; 1 a reference has a consequence; 130 stopped.
+    Exit code: 0 done; 130 stopped.
     """
     console = Console()
     given = tasks(cache.absolute(), only)
@@ -95,18 +95,21 @@ def _table(given: Sequence[Task]) -> Table:
 
 def _summary(console: Console, table: Table) -> None:
     for model in MODELS:
-        rows = [r for r in table.rows(model) if r.requirement.level is Level.MUST and r.hands]
-        if not rows:
-            continue
-        none = [r.requirement.id for r in rows if r.proposed is Level.SHOULD]
-        shared = [r.requirement.id for r in rows if not r.own and r.shared]
-        console.print(
-            f"{model}: of {len(rows)} MUSTs {len(rows) - len(none)} have a consequence, "
-            f"{len(shared)} of them only by hands that fail others as well",
-            soft_wrap=True,
-        )
-        console.print(f"  none: {', '.join(none) or '-'}", soft_wrap=True, highlight=False)
-        console.print(f"  by others: {', '.join(shared) or '-'}", soft_wrap=True, highlight=False)
+        rows = [r for r in table.rows(model) if r.requirement.level is Level.MUST]
+        groups = {
+            "a consequence": [r for r in rows if r.own],
+            "one only by hands that were made for others": [
+                r for r in rows if r.shared and not r.own
+            ],
+            "none": [r for r in rows if r.proposed is Level.SHOULD],
+            "none yet, not all of its hands are measured": [
+                r for r in rows if r.proposed is Level.MUST and not r.own and not r.shared
+            ],
+        }
+        console.print(f"{model}: {len(rows)} MUSTs", style="bold")
+        for text, those in groups.items():
+            ids = ", ".join(r.requirement.id for r in those)
+            console.print(f"  {len(those)} have {text}: {ids}", soft_wrap=True, highlight=False)
 
 
 if __name__ == "__main__":

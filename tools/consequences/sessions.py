@@ -32,6 +32,8 @@ _OPEN, _SHUT = 0.03, 0.97
 """How far an operator opens and closes: short of the stops."""
 _HALF = 1.3
 """Seconds for half a stroke: of a gripper that is slow and late, too."""
+_PATIENCE = 5.0
+"""Seconds for which an operator waits for a client."""
 _NO_GRIP = 0.01
 """N m: a joint that presses with less does not."""
 _SHARE = {Side.LEFT: 1.0, Side.RIGHT: 0.8}
@@ -87,7 +89,9 @@ class Session:
         """A client starts: how long until it commands."""
         at = self.stage.now
         self.stage.connect(client)
-        self.stage.run(1.2)
+        self.stage.run(0.7)
+        while client.began is None and self.stage.now - at < _PATIENCE:
+            self.stage.run(0.5)
         waited = math.inf if client.began is None else client.began - at
         for side in self.sides:
             self.add("starts", task, side, [waited])
@@ -235,10 +239,16 @@ class Session:
         for side in self.sides:
             at, shown = self.stage.shown(side)
             places = self.stage.places(side)
-            if len(at):
-                rows = np.minimum(np.searchsorted(times, at), len(times) - 1)
-                window = np.stack([places[np.maximum(rows - i, 0)] for i in range(11)])
-                self.add("reads", "all that it reads", side, _apart(shown, window))
+            if not len(at):
+                continue
+            # each state when it comes, and what a frame holds between two of them
+            rows = np.minimum(np.searchsorted(times, at), len(times) - 1)
+            newest = np.searchsorted(at, times, "right") - 1
+            held = (newest >= 0) & self.stage.driven()
+            rows = np.concatenate((rows, np.flatnonzero(held)))
+            shown = np.concatenate((shown, shown[newest[held]]))
+            window = np.stack([places[np.maximum(rows - i, 0)] for i in range(11)])
+            self.add("reads", "all that it reads", side, _apart(shown, window))
 
     def other_readers(self) -> None:
         """Whether a ROS 2 node with the usual, reliable, reader gets a state, and the example."""

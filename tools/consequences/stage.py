@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
 from dexkit.conformance.kit.recording import joints_of
@@ -100,6 +101,7 @@ class Stage:
         self.client: Client | None = None
         self.connected = True
         self.times: list[float] = []
+        self._driven: list[bool] = []
         self._contacts: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
         self._q_true: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
         self._shown: dict[Side, list[tuple[float, Sequence[float]]]] = {s: [] for s in self.sides}
@@ -262,6 +264,8 @@ class Stage:
     def _note(self) -> None:
         self._noted = self.now
         self.times.append(self.now)
+        client = self.client
+        self._driven.append(client is not None and client.began is not None and self.connected)
         for side in self.sides:
             hand = self.service.hands[side]
             if self.codec.joints == 1:
@@ -279,6 +283,10 @@ class Stage:
             return found
         hand = self.service.hands[side]
         return np.asarray((found - hand.low) / (hand.high - hand.low))
+
+    def driven(self) -> NDArray[np.bool_]:
+        """Whether a client drove the hand, and the network was there, at each of the times."""
+        return np.array(self._driven)
 
     def forces(self, side: Side, since: float = 0.0) -> Floats:
         """The force of contact of each joint from then on, N m: a row for each of the times."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,22 +24,24 @@ FILE = Path(__file__).with_name("table.json")
 class Row:
     """A requirement by its consequences.
 
-    :param hands: names of the wrong hands that fail it and were measured.
+    :param hands: names of the wrong hands that fail it and were measured; ``missing`` is how many
+        were not.
     :param own: the worst consequence of the hands that were made for it, or fail it alone, and the
         hand; None without any. ``shared`` likewise, of the others that fail it.
     """
 
     requirement: Requirement
     hands: tuple[str, ...]
+    missing: int
     own: tuple[str, Consequence] | None
     shared: tuple[str, Consequence] | None
 
     @property
     def proposed(self) -> Level:
-        """The level that follows: none of its hands has a consequence, and it is a SHOULD."""
-        if not self.hands or self.requirement.level is not Level.MUST:
+        """The level that follows: a MUST none of whose hands has a consequence is a SHOULD."""
+        if self.own or self.shared or self.missing or self.requirement.level is not Level.MUST:
             return self.requirement.level
-        return Level.MUST if self.own or self.shared else Level.SHOULD
+        return Level.SHOULD
 
 
 @dataclass
@@ -75,6 +77,7 @@ class Table:
                 "level": str(row.requirement.level),
                 "proposed": str(row.proposed),
                 "hands": len(row.hands),
+                "missing": row.missing,
                 "own": row.own and [row.own[0], row.own[1].kind],
                 "shared": row.shared and [row.shared[0], row.shared[1].kind],
             }
@@ -92,11 +95,12 @@ class Table:
         failing = _failing()
         return [self._row(r, failing.get(r.id, ())) for r in every if r.model in MODELS]
 
-    def _row(self, requirement: Requirement, failing: Iterable[tuple[str, bool]]) -> Row:
+    def _row(self, requirement: Requirement, failing: Sequence[tuple[str, bool]]) -> Row:
         measured = [(name, own) for name, own in failing if name in self.hands]
         own = self._worst(name for name, mine in measured if mine)
         shared = self._worst(name for name, mine in measured if not mine)
-        return Row(requirement, tuple(name for name, _ in measured), own, shared)
+        names = tuple(name for name, _ in measured)
+        return Row(requirement, names, len(failing) - len(names), own, shared)
 
     def _worst(self, names: Iterable[str]) -> tuple[str, Consequence] | None:
         found = [(name, c) for name in names for c in self.hands[name].values()]
@@ -135,6 +139,8 @@ def sentence(requirement_id: str) -> str:
     if row is None or not row.hands:
         return ""
     worst = row.own or row.shared
+    if worst is None and row.missing:
+        return ""
     if worst is None:
         return (
             f"None of the {len(row.hands)} wrong hands that fail this has a consequence for a "
