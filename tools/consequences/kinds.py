@@ -72,7 +72,7 @@ KINDS: Mapping[str, Kind] = {
         ),
         Kind(
             "lags",
-            "a move is made after {found} instead of {good}",
+            "a move takes {found} instead of {good}",
             "s",
             lambda found, good: found / (2.0 * good + 0.1),
             "Twice as long as the original is plainly another hand to an operator; a tenth of a "

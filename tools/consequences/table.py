@@ -82,6 +82,7 @@ class Table:
                 "shared": row.shared and [row.shared[0], row.shared[1].kind],
             }
             for row in self.rows()
+            if row.hands
         }
         text = ",\n".join(
             f'"{title}": {{\n{_lines(values)}\n}}'
@@ -104,6 +105,9 @@ class Table:
 
     def _worst(self, names: Iterable[str]) -> tuple[str, Consequence] | None:
         found = [(name, c) for name in names for c in self.hands[name].values()]
+        # of equals, that of the kind which is listed first
+        order = list(KINDS)
+        found.sort(key=lambda pair: order.index(pair[1].kind))
         return max(found, key=lambda pair: pair[1].size, default=None)
 
 
@@ -162,7 +166,7 @@ def told(found: Consequence) -> str:
 
 def _amount(value: float, unit: str) -> str:
     if value >= NO_END:
-        return "never" if unit == "s" else "no end"
+        return "for ever" if unit == "s" else "no end"
     if unit == "s":
         return f"{value:.2f} s"
     if unit.startswith("% "):
