@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from dexkit.errors import SessionError
@@ -17,8 +16,8 @@ from dexkit.traces import open_trace
 from dexkit.traces.sessions import ros_types
 from dexkit.traces.sessions.edit import cut
 from dexkit.traces.sessions.imported import RECORD
-from dexkit.traces.sessions.model import REST_TOPIC, reference_topic
-from dexkit.traces.sessions.paths import below, file_name
+from dexkit.traces.sessions.model import reference_topic
+from dexkit.traces.sessions.paths import below
 from dexkit.traces.writer import RecordingWriter
 from tests.each import each
 from tests.session_helpers import document, episode, jpeg, png, streamed
@@ -59,29 +58,6 @@ def test_path_that_is_none_below_its_folder_is_refused(tmp_path: Path, name: str
         below(tmp_path / "d", name)
     assert str(tmp_path / "d") in str(caught.value)
     assert str(caught.value).isprintable()
-
-
-@each(
-    "text,name",
-    [
-        ("抓取 1", "抓取 1"),
-        ("color_0", "color_0"),
-        ("rt/dex1/left/cmd", "rt_dex1_left_cmd"),
-        ("..", "__"),
-        ("", "_"),
-        (".a", "_a"),
-        ("a ", "a_"),
-        ("CON", "_CON"),
-        ("con.txt", "_con.txt"),
-        ("a\x00\n\x1b\u202e\ud800b", "a_____b"),
-        ('<>:"|?*', "_______"),
-        ("é" * 200, "é" * 50),
-    ],
-)
-def test_text_becomes_the_name_of_a_file(tmp_path: Path, text: str, name: str) -> None:
-    assert file_name(text) == name
-    assert file_name(name) == name
-    (tmp_path / name).touch()
 
 
 # -- the record of an import ---------------------------------------------------------------------
@@ -153,28 +129,6 @@ def test_hostile_record_of_an_import_is_refused(
         assert (tmp_path / form).is_dir()
     if key in ("rate_hz", "first_ns", "clock"):
         assert dexkit("rehearse", path, "--check")[0] == 2
-
-
-@each(
-    "topic,data",
-    [
-        (REST_TOPIC, b""),
-        (REST_TOPIC, ros_types.encode_string(DEEP)),
-        (REST_TOPIC, ros_types.encode_string("[]")),
-        (reference_topic("color_0"), b"\x00\x01\x00\x00\xff\xff\xff\xff"),
-        (reference_topic("color_0"), ros_types.encode_string('{"path": 5}')),
-        (reference_topic("color_0"), ros_types.encode_string('{"path": "a", "seconds": "x"}')),
-        ("rt/session/left_arm/state", b"\x00\x01\x00\x00\xff"),
-    ],
-)
-def test_hostile_message_of_an_import_is_refused(
-    tmp_path: Path, recording: Path, topic: str, data: bytes
-) -> None:
-    path = replaced(recording, tmp_path / "a.mcap", topic, data)
-    code, output = dexkit("export", path, "--to", "episodes", "--out", tmp_path / "t")
-    assert (code, f"{path}: {topic}" in output) == (2, True), output
-    code, output = dexkit("export", path, recording, "--to", "episodes", "--out", tmp_path / "t")
-    assert (code, "a.mcap: refused" in output) == (1, True), output
 
 
 # -- pictures are read where the user says, and nowhere else ---------------------------------------
@@ -437,32 +391,3 @@ def test_hostile_row_of_a_dataset_is_named_and_the_others_are_imported(
     code, output = dexkit("import", source, tmp_path / "out")
     assert (code, told in output) == (1, True), output
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["episode_000000.mcap"]
-
-
-@each(
-    "columns,code,told",
-    [
-        ({"task_index": [[0], [1], [2]]}, 0, ""),
-        ({"task_index": ["a", None, "b"]}, 0, ""),
-        ({"task_index": [{"a": 1}] * 3}, 0, ""),
-        ({"episode_index": ["0"] * 3}, 2, "episode_index holds string"),
-        ({"episode_index": [[0]] * 3}, 2, "episode_index holds list"),
-        ({"episode_index": [5] * 3}, 2, "no frame of episode 0"),
-        ({"timestamp": [[0.0]] * 3}, 1, "timestamp is not"),
-        ({"timestamp": ["a"] * 3}, 1, "timestamp is not"),
-        ({"frame_index": [None] * 3}, 1, "frame_index does not ascend"),
-        ({"frame_index": [-1, 0, 1]}, 1, "frame_index does not ascend"),
-        ({"frame_index": [{"a": 1}] * 3}, 1, "frame_index does not ascend"),
-        ({"action": [[0.1] * 2000] * 3}, 1, "action is no vector"),
-        ({"extra": [b"\xff", None, b""]}, 0, ""),
-        ({"extra": pa.array([2**61] * 3, pa.timestamp("ms"))}, 2, "extra cannot be read"),
-        ({"observation.state": [None] * 3, "action": [None] * 3}, 2, "has no joints"),
-    ],
-    ids=str,
-)
-def test_hostile_columns_of_a_dataset(
-    tmp_path: Path, columns: dict[str, Any], code: int, told: str
-) -> None:
-    source = dataset(tmp_path / "d", "v2.1", NAMES, np.full((3, 28), 0.1), **columns)
-    got, output = dexkit("import", source, tmp_path / "o.mcap")
-    assert (got, told in output) == (code, True), output
