@@ -330,58 +330,52 @@ def _filter_in(pid: int, descriptor: int) -> bytes:
         return _filter_of(sock)
 
 
-def _listening(program: Program, indices: Sequence[int]) -> list[tuple[str, str, bool]]:
-    """What a program takes packets on: protocol, local address, and if only by these interfaces."""
-    wanted = interface_filter.program(indices)
-    found = []
-    for pid in _family(program.process.pid):
-        with suppress(FileNotFoundError, ProcessLookupError):  # a child that has ended meanwhile
-            found += _listening_of(pid, wanted)
-    return found
-
-
-def _listening_of(pid: int, wanted: bytes) -> list[tuple[str, str, bool]]:
-    own, found = _sockets(pid), []
+def _listening(pid: int) -> Iterator[tuple[str, str, int, int]]:
+    """What a process takes packets on: protocol, local address, port and file descriptor."""
+    own = _sockets(pid)
     for protocol in ("udp", "udp6", "tcp", "tcp6"):
         for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
             fields = line.split()
             if fields[9] in own and (protocol[:3] == "udp" or fields[3] == "0A"):
-                filtered = _filter_in(pid, own[fields[9]]) == wanted
-                found.append((protocol, fields[1].split(":")[0], filtered))
+                address, port = fields[1].split(":")
+                words = bytes.fromhex(address)  # of four bytes, in this machine's order
+                packed = b"".join(words[i : i + 4][::-1] for i in range(0, len(words), 4))
+                kind = socket.AF_INET6 if protocol.endswith("6") else socket.AF_INET
+                yield protocol, socket.inet_ntop(kind, packed), int(port, 16), own[fields[9]]
+
+
+def _filters(program: Program, indices: Sequence[int]) -> list[tuple[str, str, bool]]:
+    """Protocol, local address, and whether packets come in by these interfaces alone."""
+    wanted = interface_filter.program(indices)
+    found = []
+    for pid in _family(program.process.pid):
+        with suppress(FileNotFoundError, ProcessLookupError):  # a child that has ended meanwhile
+            for protocol, address, _, descriptor in _listening(pid):
+                found.append((protocol, address, _filter_in(pid, descriptor) == wanted))
     return found
-
-
-_ANY, _LOCAL = "00000000", "0100007F"  # addresses as /proc/net has them on little-endian machines
 
 
 def _filtered(program: Program, index: int) -> set[bool]:
     """Whether whatever takes packets lets in loopback and that interface alone."""
-    return {filtered for _, _, filtered in _listening(program, [_LOOPBACK_INDEX, index])}
+    return {filtered for _, _, filtered in _filters(program, [_LOOPBACK_INDEX, index])}
 
 
 def _sending(program: Program) -> list[tuple[str, int]]:
     """Address and port of what a program sends from."""
-    pid = program.process.pid
-    own, found = _sockets(pid), []
-    for line in Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]:
-        fields = line.split()
-        address, port = fields[1].split(":")
-        if fields[9] in own and address != _ANY:
-            packed = int(address, 16).to_bytes(4, sys.byteorder)
-            found.append((socket.inet_ntoa(packed), int(port, 16)))
-    return found
+    found = _listening(program.process.pid)
+    return [(a, port) for protocol, a, port, _ in found if protocol == "udp" and a != "0.0.0.0"]
 
 
 def _hears_this_machine_only(name: str, program: Program) -> None:
     # some receive before they send anything, the doctor only while it looks
     deadline = time.monotonic() + 60
-    while not (seen := _listening(program, [_LOOPBACK_INDEX])):
+    while not (seen := _filters(program, [_LOOPBACK_INDEX])):
         assert time.monotonic() < deadline, (name, program.lines)
         time.sleep(0.02)
     for protocol, address, filtered in seen:
         assert filtered, (name, seen)
         # local: the doctor's, what CycloneDDS sends from, the USB/IP server's
-        assert address == _LOCAL or (protocol, address) == ("udp", _ANY), (name, seen)
+        assert address == "127.0.0.1" or (protocol, address) == ("udp", "0.0.0.0"), (name, seen)
 
 
 @pytest.mark.slow
@@ -481,17 +475,9 @@ def _seen(program: Program) -> set[tuple[str, str, int]]:
     found = set()
     for pid in _family(program.process.pid):
         with suppress(FileNotFoundError, ProcessLookupError):  # a child that has ended meanwhile
-            own = _sockets(pid)
-            for protocol in ("udp", "udp6", "tcp", "tcp6"):
-                for line in Path(f"/proc/{pid}/net/{protocol}").read_text().splitlines()[1:]:
-                    fields = line.split()
-                    if fields[9] in own and (protocol[:3] == "udp" or fields[3] == "0A"):
-                        address, port = fields[1].split(":")
-                        words = bytes.fromhex(address)
-                        packed = b"".join(words[i : i + 4][::-1] for i in range(0, len(words), 4))
-                        kind = socket.AF_INET6 if len(packed) > 4 else socket.AF_INET
-                        shown = socket.inet_ntop(kind, packed)
-                        found.add((protocol[:3], shown, int(port, 16)))
+            found |= {
+                (protocol[:3], address, port) for protocol, address, port, _ in _listening(pid)
+            }
     return found
 
 

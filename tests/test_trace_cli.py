@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dexkit.traces import open_trace, sample_path
+from tests.cli_helpers import running
 from tests.dds_helpers import free_domain
+from tests.session_helpers import dexkit
 from tests.trace_helpers import (
     CMD,
     CMD_TYPE,
@@ -31,61 +28,22 @@ from tests.trace_helpers import (
 RIGHT = "rt/dex1/right/cmd"
 
 
-def run(*args: object, timeout: float = 60) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", "from dexkit.cli import main; main()", *map(str, args)],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        env={**os.environ, "NO_COLOR": "1"},
-    )
-
-
-@contextmanager
-def running(*args: object) -> Iterator[subprocess.Popen[str]]:
-    """A command in another process, from its ready line on."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", "from dexkit.cli import main; main()", *map(str, args)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    try:
-        line = process.stdout.readline()
-        while line and not line.startswith("ready:"):
-            line = process.stdout.readline()
-        if not line:
-            pytest.fail(f"{args[0]} did not start: {process.communicate()[1]}")
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
-
-
-def interrupt(process: subprocess.Popen[str], signum: int = signal.SIGINT) -> tuple[str, str]:
-    process.send_signal(signum)
-    return process.communicate(timeout=60)
-
-
 # -- info ------------------------------------------------------------------------------------------
 
 
 def test_info_prints_topics_rates_and_gaps() -> None:
-    done = run("info", sample_path("dex1_hand_dropout"))
-    assert done.returncode == 0
-    (line,) = [x for x in done.stdout.splitlines() if x.startswith("rt/dex1/left/state")]
+    code, output = dexkit("info", sample_path("dex1_hand_dropout"))
+    assert code == 0
+    (line,) = [x for x in output.splitlines() if x.startswith("rt/dex1/left/state")]
     assert line.split()[1:] == (
         ["8,998", "461.5", "2.00", "2.28", "1502.3", "0.00", "unitree_go", "MotorStates_", "omgidl"]
     )
-    assert "controller_commit" in done.stdout
-    assert "complete" in done.stdout
+    assert "controller_commit" in output
+    assert "complete" in output
 
 
 def test_info_as_json() -> None:
-    done = run("info", "--json", sample_path("dex3_pinch"))
-    data = json.loads(done.stdout)
+    data = json.loads(dexkit("info", "--json", sample_path("dex3_pinch"))[1])
     assert data["messages"] == 23165
     assert data["truncated"] is False
     assert data["duration_s"] == pytest.approx(19.494, abs=0.001)
@@ -96,11 +54,10 @@ def test_info_as_json() -> None:
 
 
 def test_info_refuses_other_files(tmp_path: Path) -> None:
-    done = run("info", write(tmp_path / "a.mcap", b"SQLite format 3\0" + bytes(50)))
-    assert done.returncode == 2
-    assert "not an mcap file" in done.stderr
-    assert "convert" in done.stderr
-    assert "Traceback" not in done.stderr
+    code, output = dexkit("info", write(tmp_path / "a.mcap", b"SQLite format 3\0" + bytes(50)))
+    assert code == 2
+    assert "not an mcap file" in output
+    assert "convert" in output
 
 
 # -- record and replay, between processes ----------------------------------------------------------
@@ -121,11 +78,12 @@ def test_a_replayed_session_is_recorded_as_it_was(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     options = ("--domain", domain)
     with running("record", out, "--topic", "/dex1/left/cmd", "--topic", RIGHT, *options) as rec:
-        done = run("publish", clip, *options)
-        assert done.returncode == 0, done.stderr
-        stdout, stderr = interrupt(rec)
-        assert rec.returncode == 0, stderr
-    assert f"sent {len(part)} messages" in done.stdout
+        rec.ready()
+        code, output = dexkit("publish", clip, *options)
+        assert code == 0, output
+        code, stdout, stderr = rec.end(signal.SIGINT)
+        assert code == 0, stderr
+    assert f"sent {len(part)} messages" in output
     assert f"{len(part)} messages" in stdout
     assert "0 dropped" in stdout
     trace = open_trace(out)
@@ -152,14 +110,15 @@ def test_record_finds_topics_that_appear_later_and_ends_on_sigterm(tmp_path: Pat
     domain = free_domain()
     out = tmp_path / "out.mcap"
     with running("record", out, "--domain", domain) as rec, DdsNode(domain) as node:
+        rec.ready()
         for topic, kind, data in ((STATE, STATE_TYPE, state(1.0)), ("rt/any", CMD_TYPE, cmd(2.0))):
             writer = node.writer(topic, kind)
             assert writer.wait_matched(60)
             for _ in range(10):
                 writer.write_raw(data)
                 time.sleep(0.005)
-        _, stderr = interrupt(rec, signal.SIGTERM)
-        assert rec.returncode == 0, stderr
+        code, _, stderr = rec.end(signal.SIGTERM)
+        assert code == 0, stderr
     trace = open_trace(out)
     assert trace.topics == ["rt/any", STATE]
     assert trace.samples("rt/any").payloads[-1] == cmd(2.0)
@@ -173,11 +132,11 @@ def test_record_lists_endpoints_when_no_message_came(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     with DdsNode(domain) as node:
         node.writer(STATE, STATE_TYPE)
-        done = run("record", out, "--topic", CMD, "--domain", domain, "--duration", "1")
-    assert done.returncode == 1
-    assert f"domain {domain}, lo" in done.stderr
-    assert CMD in done.stderr
-    assert f"{STATE} ({STATE_TYPE})" in done.stderr
+        code, output = dexkit("record", out, "--topic", CMD, "--domain", domain, "--duration", "1")
+    assert code == 1
+    assert f"domain {domain}, lo" in output
+    assert CMD in output
+    assert f"{STATE} ({STATE_TYPE})" in output
     assert not out.exists()
 
 
@@ -188,12 +147,13 @@ def test_publish_refuses_other_publishers_on_its_topics() -> None:
     sample = sample_path("dex1_pick_place")
     with DdsNode(domain) as node:
         node.writer(RIGHT, CMD_TYPE)
-        refused = run("publish", sample, "--wait", 0, "--domain", domain)
-        assert refused.returncode == 1
-        assert f"already publishes {RIGHT} on domain {domain}" in refused.stderr
-        forced = run("publish", sample, "--wait", 0, "--force", "--pace", 40, "--domain", domain)
-    assert forced.returncode == 0, forced.stderr
-    assert "sent 8052 messages" in forced.stdout
+        code, output = dexkit("publish", sample, "--wait", 0, "--domain", domain)
+        assert code == 1
+        assert f"already publishes {RIGHT} on domain {domain}" in output
+        forced = ("--wait", 0, "--force", "--pace", 40, "--domain", domain)
+        code, output = dexkit("publish", sample, *forced)
+    assert code == 0, output
+    assert "sent 8052 messages" in output
 
 
 @pytest.mark.parametrize(("options", "code"), [((), 130), (("--loop",), 0)])
@@ -201,7 +161,9 @@ def test_an_interrupted_publisher_ends_cleanly(options: tuple[str, ...], code: i
     with running(
         "publish", sample_path("dex1_pick_place"), "--wait", 0, *options, "--domain", free_domain()
     ) as process:
-        stdout, stderr = interrupt(process)
-    assert process.returncode == code
+        process.line_out()  # what it is going to send
+        process.ready()
+        ended, stdout, stderr = process.end(signal.SIGINT)
+    assert ended == code
     assert "sent" in stdout
     assert stderr == ""
