@@ -627,6 +627,11 @@ _KNOWN = {
 }
 
 
+def _own(called: ast.expr) -> bool:
+    """Whether it is ``self.listen``, as a phase of the kit is called, and no socket's."""
+    return isinstance(called, ast.Attribute) and ast.unparse(called.value) == "self"
+
+
 def test_every_listening_socket_in_the_code_is_listed() -> None:
     """Something new that listens belongs into this file, with a filter or an address."""
     found: dict[str, set[str]] = {}
@@ -639,7 +644,7 @@ def test_every_listening_socket_in_the_code_is_listed() -> None:
             if not _CALLED.search(text):  # parsing every file takes seconds
                 continue
             for node in ast.walk(ast.parse(text)):
-                if isinstance(node, ast.Call):
+                if isinstance(node, ast.Call) and not _own(node.func):
                     called = getattr(node.func, "attr", getattr(node.func, "id", ""))
                     if called in _OPENING or _SERVERS.search(called):
                         found.setdefault(name, set()).add(called)
