@@ -16,7 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
-from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
+from dexkit.conformance.checks import STROKE_S, Context, Late, check
+from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.stimulus_record import Phase
@@ -149,77 +150,77 @@ def _operator_figures(recording: Recording, side: Side) -> _OperatorFigures | st
     return _OperatorFigures(begin, end, (len(sent) - 1) / float(sent[-1] - sent[0]), joints)
 
 
-def _judge(
+def _measured(
     ctx: Context,
     name: str,
     limit: str,
-    value: Callable[[TrackingFigures], float],
-    of_step: Callable[[Step], float] | None,
     text: Callable[[float], str],
-    nothing: str,
-) -> Outcome:
-    """The joint with the worst figure against a tolerance."""
+    of_joint: Callable[[TrackingFigures], float],
+    of_step: Callable[[Step], float] | None = None,
+) -> Figures:
+    """A figure of each step of each joint, or of each joint over the whole phase.
+
+    Where the kit's own client was slow, a figure beyond its limit may be its machine's fault.
+    """
     side = ctx.side
     assert isinstance(side, Side), "these requirements are about hands"
     found = ctx.once("operator figures", lambda: _operator_figures(ctx.recording, side))
     if isinstance(found, str):
-        return ctx.skipped(found)
-    figures = {i: value(f) for i, f in found.joints.items()}
-    figures = {i: x for i, x in figures.items() if not math.isnan(x)}
-    if not figures:
-        return ctx.skipped(nothing)
-    joint = max(figures, key=lambda i: figures[i] / ctx.tolerance(limit, i))
-    worst = figures[joint]
-    values = {name: worst, "client_hz": found.client_hz}
-    if name == "stroke_s":
-        values["stroke_mean_s"] = found.joints[joint].stroke_mean_s
+        yield ctx.skipped(found)
+        return
+    known = {i: x for i, f in found.joints.items() if not math.isnan(x := of_joint(f))}
+    if slow := [x for i, x in known.items() if x > ctx.tolerance(limit, i)]:
+        spoken = ctx.recording.dialect
+        wanted = 1.0 / client_for(spoken, tuple(Side) if spoken.commands_both else (side,)).period
+        if found.client_hz < _PART * wanted:
+            skipped = ctx.skipped(
+                f"the kit's own client managed {found.client_hz:.0f} of {wanted:.0f} commands a "
+                f"second: '{text(max(slow))}' may be its machine's fault; run again"
+            )
+            yield replace(skipped, retry=True)
+    values = {"client_hz": found.client_hz}
     if len(ctx.joints) > 1:
-        values |= {f"{name}_{ctx.joints[i].name}": x for i, x in figures.items()}
-    values = {k: v for k, v in values.items() if math.isfinite(v)}
-    observed = ctx.named(text(worst), joint)
-    if worst <= ctx.tolerance(limit, joint):
-        return ctx.passed(text(worst), observed, **values)
-    dialect = ctx.recording.dialect
-    sides = tuple(Side) if dialect.commands_both else (side,)
-    wanted = 1.0 / client_for(dialect, sides).period
-    if found.client_hz < _PART * wanted:
-        skipped = ctx.skipped(
-            f"the kit's own client managed {found.client_hz:.0f} of {wanted:.0f} commands a "
-            f"second: '{text(worst)}' may be its machine's fault; run again"
-        )
-        return replace(skipped, retry=True)
-    places = [ctx.at(ctx.states.topic, found.begin, found.end)]
-    if of_step is not None:
-        steps = [s for s in found.joints[joint].steps if not of_step(s) < worst]
-        places = [ctx.at(ctx.states.topic, s.at, s.end) for s in steps] or places
-    size, how = (worst - ctx.tolerance(limit, joint)), "total" if of_step else "mean"
-    if limit.endswith("_stroke"):
-        size *= STROKE_S / ctx.joints[joint].stroke
-    return ctx.failed(text(worst), observed, *places, **values).about(joint).if_late(size, how=how)
+        values |= {f"{name}_{ctx.joints[i].name}": x for i, x in known.items()}
+    for i in known:
+        figures, more = found.joints[i], dict(values)
+        if name == "stroke_s":
+            more["stroke_mean_s"] = figures.stroke_mean_s
+        places = [(of_joint(figures), found.begin, found.end)]
+        if of_step is not None:
+            places = [(of_step(s), s.at, s.end) for s in figures.steps]
+        for value, begin, end in places:
+            if not math.isnan(value):
+                late = value - ctx.tolerance(limit, i)
+                if limit.endswith("_stroke"):
+                    late *= STROKE_S / ctx.joints[i].stroke
+                yield Figure(
+                    value,
+                    begin,
+                    end,
+                    i,
+                    text(value),
+                    shown=text(value),
+                    late=Late((max(0.0, late),), "total" if of_step else "mean"),
+                    values={k: v for k, v in more.items() if math.isfinite(v)},
+                )
 
 
 @check("DEX1-OPER-01", "DEX1-OPER-06", "DEX3-OPER-01")
-def stroke(ctx: Context) -> Outcome:
+@worst("stroke_s", "max_stroke_s", nothing="no step was long enough: something is in the way")
+def stroke(ctx: Context) -> Figures:
     """Time of a full stroke."""
 
     def text(seconds: float) -> str:
-        if math.isinf(seconds):
-            return "the hand hardly moves"
-        return f"full stroke {seconds:.2f} s"
+        return "the hand hardly moves" if math.isinf(seconds) else f"full stroke {seconds:.2f} s"
 
-    return _judge(
-        ctx,
-        "stroke_s",
-        "max_stroke_s",
-        lambda f: f.stroke_s,
-        lambda s: s.stroke_s,
-        text,
-        "no step was long enough: something is in the way",
+    return _measured(
+        ctx, "stroke_s", "max_stroke_s", text, lambda f: f.stroke_s, lambda s: s.stroke_s
     )
 
 
 @check("DEX1-OPER-02", "DEX3-OPER-02")
-def lag(ctx: Context) -> Outcome:
+@worst("lag_s", "max_lag_s", nothing="no slow motion was long enough")
+def lag(ctx: Context) -> Figures:
     """Lag of the joint behind a slowly moving operator, seconds."""
 
     def text(seconds: float) -> str:
@@ -227,40 +228,46 @@ def lag(ctx: Context) -> Outcome:
             return "does not follow a slow motion"
         return f"lags {seconds * 1e3:.0f} ms"
 
-    return _judge(
-        ctx,
-        "lag_s",
-        "max_lag_s",
-        lambda f: f.lag_s,
-        None,
-        text,
-        "no slow motion was long enough",
-    )
+    return _measured(ctx, "lag_s", "max_lag_s", text, lambda f: f.lag_s)
 
 
 @check("DEX1-OPER-03", "DEX3-OPER-03")
-def overshoot(ctx: Context) -> Outcome:
+@worst("overshoot_rad", "max_overshoot_stroke", nothing="no step was completed")
+def overshoot(ctx: Context) -> Figures:
     """Overshoot of the joint beyond the operator's target."""
-    return _judge(
+    return _measured(
         ctx,
         "overshoot_rad",
         "max_overshoot_stroke",
+        lambda x: f"overshoots by {x:.3f} {ctx.unit}",
         lambda f: f.overshoot,
         lambda s: s.overshoot,
-        lambda x: f"overshoots by {x:.3f} {ctx.unit}",
-        "no step was completed",
     )
 
 
 @check("DEX1-OPER-04", "DEX3-OPER-04")
-def stuck(ctx: Context) -> Outcome:
+@worst("stuck_rad", "max_stuck_stroke", nothing="the hand came to rest after no step")
+def stuck(ctx: Context) -> Figures:
     """Distance of the joint from the operator's target at rest."""
-    return _judge(
+    return _measured(
         ctx,
         "stuck_rad",
         "max_stuck_stroke",
+        lambda x: f"rests {x:.3f} {ctx.unit} off",
         lambda f: f.stuck,
         lambda s: s.stuck,
-        lambda x: f"rests {x:.3f} {ctx.unit} off",
-        "the hand came to rest after no step",
+    )
+
+
+@check("DEX1-OPER-05", "DEX3-OPER-05")
+@worst("reaction_s", "max_reaction_s", nothing="it moved after no step")
+def reaction(ctx: Context) -> Figures:
+    """Seconds until the joint begins to move."""
+    return _measured(
+        ctx,
+        "reaction_s",
+        "max_reaction_s",
+        lambda x: f"reacts after {x * 1e3:.0f} ms",
+        lambda f: f.reaction_s,
+        lambda s: s.reaction_s,
     )
