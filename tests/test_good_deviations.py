@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dexkit.conformance.faults.generated import Fault, Generated, dialects, parse
-from dexkit.conformance.faults.generated.good import GROUPS
+from dexkit.conformance.faults.generated.choices import GROUPS
 from dexkit.conformance.faults.generated.rig import Faulty
 from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.virtual import Sample

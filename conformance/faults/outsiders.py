@@ -25,7 +25,7 @@ from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.kit.requirements import Level, catalogue
+from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.virtual import Service
 from dexkit.console import Console
@@ -243,8 +243,7 @@ def blame(result: RunResult) -> Blame:
         if r.verdict is Verdict.ERROR:
             found["errors"].add(r.requirement.id)
         elif r.verdict in (Verdict.FAIL, Verdict.WARN):
-            must = r.requirement.level is Level.MUST
-            found["failed" if must else "warned"].add(r.requirement.id)
+            found["failed" if r.verdict is Verdict.FAIL else "warned"].add(r.requirement.id)
     return Blame(**{key: tuple(sorted(ids)) for key, ids in found.items()})
 
 

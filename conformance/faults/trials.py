@@ -18,6 +18,7 @@ from typing import Any
 from dexkit.conformance.behaviours.operator import OPERATOR
 from dexkit.conformance.faults.registry import Mutant
 from dexkit.conformance.hands import under_test
+from dexkit.conformance.kit.claims import Claims
 from dexkit.conformance.kit.decoding import recording_of
 from dexkit.conformance.kit.judge import deciding, judge, judge_layer, results_of
 from dexkit.conformance.kit.recording import TraceLike
@@ -177,16 +178,18 @@ def run_mutant(
     service: type[TopicDevice],
     plan: Plan[Subject] | None = None,
     requirements: Sequence[Requirement] | None = None,
+    claims: Claims | None = None,
 ) -> RunResult:
     """Judge a service of hands, or a robot, on the virtual clock.
 
     :param requirements: those to be reported; None for all.
+    :param claims: what the vendor claims of the hand.
     """
     chosen = plan or plan_for()
     trace = run_virtual(chosen, service)
     recording = recording_of(trace, chosen.dialect.name, chosen.sides)
     subject = {"backend": f"virtual {service.__name__}", "device": "virtual"}
-    return judge(recording, requirements=requirements, subject=subject)
+    return judge(recording, requirements=requirements, claims=claims, subject=subject)
 
 
 # ----------------------------------------------------------------------------- to play and judge

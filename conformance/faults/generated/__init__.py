@@ -17,11 +17,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from dexkit.conformance.faults.generated.choices import DEVIATIONS, GROUPS
 from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
-from dexkit.conformance.faults.generated.good import DEVIATIONS, GROUPS
 from dexkit.conformance.faults.generated.rig import Faulty, Part, What, When, compose
 from dexkit.conformance.faults.generated.times import WHENS
 from dexkit.conformance.hands import under_test
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.requirements import CAPABILITIES
 from dexkit.errors import UsageError
 from dexkit.hand import Side
 from dexkit.models import MODELS, Dialect, HandModel, dialect, model
@@ -118,11 +120,29 @@ class Generated:
     @property
     def sides(self) -> tuple[Side, ...]:
         """The hands of a run that shows it. Hands of many joints take long: only those needed."""
+        for fault in self.faults:
+            if fault.made.served:
+                return fault.made.served
         if self.dialect.is_gripper or self.good:
             return tuple(Side) if self.dialect.is_gripper else (Side.RIGHT,)
         needs_both = any(f.made.both or any(w.both for w in f.conditions) for f in self.faults)
         named = {s for f in self.faults for s in _SIDES[f.side]}
         return tuple(s for s in Side if needs_both or s in named)
+
+    @property
+    def permitted(self) -> frozenset[str]:
+        """Requirements that may warn of it, if it is good."""
+        return frozenset().union(*(f.made.warned for f in self.faults))
+
+    @property
+    def claims(self) -> Claims:
+        """What its maker claims of it."""
+        said = [f.made.claims for f in self.faults if f.made.claims is not None]
+        if not said:
+            return Claims()
+        lacking = frozenset().union(*(f.made.lacks for f in self.faults))
+        has = units_of(self.dialect) - lacking if said[0] else frozenset()
+        return Claims({unit: unit in has for unit in CAPABILITIES})
 
     def service(self) -> type[Faulty]:
         """Its service.
@@ -244,14 +264,29 @@ def _drawn(draw: random.Random, spoken: Dialect, kind: str) -> Fault:
     )
 
 
+def units_of(spoken: Dialect) -> frozenset[str]:
+    """The units that the reference of a dialect's model has."""
+    reference = under_test(spoken.model).reference.load()
+    members = {"tau_est": "force", "dq": "velocity", "ddq": "acceleration"}
+    found = {unit for member, unit in members.items() if member in reference.measured_members}
+    found |= {"pressure"} if getattr(reference, "sensors", 0) else set()
+    found |= {"imu"} if any(getattr(reference, "attitude", ())) else set()
+    found |= {"low_rate"} if spoken.low_rate_topic else set()
+    return frozenset(found)
+
+
 def _suits(what: type[What], of: HandModel) -> bool:
     """Whether a hand of a model can have a fault, or a deviation."""
     several = len(of.joints[Side.LEFT]) > 1
-    if (what.one_joint and several) or (what.several and not several):
+    if (what.one_joint and several) or (what.several and not several) or of.name in what.not_of:
         return False
-    if what.position_servo and not any(d.position_servo for d in of.dialects):
+    servo = any(d.position_servo for d in of.dialects)
+    if (what.position_servo and not servo) or (what.control_law and servo):
         return False
-    return not what.needs or what.needs in under_test(of.name).reference.load().measured_members
+    reference = under_test(of.name).reference.load()
+    if what.has and not getattr(reference, what.has, None):
+        return False
+    return not what.needs or what.needs in reference.measured_members
 
 
 def sample_good(count: int, seed: int, spoken: Sequence[Dialect]) -> list[Generated]:

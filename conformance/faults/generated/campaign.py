@@ -24,6 +24,7 @@ from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.outsiders import blame
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.kit.catch_rates import wilson
+from dexkit.conformance.kit.claims import Claims
 from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.selection import RunKind
 from dexkit.conformance.stimuli import Plan
@@ -46,6 +47,7 @@ class Trial:
     :param in_kit: the severity of what shows under the kit's own stimulus alone.
     :param effect: what an observer can tell, gravest first.
     :param shown_by: the shortest stimulus that shows it; of survivors.
+    :param permitted: ids of requirements that may warn of a good hand: what it leaves out.
     :param failed: ids of MUSTs that fail, ``warned`` of other requirements that fail or warn, and
         ``errors`` of those that could not be judged for a fault of the kit.
     """
@@ -58,6 +60,7 @@ class Trial:
     effect: str = ""
     shown_by: str = ""
     areas: tuple[str, ...] = ()
+    permitted: tuple[str, ...] = ()
     failed: tuple[str, ...] = ()
     warned: tuple[str, ...] = ()
     errors: tuple[str, ...] = ()
@@ -82,8 +85,13 @@ class Trial:
     def caught(self) -> bool:
         """Whether the checks were right about it, for a right reason."""
         if self.severity == GOOD:
-            return not (self.failed or self.warned or self.errors)
+            return not (self.failed or self.blamed or self.errors)
         return bool(self.caught_by)
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """Ids of the requirements that warn of a good hand, and may not."""
+        return tuple(r for r in self.warned if r not in self.permitted)
 
     @property
     def wrong_reason(self) -> bool:
@@ -106,7 +114,8 @@ def try_generated(hand: Generated, seed: int = 1, run: RunKind = RunKind.DEFAULT
     trial, opinion = graded(hand, service, seed)
     if not trial.counts:
         return trial
-    trial = judged(trial, service, plan_for(hand.dialect.name, sides=hand.sides, run=run), run)
+    plan = plan_for(hand.dialect.name, sides=hand.sides, run=run)
+    trial = judged(trial, service, plan, run, hand.claims)
     if trial.caught or opinion is None:
         return trial
     return replace(trial, shown_by=shortest(hand, opinion, seed))
@@ -117,7 +126,14 @@ def graded(hand: Generated, service: type[Faulty], seed: int) -> tuple[Trial, Op
 
     :param service: the hand's service.
     """
-    trial = Trial(hand.name, hand.kind, hand.summary, GOOD, areas=tuple(sorted(hand.areas)))
+    trial = Trial(
+        hand.name,
+        hand.kind,
+        hand.summary,
+        GOOD,
+        areas=tuple(sorted(hand.areas)),
+        permitted=tuple(sorted(hand.permitted)),
+    )
     if hand.good:
         return trial, None
     opinion = examine(service, hand.dialect, hand.sides, seed)
@@ -129,10 +145,16 @@ def graded(hand: Generated, service: type[Faulty], seed: int) -> tuple[Trial, Op
     return trial, opinion
 
 
-def judged(trial: Trial, service: type[Faulty], plan: Plan[Subject], run: RunKind) -> Trial:
+def judged(
+    trial: Trial,
+    service: type[Faulty],
+    plan: Plan[Subject],
+    run: RunKind,
+    claims: Claims | None = None,
+) -> Trial:
     """The trial with what a run of that plan and kind finds."""
     wanted = run.requirements(catalogue(plan.dialect.model))
-    failed, warned, errors = blame(run_mutant(service, plan, wanted))
+    failed, warned, errors = blame(run_mutant(service, plan, wanted, claims))
     return replace(trial, failed=failed, warned=warned, errors=errors)
 
 
@@ -259,7 +281,7 @@ class Campaign:
                 GOOD: {
                     **self.score(GOOD),
                     "failed": sum(bool(t.failed) for t in self.trials_of(GOOD)),
-                    "warned": sum(bool(t.warned) for t in self.trials_of(GOOD)),
+                    "warned": sum(bool(t.blamed) for t in self.trials_of(GOOD)),
                 },
                 "equivalent": len(self.trials_of(Severity.EQUIVALENT.value)),
             },
@@ -282,7 +304,7 @@ class Campaign:
             console.print(f"          {escape(t.effect)}{reason}", soft_wrap=True)
             console.print(f"          shown by: {escape(t.shown_by)}", soft_wrap=True)
         for t in self.blamed:
-            ids = ", ".join(t.failed + t.warned + t.errors)
+            ids = ", ".join(t.failed + t.blamed + t.errors)
             console.print(f"[red]blamed[/]    {escape(t.name)}: {ids}", soft_wrap=True)
         if verbose:
             for t in self.trials:
@@ -309,6 +331,6 @@ class Campaign:
         if good := self.trials_of(GOOD):
             console.print(
                 f"{len(good)} good hands: {sum(bool(t.failed) for t in good)} fail a MUST, "
-                f"{sum(bool(t.warned) for t in good)} are warned",
+                f"{sum(bool(t.blamed) for t in good)} are warned",
                 style="red" if self.blamed else "green",
             )

@@ -21,19 +21,25 @@ from dexkit.conformance.kit.motor_messages import Motor
 from dexkit.conformance.virtual import Sample
 from dexkit.hand import Side
 
-__all__ = ["DEVIATIONS", "GROUPS"]
+__all__ = ["FOUND", "FOUND_GROUPS", "Backlash", "Counts", "Mechanics", "SoftStart", "add"]
 
 W = TypeVar("W", bound=type[What])
 _ONE = {"one_joint": True}
-_found: dict[str, type[What]] = {}
-_groups: dict[str, list[str]] = {}
+FOUND: dict[str, type[What]] = {}
+FOUND_GROUPS: dict[str, list[str]] = {}
 
 
-def _add(group: str, base: type[What], title: str, summary: str, **values: object) -> None:
+def add(group: str, base: type[What], title: str, summary: str, **values: object) -> None:
+    """Make a deviation.
+
+    :param group: a hand has one of each.
+    :param base: what it does.
+    :param values: attributes of its class.
+    """
     made: type[What] = type(base.__name__, (base,), {"good": True, "kind": "good", **values})
     made.title, made.summary = title, summary
-    _found[title] = made
-    _groups.setdefault(group, []).append(title)
+    FOUND[title] = made
+    FOUND_GROUPS.setdefault(group, []).append(title)
 
 
 # ----------------------------------------------------------------------------- measurement
@@ -50,8 +56,8 @@ class _Noise(What):
             values.tau += self.random.gauss(0.0, self.tau * self.rig.strength(self.side, joint))
 
 
-_add("noise", _Noise, "noise-q-small", "has noise of 0.02 % of the range on q", q=2e-4)
-_add("noise", _Noise, "noise-q", "has noise of 0.06 % of the range on q", q=6e-4)
+add("noise", _Noise, "noise-q-small", "has noise of 0.02 % of the range on q", q=2e-4)
+add("noise", _Noise, "noise-q", "has noise of 0.06 % of the range on q", q=6e-4)
 
 
 class _WideNoise(What):
@@ -64,8 +70,8 @@ class _WideNoise(What):
         values.q += self.random.uniform(-self.part, self.part) * span
 
 
-_add("noise", _WideNoise, "noise-q-wide", "has noise of up to 0.7 % of the range on q", **_ONE)
-_add(
+add("noise", _WideNoise, "noise-q-wide", "has noise of up to 0.7 % of the range on q", **_ONE)
+add(
     "noise",
     _Noise,
     "noise-dq",
@@ -73,7 +79,7 @@ _add(
     dq=0.01,
     needs="dq",
 )
-_add(
+add(
     "noise",
     _Noise,
     "noise-tau",
@@ -83,7 +89,9 @@ _add(
 )
 
 
-class _Counts(What):
+class Counts(What):
+    """Measures q in steps of an encoder."""
+
     per_turn = 4096
 
     def report(self, joint: int, values: Report) -> None:
@@ -91,8 +99,8 @@ class _Counts(What):
         values.q = step * round(values.q / step)
 
 
-_add("resolution", _Counts, "counts-4096", "measures q in 4096 steps of a turn", per_turn=4096)
-_add("resolution", _Counts, "counts-16384", "measures q in 16384 steps of a turn", per_turn=16384)
+add("resolution", Counts, "counts-4096", "measures q in 4096 steps of a turn", per_turn=4096)
+add("resolution", Counts, "counts-16384", "measures q in 16384 steps of a turn", per_turn=16384)
 
 
 class _Predicted(What):
@@ -113,11 +121,11 @@ class _Predicted(What):
         values.q, values.dq = q + speed * (now - at), dq
 
 
-_add("prediction", _Predicted, "predicts-100", "measures 100 times a second, and predicts")
-_add("prediction", _Predicted, "predicts-150", "measures 150 times a second", period=1 / 150)
+add("prediction", _Predicted, "predicts-100", "measures 100 times a second, and predicts")
+add("prediction", _Predicted, "predicts-150", "measures 150 times a second", period=1 / 150)
 
 
-class _Backlash(What):
+class Backlash(What):
     """Its sensor is behind a gear with play."""
 
     play = 0.002
@@ -128,14 +136,14 @@ class _Backlash(What):
         self.memory[joint] = values.q = min(max(q, values.q - half), values.q + half)
 
 
-_add("backlash", _Backlash, "backlash", "has play of 0.2 % of the range before its sensor")
-_add("backlash", _Backlash, "backlash-more", "has play of 0.5 % of the range", play=0.005)
+add("backlash", Backlash, "backlash", "has play of 0.2 % of the range before its sensor")
+add("backlash", Backlash, "backlash-more", "has play of 0.5 % of the range", play=0.005)
 
 
 # ------------------------------------------------------------------------------- mechanics
 
 
-class _Mechanics(What):
+class Mechanics(What):
     """Has other constants of its mechanics."""
 
     factors: Mapping[str, float] = {}
@@ -149,21 +157,21 @@ class _Mechanics(What):
                 setattr(hand, name, factor * getattr(hand, name))
 
 
-_add("mechanics", _Mechanics, "heavier", "has 1.5 times the inertia", factors={"inertia": 1.5})
-_add("mechanics", _Mechanics, "heavier-more", "has twice the inertia", factors={"inertia": 2.0})
-_add("mechanics", _Mechanics, "lighter", "has half of the inertia", factors={"inertia": 0.5})
-_add("mechanics", _Mechanics, "slower", "has 1.15 times the friction", factors={"viscous": 1.15})
-_add("mechanics", _Mechanics, "faster", "has 0.8 times the friction", factors={"viscous": 0.8})
-_add("mechanics", _Mechanics, "sticky", "has 1.5 times the dry friction", factors={"coulomb": 1.5})
-_add(
+add("mechanics", Mechanics, "heavier", "has 1.5 times the inertia", factors={"inertia": 1.5})
+add("mechanics", Mechanics, "heavier-more", "has twice the inertia", factors={"inertia": 2.0})
+add("mechanics", Mechanics, "lighter", "has half of the inertia", factors={"inertia": 0.5})
+add("mechanics", Mechanics, "slower", "has 1.15 times the friction", factors={"viscous": 1.15})
+add("mechanics", Mechanics, "faster", "has 0.8 times the friction", factors={"viscous": 0.8})
+add("mechanics", Mechanics, "sticky", "has 1.5 times the dry friction", factors={"coulomb": 1.5})
+add(
     "mechanics",
-    _Mechanics,
+    Mechanics,
     "stronger",
     "has five times the largest torque, and the inertia of such a motor",
     factors={"tau_max": 5.0, "inertia": 3.0},
     **_ONE,
 )
-_add("mechanics", _Mechanics, "soft-stops", "has stops half as stiff", factors={"stiffness": 0.5})
+add("mechanics", Mechanics, "soft-stops", "has stops half as stiff", factors={"stiffness": 0.5})
 
 
 class _WarmsUp(What):
@@ -178,7 +186,7 @@ class _WarmsUp(What):
         hand.coulomb = self.own * (1.0 + max(0.0, 1.0 - self.rig.tracks[self.side].moved / 20.0))
 
 
-_add("mechanics", _WarmsUp, "warms-up", "has twice the dry friction until it is warm")
+add("mechanics", _WarmsUp, "warms-up", "has twice the dry friction until it is warm")
 
 
 class _Weight(What):
@@ -192,11 +200,11 @@ class _Weight(What):
         return tau + self.part * self.rig.strength(self.side, joint)
 
 
-_add("weight", _Weight, "sags-up", "is pulled open by a weight", part=0.05)
-_add("weight", _Weight, "sags-down", "is pulled closed by a weight", part=-0.05)
+add("weight", _Weight, "sags-up", "is pulled open by a weight", part=0.05)
+add("weight", _Weight, "sags-down", "is pulled closed by a weight", part=-0.05)
 
 
-class _SoftStart(What):
+class SoftStart(What):
     """Raises the torque within 0.15 s when it begins to be driven."""
 
     seconds = 0.15
@@ -212,7 +220,7 @@ class _SoftStart(What):
         return tau * min(1.0, 0.1 + (self.rig.now - self.driven_at) / self.seconds)
 
 
-_add("start", _SoftStart, "soft-start", "raises its torque within 0.15 s when it is driven")
+add("start", SoftStart, "soft-start", "raises its torque within 0.15 s when it is driven")
 
 
 class _TopSpeed(What):
@@ -230,8 +238,8 @@ class _TopSpeed(What):
         return min(max(tau, low), high)
 
 
-_add("speed", _TopSpeed, "top-speed-4.5", "moves at 4.5 rad/s at most", rads=4.5, **_ONE)
-_add("speed", _TopSpeed, "top-speed-3.6", "moves at 3.6 rad/s at most", rads=3.6, **_ONE)
+add("speed", _TopSpeed, "top-speed-4.5", "moves at 4.5 rad/s at most", rads=4.5, **_ONE)
+add("speed", _TopSpeed, "top-speed-3.6", "moves at 3.6 rad/s at most", rads=3.6, **_ONE)
 
 
 class _Servo(What):
@@ -250,8 +258,8 @@ class _Servo(What):
         return self.replaced(motors, stiff)
 
 
-_add("servo", _Servo, "servo-stiff", "is a position servo of four times the stiffness", **_ONE)
-_add("servo", _Servo, "servo-own", "is a position servo of its own stiffness", times=1.5, **_ONE)
+add("servo", _Servo, "servo-stiff", "is a position servo of four times the stiffness", **_ONE)
+add("servo", _Servo, "servo-own", "is a position servo of its own stiffness", times=1.5, **_ONE)
 
 
 # ---------------------------------------------------------------------------------- timing
@@ -282,7 +290,7 @@ class _Latency(What):
 
 
 for _ms in (5, 10, 20):
-    _add(
+    add(
         "latency",
         _Latency,
         f"latency-{_ms}",
@@ -324,8 +332,8 @@ class _StateLatency(_Published):
 
 
 # with a late command they make more than the 20 ms that a round may take
-_add("latency", _StateLatency, "state-late-6", "publishes 6 ms after it measured", seconds=0.006)
-_add("latency", _StateLatency, "state-late-10", "publishes 10 ms after it measured", seconds=0.01)
+add("latency", _StateLatency, "state-late-6", "publishes 6 ms after it measured", seconds=0.006)
+add("latency", _StateLatency, "state-late-10", "publishes 10 ms after it measured", seconds=0.01)
 
 
 class _Jitters(_Published):
@@ -349,9 +357,9 @@ class _Pauses(_Published):
         return [] if quiet else samples
 
 
-_add("state", _Pauses, "pauses", "has a gap of 75 ms in every 2.5 s: a log is written")
-_add("state", _Jitters, "jitter-2", "publishes 2 % of its states a period late", part=0.02)
-_add("state", _Jitters, "jitter-5", "publishes 5 % of its states a period late", part=0.05)
+add("state", _Pauses, "pauses", "has a gap of 75 ms in every 2.5 s: a log is written")
+add("state", _Jitters, "jitter-2", "publishes 2 % of its states a period late", part=0.02)
+add("state", _Jitters, "jitter-5", "publishes 5 % of its states a period late", part=0.05)
 
 
 # --------------------------------------------------------------------------------- braking
@@ -369,7 +377,7 @@ class _Coasts(What):
 
 
 # a status of 0 locks a hand of several joints (DEX3-MODE-06): coasting is a fault there
-_add("brake", _Coasts, "brake-coast", "coasts when it brakes", **_ONE)
+add("brake", _Coasts, "brake-coast", "coasts when it brakes", **_ONE)
 
 
 class _Holds(What):
@@ -386,7 +394,7 @@ class _Holds(What):
         return kp * (at - q) - kd * dq
 
 
-_add("brake", _Holds, "brake-hold", "holds its position when it brakes")
+add("brake", _Holds, "brake-hold", "holds its position when it brakes")
 
 
 class _Releases(What):
@@ -417,15 +425,15 @@ class _Releases(What):
         return tau + self.last.get(joint, 0.0) * max(0.0, left)
 
 
-_add("brake", _Releases, "brake-release", "lets its torque go within 0.3 s when it brakes")
-_add("brake", _Releases, "brake-release-fast", "lets its torque go within 0.1 s", seconds=0.1)
+add("brake", _Releases, "brake-release", "lets its torque go within 0.3 s when it brakes")
+add("brake", _Releases, "brake-release-fast", "lets its torque go within 0.1 s", seconds=0.1)
 
 
-class _StrongBrake(_Mechanics):
+class _StrongBrake(Mechanics):
     factors: Mapping[str, float] = {"brake": 3.0}
 
 
-_add("brake", _StrongBrake, "brake-short", "brakes three times as hard")
+add("brake", _StrongBrake, "brake-short", "brakes three times as hard")
 
 
 class _Relaxes(What):
@@ -444,9 +452,4 @@ class _Relaxes(What):
         self.done = silent
 
 
-_add("brake", _Relaxes, "brake-relax", "stops pressing when commands end, and holds")
-
-DEVIATIONS: Mapping[str, type[What]] = _found
-"""Every deviation, by name."""
-GROUPS: Mapping[str, tuple[str, ...]] = {k: tuple(v) for k, v in _groups.items()}
-"""The names of the deviations of which a hand has one at most."""
+add("brake", _Relaxes, "brake-relax", "stops pressing when commands end, and holds")

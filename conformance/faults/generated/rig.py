@@ -103,7 +103,14 @@ class What:
     :cvar idle: why it has no effect under ``always``; empty where it has one.
     :cvar one_joint: whether it needs a hand of one joint.
     :cvar position_servo: whether it needs a hand of position servos.
+    :cvar control_law: whether it needs a hand that obeys the gains of commands.
     :cvar needs: the member of a motor's state that the reference must measure; empty for none.
+    :cvar has: the attribute that the reference must have; empty for none.
+    :cvar not_of: models whose hands cannot have it.
+    :cvar warned: ids of requirements that may warn of a good hand that does this.
+    :cvar lacks: units that a hand with this does not have, and does not claim.
+    :cvar claims: whether its maker claims the units that it has, or none; None without a file.
+    :cvar served: the sides that are served; empty for those that any such hand has.
     :cvar turn: its place among the deviations of a good hand: below 0 before the others, above 0
         after them.
     """
@@ -118,7 +125,14 @@ class What:
     idle = ""
     one_joint = False
     position_servo = False
+    control_law = False
     needs = ""
+    has = ""
+    not_of: frozenset[str] = frozenset()
+    warned: frozenset[str] = frozenset()
+    lacks: frozenset[str] = frozenset()
+    claims: bool | None = None
+    served: tuple[Side, ...] = ()
     turn = 0
 
     def __init__(self, rig: Faulty, side: Side, joints: tuple[int, ...]) -> None:
