@@ -15,8 +15,8 @@ from dexkit.conformance.faults import generated, outsiders
 from dexkit.conformance.faults.__main__ import command
 from dexkit.conformance.faults.generated import Fault, Generated, dialects, oracle, parse
 from dexkit.conformance.faults.generated.campaign import Campaign, Trial, try_generated
-from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
 from dexkit.conformance.faults.generated.choices import DEVIATIONS
+from dexkit.conformance.faults.generated.faults import FAULTS, KINDS
 from dexkit.conformance.faults.generated.rig import What, compose
 from dexkit.conformance.faults.generated.stimulus import play_order, random_segments
 from dexkit.conformance.faults.generated.times import WHENS

@@ -14,7 +14,14 @@ from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.nudges import STIFFNESS, displacement_noise, is_alike, nudges
 from dexkit.conformance.checks.obedience import sags, silent, stays, unharmed
 from dexkit.conformance.checks.robot import LATE_S, RobotContext, no_state
-from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, steps, steps_of
+from dexkit.conformance.checks.steps import (
+    Step,
+    disobeyed,
+    missed,
+    obeyed_before,
+    steps,
+    steps_of,
+)
 from dexkit.conformance.checks.timing import gaps
 from dexkit.conformance.kit.measurement_error import Measure
 from dexkit.conformance.kit.motor_messages import Motor, Motors
@@ -661,7 +668,7 @@ def unchanged(ctx: Context) -> Outcome:
     between = [*ctx.phases("center"), *ctx.phases()]
     for phase in (p for p in between if obeyed_before(ctx, p)):
         for step in steps_of(ctx, phase):
-            if step.error > ctx.tolerance("max_error_stroke", step.joint):
+            if missed(ctx, step) > ctx.tolerance("max_error_stroke", step.joint):
                 return disobeyed(ctx, "between two phases", step)
     first = [s for s in steps(ctx) if abs(s.size) >= ctx.tolerance("min_step_stroke", s.joint)]
     speeds = judged(

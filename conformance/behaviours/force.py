@@ -64,7 +64,14 @@ def _squeeze(ctx: Context) -> tuple[float, float, float] | None:
 @with_object
 @worst("tau_nm", "min_tau_nm", nothing="no state while it squeezed")
 def in_contact(ctx: Context) -> Figures:
-    """tau_est in size while squeezing an object."""
+    """tau_est in size while squeezing an object.
+
+    A gripper without force fills 0 throughout: no known client acts on it.
+    """
+    if no_torque(ctx) is not None:
+        none = ctx.failed("not filled", "tau_est is 0 throughout: this gripper measures no force")
+        yield replace(none, absent=True).tolerated()
+        return
     found = _squeeze(ctx)
     if found is not None:
         tau, begin, end = found

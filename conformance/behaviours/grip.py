@@ -390,6 +390,9 @@ def _force(ctx: Context, phase: Phase) -> float | None:
 @worst("tau_nm", "min_tau_nm", nothing="no state during grips with little stiffness")
 def soft_grips(ctx: Context) -> Figures:
     """The smallest tau_est of grips with low stiffness."""
+    if (none := no_torque(ctx)) is not None:
+        yield none
+        return
     for grip in soft_grips_of(ctx):
         text = (
             f"tau_est of {grip.tau:.2f} N m with a kp of {grip.kp:g} N m/rad, where kp times the "
@@ -457,6 +460,9 @@ def unsigned(ctx: Context) -> Figures:
 @worst("part", "min_part", nothing="it never pressed on the object for long enough")
 def as_commanded(ctx: Context) -> Figures:
     """The smallest tau_est in contact, relative to kp times the distance to the goal."""
+    if (none := no_torque(ctx)) is not None:
+        yield none
+        return
     for piece in contacts(ctx, ctx.touch):
         asked = min(piece.kp * (piece.q - piece.goal), ctx.tolerance("max_asked_nm"))
         if asked >= ctx.tolerance("min_asked_nm"):
@@ -727,6 +733,8 @@ def contact_force_fits_stiffness(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, relative to the hand's measured stiffness times the
     error.
     """
+    if (none := no_torque(ctx)) is not None:
+        return none
     found = nudges(ctx, [*ctx.phases(), *ctx.phases("nudge")])
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not found:

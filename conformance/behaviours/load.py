@@ -7,7 +7,7 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import silent
-from dexkit.conformance.checks.steps import obeyed_before, steps_of
+from dexkit.conformance.checks.steps import obeyed_before, rest_error, steps_of
 from dexkit.conformance.checks.timing import gaps, least_rate, slow, too_slow
 from dexkit.conformance.stimuli.hand import HandScript
 from dexkit.conformance.stimuli.phases import Place, stimulus
@@ -156,7 +156,8 @@ def obeys_under_load(ctx: Context) -> Figures:
             way = goals[:, joint] - goals[0, joint]
             turn = int(np.argmax(np.abs(way)))
             size = float(way[turn])
-            if abs(size) < ctx.tolerance("min_way_stroke", joint):
+            far = abs(size) - rest_error(ctx, joint)  # friction takes the rest
+            if far < ctx.tolerance("min_way_stroke", joint):
                 continue
             # it may still be on its way from the load before, or be held off its goal
             origin = float(goals[0, joint])
@@ -164,6 +165,6 @@ def obeys_under_load(ctx: Context) -> Figures:
                 origin = float(start[joint])
             until = float(t[turn]) + ctx.tolerance("max_delay_s")
             q = ctx.q(float(t[turn]), until)[:, joint]
-            made = float(((q - origin) / size).max()) if len(q) else 0.0
+            made = float(((q - origin) * np.sign(size)).max()) / far if len(q) else 0.0
             text = f"made {made:.0%} of a way of {size:.2f} {ctx.unit} under load"
             yield Figure(made, begin, until, joint, text, late=until - begin)

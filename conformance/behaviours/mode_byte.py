@@ -218,7 +218,7 @@ def _status(ctx: Context, mode: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDA
     return mode, np.zeros(len(mode), dtype=np.bool_)
 
 
-_GOING = 0.9  # of a phase's time; a step may begin with it
+_GOING = 0.8  # of a phase's time; a step may begin with it
 
 
 @check("DEX3-MODE-05")

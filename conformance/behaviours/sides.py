@@ -10,7 +10,14 @@ import numpy as np
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import arrival
-from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, rests_before, steps_of
+from dexkit.conformance.checks.steps import (
+    Step,
+    disobeyed,
+    missed,
+    obeyed_before,
+    rests_before,
+    steps_of,
+)
 from dexkit.conformance.kit.measurement_error import Measure, Quantity
 from dexkit.conformance.kit.median import median
 from dexkit.conformance.kit.sums import mean
@@ -131,7 +138,7 @@ def by_its_own(ctx: Context) -> Figures:
         if not rests_before(ctx, step) or not len(last) or not large:
             continue
         made = replace(step, final=median(last))
-        if made.error > ctx.tolerance("max_error_stroke", step.joint):
+        if missed(ctx, made) > ctx.tolerance("max_error_stroke", step.joint):
             yield disobeyed(ctx, "while the other hand was commanded otherwise", made)
         late = STROKE_S * abs(step.size) / step.stroke
         yield made.figure(made.progress, f"while the other hand had zero gains: {made}", late=late)

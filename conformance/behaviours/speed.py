@@ -8,7 +8,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
-from dexkit.conformance.checks.steps import Step, steps_of
+from dexkit.conformance.checks.steps import Step, speed_of, steps_of
 from dexkit.conformance.stimuli.fingers import CLOSED, OPEN, FingerScript
 from dexkit.conformance.stimuli.phases import stimulus
 from dexkit.conformance.stimuli.script import Steps
@@ -42,6 +42,9 @@ def move_at_own_speeds(script: FingerScript) -> Steps:
 _TURNS_S = 0.08  # s after which a joint has taken up a new speed
 
 
+_LARGE = 0.3  # of the travel: a step that shows a joint's full speed
+
+
 _MOST_OF_IT = 0.9  # part of a way after which a joint may slow down
 
 
@@ -58,6 +61,18 @@ def slow_command(ctx: Context) -> Figures:
         for joint in phase.targets.get(ctx.side, {}):
             part = float(np.ptp(q[:, joint])) / float(t[-1] - t[0]) / ctx.joints[joint].dq_max
             yield Figure(part, begin, end, joint, f"moved with {part:.0%} of its full speed")
+
+
+def _full_speed(ctx: Context, joint: int) -> float:
+    """A joint's own full speed: that of its fastest large step, or else the model's."""
+    speeds = [
+        speed
+        for phase in (*ctx.phases("joint"), *ctx.phases("ends"))
+        for step in steps_of(ctx, phase)
+        if step.joint == joint and abs(step.size) >= _LARGE * step.stroke
+        if (speed := speed_of(step)) is not None
+    ]
+    return max(speeds, default=ctx.joints[joint].dq_max)
 
 
 def _commanded_speeds(ctx: Context) -> list[tuple[Step, float]]:
@@ -98,7 +113,7 @@ def own_speeds(ctx: Context) -> Figures:
         seconds = float(step.t[last]) - step.begin - ctx.tolerance("start_s")
         if asked <= 0.0 or seconds <= 0.0:
             continue
-        part = float(way[last]) / seconds / ctx.joints[step.joint].dq_max
+        part = float(way[last]) / seconds / _full_speed(ctx, step.joint)
         excess = max(
             part / (ctx.tolerance("max_ratio") * asked + slack),
             (ctx.tolerance("min_ratio") * asked - slack) / max(part, 1e-6),

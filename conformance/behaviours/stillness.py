@@ -31,6 +31,9 @@ def holds(ctx: Context) -> Outcome:
 _AT_LAST = 1.0  # s at the end of a silence
 
 
+_CREEPS = 1.5  # times the least speed of a judged motion: a slower joint may stop by its friction
+
+
 _STOOD_S = 0.3  # s before the time-out in which a joint that goes on to its goal moves
 
 
@@ -76,9 +79,9 @@ def _holds_in(ctx: Context, silence: Silence) -> Outcome:
 
 
 def _stood(ctx: Context, joint: int, silence: Silence) -> bool:
-    """Whether a joint had come to rest before the time-out could stop it."""
+    """Whether a joint had come to rest, or nearly, before the time-out could stop it."""
     until = silence.last + 0.8 * ctx.requirement.tolerance("timeout_s")
-    least = ctx.requirement.tolerance("min_travel_stroke") * _STOOD_S / _AT_LAST
+    least = _CREEPS * ctx.requirement.tolerance("min_travel_stroke") * _STOOD_S / _AT_LAST
     return float(motions_in(ctx, [joint], until - _STOOD_S, until)[0]) < least
 
 

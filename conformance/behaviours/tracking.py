@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dexkit.command_age import PAUSE
 from dexkit.conformance.checks import STROKE_S, Context, Late, Outcome, check
 from dexkit.conformance.checks.figures import Figure, judged
-from dexkit.conformance.checks.steps import own_speed, speed_of, steps_of
+from dexkit.conformance.checks.steps import own_speed, rest_error, speed_of, steps_of
 from dexkit.conformance.kit.row_selection import Selected, finite_rows
 from dexkit.conformance.kit.sums import mean
 from dexkit.conformance.stimuli.hand import HandScript
@@ -336,6 +336,7 @@ def follows(ctx: Context) -> Outcome:
             found.joint,
             text,
             shown=f"rms {found.rms:.3f} {ctx.unit}",
+            limit=ctx.tolerance("max_rms_stroke", found.joint) + rest_error(ctx, found.joint),
             late=STROKE_S * found.rms / ctx.joints[found.joint].stroke * (found.end - found.begin),
             values={"peak_rad": found.peak, "delay_s": found.delay, **values},
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome
 from dexkit.conformance.checks.figures import Figure, Figures, judged
-from dexkit.conformance.checks.steps import Step, disobeyed, obeyed_before, steps_of
+from dexkit.conformance.checks.steps import Step, disobeyed, missed, obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gap_measures, gaps, longest_gap
 from dexkit.conformance.kit.measurement_error import Measure
 from dexkit.conformance.kit.stimulus_record import Phase
@@ -45,7 +45,7 @@ def unharmed(ctx: Context, what: str) -> Outcome:
         if step is None:
             text = f"no state after {what}, when a good command was sent"
             return ctx.failed("no state", text, ctx.at(topic, end))
-        if step.error > ctx.tolerance("max_error_stroke", step.joint):
+        if missed(ctx, step) > ctx.tolerance("max_error_stroke", step.joint):
             return disobeyed(ctx, f"after {what}", step)
     return Outcome(None).resting_on(*measures)
 
@@ -163,7 +163,7 @@ def arrival(
     if not found:
         return ctx.failed("no state", f"no state of the {ctx.side} hand {when}")
     there = [s for s in found if not (soon_s and s.arrives_within(soon_s))]
-    figures = [s.error_figure(f"{when}: {s}") for s in there]
+    figures = [s.figure(missed(ctx, s), f"{when}: {s}") for s in there]
     nothing = ctx.passed("under way", f"{when}: all are about to arrive")
     outcome = judged(ctx, figures, "error_rad", "max_error_stroke", nothing=nothing)
     return replace(outcome, figure="obeys" if outcome.met else "disobeys") if there else outcome

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -200,6 +200,29 @@ def own_speed(ctx: Context, joint: int, least_stroke: float) -> float | None:
     return ctx.once(("own speed", joint, least_stroke), work_out)
 
 
+def rest_error(ctx: Context, joint: int) -> float:
+    """How far from its goals a joint comes to rest with the client's gains, rad: its friction.
+
+    What MOVE-02 allows, at most.
+    """
+
+    def work_out() -> float:
+        errors = [
+            s.error
+            for phase in (*ctx.phases("step"), *ctx.phases("joint"))
+            for s in steps_of(ctx, phase)
+            if s.joint == joint
+        ]
+        return min(max(errors, default=0.0), DISOBEYS * ctx.joints[joint].stroke)
+
+    return ctx.once(("rest error", joint), work_out)
+
+
+def missed(ctx: Context, step: Step) -> float:
+    """How much further from its target a step ends than the joint does by its friction, rad."""
+    return max(0.0, step.error - rest_error(ctx, step.joint))
+
+
 def limited_by_speed(ctx: Context, step: Step) -> bool:
     """Whether a joint's own top speed limits a step: it was not faster after much larger changes of
     its goal in the same run, with the same stiffness.
@@ -294,8 +317,8 @@ DISOBEYS = 0.1  # of the stroke
 
 
 def disobeyed(ctx: Context, when: str, step: Step) -> Outcome:
-    """The failure of a hand that ends a step away from its target."""
-    figure = replace(step.error_figure(f"{when}: {step}"), shown="disobeys")
+    """The failure of a hand that ends a step further from its target than it does by friction."""
+    figure = step.figure(missed(ctx, step), f"{when}: {step}", shown="disobeys")
     return judged(ctx, [figure], "error_rad", "max_error_stroke", nothing="")
 
 

@@ -265,7 +265,7 @@ class Judgement:
             unit = self.requirement.capability
             claim = f"{outcome.reason or outcome.observed}, but the unit '{unit}' is claimed"
             outcome = replace(
-                outcome, met=False, figure="absent", observed=claim, reason=""
+                outcome, met=False, tolerable=False, figure="absent", observed=claim, reason=""
             ).because(f"Nothing fills it: either do, or do not claim '{unit}'.")
         if outcome.met is None:
             return self.result(Verdict.NOT_APPLICABLE, outcome)
