@@ -201,9 +201,9 @@ def own_speed(ctx: Context, joint: int, least_stroke: float) -> float | None:
 
 
 def rest_error(ctx: Context, joint: int) -> float:
-    """How far from its goals a joint comes to rest with the client's gains, rad: its friction.
+    """How far from its goals a joint comes to rest in plain steps, rad: by its friction.
 
-    What MOVE-02 allows, at most.
+    A tenth of the range at most.
     """
 
     def work_out() -> float:
@@ -213,7 +213,8 @@ def rest_error(ctx: Context, joint: int) -> float:
             for s in steps_of(ctx, phase)
             if s.joint == joint
         ]
-        return min(max(errors, default=0.0), DISOBEYS * ctx.joints[joint].stroke)
+        usual = median(np.array(errors)) if errors else 0.0
+        return min(usual, DISOBEYS * ctx.joints[joint].stroke)
 
     return ctx.once(("rest error", joint), work_out)
 
