@@ -174,6 +174,7 @@ def _frozen_joints(view: SideView) -> Fault | None:
     """Joints whose q stays equal again and again, and then jumps to where the joint is."""
     states = view.states
     found: dict[int, list[Run]] = {}
+    usual: dict[int, float] = {}
     for joint, spec in enumerate(view.joints):
         q = states.q[:, joint]
         changes = np.flatnonzero(np.diff(q) != 0) + 1
@@ -181,17 +182,21 @@ def _frozen_joints(view: SideView) -> Fault | None:
             continue
         step = np.abs(q[changes] - q[changes - 1])
         held = np.diff(states.t[changes])
-        frozen = (held >= _HELD_S[0]) & (held < _HELD_S[1]) & (np.diff(changes) >= _HELD_STATES)
+        frozen = (held >= _HELD_S[0]) & (np.diff(changes) >= _HELD_STATES)
         frozen &= step[1:] > max(3 * float(np.percentile(step, 90)), 0.004 * spec.stroke)
-        if int(frozen.sum()) >= _AT_LEAST:
-            some = np.flatnonzero(frozen)
-            found[joint] = list(
-                zip(changes[some].tolist(), changes[some + 1].tolist(), strict=True)
-            )
+        moving = frozen & (held < _HELD_S[1])
+        if int(moving.sum()) < _AT_LEAST:
+            continue
+        usual[joint] = float(np.median(held[moving]))
+        ends = changes[1:][frozen]
+        # where the joint rested before, it froze in the end
+        begins = np.searchsorted(states.t, states.t[ends] - usual[joint])
+        begins = np.where(moving[frozen], changes[:-1][frozen], begins)
+        found[joint] = list(zip(begins.tolist(), ends.tolist(), strict=True))
     if not found:
         return None
     worst = max(found, key=lambda joint: len(found[joint]))
-    held_s = float(np.median([states.t[b] - states.t[a] for a, b in found[worst]]))
+    held_s = usual[worst]
     wrong = np.zeros(states.q.shape, dtype=np.bool_)
     for joint, runs in found.items():
         for begin, end in runs:
