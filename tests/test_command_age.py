@@ -33,14 +33,6 @@ STARVED = 0.8  # seconds that CycloneDDS's own thread may stay behind after a pa
 
 
 class TestPauseWatch:
-    def test_interval_below_the_limit_is_no_pause(self) -> None:
-        clock = ManualClock()
-        watch = PauseWatch(clock)
-        clock.advance(10.0)  # before the first look
-        for _ in range(5):
-            assert watch.measure_pause() == 0.0
-            clock.advance(PAUSE)
-
     @pytest.mark.parametrize("suspended", [False, True], ids=["stopped", "suspended"])
     def test_pause_is_reported_once(self, suspended: bool) -> None:
         clock = ManualClock()
@@ -48,14 +40,6 @@ class TestPauseWatch:
         watch.measure_pause()
         (clock.suspend if suspended else clock.advance)(3.0)
         assert watch.measure_pause() == 3.0
-        assert watch.measure_pause() == 0.0
-
-    def test_restarted_watch_reports_no_pause(self) -> None:
-        clock = ManualClock()
-        watch = PauseWatch(clock)
-        watch.measure_pause()
-        clock.advance(3.0)
-        watch.restart()
         assert watch.measure_pause() == 0.0
 
     def test_real_clock_advances_during_suspend(self) -> None:

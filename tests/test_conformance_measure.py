@@ -26,7 +26,6 @@ from tests.each import each
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]  # a MUST
 JITTER = BY_ID["DEX1-RATE-02"]  # a SHOULD
-STATE = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
 
 
 class Clock:
@@ -110,23 +109,6 @@ def test_pass_within_the_kits_error_is_shown_on_card_and_page() -> None:
     result = RunResult(about, [found, judged(0.05, 0.002)])
     assert [told in text for text in near_limits(result)] == [True]
     assert "Nearer to a limit than the kit can measure" in render(result)
-
-
-def with_gap(seconds: float) -> Recording:
-    """A short run with one gap, on a machine whose timer was always 1 ms late."""
-    trace = copy_of(short_run())
-    begin = trace.rows[STATE][0][0] + round(2.5e9)
-    end = begin + round(seconds * 1e9)
-    trace.rows[STATE] = [r for r in trace.rows[STATE] if not begin <= r[0] < end]
-    return with_beats(trace, usual_us=1_000)
-
-
-def test_error_is_that_of_the_beats_at_the_place() -> None:
-    found = result_of(judge(with_gap(0.2)), GAP.id)
-    assert found.verdict is Verdict.FAIL
-    assert found.measure is not None
-    assert found.measure.error == pytest.approx(0.001)
-    assert found.measure.margin == pytest.approx(-0.1, abs=0.004)
 
 
 def test_virtual_run_measures_without_error_and_others_do_not_know() -> None:

@@ -14,8 +14,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dexkit.dds import DdsNode, Writer
 from dexkit.socket_losses import ReceiveBuffers
@@ -45,31 +43,6 @@ def recording_of_states(path: Path) -> Iterator[tuple[Recorder, DdsRecording, Wr
 
 
 # -- the arithmetic --------------------------------------------------------------------------------
-
-
-@given(
-    period=st.integers(1, 100),
-    jitter=st.lists(st.floats(-0.4, 0.4), min_size=60, max_size=60),
-    hole=st.integers(2, 30),
-)
-def test_a_hole_in_a_regular_stream_is_estimated(
-    period: int, jitter: list[float], hole: int
-) -> None:
-    losses = Losses()
-    times = [round((n + jitter[n]) * period * MS) + T0 for n in range(60)]
-    for n in (*range(30), *range(30 + hole, 60)):
-        losses.note_sample("rt/a", 1, times[n])
-    # nothing is claimed unless the system dropped something
-    assert not losses.update(1.0, 0, {})
-    assert losses.dropped_by_topic == {}
-    for n in range(60, 90):
-        losses.note_sample("rt/a", 1, T0 + n * period * MS)
-    again = T0 + (90 + hole) * period * MS
-    losses.note_sample("rt/a", 1, again)
-    assert losses.update(2.0, hole, {})
-    assert losses
-    assert abs(losses.dropped_by_topic["rt/a"] - hole) <= 1 + hole // 4
-    assert losses.dropped_by_topic["rt/a"] <= losses.datagrams + 2
 
 
 _HALF = frozenset(Random(2).sample(range(1000), 500))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import re
 import subprocess
 import sys
@@ -40,9 +39,8 @@ from tools.pins.keys import (
 )
 from tools.pins.matrix import tasks
 from tools.pins.pinned import Pins
-from tools.pins.recordings import Broken, pack, unpack
+from tools.pins.recordings import pack, unpack
 from tools.pins.sources import Place, Sources
-from tools.pins.store import Store
 from tools.pins.trial import Task, known, same_again, work
 from tools.pins.verdicts import verdicts_of
 
@@ -403,29 +401,6 @@ def test_damaged_files_are_made_again(tmp_path: Path, damage: bytes | None) -> N
     again = work(task)
     assert again == first
     assert again.played
-
-
-def test_a_damaged_recording_is_not_read() -> None:
-    run = run_of(cheapest("usb", "dex3-1"))
-    data = pack(run.play(run.made, run.about))
-    assert unpack(data).channels
-    for at in range(20, len(data), 1 + len(data) // 40):
-        with pytest.raises(Broken):
-            unpack(data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :])
-        with pytest.raises(Broken):
-            unpack(data[:at])
-
-
-def test_the_oldest_files_are_removed_first(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    for age, key in ((30, "aa1"), (20, "bb2"), (10, "cc3")):
-        store.keep_recording(key, bytes(100))
-        for path in tmp_path.glob(f"*/{key}*"):
-            os.utime(path, (1e9 - age, 1e9 - age))
-    assert store.packed("aa1") == bytes(100)  # used now
-    assert store.tidy(250) == (200, 100)
-    assert store.packed("bb2") is None
-    assert store.packed("cc3") == bytes(100)
 
 
 # -------------------------------------------------------------------------------- the command

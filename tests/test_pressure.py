@@ -138,12 +138,6 @@ def test_rest_is_told_from_contact(rate: float, begin: float, end: float, push: 
     assert np.abs(found - untouched(Side.LEFT, 0.0)[0])[there].max() < 100
 
 
-def test_rest_at_zero_as_of_older_emulators_is_a_rest() -> None:
-    t = np.arange(0.0, 4.0, 0.01)
-    values = np.where(t > 2.0, 5e4, 0.0)[:, None] * [1.0, 0.0] + [0.0, NO_VALUE]
-    assert resting_pressure(t, values)[0] == 0.0
-
-
 # -- the tools -------------------------------------------------------------------------------
 
 

@@ -266,26 +266,6 @@ def test_failed_installation_ends_the_action(pretended: Runner) -> None:
     assert arguments[-2:] == [f"{ROOT}[conformance]", "nothing-of-this-name"]
 
 
-HALF = """
-class Half:
-    '''Forgot to say what it is.'''
-    def __init__(self, side): pass
-    def open(self): pass
-    def close(self): pass
-    def exchange(self, command): raise ZeroDivisionError("half a hand")
-"""
-
-
-def test_incomplete_hand_class_error_names_missing_members(tmp_path: Path) -> None:
-    runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    runner.workspace.mkdir()
-    (runner.workspace / "mine.py").write_text(HALF)
-    ran = runner("Judge the hand", backend="mine:Half", output="half")
-    assert ran.returncode == 4, ran.stdout + ran.stderr
-    assert "not a Hand: it has no spec" in ran.stderr
-    assert "nothing was judged" in runner.summary
-
-
 def test_listing_requirements_is_not_a_pass(tmp_path: Path) -> None:
     runner = Runner(tmp_path, f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     ran = runner("Judge the hand", backend="sim-dex1", arguments="--list")
