@@ -73,34 +73,6 @@ def test_an_object_that_is_not_copied_gets_the_same_record(memory: MemoryFileSys
         assert in_place == copied
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_object_that_vanishes_while_read_becomes_a_row(
-    memory: MemoryFileSystem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory.pipe("/ranges/a.mcap", sample_path(SAMPLE).read_bytes())
-    (session,) = find("memory://ranges")
-    assert isinstance(session, SessionFile)
-    genuine = Object.part
-    for error, state in (
-        (FileNotFoundError(2, "gone"), "gone"),
-        (PermissionError(13, "refused"), "no permission"),
-        (OSError("reset"), "unavailable"),
-    ):
-        calls = iter(range(10**6))
-
-        def part(self: Object, *place: int, e: OSError = error, c: Any = calls) -> bytes:
-            if (
-                next(c) > len(memory.cat("/ranges/a.mcap")) // objects.BLOCK + 10
-            ):  # after the digest
-                raise e
-            return genuine(self, *place)
-
-        monkeypatch.setattr(Object, "part", part)
-        record = examine(Task(session, max_size=100))
-        assert (str(record.state), record.exit_code) == (state, 2)
-        assert record.sha256
-
-
 class Server(SimpleHTTPRequestHandler):
     """Gives files, in ranges if it is asked to; some not at all."""
 

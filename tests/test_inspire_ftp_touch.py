@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,10 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.clock import ManualClock
-from dexkit.conformance.faults import plan_for
-from dexkit.conformance.kit.recording import Recording
-from dexkit.conformance.virtual.inspire import FtpService
-from dexkit.conformance.virtual.topic_run import run_virtual
 from dexkit.emulators.sim_inspire import SimInspireFtp
 from dexkit.errors import UsageError
 from dexkit.hand import HandCommand, HandState, Side
@@ -29,11 +24,9 @@ from dexkit.monitor.screen import hand_lines
 from dexkit.service import HandService
 from dexkit.service.dialects import StateView, dialect_map
 from dexkit.traces import open_trace, sample_path
-from dexkit.traces.sessions.streams import _streams
 from dexkit.traces.watched import feed
 from dexkit.view.html_tables import hand_table
 from dexkit.watch import Collector, Picture, SubjectView
-from dexkit.watch.fields import parts_of
 from tests.service_helpers import FakeNode, wait_until
 
 FTP = dialect("inspire_ftp")
@@ -126,25 +119,7 @@ def test_service_publishes_touch_with_every_second_state() -> None:
     assert len(TOUCH.decode(node.sent[touched[0]][1]).palm_touch) == 112
 
 
-def test_service_of_a_hand_without_areas_has_no_touch_topic() -> None:
-    hand = SimInspireFtp(RIGHT)
-    hand._spec = replace(hand.spec, n_sensors=0)
-    assert HandService(hand, node=FakeNode()).touch_topic == ""
-
-
 # ---------------------------------------------------------------------------------- the conformance
-
-
-def test_touch_in_a_recording_is_no_stream_of_joints() -> None:
-    trace = run_virtual(
-        replace(plan_for("inspire_ftp", sides=(RIGHT,)), phases=frozenset(["listen"])), FtpService
-    )
-    recording = Recording.decode(trace)
-    assert recording.touch[RIGHT].values.shape[1:] == (17, 112)
-    assert np.isnan(recording.touch[RIGHT].values[0, 0, 9:]).all()
-    assert len(parts_of(FTP.touch_topic_of(RIGHT), TOUCH.name)[0].fields) == len(FTP.areas)
-    for topic, count in ((FTP.touch_topic_of(RIGHT), 0), (FTP.topics(RIGHT)[1], 1)):
-        assert len(list(_streams(topic, trace.load([topic])[topic]))) == count
 
 
 def test_viewers_show_a_session_with_goals_alone_and_touch() -> None:
