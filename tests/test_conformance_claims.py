@@ -66,7 +66,9 @@ def test_example_and_documentation_list_every_unit() -> None:
 
 
 def test_every_unit_has_a_requirement() -> None:
-    assert {r.capability for r in catalogue(None, None)} == {"", *CAPABILITIES}
+    judged = {r.capability for r in catalogue(None, None)}
+    # no client reads ddq; files that claim it are still read
+    assert judged == {"", *CAPABILITIES} - {"acceleration"}
 
 
 def test_without_claims_file_verdicts_are_unchanged() -> None:

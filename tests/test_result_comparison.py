@@ -242,7 +242,7 @@ def test_claims_of_a_session_are_what_the_signer_states(session: Path) -> None:
     assert found.stated["subject.vendor"] == "Y"
     assert found.stated["claims"] == units
     forged = changed(document, lambda d: d["claims"].update(force=False))
-    assert any(".requirement.level" in p for p in paths(compare_with_recording(forged, session)))
+    assert any(p.startswith("results") for p in paths(compare_with_recording(forged, session)))
     forged = changed(document, lambda d: d["claims"].update(wings=True))
     with pytest.raises(UsageError, match="wings"):
         compare_with_recording(forged, session)
