@@ -19,10 +19,10 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import catch_sentence
 from dexkit.conformance.report.markdown import render_markdown
-from dexkit.conformance.report.pages import plain
 from dexkit.conformance.report.terminal import print_result
 from dexkit.escaping import html
 from dexkit.models import HandModel
+from dexkit.templates import plain
 from tests.report_helpers import result_of_every_kind
 
 

@@ -34,13 +34,13 @@ from dexkit.conformance.report.html import render
 from dexkit.conformance.report.junit import write_junit
 from dexkit.conformance.report.labels import VERDICTS, catch_sentence
 from dexkit.conformance.report.markdown import MOST_CARDS, render_markdown
-from dexkit.conformance.report.pages import plain
 from dexkit.conformance.report.terminal import MARKS
 from dexkit.conformance.usb.recording import UsbRecording
 from dexkit.conformance.virtual import run_virtual
 from dexkit.conformance.virtual.usb import run_virtual_usb
 from dexkit.errors import UsageError
 from dexkit.hand import Side
+from dexkit.templates import plain
 from dexkit.traces import Recorder, open_trace, sample_path
 from tests.conformance_helpers import copy_of, short_run
 from tests.each import each

@@ -18,8 +18,9 @@ from dexkit.conformance.report.labels import (
     hand_name,
     model_title,
 )
-from dexkit.conformance.report.pages import code, fill
+from dexkit.conformance.report.pages import fill
 from dexkit.errors import UsageError
+from dexkit.templates import code
 
 __all__ = [
     "Change",

@@ -24,7 +24,8 @@ from dexkit.conformance.report.labels import (
     verdicts_by_area,
     whose,
 )
-from dexkit.conformance.report.pages import code, fill
+from dexkit.conformance.report.pages import fill
+from dexkit.templates import code
 
 __all__ = ["render_markdown"]
 

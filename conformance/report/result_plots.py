@@ -161,7 +161,6 @@ class _Limit:
 _PERIODS = (
     _Limit("min_rate_hz", "{0:g} Hz: {1:.2g} ms", lambda hz: 1e3 / hz),
     _Limit("max_rate_hz", "{0:g} Hz: {1:.2g} ms", lambda hz: 1e3 / hz),
-    _Limit("max_p99_s", "99 % below: {1:g} ms", lambda s: 1e3 * s),
     _Limit("max_gap_s", "longest gap allowed: {1:g} ms", lambda s: 1e3 * s),
 )
 _RATES = (_Limit("min_rate_hz", "at least {0:g} Hz"), _Limit("max_rate_hz", "at most {0:g} Hz"))
@@ -171,7 +170,6 @@ _TORQUES = (
     _Limit("max_tau_nm", "at most {0:g} N m in size"),
     _Limit("max_tau_nm", "at most {0:g} N m in size", float.__neg__),
 )
-_OVERSHOOT = (_Limit("max_overshoot_stroke", "overshoot allowed", lambda part: 100 * part),)
 
 
 def _levels(need: Requirement, limits: tuple[_Limit, ...]) -> list[Level]:
@@ -224,10 +222,10 @@ def _periods(label: str, css: str, t: Floats, draw: str) -> list[Line]:
 
 
 def _rate(scene: _Scene, _: str) -> list[Line]:
-    """Rate in windows of half a second; none where the longest intervals are what is limited."""
+    """Rate in windows of half a second."""
     clock = scene.hand.states.clock
     edges = np.arange(float(clock[0]), float(clock[-1]), 0.5)
-    if len(edges) < 3 or "max_p99_s" in scene.need.tolerances:
+    if len(edges) < 3:
         return []
     counts, _edges = np.histogram(clock, edges)
     middles = np.asarray((edges[1:] + edges[:-1]) / 2)
@@ -510,7 +508,6 @@ def _steps(scene: _Scene) -> Iterator[Chart]:
             for name, size in half.items()
             if name in limits
         ],
-        levels=_levels(scene.need, _OVERSHOOT),
         include=(0.0,),
         height=230,
     )
