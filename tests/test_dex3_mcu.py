@@ -410,16 +410,6 @@ def test_command_is_obeyed_although_its_answer_is_dropped() -> None:
     assert bench.mcu.counters.dropped == 1
 
 
-def test_corrupted_answers_have_one_bit_flipped() -> None:
-    bench = Bench(faults=["corrupt:for=1s"])
-    good = bench.mcu.state()
-    bad = bench.mcu.exchange(empty())
-    assert bad is not None
-    assert len(bad) == len(good)
-    assert sum(bin(a ^ b).count("1") for a, b in zip(good, bad, strict=True)) == 1
-    assert bench.mcu.counters.corrupted == 1
-
-
 def test_silent_motor_ignores_commands_and_times_out() -> None:
     bench = Bench(faults=["silent@1s:id=3,for=3s"])
     bench.run(1.0, bench.frame(bench.rest))
@@ -457,25 +447,6 @@ def test_a_motor_with_an_error_brakes_until_it_is_over(spec: str, bits: int) -> 
     assert state.q == pytest.approx(bench.away(), abs=0.03)
 
 
-def test_unplugging_and_stalling_are_reported() -> None:
-    bench = Bench(faults=["unplug@1s:for=2s", "stall@4s", "stall-out@5s"])
-    halted: list[str] = []
-    bench.mcu.on_stall = halted.append
-    bench.mcu.advance()
-    assert bench.mcu.plugged
-    assert bench.mcu.next_time == 101.0
-    bench.clock.advance(1.5)
-    bench.mcu.advance()
-    assert not bench.mcu.plugged
-    bench.clock.advance(2.0)
-    bench.mcu.advance()
-    assert bench.mcu.plugged
-    bench.clock.advance(2.0)
-    bench.mcu.advance()
-    assert halted == ["in", "out"]
-    assert bench.mcu.next_time is None
-
-
 def test_pulling_the_cable_stops_no_motor_but_their_protection_does() -> None:
     bench = Bench(faults=["unplug:for=3s"])
     bench.ask(bench.frame(bench.away()))
@@ -499,16 +470,3 @@ def test_bad_faults_name_what_a_hand_can_have(text: str) -> None:
         parse_fault(text, DEX3_FAULTS)
     assert caught.value.hint == grammar(DEX3_FAULTS)
     assert all(kind.name in caught.value.hint for kind in DEX3_FAULTS.kinds)
-
-
-def test_the_same_seed_gives_the_same_run() -> None:
-    def run() -> list[bytes | None]:
-        bench = Bench(faults=["drop:p=0.3", "corrupt:p=0.3", "delay:p=0.5"])
-        answers = []
-        for _ in range(50):
-            answers.append(bench.mcu.exchange(bench.frame(bench.away())))
-            bench.clock.advance(0.01)
-        return answers
-
-    assert run() == run()
-    assert None in run()

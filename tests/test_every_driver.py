@@ -32,6 +32,7 @@ from dexkit.errors import HandLost, HandNotFound, HandTimeout, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, Side
 from dexkit.wire import mx64
 from tests import ezgripper_helpers
+from tests.dds_helpers import wait_until
 from tests.each import each
 from tests.patience import PATIENCE
 
@@ -249,15 +250,35 @@ def test_a_hand_is_opened_without_motion_driven_and_let_go(driver: Driver, tmp_p
         assert before <= state.stamp <= time.monotonic()
         assert not state.fault.any()
         assert state.measured
-        exchange(hand, towards(hand, tuple(started.q)))
         hand.close()
         hand.close()
         with pytest.raises(HandLost):
             hand.exchange(brake)
-        ends = time.monotonic() + PATIENCE
-        while not emulated.lets_go():
-            assert time.monotonic() < ends
-            time.sleep(0.01)
+        wait_until(emulated.lets_go)
+
+
+@every_driver
+def test_closing_stops_it_on_its_way(driver: Driver, tmp_path: Path) -> None:
+    with driver.emulated() as emulated:  # type: ignore[attr-defined]
+        hand = driver.make(emulated.place, tmp_path)
+        hand.open()
+        brake = HandCommand.brake(hand.spec.n_joints)
+        start, goal = exchange(hand, brake).q, np.array(driver.goal)
+        span = hand.spec.q_max - hand.spec.q_min
+        for _ in range(5):  # a program that is paused may find it arrived
+            drive(
+                hand, towards(hand, driver.goal), lambda s: (np.abs(s.q - goal) < 0.03 * span).all()
+            )
+            exchange(hand, towards(hand, tuple(start)))
+            hand.close()
+            wait_until(emulated.stands)
+            hand.open()
+            left = np.abs(exchange(hand, brake).q - start)
+            if (left > 0.3 * np.abs(goal - start))[np.abs(goal - start) > 0.1 * span].all():
+                break
+        else:
+            raise AssertionError("it went on to its goal")
+        hand.close()
 
 
 @every_driver

@@ -31,7 +31,6 @@ from dexkit.drivers.ezgripper import (
     calibration,
     servo_registers,
 )
-from dexkit.drivers.ezgripper import gripper as gripper_module
 from dexkit.drivers.ezgripper.bus import DevicePort, ServoBus
 from dexkit.drivers.ezgripper.calibration import CalibrationFailed
 from dexkit.drivers.ezgripper.control import Phase
@@ -49,7 +48,6 @@ from dexkit.emulators.mx64 import (
     Servo,
 )
 from dexkit.emulators.mx64.protocol1 import Protocol1Servo
-from dexkit.emulators.mx64.settings import Physics
 from dexkit.errors import (
     DexkitError,
     HandError,
@@ -729,18 +727,6 @@ def test_lost_link_does_not_repeat_calibration(
     assert len(calls) == 2
 
 
-@pytest.mark.usefixtures("_patient_servo")
-def test_calibration_without_fingers_on_the_tendon(tmp_path: Path) -> None:
-    # nothing stops a servo that nothing is attached to: closed lies beyond the search
-    mechanics = replace(Physics().gripper, closed_stiffness=1e-6)
-    with emulated(start=90.0, physics=Physics(gripper=mechanics)) as gripper:
-        hand = EZGripper(
-            gripper.path, configuration=configured(tmp_path, zero=None, calibrate=Calibrate.AUTO)
-        )
-        with pytest.raises(CalibrationFailed, match="reached no stop"):
-            hand.open()
-
-
 def test_interrupted_calibration_switches_torque_off(tmp_path: Path) -> None:
     with emulated(start=90.0) as gripper:
         hand = EZGripper(gripper.path, configuration=configured(tmp_path))
@@ -809,14 +795,3 @@ def test_the_baud_rate_is_changed(tmp_path: Path) -> None:
         assert result.exit_code == 0, (result.output, result.exception)
         assert gripper.servo.get(mx64.BAUD_RATE) == 3
         assert hand.spec.io_rate < 100
-
-
-# --- time
-
-
-def test_rate_follows_latency_timer_of_adapter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(gripper_module, "latency_timer", lambda path: 16)
-    with emulated() as gripper, gripper_on(gripper.path, configured(tmp_path)) as hand:
-        assert hand.spec.io_rate == pytest.approx(62.5)

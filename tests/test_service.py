@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import pytest
 
-from dexkit.backoff import Backoff
 from dexkit.clock import ManualClock
 from dexkit.errors import (
     BackendBroken,
@@ -150,32 +149,6 @@ class TestLink:
             counters = service.cores[Side.LEFT].counters
             assert (counters.losses, counters.reconnects) == (1, 1)
         assert hand.closes == 2
-
-    def test_each_loss_begins_with_the_shortest_delay(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        delays: list[float] = []
-
-        class Recorded(Backoff):
-            def next(self) -> float:
-                delays.append(super().next())
-                return delays[-1]
-
-        monkeypatch.setattr("dexkit.service.service.Backoff", Recorded)
-        hand, node = ScriptedHand(), FakeNode()
-        with serve(hand, node) as service:
-            counters = service.cores[Side.LEFT].counters
-            hand.plugged = False
-            wait_until(lambda: len(delays) == 3)
-            hand.plugged = True
-            wait_until(lambda: counters.reconnects == 1)
-            done = counters.exchanges
-            wait_until(lambda: counters.exchanges > done + 5)
-            assert delays == [0.1, 0.2, 0.4]
-            delays.clear()
-            hand.plugged = False
-            wait_until(lambda: delays)
-            assert delays[0] == 0.1
 
     def test_hand_lost_during_stop_ends_cleanly(self) -> None:
         hand, node = ScriptedHand(), FakeNode()
