@@ -117,6 +117,7 @@ def check_wiring(seed: int, tmp_path: Path, effort: Effort) -> None:
     assert all(len(joints) == 1 for joints in by_time.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3])
 def test_bringup_finds_a_random_wiring(seed: int, tmp_path: Path) -> None:
     check_wiring(seed, tmp_path, FAST)

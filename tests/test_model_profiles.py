@@ -66,7 +66,10 @@ CONSTANTS = {
 }
 NAMED = re.compile(rf"[\"']({'|'.join(NAMES)})[\"']|\b({'|'.join(CONSTANTS)})\b")
 # what was measured is stated a model each
-HOMES = ("dexkit/models/", "dexkit/robots.py", "conformance/kit/catch_rates.py")
+HOMES = (
+    *("dexkit/models/", "dexkit/robots.py"),
+    *("conformance/kit/catch_rates.py", "tools/consequences/"),
+)
 # wrong hands are declared for the models on which they are tried
 WRONG_HANDS = "conformance/faults/"
 # names of subcommands, with the module or the arguments of each
