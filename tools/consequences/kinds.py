@@ -90,17 +90,16 @@ KINDS: Mapping[str, Kind] = {
             "presses",
             "an object is pressed with {found} instead of {good}",
             "N m",
-            _ratio(2.5, 0.4),
+            _ratio(2.5, 0.5),
             "Clients set no force, but a lead or a depth, and the stiffness of vendors differs by "
-            "two; from 2.5 times on, or below a 2.5th, an object is crushed or is not held.",
+            "two; from 2.5 times on, or below half, an object is crushed or is not held.",
         ),
         Kind(
             "drops",
             "a grip falls to {found} instead of {good}, and the object is dropped",
             "N m",
-            lambda found, good: 0.4 * good / max(found, 1e-6) if good > 0.01 else 0.0,
-            "Grips are made with about twice the force at which an object slips, and the arm that "
-            "lifts it adds some: below 0.4 of the original's least force it slips.",
+            lambda found, good: 0.5 * good / max(found, 1e-6) if good > 0.01 else 0.0,
+            "Grips are made with about twice the force at which an object slips.",
         ),
         Kind(
             "lets go",

@@ -233,7 +233,7 @@ class Session:
             found[side] = tuple((places * stroke + low).tolist())
         return found
 
-    def records(self) -> None:
+    def records(self, task: str) -> None:
         """What the client has read, against what was true within the last 0.1 s."""
         times = np.array(self.stage.times)
         for side in self.sides:
@@ -248,7 +248,7 @@ class Session:
             rows = np.concatenate((rows, np.flatnonzero(held)))
             shown = np.concatenate((shown, shown[newest[held]]))
             window = np.stack([places[np.maximum(rows - i, 0)] for i in range(11)])
-            self.add("reads", "all that it reads", side, _apart(shown, window))
+            self.add("reads", task, side, _apart(shown, window))
 
     def other_readers(self) -> None:
         """Whether a ROS 2 node with the usual, reliable, reader gets a state, and the example."""
@@ -333,7 +333,7 @@ def teleoperate(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> 
     s.move("to rest", _both(s, 0.5), _HALF)
     _one_at_a_time(s, client)
     _events(s, client)
-    s.records()
+    s.records("all that it reads")
     return s
 
 
@@ -558,7 +558,7 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     stage.send(stage.codec.encode(limp), 2)
     stage.run(0.6)
     s.left("disconnected without gains")
-    s.records()
+    s.records("all that it reads with an object")
     return s
 
 
@@ -628,5 +628,7 @@ def measure(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> dict
     """All figures of a hand."""
     found: dict[Figure, float] = {}
     for session in SESSIONS:
-        found |= session(made, spoken, sides).figures
+        figures = session(made, spoken, sides).figures
+        assert not found.keys() & figures.keys(), "two sessions measure the same"
+        found |= figures
     return found
