@@ -586,7 +586,7 @@ def example(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sess
         client.gains, client.period, client.timeout = client.GRIP, 1.0, True
         s.move("grip", every(0.5), 2.5)
         client.gains, client.status = client.STOP, int(JointMode.FOC)
-        s.still("stop", 2.2)
+        stage.run(2.2)  # limp: it may sink
         client.gains, client.timeout, client.period = client.TURN, False, client.fast
         s.move("turn again", every(0.3), 1.0)
     s.gone("ended")
