@@ -306,6 +306,7 @@ def test_a_file_that_cannot_be_used_is_an_error(tmp_path: Path, text: str, why: 
         outsiders.load(str(path))
 
 
+@pytest.mark.slow
 def test_a_hand_that_fails_leaves_the_others(tmp_path: Path) -> None:
     path = tmp_path / "hands.py"
     fails = "    def live(self, dt): raise RuntimeError('mine')\n"
@@ -324,6 +325,7 @@ def test_a_hand_that_fails_leaves_the_others(tmp_path: Path) -> None:
     assert (failed["right"], found["right"], found["problem"]) == (False, True, "")
 
 
+@pytest.mark.slow
 def test_an_outsider_that_ends_its_process_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "hands.py"
     body = "    def live(self, dt):\n        import os\n        os._exit(0)\n"

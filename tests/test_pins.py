@@ -44,6 +44,9 @@ from tools.pins.sources import Place, Sources
 from tools.pins.trial import Task, known, same_again, work
 from tools.pins.verdicts import verdicts_of
 
+# of a tool for developers; make test has test_pinned_verdicts
+pytestmark = pytest.mark.slow
+
 
 @functools.cache
 def cheapest(layer_name: str, model: str) -> Mutant:
