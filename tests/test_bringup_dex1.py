@@ -158,21 +158,6 @@ def test_the_other_sides_gripper_alone_is_named(tmp_path: Path) -> None:
         bring.run()
 
 
-def test_bringup_resumes_where_it_was(tmp_path: Path) -> None:
-    line, bring = watched(tmp_path, Wiring.random(4))
-    for _ in range(2):
-        question = bring.until_question()
-        assert question is not None
-        bring.session.answer(bring.look(question))
-    bring.bench.store(bring.session.findings)
-    assert json.loads((tmp_path / "dex1.json").read_text())["left"]["settings"] == {}
-    found = bring.bench.load()
-    assert len(found.motors) == 1
-    bring.begin(found)
-    bring.run()
-    assert len(line.motors) == 2
-
-
 # ------------------------------------------------------------------------------ the driver
 
 

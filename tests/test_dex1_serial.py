@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -29,7 +28,7 @@ from dexkit.drivers.dex1_serial.line import MotorLine, acquire, is_shared
 from dexkit.emulators.m4010 import Dex1Motors, Dex1Process, Firmware
 from dexkit.errors import HandLost, HandNotFound, HandRefused, HandTimeout, UsageError
 from dexkit.hand import Hand, HandCommand, HandState, JointMode, MotorError, Side
-from dexkit.wire.m4010 import MotorCmd, MotorData
+from dexkit.wire.m4010 import MotorCmd
 from tests.each import each
 from tests.patience import PATIENCE, waits_of
 
@@ -604,40 +603,3 @@ def test_options_of_the_other_gripper_are_refused(arguments: list[str], expected
     error, said = calibrate(*arguments)
     assert isinstance(error, UsageError)
     assert expected in said
-
-
-def test_line_is_in_step_again_after_an_answer_that_was_taken_for_the_next(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The answer of the first command comes after the second, and that one's right after it."""
-    monkeypatch.setattr(line_module, "LATE", 0.5)
-    motor, port = os.openpty()
-    tty.setraw(port)
-    seen = []
-
-    def answer() -> None:
-        size = len(MotorCmd(id=1).pack())
-        for number in range(1, 5):
-            data = b""
-            while len(data) < size:
-                data += os.read(motor, size - len(data))
-            seen.append(number)
-            if number == 1:
-                continue  # it is late
-            for pos in (1, 2) if number == 2 else (number,):
-                os.write(motor, MotorData(id=1, pos=pos).pack())
-                time.sleep(0.05 if pos == 1 else 0)  # the second is not there yet
-
-    thread = threading.Thread(target=answer, daemon=True)
-    thread.start()
-    line = MotorLine(os.ttyname(port), 115_200)
-    command = MotorCmd(id=1).pack()
-    with pytest.raises(HandTimeout):
-        line.exchange(command, 1, 0.05)
-    found = [line.exchange(command, 1, PATIENCE).pos for _ in range(3)]
-    assert found == [1, 3, 4]
-    thread.join(PATIENCE)
-    assert seen == [1, 2, 3, 4]
-    line._close_port()
-    os.close(motor)
-    os.close(port)

@@ -277,27 +277,6 @@ class TestDiscovery:
         ):
             hand_on(server).open()
 
-    def test_this_machines_usb_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        with serving(RawDevice(FakeHand())) as server:
-            monkeypatch.setattr(discovery, "LOCAL_SERVER", at(server))
-            fake = FakeBackend(FakeHand())
-            with fake_hand(fake, monkeypatch):
-                assert "claim_interface" in fake.calls
-
-    def test_server_without_usbip_protocol_is_not_found(self) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-
-            def babble() -> None:
-                peer, _ = listener.accept()
-                with peer:
-                    peer.sendall(b"220 mail.example.org ESMTP\r\n" * 20)
-
-            thread = threading.Thread(target=babble)
-            thread.start()
-            with pytest.raises(HandNotFound, match="Invalid USB/IP DEVLIST reply"):
-                find_hand(Side.LEFT, server=Server("127.0.0.1", listener.getsockname()[1]))
-            thread.join()
-
 
 class TestOpening:
     """What is asked of libusb, and what becomes of its answers."""
@@ -324,12 +303,6 @@ class TestOpening:
             "close_device",
         ]
         assert fake.kernel_driver
-
-    def test_an_unconfigured_device_is_configured(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        fake = FakeBackend(FakeHand())
-        fake.configuration = 0
-        with fake_hand(fake, monkeypatch):
-            assert fake.configuration == 1
 
     def test_first_bulk_endpoints_are_used_by_default(
         self, monkeypatch: pytest.MonkeyPatch

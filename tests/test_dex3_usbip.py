@@ -354,16 +354,6 @@ def test_transfer_that_comes_after_its_unlink(newest: int) -> None:
         assert reply(sock) == (protocol.RET_SUBMIT, last + 1 & 0xFFFFFFFF, 0, STATE.size)
 
 
-def test_unlinks_of_transfers_that_never_come_are_limited() -> None:
-    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
-        with contextlib.suppress(ConnectionError):
-            for number in range(MAX_PARKED + 1):
-                unlink(sock, 10**6 + number, number + 1)
-            assert protocol._recvall(sock, 1) is None
-        with host(inside(hands).port) as computer:
-            exchange(computer.find())
-
-
 def test_hand_has_one_client_at_a_time() -> None:
     with emulated_dex3() as hands:
         port = inside(hands).port
@@ -409,18 +399,6 @@ def test_pending_reads_are_limited() -> None:
             exchange(computer.find())
 
 
-def test_a_reply_never_claims_more_than_it_carries() -> None:
-    with emulated_dex3() as hands, imported(inside(hands).port) as sock:
-        # a read whose setup packet has direction write: 255 bytes wanted, none there
-        setup = bytes((0x00, 5, 1, 0, 0, 0, 255, 0))
-        sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 1, 0x10002, IN, 0, 0, 255, 0, 0, 0, setup))
-        assert reply(sock) == (protocol.RET_SUBMIT, 1, 0, 0)
-        # a descriptor of 18 bytes into a transfer of 8
-        setup = bytes((0x80, 6, 0, 1, 0, 0, 18, 0))
-        sock.sendall(struct.pack(">IIIIIIiiii8s", 1, 2, 0x10002, IN, 0, 0, 8, 0, 0, 0, setup))
-        assert reply(sock) == (protocol.RET_SUBMIT, 2, 0, 8)
-
-
 def test_connections_are_bounded_and_the_newest_is_served() -> None:
     with emulated_dex3(BOTH) as hands, contextlib.ExitStack() as opened:
         port = inside(hands).port
@@ -444,36 +422,6 @@ def test_client_that_sends_no_request_is_disconnected(monkeypatch: pytest.Monkey
             assert half.recv(1) == b""
             submit(quiet, 1, OUT, 2, brake())  # who has a hand may be silent
             assert reply(quiet)[:3] == (protocol.RET_SUBMIT, 1, 0)
-
-
-def test_server_does_not_spin_without_file_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
-    with emulated_dex3() as hands:
-        machine = inside(hands)._server
-        tries = []
-
-        class Exhausted:
-            """The listener of a process without file descriptors, three times."""
-
-            def __init__(self, listener: socket.socket) -> None:
-                self._listener = listener
-
-            def accept(self) -> tuple[socket.socket, Any]:
-                tries.append(time.monotonic())
-                if len(tries) <= 3:
-                    raise OSError(errno.EMFILE, "Too many open files")
-                return self._listener.accept()
-
-            def __getattr__(self, name: str) -> Any:
-                return getattr(self._listener, name)
-
-            def fileno(self) -> int:
-                return self._listener.fileno()
-
-        monkeypatch.setattr(machine, "_listener", Exhausted(machine._listener))
-        with imported(inside(hands).port) as sock:
-            submit(sock, 1, OUT, 2, brake())
-            assert reply(sock)[:3] == (protocol.RET_SUBMIT, 1, 0)
-        assert len(tries) <= 5  # one for each pause, not thousands
 
 
 @pytest.mark.parametrize(

@@ -20,19 +20,6 @@ def settle(joint: Joint, torque: float, seconds: float = 2.0, dt: float = DT) ->
         joint.step(torque, dt)
 
 
-def test_free_joint_accelerates_by_torque_over_inertia() -> None:
-    joint = Joint(inertia=0.01)
-    settle(joint, 0.5, 1.0)
-    assert joint.dq == pytest.approx(0.5 / 0.01)
-    assert joint.q == pytest.approx(0.5 * 50, rel=2e-3)
-
-
-def test_viscous_friction_sets_the_top_speed() -> None:
-    joint = Joint(inertia=0.01, viscous=0.1, coulomb=0.2)
-    settle(joint, 0.7, 3.0)
-    assert joint.dq == pytest.approx((0.7 - 0.2) / 0.1, rel=1e-6)
-
-
 def test_coulomb_friction_holds_and_stops_exactly() -> None:
     joint = Joint(inertia=0.01, coulomb=0.2)
     settle(joint, 0.19)

@@ -183,16 +183,6 @@ def test_transactions_take_line_time(what: str, data: bytes, wire_us: int, delay
     assert transaction(host, data) == pytest.approx(expected, abs=1e-9)
 
 
-def test_an_untuned_adapter_gives_sixty_reads_a_second() -> None:
-    host = Host(servo(), latency_timer=16e-3)
-    n = 0
-    while host.now < 1.0:
-        assert host.exchange_raw(dxl.encode(1, 2, READ_POSITION))
-        host.now = host.at
-        n += 1
-    assert n == 63  # one at each tick of the first second; docs/sources/mx64-ezgripper.md#c2
-
-
 # --- faults
 
 
