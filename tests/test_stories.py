@@ -18,6 +18,7 @@ from dexkit.conformance.report.card import cards
 from dexkit.models import MODELS, model
 from dexkit.robots import ROBOTS
 
+slow = pytest.mark.slow
 Change = Callable[[Any, Any], None]
 """Changes the state that a service publishes, in place."""
 
@@ -71,10 +72,12 @@ def degrees(service: Any, state: Any) -> None:
     ("change", "name", "words"),
     [
         (zeros, "dex1-1", "q, dq and tau_est are exactly 0 in"),
-        (zeros, "dex3-1", "q, dq and tau_est of all joints are exactly 0 in"),
+        pytest.param(
+            zeros, "dex3-1", "q, dq and tau_est of all joints are exactly 0 in", marks=slow
+        ),
         (elsewhere, "dex1-1", "q jumps away and back"),
         (turned, "dex1-1", "dq is -1 times the slope of q"),
-        (degrees, "dex1-1", "times the slope of q"),
+        pytest.param(degrees, "dex1-1", "times the slope of q", marks=slow),
     ],
 )
 def test_faults_of_states_come_first(change: Change, name: str, words: str) -> None:
@@ -92,16 +95,18 @@ def test_faults_of_states_come_first(change: Change, name: str, words: str) -> N
     [
         ("dex1-1 SwappedWhenRestarted", "while only the left hand was commanded"),
         ("dex1-1 IgnoresGains", "with kp = kd = 0"),
-        ("dex1-1 NoWatchdog", "after the last command"),
+        pytest.param("dex1-1 NoWatchdog", "after the last command", marks=slow),
         ("dex1-1 FedByRejected", "while rejected ones arrive"),
-        ("dex1-1 MilliNewtonMetres", "2000.00 N m"),
-        ("dex1-1 TurnedTorque", "against a commanded torque"),
-        ("dex1-1 StaleState", "a new value every 20"),
+        pytest.param("dex1-1 MilliNewtonMetres", "2000.00 N m", marks=slow),
+        pytest.param("dex1-1 TurnedTorque", "against a commanded torque", marks=slow),
+        pytest.param("dex1-1 StaleState", "a new value every 20", marks=slow),
         ("dex1-1 ShiftsForAWhile", "q jumps away and back"),
-        ("dex1-1 Hiccup", "a gap from 1.998 s to 2.30"),
+        pytest.param("dex1-1 Hiccup", "a gap from 1.998 s to 2.30", marks=slow),
         ("dex3-1 IgnoresStatus", "with status 0, which locks the motor"),
-        ("dex3-1 SlowToLeave", "it began to move only after"),
-        ("brainco-revo2 DeafAfterFar", "right after the phase 'out-of-range'"),
+        pytest.param("dex3-1 SlowToLeave", "it began to move only after", marks=slow),
+        pytest.param(
+            "brainco-revo2 DeafAfterFar", "right after the phase 'out-of-range'", marks=slow
+        ),
     ],
 )
 def test_first_story_names_the_fault(name: str, words: str) -> None:

@@ -37,7 +37,7 @@ ORDER = (
     *("life_cycle.restarted_client", "life_cycle.restarted_service", "watchdog.resumes"),
     *("mode_byte", "bad_commands", "watchdog", "timeout_protection", "life_cycle", "rate"),
     *("grip.stops_at_object", "position.not_the_command"),
-    *("velocity.keeps_up", "freshness", "position", "velocity", "stillness", "force.unit"),
+    *("freshness", "velocity.keeps_up", "position", "velocity", "stillness", "force.unit"),
     *("grip.keeps_gripping", "grip.lasts", "force", "grip", "touch", "pressure", "attitude"),
     *("motion", "load", "motion.path", "tracking", "operator", "fields", "robot_state"),
 )
@@ -69,6 +69,9 @@ _PROVOCATIONS = (
 """Phases of which a story says that something is seen only right after them."""
 _NEAR_S = 0.3
 """Seconds by which places in the recording may be apart that show the same."""
+_OFTEN = ("state", "motion", "phase:step", "phase:joint", "phase:fingerprint")
+"""Needs of requirements that are judged all over a run, or again and again: others have a phase
+after which they are judged in any case."""
 _SOON_S = 0.5
 """Seconds after a phase in which something is seen right after it."""
 _PLACES = 5
@@ -197,7 +200,7 @@ def _after(recording: Recording, root: Sequence[Result]) -> str:
         since = [min((at - end for end in ends if end <= at), default=math.inf) for at in places]
         waits[name] = max(since, default=math.inf)
     name = min(waits, key=lambda name: waits[name])
-    if waits[name] > _SOON_S or root[0].requirement.phase == name:
+    if waits[name] > _SOON_S or root[0].requirement.needs not in _OFTEN:
         return ""
     return f", right after the phase '{name}'"
 
