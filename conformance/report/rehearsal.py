@@ -10,7 +10,7 @@ import numpy as np
 from dexkit import __version__
 from dexkit.conformance.report.charts import Band, Chart, Level, Line
 from dexkit.conformance.report.pages import fill
-from dexkit.conformance.virtual.rehearsal import JointFigures, Rehearsal, Rehearsed
+from dexkit.conformance.virtual.rehearsal import Rehearsal, Rehearsed
 from dexkit.hand import Side
 from dexkit.models import model
 from dexkit.traces.replay.machine import End, Phase
@@ -46,7 +46,6 @@ def render(prepared: Prepared, rehearsal: Rehearsal, *, source: str, options: st
         known=_facts(rehearsal, source, options),
         findings=prepared.findings,
         GRADES=_CSS,
-        FIGURES=_FIGURES,
         hands=[_hand(rehearsal, side) for side in rehearsal.plan.sides],
     )
 
@@ -78,7 +77,7 @@ def _facts(rehearsal: Rehearsal, source: str, options: str) -> dict[str, str]:
 
 
 def _hand(rehearsal: Rehearsal, side: Side) -> dict[str, object]:
-    """Figures and plots of a hand."""
+    """Plots of a hand, and the figures of each joint with its largest torque."""
     hand = rehearsal.hands[side]
     limits = joint_limits(rehearsal.plan.dialect, side)
     bands = [
@@ -86,7 +85,7 @@ def _hand(rehearsal: Rehearsal, side: Side) -> dict[str, object]:
         for phase, begin, end in rehearsal.phases
         if phase is not Phase.PLAY and end - begin > 0.05
     ]
-    figures = _figures(hand.figures(limits.tau), limits.tau.tolist())
+    figures = [*zip(hand.figures(limits.tau), limits.tau.tolist(), strict=True)]
     if len(hand.t) < 2:
         return {"side": side, "figures": figures, "plots": []}
     span = (0.0, float(hand.t[-1]))
@@ -156,34 +155,3 @@ def _overview(
             include=(0.0, 10.0),
         ),
     ]
-
-
-def _figures(figures: Sequence[JointFigures], tau_max: Sequence[float]) -> list[tuple[str, ...]]:
-    """A row for each joint."""
-    return [
-        (
-            f.name,
-            f"{f.commanded:.2f}",
-            f"{f.moved:.2f}",
-            f"{f.rms:.3f}",
-            f"{f.worst:.3f} at {f.at:.2f} s",
-            f"{f.speed:.1f}",
-            f"{f.torque:.2f} of {most:.2f}",
-            f"{f.ripple:.3f}",
-            f"{f.limit:.1%}",
-        )
-        for f, most in zip(figures, tau_max, strict=True)
-    ]
-
-
-_FIGURES = (
-    "joint",
-    "commanded over, rad",
-    "moved over, rad",
-    "rms distance, rad",
-    "largest distance, rad",
-    "fastest, rad/s",
-    "largest torque, N·m",
-    "torque ripple rms, N·m",
-    "time at largest torque",
-)
