@@ -97,10 +97,10 @@ def switch_off_robot_joint(script: RobotScript) -> Steps:
 @stimulus("lock", UsbScript, after="move")
 def lock_usb_joints(script: UsbScript) -> UsbSteps:
     """Position commands with status 0: nothing may move."""
-    locked = [replace(m, status=0) for m in script.goals_inward(script.hold_commands())]
+    motors = [replace(m, status=0) for m in script.goals_inward(script.hold_commands())]
     yield from script.send_for(0.05, script.frame(Motor(protect=True)))
     phase = script.begin("lock", status=0)
-    yield from script.send_for(0.2, script.frame(locked))
+    yield from script.send_for(0.2, script.frame(motors))
     script.end(phase)
 
 

@@ -257,17 +257,3 @@ def stuck(ctx: Context) -> Figures:
         lambda f: f.stuck,
         lambda s: s.stuck,
     )
-
-
-@check("DEX1-OPER-05", "DEX3-OPER-05")
-@worst("reaction_s", "max_reaction_s", nothing="it moved after no step")
-def reaction(ctx: Context) -> Figures:
-    """Seconds until the joint begins to move."""
-    return _measured(
-        ctx,
-        "reaction_s",
-        "max_reaction_s",
-        lambda x: f"reacts after {x * 1e3:.0f} ms",
-        lambda f: f.reaction_s,
-        lambda s: s.reaction_s,
-    )
