@@ -82,7 +82,7 @@ Again = Callable[[Recording, Collection[str]], Sequence[Result]]
 
 
 def stories_of(recording: Recording, results: Iterable[Result], again: Again) -> list[Story]:
-    """The stories of a run, that which explains most first; none where nothing failed.
+    """The stories of a run, the likeliest first; none where nothing failed.
 
     :param results: of all requirements about the hands.
     """

@@ -214,12 +214,18 @@ class Told:
     """A story with the cards of what it explains.
 
     :param own: the card of the requirement that shows it; None for what the states show.
-    :param also: the cards of the requirements that are not met because of it, too.
+    :param also: the cards of the requirements that follow from it.
     """
 
     story: Story
     own: Card | None
     also: tuple[Card, ...]
+
+    @property
+    def seen(self) -> str:
+        """How the others are introduced: what a trial has shown, or may be."""
+        follow = "because of it" if self.own is None else "and may follow from it"
+        return f"also seen {follow}"
 
     @property
     def whose(self) -> str:
@@ -233,7 +239,7 @@ class Told:
 
 
 def told(result: RunResult) -> list[Told]:
-    """The stories of a run, that which explains most first."""
+    """The stories of a run, the likeliest first."""
     of = {need.id: Card.from_results(group) for need, group in result.by_requirement()}
     return [
         Told(

@@ -155,10 +155,10 @@ def _hung(console: Console, head: str, text: str) -> str:
 
 
 def _print_stories(result: RunResult, console: Console) -> None:
-    """Print what is wrong, what explains most first, and what follows from it."""
+    """Print what is wrong, likeliest first, and what follows from it."""
     stories = told(result)
     if stories:
-        several = ", what explains most first" if len(stories) > 1 else ""
+        several = ", likeliest first" if len(stories) > 1 else ""
         console.print(f"\n[bold]What is wrong{several}:[/bold]", highlight=False)
     for number, each in enumerate(stories, 1):
         text = _hung(console, f"{number:>3}. ", f"{each.story.sentence} ({each.whose})")
@@ -166,7 +166,7 @@ def _print_stories(result: RunResult, console: Console) -> None:
         console.print(f"[{style}]{text}[/]", highlight=False, soft_wrap=True)
         if each.also:
             names = "; ".join(f"{c.requirement.id} {c.figures}".strip() for c in each.also)
-            text = _hung(console, "     ", f"also seen because of it: {names}")
+            text = _hung(console, "     ", f"{each.seen}: {names}")
             console.print(f"[dim]{text}[/]", highlight=False, soft_wrap=True)
 
 
