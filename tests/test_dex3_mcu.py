@@ -112,6 +112,29 @@ def packet(number: int, *, status: int = 1, timeout: bool = True, q: int = 0) ->
 # --- frames
 
 
+@each("side", SIDES)
+@each("layout", [COMMAND_1234, COMMAND_734])
+def test_one_send_one_receive(side: Side, layout: CommandLayout) -> None:
+    bench = Bench(side)
+    bench.codec = HandCodec(DEX3_1.joints[side], layout=layout)
+    goal = bench.away()
+    state = bench.run(1.5, bench.frame(goal))
+    assert state.q == pytest.approx(goal, abs=0.02)
+    assert state.mode.tolist() == [1] * 7
+    assert not state.fault.any()
+    assert bench.mcu.counters.frames == bench.mcu.counters.answers == 150
+    assert bench.codec.problems == []
+
+
+def test_the_state_is_that_of_the_answer() -> None:
+    bench = Bench()
+    bench.ask(bench.frame(bench.away()))
+    bench.clock.advance(0.05)
+    state = bench.ask(empty())
+    assert state.q == pytest.approx(bench.mechanics.q, abs=1e-5)
+    assert np.abs(state.q - bench.rest).max() > 0.01
+
+
 def test_hand_at_rest_reports_its_initial_state() -> None:
     bench = Bench()
     raw = bench.mcu.exchange(empty())
@@ -153,6 +176,17 @@ def test_a_hand_may_mark_slots_without_an_element_in_pa_or_in_counts(code: int) 
     assert np.isfinite(state.pressure).sum() == 33
     with pytest.raises(UsageError, match="3750 or 30000"):
         Firmware(no_value=0)
+
+
+def test_sensors_measure_an_object() -> None:
+    bench = Bench(object_at=40.0)
+    closed = [j.q_max if j.closing > 0 else j.q_min for j in DEX3_1.joints[Side.LEFT]]
+    closed[0] = 0.0
+    state = bench.run(1.5, bench.frame(closed))
+    assert state.pressure is not None
+    tips = [i for i, s in enumerate(DEX3_1.sensors) if s.place.endswith("tip")]
+    assert all(np.nanmax(state.pressure[i]) > 150_000.0 for i in tips)
+    assert np.isfinite(state.pressure).sum() == 33
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -242,6 +276,19 @@ def test_invalid_frame_is_answered_and_moves_nothing(
     assert f"30 {counter.replace('_', ' ')}" in bench.mcu.counters.summary()
 
 
+def test_bad_frame_can_be_left_unanswered() -> None:
+    bench = Bench(firmware=Firmware(answer_bad_frame=False))
+    assert bench.mcu.exchange(spoil_crc(bench.frame(bench.rest))) is None
+    assert bench.mcu.exchange(bench.frame(bench.rest)) is not None
+
+
+def test_any_frame_header_is_accepted() -> None:
+    bench = Bench()
+    frame = bench.frame(bench.away())
+    state = bench.run(0.2, b"\xeb\x90" + frame[2:])
+    assert state.mode.tolist() == [1] * 7
+
+
 def test_a_damaged_packet_leaves_its_motor_with_its_last_command() -> None:
     bench = Bench()
     bench.ask(single(0, packet(0), packet(1, q=56_000)))
@@ -250,6 +297,13 @@ def test_a_damaged_packet_leaves_its_motor_with_its_last_command() -> None:
     state = bench.ask(empty())
     assert state.mode.tolist() == [1, 1, 0, 0, 0, 0, 0]  # packet 0 was damaged: still FOC
     assert state.q[1] == pytest.approx(0.0, abs=0.05)  # packet 1 was taken
+    assert bench.mcu.counters.damaged_packets == 1
+
+
+def test_packets_for_motors_that_are_not_there_are_counted() -> None:
+    bench = Bench()
+    state = bench.ask(single(4, packet(0)))
+    assert state.mode.tolist() == [0] * 7
     assert bench.mcu.counters.damaged_packets == 1
 
 
@@ -277,7 +331,32 @@ def test_invalid_input_moves_no_motor(data: bytes) -> None:
     assert state.q == pytest.approx(bench.rest, abs=1e-5)
 
 
+@given(bit=st.integers(0, 8 * 20 - 1), sizes=st.lists(st.integers(0, 300), min_size=5, max_size=5))
+def test_damage_inside_a_good_frame_reaches_no_motor(bit: int, sizes: list[int]) -> None:
+    bench = Bench()
+    data = bytearray(_GOOD)
+    data[26 + bit // 8] ^= 1 << bit % 8  # motor 0 of bus 0
+    seal(data)
+    state = bench.ask(bytes(data))
+    assert state.mode.tolist() == [0, 1, 1, 1, 1, 1, 1]
+    for bus, size in enumerate(sizes):
+        data[6 + 4 * bus : 10 + 4 * bus] = size.to_bytes(4, "little")
+    seal(data)
+    assert bench.mcu.exchange(bytes(data)) is not None
+    assert bench.mcu.exchange(bytes(26) + b"\xff" * 1200 + bytes(8)) is not None
+
+
 # --- modes
+
+
+def test_lock_status_brakes_and_foc_status_drives() -> None:
+    bench = Bench()
+    goal = bench.away()
+    locked = dataclasses.replace(
+        HandCommand.position(goal, kp=1.5, kd=0.2), mode=np.zeros(7, np.uint8)
+    )
+    assert bench.run(0.3, bench.codec.encode(locked, True)).q == pytest.approx(bench.rest, abs=1e-4)
+    assert np.abs(bench.run(0.3, bench.frame(goal)).q - bench.rest).max() > 0.1
 
 
 @each("status", [2, 5, 6, 7])
@@ -289,6 +368,14 @@ def test_undefined_status_brakes_or_is_ignored(status: int) -> None:
     bench.ask(bench.frame(bench.rest))
     assert bench.ask(single(0, packet(0, status=status))).mode[0] == 1
     assert bench.mcu.counters.ignored_packets == 1
+
+
+def test_gains_change_the_motion() -> None:
+    bench = Bench()
+    soft = bench.run(0.1, bench.frame(bench.away(), kp=0.2)).q
+    bench = Bench()
+    stiff = bench.run(0.1, bench.frame(bench.away(), kp=3.0)).q
+    assert (np.abs(stiff - bench.rest) > np.abs(soft - bench.rest)).all()
 
 
 # --- time-out protection
@@ -368,6 +455,16 @@ def test_without_protection_the_command_stays_in_force() -> None:
     assert state.q == pytest.approx(bench.away(), abs=0.02)
 
 
+def test_a_tripped_motor_can_go_limp_instead() -> None:
+    bench = Bench(firmware=Firmware(tripped_brakes=False))
+    bench.ask(bench.frame(bench.rest))
+    bench.clock.advance(1.1)
+    state = bench.ask(empty())
+    assert (state.fault == TRIPPED).all()
+    assert state.mode.tolist() == [1] * 7
+    assert not state.tau_est.any()
+
+
 # --- broadcast, and who answers
 
 
@@ -382,6 +479,27 @@ def test_broadcast_commands_a_bus_and_is_not_answered() -> None:
     assert state.mode.tolist() == [1, 1, 1, 0, 0, 0, 0]
 
 
+def test_a_motor_that_is_also_addressed_alone_answers() -> None:
+    bench = Bench()
+    bench.ask(single(0, packet(BROADCAST_ID), packet(2, status=0)))
+    assert bench.codec.missing_motors == (0, 1)
+    assert bench.ask(empty()).mode.tolist() == [1, 1, 0, 0, 0, 0, 0]
+
+
+def test_broadcast_arms_the_protection() -> None:
+    bench = Bench()
+    bench.ask(single(0, packet(BROADCAST_ID)))
+    bench.clock.advance(1.5)
+    bench.mcu.advance()
+    assert bench.mcu.tripped == [True] * 3 + [False] * 4
+
+
+def test_motors_that_were_not_addressed_may_be_silent() -> None:
+    bench = Bench(firmware=Firmware(unaddressed_motors_answer=False))
+    bench.ask(single(0, packet(1)))
+    assert bench.codec.missing_motors == (0, 2, 3, 4, 5, 6)
+
+
 # --- faults
 
 
@@ -393,6 +511,26 @@ def test_command_is_obeyed_although_its_answer_is_dropped() -> None:
     bench.clock.advance(0.8)
     assert bench.ask(empty()).mode.tolist() == [1] * 7  # it was obeyed
     assert bench.mcu.counters.dropped == 1
+
+
+def test_corrupted_answers_have_one_bit_flipped() -> None:
+    bench = Bench(faults=["corrupt:for=1s"])
+    good = bench.mcu.state()
+    bad = bench.mcu.exchange(empty())
+    assert bad is not None
+    assert len(bad) == len(good)
+    assert sum(bin(a ^ b).count("1") for a, b in zip(good, bad, strict=True)) == 1
+    assert bench.mcu.counters.corrupted == 1
+
+
+def test_delayed_answers_carry_their_delay() -> None:
+    bench = Bench(faults=["delay:ms=30,for=1s"], firmware=Firmware(answer_time=0.001))
+    bench.mcu.exchange(empty())
+    assert bench.mcu.late == pytest.approx(0.031)
+    bench.clock.advance(1.5)
+    bench.mcu.exchange(empty())
+    assert bench.mcu.late == pytest.approx(0.001)
+    assert bench.mcu.counters.delayed == 1
 
 
 def test_silent_motor_ignores_commands_and_times_out() -> None:
@@ -432,6 +570,47 @@ def test_a_motor_with_an_error_brakes_until_it_is_over(spec: str, bits: int) -> 
     assert state.q == pytest.approx(bench.away(), abs=0.03)
 
 
+def test_overheat_fault_below_the_limit_only_warms() -> None:
+    bench = Bench(faults=["overheat:id=2,c=60"])
+    state = bench.run(0.5, bench.frame(bench.rest))
+    assert state.winding_temperature is not None
+    assert state.winding_temperature[2] == pytest.approx(60.0, abs=1.0)
+    assert not state.fault.any()
+
+
+def test_a_stuck_joint_does_not_move() -> None:
+    bench = Bench(faults=["stuck:id=4,for=1s"])
+    state = bench.run(0.9, bench.frame(bench.away()))
+    assert state.q[4] == pytest.approx(bench.rest[4], abs=1e-4)
+    state = bench.run(1.5, bench.frame(bench.away()))
+    assert state.q[4] == pytest.approx(bench.away()[4], abs=0.03)
+
+
+def test_fault_for_the_other_side_is_ignored() -> None:
+    for side in Side:
+        bench = Bench(side, faults=["drop:side=left"])
+        assert (bench.mcu.exchange(empty()) is None) == (side is Side.LEFT)
+
+
+def test_unplugging_and_stalling_are_reported() -> None:
+    bench = Bench(faults=["unplug@1s:for=2s", "stall@4s", "stall-out@5s"])
+    halted: list[str] = []
+    bench.mcu.on_stall = halted.append
+    bench.mcu.advance()
+    assert bench.mcu.plugged
+    assert bench.mcu.next_time == 101.0
+    bench.clock.advance(1.5)
+    bench.mcu.advance()
+    assert not bench.mcu.plugged
+    bench.clock.advance(2.0)
+    bench.mcu.advance()
+    assert bench.mcu.plugged
+    bench.clock.advance(2.0)
+    bench.mcu.advance()
+    assert halted == ["in", "out"]
+    assert bench.mcu.next_time is None
+
+
 def test_pulling_the_cable_stops_no_motor_but_their_protection_does() -> None:
     bench = Bench(faults=["unplug:for=3s"])
     bench.ask(bench.frame(bench.away()))
@@ -455,3 +634,31 @@ def test_bad_faults_name_what_a_hand_can_have(text: str) -> None:
         parse_fault(text, DEX3_FAULTS)
     assert caught.value.hint == grammar(DEX3_FAULTS)
     assert all(kind.name in caught.value.hint for kind in DEX3_FAULTS.kinds)
+
+
+def test_sides_are_for_hands_only() -> None:
+    assert parse_fault("drop:side=right", DEX3_FAULTS).side is Side.RIGHT
+    with pytest.raises(UsageError, match="no key 'side'"):
+        parse_fault("drop:side=right")
+
+
+@each(
+    "wrong",
+    [{"queue": 0}, {"command_timeout": 0.0}, {"answer_time": -1.0}, {"model_code": 256}],
+)
+def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(UsageError):
+        Firmware(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_same_seed_gives_the_same_run() -> None:
+    def run() -> list[bytes | None]:
+        bench = Bench(faults=["drop:p=0.3", "corrupt:p=0.3", "delay:p=0.5"])
+        answers = []
+        for _ in range(50):
+            answers.append(bench.mcu.exchange(bench.frame(bench.away())))
+            bench.clock.advance(0.01)
+        return answers
+
+    assert run() == run()
+    assert None in run()

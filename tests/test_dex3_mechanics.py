@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.dex3_mechanics import F_1515_108, F_1515_214, Dex3Mechanics
 from dexkit.emulators.finger_mechanics import AMBIENT, STEP, MotorModel
 from dexkit.errors import UsageError
-from dexkit.hand import Floats, JointMode, Side
+from dexkit.hand import Floats, HandCommand, JointMode, MotorError, Side
 from dexkit.models import DEX3_1
 from tests.each import each
 
@@ -37,6 +38,14 @@ def close_to(mechanics: Dex3Mechanics, percent: float, kp: float = KP, kd: float
 
 
 # -- motors ----------------------------------------------------------------------------------
+
+
+def test_thumb_0_has_a_different_gear_ratio() -> None:
+    assert [s.gear_ratio for s in Dex3Mechanics(Side.LEFT).specs] == [214.0] + 6 * [108.0]
+    assert F_1515_108.driving_loss == pytest.approx(0.355, abs=1e-3)
+    assert F_1515_108.holding_loss == pytest.approx(0.803, abs=1e-3)
+    assert F_1515_214.driving_loss == pytest.approx(0.426, abs=1e-3)
+    assert F_1515_214.holding_loss == pytest.approx(1.069, abs=1e-3)
 
 
 @each("joint", range(7))
@@ -159,6 +168,24 @@ def test_brake_stops_at_once_and_limp_coasts() -> None:
     assert slid["limp"] > 0.2
 
 
+def test_a_braked_hand_is_harder_to_move_than_a_limp_one() -> None:
+    moved = []
+    for mode in (0, 1):
+        mechanics = Dex3Mechanics(Side.LEFT)
+        mechanics.command(INDEX_0, mode)
+        pushed = mechanics.joints[INDEX_0]
+        pushed.spring, pushed.spring_rest = 0.05, -1.5  # something pulls with up to 0.06 N m
+        live(mechanics, 0.1)
+        moved.append(-0.3 - pushed.q)
+    assert 0.0 < moved[0] < 0.1 * moved[1]
+
+
+def test_negative_gain_does_not_destabilise_the_joint() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.command(INDEX_0, 1, -1.0, kp=-5.0, kd=-1.0)
+    assert live(mechanics, 1.0).q[INDEX_0] == pytest.approx(-0.3)
+
+
 def test_a_repeated_command_changes_nothing() -> None:
     """Neither does the short-cut for joints at rest."""
     once, often = Dex3Mechanics(Side.LEFT, object_at=40), Dex3Mechanics(Side.LEFT, object_at=40)
@@ -186,7 +213,49 @@ command = st.tuples(
 )
 
 
+@given(
+    st.sampled_from(Side),
+    st.lists(st.tuples(command, st.integers(0, 40)), min_size=1, max_size=40),
+    st.sampled_from([None, 25.0, 60.0]),
+)
+def test_any_command_keeps_the_state_finite(
+    side: Side,
+    moves: list[tuple[tuple[int, int, float, float, float, float, float], int]],
+    object_at: float | None,
+) -> None:
+    mechanics = Dex3Mechanics(side, object_at=object_at)
+    low = np.array([s.q_min for s in mechanics.specs]) - 0.1
+    high = np.array([s.q_max for s in mechanics.specs]) + 0.1
+    most = np.array([F_1515_214.tau_max] + 6 * [F_1515_108.tau_max])
+    for (joint, mode, q, dq, tau, kp, kd), steps in moves:
+        mechanics.command(joint, mode, q, dq, tau, kp, kd)
+        mechanics.step(steps)
+        state = mechanics.state(0.0)
+        assert ((state.q > low) & (state.q < high)).all()
+        assert (np.abs(state.tau_est) <= most).all()
+        assert np.isfinite(state.dq).all()
+        assert np.isfinite(state.ddq).all()
+        assert state.pressure is not None
+        assert np.isfinite(state.pressure[~np.isnan(mechanics.sensor_temperature)]).all()
+
+
 # -- an object -------------------------------------------------------------------------------
+
+
+def test_grip_force_grows_with_the_gain() -> None:
+    torques = []
+    for kp in (0.5, 1.5):
+        mechanics = Dex3Mechanics(Side.LEFT, object_at=40)
+        close_to(mechanics, 65, kp=kp)
+        live(mechanics, 2.0)
+        for joint in FLEXING:
+            behind = goal(mechanics, joint, 65) - mechanics.q[joint]
+            assert mechanics.tau[joint] == pytest.approx(kp * behind)
+            assert abs(mechanics.q[joint]) > abs(goal(mechanics, joint, 40))
+            # the gearing takes its part of it
+            assert 0.5 < mechanics.contact[joint] / abs(mechanics.tau[joint]) < 1.0
+        torques.append(abs(mechanics.tau))
+    assert (torques[1][1:] > 2.5 * torques[0][1:]).all()
 
 
 def change(mechanics: Dex3Mechanics) -> Floats:
@@ -252,6 +321,13 @@ def test_a_strong_grip_presses_the_object_into_the_palm() -> None:
     assert 0.098 / 0.9e-4 < np.nanmin(change(mechanics)) < np.nanmax(change(mechanics)) < 2.8e5
 
 
+def test_pressure_is_limited_to_2500_g_an_element() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT, object_at=50)
+    mechanics.joints[THUMB_2].locked = True
+    mechanics.joints[THUMB_2].q = 1.7  # squeezed far beyond what the motor can do
+    assert np.nanmax(change(mechanics)) == pytest.approx(2.5 * 9.81 / 0.9e-4)
+
+
 @each("side", Side)
 def test_untouched_elements_rest_near_the_pressure_of_the_air(side: Side) -> None:
     # docs/sources/unitree-dex.md#b4: 101,000 to 103,300 were reported of a real hand
@@ -279,6 +355,20 @@ def test_a_light_touch_and_a_squeeze_are_seen_by_programs_of_real_hands(kp: floa
     live(mechanics, 2.0)
     assert np.nanmax(mechanics.pressure - before) > 1000
     assert (np.nanmax(mechanics.pressure) > 150_000) == (kp > 1)
+
+
+def test_the_least_force_that_is_felt_is_a_contact_for_programs_of_real_hands() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.press(0, 4 * 0.0099 * 9.81)  # 0.3 of it on one element
+    assert np.nanmax(change(mechanics)) > 1000
+
+
+def test_fingers_that_rest_beyond_the_object_start_on_it() -> None:
+    mechanics = Dex3Mechanics(Side.RIGHT, object_at=10)
+    for joint in FLEXING:
+        assert mechanics.q[joint] == goal(mechanics, joint, 10)
+    live(mechanics, 0.5)
+    assert np.nansum(change(mechanics)) == 0.0
 
 
 # -- heat, supply, faults --------------------------------------------------------------------
@@ -317,6 +407,100 @@ def test_supply_current_follows_the_motors() -> None:
     live(mechanics, 1.0)
     assert idle < mechanics.current < 10.0
     assert mechanics.supply.power_a == mechanics.current
+
+
+def test_imu_measures_gravity() -> None:
+    assert Dex3Mechanics(Side.LEFT).imu.accelerometer == (0.0, 0.0, 9.81)
+
+
+def test_an_overheated_motor_brakes_until_it_has_cooled() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.command(INDEX_0, 1, -1.2, kp=KP, kd=KD)
+    live(mechanics, 0.05)
+    mechanics.heat(INDEX_0, 125.0)
+    assert MotorError(mechanics.errors[INDEX_0]) == (
+        MotorError.CASE_TEMPERATURE | MotorError.WINDING_OVERTEMPERATURE
+    )
+    mechanics.command(INDEX_0, 1, -1.2, kp=KP, kd=KD)
+    assert mechanics.mode[INDEX_0] == JointMode.BRAKE
+    live(mechanics, 0.5)
+    assert mechanics.q[INDEX_0] > -1.0
+    assert mechanics.fans
+    live(mechanics, 150.0)
+    assert mechanics.errors[INDEX_0] == 0
+    mechanics.command(INDEX_0, 1, -1.2, kp=KP, kd=KD)
+    assert live(mechanics, 2.0).q[INDEX_0] == pytest.approx(-1.2, abs=0.02)
+
+
+def test_a_failed_motor_brakes_until_it_recovers() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.fail(INDEX_0, MotorError.OVERCURRENT)
+    for joint in (INDEX_0, INDEX_1):
+        mechanics.command(joint, 1, -1.2, kp=KP, kd=KD)
+    live(mechanics, 1.0)
+    assert mechanics.errors[INDEX_0] == MotorError.OVERCURRENT
+    assert mechanics.q[INDEX_0] == pytest.approx(-0.3)
+    assert mechanics.q[INDEX_1] == pytest.approx(-1.2, abs=0.02)
+    mechanics.recover(INDEX_0, MotorError.OVERCURRENT)
+    assert live(mechanics, 1.0).q[INDEX_0] == pytest.approx(-0.3)
+    mechanics.command(INDEX_0, 1, -1.2, kp=KP, kd=KD)
+    assert live(mechanics, 2.0).q[INDEX_0] == pytest.approx(-1.2, abs=0.02)
+
+
+def test_a_motor_without_power_makes_no_torque() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.power(INDEX_0, False)
+    mechanics.command(INDEX_0, 1, -1.2, tau=-0.5, kp=KP, kd=KD)
+    live(mechanics, 0.5)
+    assert (mechanics.q[INDEX_0], mechanics.tau[INDEX_0]) == (-0.3, 0.0)
+    mechanics.power(INDEX_0, True)
+    assert live(mechanics, 0.5).q[INDEX_0] == -0.3  # it waits for a command
+    mechanics.command(INDEX_0, 1, -1.2, kp=KP, kd=KD)
+    assert live(mechanics, 2.0).q[INDEX_0] == pytest.approx(-1.2, abs=0.02)
+
+
+def test_jammed_joint_makes_torque_without_motion() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.jam(INDEX_0, True)
+    mechanics.command(INDEX_0, 1, -0.5, kp=KP, kd=KD)
+    live(mechanics, 0.5)
+    assert mechanics.q[INDEX_0] == pytest.approx(-0.3)
+    assert mechanics.tau[INDEX_0] == pytest.approx(-0.2 * KP)
+    mechanics.jam(INDEX_0, False)
+    assert live(mechanics, 2.0).q[INDEX_0] == pytest.approx(-0.5, abs=0.02)
+
+
+def test_state_holds_every_quantity_of_the_mechanics() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT, object_at=40)
+    mechanics.apply(HandCommand.position(DEX3_1.rest_q[Side.LEFT], kp=KP, kd=KD))
+    state = live(mechanics, 0.1).state(3.5)
+    assert state.stamp == 3.5
+    for name in ("q", "dq", "ddq", "tau", "temperature", "winding_temperature"):
+        value = getattr(state, "tau_est" if name == "tau" else name)
+        assert np.array_equal(value, getattr(mechanics, name))
+        assert value.flags.c_contiguous
+    assert state.mode.tolist() == [1] * 7
+    assert state.fault.tolist() == [0] * 7
+    assert state.voltage.tolist() == [24.0] * 7
+    assert state.sensor_lost is not None
+    assert state.sensor_lost.tolist() == [0] * 9
+    assert state.imu is mechanics.imu
+    assert state.supply == mechanics.supply
+    state.q[0] = 9.0  # states are copies
+    assert state.pressure is not None
+    state.pressure[:] = 9.0
+    assert mechanics.q[0] != 9.0
+    assert np.nanmin(mechanics.pressure) > 1e5
+
+
+def test_acceleration_is_the_mean_over_the_last_steps() -> None:
+    mechanics = Dex3Mechanics(Side.LEFT)
+    mechanics.command(INDEX_0, 1, tau=-0.05)
+    before = mechanics.dq[INDEX_0]
+    mechanics.step(4)
+    assert mechanics.ddq[INDEX_0] == pytest.approx((mechanics.dq[INDEX_0] - before) / (4 * STEP))
+    mechanics.step(0)
+    assert mechanics.ddq[INDEX_0] < 0.0
 
 
 @each(

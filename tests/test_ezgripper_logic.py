@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.drivers.ezgripper import calibration_file, register_block, scaling
+from dexkit.drivers.ezgripper import calibration, calibration_file, register_block, scaling
 from dexkit.drivers.ezgripper.contact import MIN_FREE_SPEED, ContactDetector
 from dexkit.drivers.ezgripper.control import Control, ControlSettings, Phase
 from dexkit.drivers.ezgripper.force import DEFAULT_FORCE_TABLE, ForceTable
@@ -37,6 +37,12 @@ def test_relative_position_does_not_depend_on_the_turn(
 ) -> None:
     present = zero + relative + 4096 * turns_now
     assert scaling.relative_position(present, zero + 4096 * turns_then) == relative
+
+
+def test_documented_example_of_folded_position() -> None:
+    # zero 3010, fully open: 5510, reads 1414 after a reboot (docs/sources/mx64-ezgripper.md#d4)
+    assert scaling.relative_position(5510, 3010) == 2500
+    assert scaling.relative_position(1414, 3010) == 2500
 
 
 def test_joint_angles_convert_to_ticks_and_back() -> None:
@@ -305,6 +311,13 @@ def test_contact_persists_during_slow_creep() -> None:
         assert detector.update(t, round(1000 - i / 10), 0) is not None
 
 
+def test_new_motion_starts_a_new_contact_window() -> None:
+    detector = ContactDetector()
+    for i in range(500):
+        assert detector.update(i * 0.002, 1000, 1000) is None
+    assert _run(detector, lambda now: 1000, 0, start=1.0, duration=0.098) is None
+
+
 # --- control
 
 
@@ -335,6 +348,36 @@ FULL = scaling.profile_velocity(150.0)
 SLOW = scaling.profile_velocity(50.0)
 
 
+def test_zero_gains_never_move() -> None:
+    control = Control(ZERO)
+    for position in (ZERO, ZERO + 1000, ZERO + 2500 - 4096):
+        goal = control.plan(LIMP, _sample(0.0, position))
+        assert goal.current == 0
+        assert goal.position == position
+        assert control.phase is Phase.LIMP
+
+
+def test_position_goal_is_in_servos_present_turn() -> None:
+    # the same gripper before and after a reboot that folds 5510 to 1414
+    for position in (5510, 1414):
+        goal = Control(ZERO).plan(CLOSE, _sample(0.0, position))
+        assert goal.position == position - 2500
+        assert goal.current == scaling.current_of_effort(50)
+
+
+def test_brake_holds_where_it_began_at_rest() -> None:
+    control = Control(ZERO)
+    control.plan(LIMP, _sample(-0.1, ZERO + 600))
+    held = control.plan(BRAKE, _sample(0.0, ZERO + 600))
+    assert (held.position, held.current) == (ZERO + 600, 240)
+    # it drifts, is pushed, gets another brake command: the goal stays
+    for i, velocity in enumerate((0, 20, -20, 0)):
+        sample = _sample(0.02 + i * 0.01, ZERO + 650, velocity=velocity)
+        assert control.plan(BRAKE, sample).position == ZERO + 600
+    control.plan(OPEN, _sample(0.1, ZERO + 650))
+    assert control.plan(BRAKE, _sample(0.12, ZERO + 800)).position == ZERO + 800
+
+
 def test_no_torque_before_first_command() -> None:
     for control in (Control(ZERO), Control(ZERO)):
         for i, position in enumerate((600, 650, 700)):  # the springs open the fingers
@@ -349,6 +392,18 @@ def test_no_torque_before_first_command() -> None:
         assert control.plan(BRAKE, _sample(2.0, ZERO + 600)).current == 0
         assert control.plan(CLOSE, _sample(2.1, ZERO + 600)).current == 0
         assert control.plan(OPEN, _sample(2.2, ZERO + 600)).current == 800
+
+
+def test_brake_in_motion_stops_and_does_not_come_back() -> None:
+    control = Control(ZERO)
+    control.plan(CLOSE, _sample(0.0, ZERO + 700, velocity=-200))
+    first = control.plan(BRAKE, _sample(0.01, ZERO + 600, velocity=-200))
+    assert (first.position, first.current) == (ZERO + 600, 800), "all force while it moves"
+    assert control.plan(BRAKE, _sample(0.02, ZERO + 560, velocity=-60)) == first
+    stopped = control.plan(BRAKE, _sample(0.03, ZERO + 550, velocity=-1))
+    assert stopped == Goal(ZERO + 550, 800, 0)
+    assert control.plan(BRAKE, _sample(0.04, ZERO + 549)).position == ZERO + 550
+    assert control.plan(BRAKE, _sample(0.05, ZERO + 549)).current == 240
 
 
 def test_startup_is_slow_until_the_goal_was_reached_once() -> None:
@@ -369,6 +424,27 @@ def test_startup_limit_ends_in_any_case_and_does_not_count_time_braked() -> None
     assert control.plan(OPEN, _sample(103.1, ZERO + 1000)).profile_velocity == FULL
 
 
+def _squeeze(control: Control, start: float, seconds: float, position: int) -> Goal:
+    steps = int(seconds / 0.005)
+    for i in range(steps + 1):
+        goal = control.plan(CLOSE, _sample(start + i * 0.005, position))
+    return goal
+
+
+def test_contact_holds_with_less_effort_and_opens_with_full() -> None:
+    control = Control(ZERO)
+    assert _squeeze(control, 0.0, 0.3, ZERO + 1000).current == 800
+    assert control.phase is Phase.CONTACT
+    assert _squeeze(control, 0.3, 0.6, ZERO + 1000).current == 240
+    assert control.phase is Phase.HOLDING
+    assert control.contact is not None
+    assert control.contact.direction == -1
+    # first the servo's trajectory, which has run on to 0, is brought back to the fingers
+    assert control.plan(OPEN, _sample(1.0, ZERO + 1000)) == Goal(ZERO + 1000, 800, 0)
+    assert control.contact is None
+    assert control.plan(OPEN, _sample(1.01, ZERO + 1001)).position == ZERO + 2500
+
+
 def test_a_hot_servo_gets_the_hold_effort_until_it_has_cooled() -> None:
     control = Control(ZERO)
 
@@ -382,6 +458,27 @@ def test_a_hot_servo_gets_the_hold_effort_until_it_has_cooled() -> None:
         240,
         800,
     ]
+
+
+def test_after_a_recovery_nothing_moves_until_the_command_changes() -> None:
+    control = Control(ZERO)
+    control.plan(CLOSE, _sample(0.0, ZERO + 1000))
+    control.recovered(CLOSE, overload_at=1000.0)
+    folded = (ZERO + 1000) % 4096
+    for i in range(100):
+        # a brake of the service in between does not make the old command new
+        command = BRAKE if i % 10 == 5 else CLOSE
+        goal = control.plan(command, _sample(1.0 + i * 0.01, folded))
+        assert goal.position == folded
+        assert goal.current == 0
+        assert control.phase is Phase.BRAKE
+    # a new command acts, but with no more than the hold effort against the same load
+    squeeze = control.plan(HandCommand.position(0.1), _sample(3.0, folded))
+    assert squeeze.position < folded
+    assert squeeze.current == 240
+    assert squeeze.profile_velocity == SLOW
+    assert control.plan(OPEN, _sample(3.1, folded)).current == 800
+    assert control.plan(CLOSE, _sample(3.2, folded)).current == 800
 
 
 _commands = st.one_of(
@@ -437,6 +534,24 @@ def test_goals_stay_within_stroke_and_effort(
             assert 0 <= target <= 2500
 
 
+@each(
+    "wrong",
+    [
+        {"effort": 0},
+        {"effort": 101},
+        {"hold_effort": math.nan},
+        {"speed": 1.0},
+        {"speed": math.inf},
+        {"hold_after": -1},
+        {"warm": 90},
+        {"startup_time": math.inf},
+    ],
+)
+def test_invalid_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(UsageError):
+        ControlSettings(**wrong)
+
+
 # --- recovery
 
 
@@ -467,6 +582,14 @@ def test_reboot_delay_grows_and_resets() -> None:
     assert delays == [0.5, 1, 2, 3, 3]
     policy.fault(now + 100)
     assert policy.delay == 0.5
+
+
+def test_a_hot_servo_is_not_rebooted() -> None:
+    policy = RebootPolicy()
+    policy.fault(0.0)
+    assert not policy.due(1000.0, HardwareError.OVERHEATING, 75, 80)
+    assert policy.due(1000.0, HardwareError.OVERHEATING, 70, 80)
+    assert policy.due(1000.0, HardwareError.OVERLOAD, 75, 80)
 
 
 # --- configuration
@@ -595,3 +718,41 @@ def test_environment_variable_sets_calibration_file(
     assert calibration_file.default_path().name == "ezgripper.json"
     assert calibration_file.record_key("DA1Z9T40", 1) == "DA1Z9T40"
     assert calibration_file.record_key("DA1Z9T40", 3) == "DA1Z9T40#3"
+
+
+# --- calibration
+
+
+class _Answering:
+    """A servo that moves with ``speed`` percent a second, ``late`` seconds after each new goal."""
+
+    def __init__(self, speed: float, late: float) -> None:
+        self.speed, self.late = speed, late
+        self.now, self.position, self.goal, self.since = 0.0, float(ZERO), ZERO, 0.0
+
+    def sample(self) -> Sample:
+        return _sample(self.now, round(self.position))
+
+    def exchange(self, goal: Goal) -> Sample:
+        if goal.position != self.goal:
+            self.goal, self.since = goal.position, self.now
+        self.now += 0.005
+        if self.now - self.since > self.late:
+            way = self.goal - self.position
+            step = self.speed * scaling.TICKS_PER_PERCENT * 0.005
+            self.position += math.copysign(min(abs(way), step), way)
+        return self.sample()
+
+    def engage(self, goal: Goal) -> None:
+        self.exchange(goal)
+
+    def rearm_watchdog(self) -> None:
+        raise AssertionError
+
+
+def test_the_overhead_of_a_move_is_not_its_distance_over_the_speed() -> None:
+    for way in calibration.measure_distances(_Answering(150.0, 0.05), ZERO):
+        assert way.speed == pytest.approx(150.0, rel=0.03)
+        # less the last percent, from which on a move counts as done
+        assert way.overhead == pytest.approx(0.05 - 1 / 150, abs=0.01)
+        assert [percent for percent, _ in way.times] == list(calibration.DISTANCES)

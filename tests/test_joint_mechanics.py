@@ -20,6 +20,19 @@ def settle(joint: Joint, torque: float, seconds: float = 2.0, dt: float = DT) ->
         joint.step(torque, dt)
 
 
+def test_free_joint_accelerates_by_torque_over_inertia() -> None:
+    joint = Joint(inertia=0.01)
+    settle(joint, 0.5, 1.0)
+    assert joint.dq == pytest.approx(0.5 / 0.01)
+    assert joint.q == pytest.approx(0.5 * 50, rel=2e-3)
+
+
+def test_viscous_friction_sets_the_top_speed() -> None:
+    joint = Joint(inertia=0.01, viscous=0.1, coulomb=0.2)
+    settle(joint, 0.7, 3.0)
+    assert joint.dq == pytest.approx((0.7 - 0.2) / 0.1, rel=1e-6)
+
+
 def test_coulomb_friction_holds_and_stops_exactly() -> None:
     joint = Joint(inertia=0.01, coulomb=0.2)
     settle(joint, 0.19)
@@ -33,12 +46,38 @@ def test_coulomb_friction_holds_and_stops_exactly() -> None:
     assert joint.q == pytest.approx(0.5 * 0.01 / 0.2, rel=0.05)
 
 
+def test_load_friction_adds_up() -> None:
+    joint = Joint(inertia=0.01, coulomb=0.2)
+    for _ in range(100):
+        joint.step(0.5, DT, friction=0.31)
+    assert joint.dq == 0.0
+
+
 @pytest.mark.parametrize("push", [-1, 1])
 def test_wall_gives_way_by_force_over_stiffness(push: int) -> None:
     joint = Joint(inertia=0.01, walls=(Wall(1.0, push, 100.0, 1.0),), q=1.0)
     settle(joint, -push * 5.0)
     assert joint.q == pytest.approx(1.0 - push * 5.0 / 100.0)
     assert joint.contact == pytest.approx(push * 5.0)
+
+
+def test_wall_exerts_no_pull_on_a_leaving_joint() -> None:
+    joint = Joint(inertia=0.01, walls=(Wall(0.0, 1, 1000.0, 10.0),), q=-0.001)
+    settle(joint, 0.1, 0.5)
+    assert joint.q > 0.5
+    assert joint.contact == 0.0
+
+
+def test_spring_returns_to_rest() -> None:
+    joint = Joint(inertia=0.01, viscous=0.1, spring=1.0, spring_rest=0.7)
+    settle(joint, 0.0, 10.0)
+    assert joint.q == pytest.approx(0.7, abs=1e-3)
+
+
+def test_locked_joint_does_not_move() -> None:
+    joint = Joint(inertia=0.01, q=0.3, dq=2.0, locked=True)
+    settle(joint, 100.0)
+    assert (joint.q, joint.dq) == (0.3, 0.0)
 
 
 @given(
@@ -130,6 +169,16 @@ def test_blocked_motor_makes_its_full_torque(damping: float) -> None:
     assert joint.contact == pytest.approx(-0.4, abs=0.003)
 
 
+def test_motor_torque_is_limited() -> None:
+    joint = Joint(inertia=0.01)
+    assert joint.drive(5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(0.7)  # from rest
+    assert joint.drive(5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(0.3)  # along
+    assert joint.drive(-5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(-0.7)  # against
+    joint.locked = True
+    assert joint.drive(-5.0, 0.0, 0.7, 0.3, DT) == pytest.approx(-0.7)
+    assert joint.dq == 0.0
+
+
 def test_gear_friction_reduces_driving_and_adds_holding_torque() -> None:
     def at_rest(load: float) -> bool:
         joint = Joint(inertia=0.01, spring=1.0, spring_rest=-load)  # pulls with -load
@@ -173,3 +222,13 @@ def test_steps_follow_the_clock_without_drift() -> None:
     assert steps.due(100.0 + 1.3) == 0
     assert steps.due(99.0) == 0  # a clock that goes back costs nothing
     assert steps.done == lived == 2600
+
+
+def test_long_pause_is_not_simulated() -> None:
+    steps = FixedSteps(1e-3, most=0.5)
+    steps.restart(0.0)
+    assert steps.due(3600.0) == 500
+    assert steps.due(3600.001) == 1
+    assert steps.done == 3_600_001
+    steps.restart(7.0)
+    assert steps.due(7.25) == 250

@@ -6,12 +6,15 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dexkit.errors import (
+    ChecksumError,
     DexkitError,
     EncodeError,
+    OversizeError,
+    TruncatedError,
     WireError,
 )
 from dexkit.wire import m4010
@@ -145,6 +148,18 @@ def test_value_that_does_not_fit_its_field_is_refused(
         frame.pack()
 
 
+def test_invalid_frames_are_refused() -> None:
+    for kind, frame in ((MotorCmd, MotorCmd(1).pack()), (MotorData, MotorData(1).pack())):
+        with pytest.raises(TruncatedError):
+            kind.parse(frame[:-1])
+        with pytest.raises(OversizeError):
+            kind.parse(frame + b"\0")
+        with pytest.raises(WireError, match="starts with"):
+            kind.parse(b"\0" + frame[1:])
+        with pytest.raises(ChecksumError):
+            kind.parse(frame[:-1] + b"\0")
+
+
 # --- properties
 
 _i16 = st.integers(-0x8000, 0x7FFF)
@@ -180,6 +195,11 @@ data = st.builds(
 frames = st.one_of(commands, data)
 
 
+@given(frames)
+def test_parse_inverts_pack(frame: MotorCmd | MotorData) -> None:
+    assert type(frame).parse(frame.pack()) == frame
+
+
 @given(commands)
 def test_units_invert_counts(command: MotorCmd) -> None:
     """What a count stands for is sent as that count, at any ratio."""
@@ -203,6 +223,17 @@ def test_units_invert_counts_of_data(one: MotorData) -> None:
         timeout=one.timeout,
     )
     assert again == dataclasses.replace(one, ex_sensor1=0, ex_sensor2=0)
+
+
+@given(frames)
+@settings(max_examples=15, deadline=None)
+def test_every_flipped_bit_is_rejected(frame: MotorCmd | MotorData) -> None:
+    good = frame.pack()
+    for bit in range(8 * len(good)):
+        bad = bytearray(good)
+        bad[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(WireError):
+            type(frame).parse(bytes(bad))
 
 
 @given(
@@ -250,6 +281,19 @@ def _cut(stream: bytes, draw: st.DataObject) -> list[bytes]:
     return [stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
 
 
+@given(st.lists(data, max_size=6), st.data())
+def test_parser_does_not_care_how_bytes_are_cut(sent: list[MotorData], draw: st.DataObject) -> None:
+    parser = FrameParser()
+    found = [f for part in _cut(b"".join(d.pack() for d in sent), draw) for f in parser.feed(part)]
+    assert found == sent
+    assert (parser.frames, parser.skipped, parser.crc_errors, parser.pending) == (
+        len(sent),
+        0,
+        0,
+        0,
+    )
+
+
 @given(st.lists(frames, max_size=6), st.data())
 def test_parser_separates_commands_and_data_of_all_motors(
     sent: list[MotorCmd | MotorData], draw: st.DataObject
@@ -257,6 +301,36 @@ def test_parser_separates_commands_and_data_of_all_motors(
     parser = FrameParser((COMMAND, DATA))
     found = [f for part in _cut(b"".join(f.pack() for f in sent), draw) for f in parser.feed(part)]
     assert found == sent
+
+
+@given(st.binary(max_size=80), data)
+def test_a_good_frame_is_found_behind_garbage(noise: bytes, frame: MotorData) -> None:
+    parser = FrameParser()
+    found = parser.feed(noise + frame.pack() + bytes(DATA.size))
+    assert frame in found
+    assert parser.pending < DATA.size
+
+
+@given(st.lists(st.binary(max_size=60), max_size=10))
+def test_parser_survives_anything_within_bounds(noise: list[bytes]) -> None:
+    parser = FrameParser((COMMAND, DATA))
+    for piece in noise:
+        parser.feed(piece)
+        assert parser.pending < DATA.size
+    total = sum(map(len, noise))
+    assert parser.skipped + parser.pending <= total
+    parser.reset()
+    assert parser.pending == 0
+
+
+@given(data, data, st.integers(0, 8 * 26 - 1))
+def test_a_spoilt_frame_does_not_cost_the_next(
+    first: MotorData, second: MotorData, bit: int
+) -> None:
+    spoilt = bytearray(first.pack())
+    spoilt[bit // 8] ^= 1 << bit % 8
+    parser = FrameParser()
+    assert second in parser.feed(bytes(spoilt) + second.pack() + bytes(DATA.size))
 
 
 def test_constants_of_the_vendors_library() -> None:

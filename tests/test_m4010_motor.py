@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import select
@@ -18,10 +19,10 @@ from hypothesis import strategies as st
 from dexkit.cli.emulate import command
 from dexkit.emulators.dex1_mechanics import Dex1Mechanics
 from dexkit.emulators.faults import M4010_FAULTS, parse_fault
-from dexkit.emulators.m4010 import Bus, Dex1Process, Firmware, Motor
+from dexkit.emulators.m4010 import Bus, Dex1Motors, Dex1Process, Firmware, Motor
 from dexkit.emulators.m4010.motor import LOCKING
-from dexkit.errors import DexkitError, UsageError
-from dexkit.hand import MotorError
+from dexkit.errors import DexkitError, EmulatorError, UsageError
+from dexkit.hand import MotorError, Side
 from dexkit.wire import m4010
 from dexkit.wire.m4010 import (
     DATA,
@@ -32,6 +33,7 @@ from dexkit.wire.m4010 import (
     Status,
     calibration_outcome,
 )
+from tests.dds_helpers import wait_until
 from tests.each import each
 
 ZEROS = MotorCmd.setpoint(0)
@@ -98,6 +100,33 @@ def test_motor_answers_any_probe_with_its_measurements() -> None:
     assert (data.temp, data.winding, data.voltage) == (25, 25, 24.0)
 
 
+def test_motor_reaches_its_goal_and_reports_its_motion() -> None:
+    host = Host(motor())
+    seen = [host.drive(0.02, q=5.4, kp=5.0, kd=0.05) for _ in range(60)]
+    assert seen[-1].joint().q == pytest.approx(5.4, abs=0.05)
+    assert max(data.joint().dq for data in seen) > 5.0
+    assert seen[0].status == Status.FOC
+
+
+def test_zero_gains_make_no_torque() -> None:
+    host = Host(motor())
+    assert host.drive(0.3, q=5.0).joint().q == pytest.approx(1.08, abs=1e-3)
+
+
+def test_gains_below_one_count_are_zero() -> None:
+    """kd 0.0487 is 0 on the wire (docs/sources/unitree-dex.md#g): the resolution is part of the
+    product.
+    """
+    assert MotorCmd.setpoint(0, kd=0.0487).k_spd == 0
+    assert MotorCmd.setpoint(0, kd=0.05).k_spd == 1
+
+
+def test_feed_forward_torque_opens_and_closes() -> None:
+    host = Host(motor(start=50.0))
+    assert host.drive(0.1, tau=0.3).joint().q > 2.8
+    assert host.drive(0.3, tau=-0.3).joint().q < 2.6
+
+
 def test_a_held_object_stays_held_when_the_motor_brakes() -> None:
     host = Host(motor(start=60.0, touch=40.0))
     pressed = host.drive(1.0, q=1.98, kp=5.0, kd=0.05)
@@ -147,6 +176,15 @@ def test_two_motors_on_a_line_answer_for_themselves() -> None:
         Bus([Motor(0), Motor(0)])
     with pytest.raises(UsageError, match="0 to 14"):
         Motor(15)
+
+
+def test_other_status_brakes_or_is_ignored() -> None:
+    for brakes, status in ((True, Status.BRAKE), (False, Status.FOC)):
+        host = Host(motor(firmware=Firmware(other_status_brakes=brakes)))
+        host.drive(0.02, q=1.1, kp=5.0)
+        data = host.ask(MotorCmd(0, 3))
+        assert data is not None
+        assert data.status == status
 
 
 # --- the protection
@@ -261,6 +299,14 @@ def test_partial_frame_is_dropped_after_a_gap() -> None:
     assert len(host.send(frame)) == 26
 
 
+def test_damaged_command_is_not_answered() -> None:
+    host = Host(motor())
+    frame = bytearray(ZEROS.pack())
+    frame[9] ^= 4
+    assert host.send(bytes(frame)) == b""
+    assert host.bus.counters.crc_errors == 1
+
+
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_a_command_after_anything_is_answered(pieces: list[bytes]) -> None:
     host = Host(motor())
@@ -268,6 +314,24 @@ def test_a_command_after_anything_is_answered(pieces: list[bytes]) -> None:
         host.send(piece, 0.0005)
     host.listen(0.01)
     assert host.ask(MotorCmd(0)) is not None
+
+
+@given(
+    st.floats(-1e4, 1e4),
+    st.floats(-1e3, 1e3),
+    st.floats(-1e3, 1e3),
+    st.floats(0, 1e4),
+    st.floats(0, 1e4),
+)
+def test_motor_stays_finite_and_within_its_stops_under_any_command(
+    q: float, dq: float, tau: float, kp: float, kd: float
+) -> None:
+    host = Host(motor())
+    host.ask(MotorCmd.setpoint(0, q=q, dq=dq, tau=tau, kp=kp, kd=kd))
+    host.listen(0.2)
+    data = host.ask(ZEROS)
+    assert data is not None
+    assert -0.5 < data.joint().q < 6.2
 
 
 # --- faults
@@ -337,6 +401,15 @@ def test_fault_applies_to_the_motor_with_its_id() -> None:
     assert right.q == pytest.approx(1.08)
 
 
+def test_holding_with_force_heats_the_motor() -> None:
+    one = motor(start=60.0, touch=40.0)
+    host = Host(one)
+    host.drive(0.5, q=0.5, kp=5.0)
+    host.ask(MotorCmd.setpoint(0, q=0.0, kp=5.0))
+    host.listen(8.0)
+    assert one.winding > one.case > 25.5
+
+
 def test_unplugging_loses_bytes_in_transit_but_not_the_motor_state() -> None:
     one = motor()
     host = Host(one, faults=("unplug@10ms:for=20ms",))
@@ -347,6 +420,15 @@ def test_unplugging_loses_bytes_in_transit_but_not_the_motor_state() -> None:
     host.listen(0.3)
     assert not host.bus.unplugged
     assert one.q > 2.0  # it went on
+
+
+@each(
+    ("spec", "says"),
+    [("stall", "no kind 'stall'"), ("silent:id=2", "not an id"), ("drop:side=left", "no key")],
+)
+def test_faults_of_other_devices_are_refused(spec: str, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        parse_fault(spec, M4010_FAULTS)
 
 
 # --- the command
@@ -365,7 +447,8 @@ def exchange(port: serial.Serial, command: MotorCmd, timeout: float = 60.0) -> M
     return None
 
 
-def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path, signum: signal.Signals) -> None:
     link = tmp_path / "tty"
     motors = Dex1Process(["--side", "both"], link)
     try:
@@ -377,7 +460,7 @@ def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path) -> None:
                 data = exchange(port, MotorCmd(number))
                 assert data is not None
                 assert data.id == number
-        motors.process.send_signal(signal.SIGTERM)
+        motors.process.send_signal(signum)
         assert motors.process.wait(60) == 0
         output, errors = motors.process.communicate()
     finally:
@@ -385,6 +468,43 @@ def test_both_on_one_line_answer_and_leave_nothing(tmp_path: Path) -> None:
     assert b"2 commands" in output
     assert errors == b""
     assert not link.is_symlink()
+
+
+def test_motor_answers_only_at_its_baud_rate(tmp_path: Path) -> None:
+    """The vendor's service opens the port at another rate, too, and then changes it."""
+    with Dex1Motors((Side.LEFT,), links={Side.LEFT: tmp_path / "l"}) as motors:
+        counters = motors.bus(Side.LEFT).counters
+        with serial.Serial(motors.path, m4010.OPENING_BAUD_RATE, timeout=0) as port:
+            assert exchange(port, ZEROS, 0.01) is None
+            wait_until(lambda: counters.garbled == 20)
+            port.baudrate = m4010.BAUD_RATE
+            assert exchange(port, MotorCmd(1)) is not None
+        assert counters.garbled == 20
+
+
+def test_each_motor_can_have_its_own_line(tmp_path: Path) -> None:
+    links = {Side.LEFT: tmp_path / "l", Side.RIGHT: tmp_path / "r"}
+    with Dex1Motors(tuple(Side), links=links) as motors:
+        assert len(motors.ready_lines) == 2
+        for side, link in links.items():
+            with serial.Serial(str(link), m4010.BAUD_RATE, timeout=0) as port:
+                mine, other = (1, 0) if side is Side.LEFT else (0, 1)
+                assert exchange(port, MotorCmd(mine)) is not None
+                assert exchange(port, MotorCmd(other), 0.05) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faults_are_read_from_input_until_its_end(tmp_path: Path) -> None:
+    with contextlib.closing(Dex1Process(["--side=left"])) as motors:
+        with serial.Serial(motors.path, m4010.BAUD_RATE, timeout=0) as port:
+            assert exchange(port, MotorCmd(1)) is not None
+            motors.inject("silent")
+            end = time.monotonic() + 60
+            while exchange(port, MotorCmd(1), 0.05) is not None:
+                assert time.monotonic() < end
+        assert motors.process.stdin is not None
+        motors.process.stdin.close()
+        assert motors.process.wait(60) == 0
 
 
 @each(
@@ -408,3 +528,38 @@ def test_wrong_options_of_dex1_motor_are_refused(
     assert isinstance(result.exception, (DexkitError, SystemExit))
     assert getattr(result.exception, "exit_code", result.exit_code) == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_invalid_settings_are_refused() -> None:
+    for wrong in (
+        lambda: Firmware(command_timeout=0.0),
+        lambda: Firmware(baudrate=0),
+        lambda: Dex1Mechanics(start_pct=101.0),
+        lambda: Dex1Mechanics(object_pct=0.0),
+        lambda: Dex1Mechanics(locking=-1.0),
+        lambda: Bus([]),
+        lambda: Bus([Motor(0)], latency_timer=-1.0),
+    ):
+        with pytest.raises(UsageError):
+            wrong()
+    with pytest.raises(EmulatorError):
+        Dex1Process(["--side=up"])
+
+
+def test_a_link_left_by_a_killed_emulator_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the next emulator mostly gets the same terminal again: the link names its own
+    ours, other = os.openpty(), os.openpty()
+    link = tmp_path / "tty"
+    link.symlink_to(os.ttyname(ours[1]))
+    monkeypatch.setattr(os, "openpty", lambda: ours)
+    with Dex1Motors(links={Side.LEFT: link}) as motors:
+        assert motors.path == str(link)
+    link.unlink(missing_ok=True)
+    link.symlink_to(os.ttyname(other[1]))
+    monkeypatch.undo()
+    with pytest.raises(EmulatorError, match="which exists"), Dex1Motors(links={Side.LEFT: link}):
+        pass
+    for fd in other:
+        os.close(fd)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
@@ -52,6 +55,59 @@ def test_frames_are_those_of_braincos_library(frame: bytes, request_: Request) -
         request_.count,
     )
     assert modbus.signed(found.values) == request_.values
+
+
+WORDS = st.integers(0, 0xFFFF)
+REQUESTS = st.one_of(
+    st.builds(
+        Request,
+        st.sampled_from([Function.READ_HOLDING, Function.READ_INPUT]),
+        WORDS,
+        st.integers(1, modbus.MOST_READ),
+    ),
+    st.builds(Request.write, WORDS, st.lists(WORDS, min_size=1, max_size=modbus.MOST_WRITTEN)),
+    st.builds(
+        lambda at, value: Request(Function.WRITE_ONE, at, 1, (value,)),
+        WORDS,
+        WORDS,
+    ),
+)
+
+
+@given(REQUESTS, st.integers(0, 255), WORDS, st.data())
+@settings(max_examples=25, deadline=None)
+def test_requests_and_answers_survive_both_framings(
+    request_: Request, unit: int, number: int, data: st.DataObject
+) -> None:
+    count = request_.count if request_.function in (3, 4) else 0
+    values = data.draw(st.lists(WORDS, min_size=count, max_size=count))
+    cut = data.draw(st.integers(0, 12))
+    assert modbus.parse_request(request_.pack()) == request_
+    answer = modbus.answer(request_, values)
+    assert modbus.parse_answer(answer, request_) == tuple(values)
+    for pdu, answers in ((request_.pack(), False), (answer, True)):
+        tcp, rtu = Adu(unit, pdu, number), Adu(unit, pdu)
+        for parser, frame, adu in (
+            (TcpParser(), tcp.pack_tcp(), tcp),
+            (RtuParser(answers=answers), rtu.pack_rtu(), rtu),
+        ):
+            found = [*parser.feed(frame[:cut]), *parser.feed(frame[cut:] + frame)]
+            assert found == [adu, adu]
+            assert (parser.skipped, parser.pending) == (0, 0)
+
+
+@given(st.binary(max_size=60), st.booleans())
+def test_garbage_is_skipped_and_a_frame_behind_it_is_found(noise: bytes, answers: bool) -> None:
+    parser = RtuParser(answers=answers)
+    found = parser.feed(noise)
+    parser.reset()
+    assert sum(len(f.pack_rtu()) for f in found) + parser.skipped == len(noise)
+    tcp = TcpParser()
+    tcp.feed(noise)
+    assert tcp.pending < 260
+    for parse in (modbus.parse_request, lambda pdu: modbus.parse_answer(pdu, ASKED)):
+        with contextlib.suppress(WireError):
+            parse(noise)
 
 
 ASKED = Request(Function.READ_HOLDING, 5, 2)

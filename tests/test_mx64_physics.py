@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dexkit.emulators.mx64 import Firmware, Physics
+from dexkit.emulators.mx64 import Firmware, Physics, Servo
 from dexkit.emulators.mx64.drive import PERIOD, Drive, Profile
 from dexkit.wire import mx64
-from dexkit.wire.mx64 import HardwareError, OperatingMode
+from dexkit.wire.mx64 import HardwareError, MovingStatus, OperatingMode
 from tests.each import each
 from tests.mx64_helpers import QUIET, read, ready, run, servo, write
 
@@ -113,6 +113,18 @@ def test_object_is_touched_and_squeezed(units: int) -> None:
     assert squeeze * p.gripper.object_stiffness <= most * 1.05 + 0.3
 
 
+def test_more_current_squeezes_harder() -> None:
+    openings = []
+    for units in (160, 320, 640):
+        target = servo(object_pct=40.0, start=80.0)
+        ready(target, EZ)
+        write(target, mx64.GOAL_CURRENT, units)
+        write(target, mx64.GOAL_POSITION, 1510)
+        run(target, 1.5)
+        openings.append(target.drive.opening)
+    assert openings[0] > openings[1] > openings[2]
+
+
 def test_squeezed_object_pushes_back_when_torque_goes() -> None:
     target = servo(object_pct=40.0, start=80.0)
     ready(target, EZ)
@@ -127,6 +139,12 @@ def test_squeezed_object_pushes_back_when_torque_goes() -> None:
     assert target.drive.resting
 
 
+def test_springs_do_not_back_drive_the_gears() -> None:
+    target = servo(start=10.0)
+    run(target, 5.0)
+    assert target.drive.opening == pytest.approx(10.0, abs=0.1)
+
+
 # --- modes
 
 
@@ -137,6 +155,37 @@ def test_position_mode_reaches_its_goal() -> None:
         write(target, mx64.GOAL_POSITION, goal)
         run(target, 1.5)
         assert read(target, mx64.PRESENT_POSITION) == pytest.approx(goal, abs=25)
+
+
+def test_integral_gain_removes_steady_error() -> None:
+    target = servo()
+    ready(target, OperatingMode.POSITION)
+    write(target, mx64.POSITION_I_GAIN, 2000)
+    write(target, mx64.GOAL_POSITION, 3600)
+    run(target, 4.0)
+    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(3600, abs=4)
+
+
+def test_velocity_mode_holds_its_speed() -> None:
+    target = servo(start=0.0)
+    ready(target, OperatingMode.VELOCITY)
+    write(target, mx64.GOAL_VELOCITY, 100)
+    run(target, 0.8)
+    assert read(target, mx64.PRESENT_VELOCITY) == pytest.approx(100, abs=5)
+    assert read(target, mx64.VELOCITY_TRAJECTORY) == 100
+    write(target, mx64.GOAL_VELOCITY, 0)
+    run(target, 0.5)
+    assert read(target, mx64.PRESENT_VELOCITY) == pytest.approx(0, abs=5)
+
+
+def test_velocity_mode_ramps_with_profile_acceleration() -> None:
+    target = servo(start=0.0)
+    ready(target, OperatingMode.VELOCITY)
+    write(target, mx64.PROFILE_ACCELERATION, 10)  # 2146 rev/min2: 20 rpm take 0.56 s
+    write(target, mx64.GOAL_VELOCITY, round(20 / 0.229))
+    run(target, 0.28)
+    half = read(target, mx64.VELOCITY_TRAJECTORY) * 0.229
+    assert half == pytest.approx(10, abs=0.5)
 
 
 def test_current_mode_moves_until_blocked() -> None:
@@ -152,6 +201,65 @@ def test_current_mode_moves_until_blocked() -> None:
     write(weak, mx64.GOAL_CURRENT, -20)
     run(weak, 0.5)
     assert weak.drive.opening == pytest.approx(50.0, abs=0.1)
+
+
+def test_pwm_mode_sets_the_duty() -> None:
+    target = servo(start=0.0)
+    ready(target, OperatingMode.PWM)
+    write(target, mx64.GOAL_PWM, 300)
+    run(target, 0.3)
+    assert read(target, mx64.PRESENT_PWM) == pytest.approx(300, abs=1)
+    assert read(target, mx64.PRESENT_VELOCITY) > 50
+    limited = servo(start=0.0)
+    write(limited, mx64.PWM_LIMIT, 100)
+    ready(limited, OperatingMode.POSITION)
+    write(limited, mx64.GOAL_POSITION, 4000)
+    run(limited, 0.3)
+    assert read(limited, mx64.PRESENT_PWM) == 100
+
+
+def test_goal_pwm_limits_the_current_mode_too() -> None:
+    target = servo(object_pct=45.0)
+    ready(target, EZ)
+    write(target, mx64.GOAL_PWM, 100)
+    write(target, mx64.GOAL_POSITION, 1510)
+    run(target, 1.0)
+    assert read(target, mx64.PRESENT_PWM) == -100
+    assert abs(read(target, mx64.PRESENT_CURRENT)) < 150
+
+
+def test_feedforward_reduces_following_error() -> None:
+    """With the profile's speed fed forward the servo lags its trajectory less."""
+    lags = []
+    for gain in (0, 800):
+        target = servo(start=0.0)
+        ready(target, OperatingMode.EXTENDED_POSITION)
+        write(target, mx64.FEEDFORWARD_1ST_GAIN, gain)
+        write(target, mx64.FEEDFORWARD_2ND_GAIN, gain)
+        write(target, mx64.PROFILE_ACCELERATION, 100)
+        write(target, mx64.PROFILE_VELOCITY, 100)
+        write(target, mx64.GOAL_POSITION, 3500)
+        run(target, 0.6)
+        lags.append(read(target, mx64.POSITION_TRAJECTORY) - read(target, mx64.PRESENT_POSITION))
+    assert lags[1] < lags[0] / 1.2
+
+
+def test_present_current_option_follows_goal() -> None:
+    follows = dataclasses.replace(QUIET, current_follows_goal=True)
+    target = servo(object_pct=45.0, firmware=follows)
+    ready(target, EZ)
+    write(target, mx64.GOAL_CURRENT, 300)
+    write(target, mx64.GOAL_POSITION, 1510)
+    run(target, 1.0)
+    assert read(target, mx64.PRESENT_CURRENT) == -300
+
+
+def test_noise_on_current_is_seeded() -> None:
+    def readings(seed: int) -> list[int]:
+        target = Servo(firmware=Firmware(current_noise=5.0), seed=seed)
+        return [read(target, mx64.PRESENT_CURRENT) for _ in range(20)]
+
+    assert readings(1) == readings(1) != readings(2)
 
 
 # --- profiles
@@ -217,6 +325,25 @@ def test_time_based_profile_ends_on_time(total: int, ramp: int) -> None:
     assert time == pytest.approx(total * 1e-3, abs=0.012)
 
 
+def test_new_goal_keeps_the_speed() -> None:
+    profile = Profile()
+    profile.hold(0.0)
+    profile.start(2000.0, 200, 50)
+    for _ in range(150):
+        profile.step(PERIOD)
+    before = profile.velocity
+    profile.start(-2000.0, 200, 50)
+    profile.step(PERIOD)
+    assert 0 < profile.velocity < before
+    assert before - profile.velocity < 50 * mx64.ACCELERATION_UNIT / mx64.TICK * PERIOD * 1.01
+
+
+def test_step_without_profile_has_no_shape() -> None:
+    profile = Profile()
+    profile.start(100.0, 0, 10)
+    assert (profile.shape, profile.position, profile.running) == (MovingStatus.NONE, 100.0, False)
+
+
 # --- heat and supply
 
 
@@ -273,6 +400,16 @@ def test_overload_needs_load_and_time(units: int, trips: bool) -> None:
     assert target.torque is not trips
 
 
+def test_overload_can_be_masked() -> None:
+    target = servo(start=1.0)
+    write(target, mx64.SHUTDOWN, HardwareError.OVERHEATING)
+    ready(target, EZ)
+    write(target, mx64.GOAL_POSITION, -15000)
+    run(target, 8.0)
+    assert target.hardware_error == HardwareError.OVERLOAD
+    assert target.torque
+
+
 def test_supply_sags_under_load() -> None:
     target = servo(start=1.0)
     assert read(target, mx64.PRESENT_INPUT_VOLTAGE) == 120
@@ -294,6 +431,17 @@ def test_servo_is_slower_at_a_low_supply_voltage() -> None:
         times.append(target.now - begin)
     # ROBOTIS: 58 and 78 rpm without load
     assert times[0] / times[1] == pytest.approx(78 / 58, rel=0.1)
+
+
+def test_jammed_gear_overloads() -> None:
+    target = servo()
+    ready(target, EZ)
+    target.drive.joint.locked = True
+    write(target, mx64.GOAL_POSITION, 1600)
+    at = read(target, mx64.PRESENT_POSITION)
+    run(target, 6.0)
+    assert read(target, mx64.PRESENT_POSITION) == at
+    assert target.hardware_error == HardwareError.OVERLOAD
 
 
 def test_two_runs_are_the_same_to_the_last_bit() -> None:

@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dexkit.emulators.mx64 import Firmware, Servo
+from dexkit.errors import UsageError
 from dexkit.wire import dynamixel as dxl
 from dexkit.wire import mx64
 from dexkit.wire.dynamixel import ErrorNumber, Instruction, Packet
-from dexkit.wire.mx64 import HardwareError, Item, OperatingMode
+from dexkit.wire.mx64 import HardwareError, Item, MovingStatus, OperatingMode
 from tests.each import each
 from tests.mx64_helpers import QUIET, error_of, read, ready, run, servo, write
 
@@ -31,6 +32,11 @@ def with_firmware(**changes: object) -> Firmware:
 
 
 # --- identity and reads
+
+
+def test_ping_is_byte_exact() -> None:
+    status = servo().handle(Packet(1, Instruction.PING))
+    assert status == bytes.fromhex("FFFFFD00010700550037012D8B40")
 
 
 def test_every_item_reads_with_its_initial_value() -> None:
@@ -54,6 +60,20 @@ def test_read_answers_data_or_access_error(address: int, length: int) -> None:
         assert (error, len(data)) == (0, length)
     else:
         assert (error, data) == (ErrorNumber.ACCESS, b"")
+
+
+def test_reading_across_a_gap_can_be_allowed() -> None:
+    # what SAKE's driver does: 70 with length 2, where 71 is nothing
+    assert servo().read_block(70, 2) == (ErrorNumber.ACCESS, b"")
+    lenient = servo(firmware=with_firmware(read_across_gaps=True))
+    assert lenient.read_block(70, 2) == (0, b"\0\0")
+
+
+def test_part_of_an_item_can_be_read_but_not_written() -> None:
+    target = servo()
+    assert target.read_block(mx64.VELOCITY_LIMIT.address, 2) == (0, (435).to_bytes(2, "little"))
+    assert target.write_block(mx64.VELOCITY_LIMIT.address, b"\0\1") == ErrorNumber.DATA_LENGTH
+    assert target.write_block(mx64.GOAL_POSITION.address + 2, b"\0\0") == ErrorNumber.DATA_LENGTH
 
 
 # --- writes
@@ -92,6 +112,14 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
         assert write(target, item, value) == ErrorNumber.ACCESS, item.name
         assert write(target, mx64.TORQUE_ENABLE, 0) == 0
         assert write(target, item, value) == 0, item.name
+
+
+def test_error_of_write_to_unused_address_is_configurable() -> None:
+    target = servo()
+    other = servo(firmware=with_firmware(undefined_address_error=ErrorNumber.DATA_RANGE))
+    for address in (14, 28, 56, 66, 71, 86, 92, 99, 147, 252, 662, 700):
+        assert target.write_block(address, b"\0") == ErrorNumber.ACCESS, address
+        assert other.write_block(address, b"\0") == ErrorNumber.DATA_RANGE, address
 
 
 @each(
@@ -144,6 +172,46 @@ def test_goal_beyond_limit_is_refused(limit: Item, at: int, goal: Item, most: in
         assert write(target, goal, -most - 1) == ErrorNumber.DATA_LIMIT
 
 
+def test_position_limits_count_in_mode_3_only() -> None:
+    target = servo()
+    assert write(target, mx64.GOAL_POSITION, -1) == ErrorNumber.DATA_LIMIT
+    assert write(target, mx64.GOAL_POSITION, 4096) == ErrorNumber.DATA_LIMIT
+    assert write(target, mx64.OPERATING_MODE, OperatingMode.CURRENT_BASED_POSITION) == 0
+    assert write(target, mx64.GOAL_POSITION, -15000) == 0
+
+
+def test_profile_velocity_above_the_limit_can_be_allowed() -> None:
+    target = servo(firmware=with_firmware(profile_velocity_limited=False))
+    assert write(target, mx64.PROFILE_VELOCITY, 500) == 0
+
+
+def test_profile_times_have_their_own_limit() -> None:
+    target = servo()
+    write(target, mx64.DRIVE_MODE, mx64.DriveMode.TIME_BASED_PROFILE)
+    for item in (mx64.PROFILE_VELOCITY, mx64.PROFILE_ACCELERATION):
+        assert write(target, item, mx64.PROFILE_TIME_MAX) == 0
+        assert write(target, item, mx64.PROFILE_TIME_MAX + 1) == ErrorNumber.DATA_LIMIT
+
+
+def test_one_write_can_span_items() -> None:
+    target = servo()
+    ready(target, OperatingMode.CURRENT_BASED_POSITION)
+    data = b"".join(
+        item.encode(value)
+        for item, value in (
+            (mx64.GOAL_CURRENT, 320),
+            (mx64.GOAL_VELOCITY, 0),
+            (mx64.PROFILE_ACCELERATION, 800),
+            (mx64.PROFILE_VELOCITY, 500),
+            (mx64.GOAL_POSITION, 3000),
+        )
+    )
+    assert target.write_block(mx64.GOAL_CURRENT.address, data) == 0
+    assert read(target, mx64.GOAL_POSITION) == 3000
+    run(target, 0.02)
+    assert target.drive.profile.running
+
+
 # --- mode changes, folding
 
 
@@ -186,6 +254,18 @@ def test_reboot_folds_the_position_into_one_turn() -> None:
     assert read(target, mx64.PRESENT_POSITION) == pytest.approx(position - 4096, abs=2)
 
 
+def test_torque_on_in_mode_3_folds_but_not_in_mode_4() -> None:
+    target = servo(closed_at=3010, start=100.0)
+    write(target, mx64.OPERATING_MODE, OperatingMode.EXTENDED_POSITION)
+    target.drive.counter -= 4096  # as after a full turn
+    before = read(target, mx64.PRESENT_POSITION)
+    write(target, mx64.TORQUE_ENABLE, 1)
+    assert read(target, mx64.PRESENT_POSITION) == before > 4095
+    write(target, mx64.TORQUE_ENABLE, 0)
+    write(target, mx64.OPERATING_MODE, OperatingMode.POSITION)
+    assert 0 <= read(target, mx64.PRESENT_POSITION) <= 4095
+
+
 def test_goal_follows_the_position_at_torque_on() -> None:
     target = servo()
     write(target, mx64.GOAL_POSITION, 100)
@@ -196,6 +276,38 @@ def test_goal_follows_the_position_at_torque_on() -> None:
     write(keeps, mx64.TORQUE_ENABLE, 1)
     run(keeps, 1.5)
     assert read(keeps, mx64.PRESENT_POSITION) == pytest.approx(2000, abs=20)
+
+
+def test_homing_offset_is_added_and_limited_in_mode_3() -> None:
+    target = servo()
+    at = read(target, mx64.PRESENT_POSITION)
+    write(target, mx64.HOMING_OFFSET, -2000)
+    assert read(target, mx64.PRESENT_POSITION) == at - 1024
+    write(target, mx64.OPERATING_MODE, OperatingMode.EXTENDED_POSITION)
+    assert read(target, mx64.PRESENT_POSITION) == at - 2000
+    ready(target, OperatingMode.EXTENDED_POSITION)
+    write(target, mx64.GOAL_POSITION, at - 2000 + 500)
+    run(target, 1.0)
+    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at - 1500, abs=10)
+
+
+def test_reverse_mode_mirrors_everything() -> None:
+    target = servo()
+    normal = read(target, mx64.PRESENT_POSITION)
+    write(target, mx64.DRIVE_MODE, mx64.DriveMode.REVERSE)
+    send(target, Instruction.REBOOT)
+    run(target, 0.5)
+    at = read(target, mx64.PRESENT_POSITION)
+    assert at == 4096 - normal
+    ready(target, OperatingMode.CURRENT_BASED_POSITION)
+    opening = target.drive.opening
+    write(target, mx64.GOAL_POSITION, at + 500)
+    run(target, 0.1)
+    assert read(target, mx64.PRESENT_VELOCITY) > 0
+    assert read(target, mx64.PRESENT_CURRENT) > 0
+    run(target, 1.0)
+    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at + 500, abs=10)
+    assert target.drive.opening == pytest.approx(opening - 20, abs=1)
 
 
 # --- status policy
@@ -217,6 +329,12 @@ def test_status_return_level(level: int, ping: bool, reads: bool, writes: bool) 
     assert read(servo(), mx64.LED) == 0
 
 
+def test_broadcast_write_acts_without_answer() -> None:
+    target = servo()
+    assert target.handle(Packet(254, Instruction.WRITE, b"\x41\0\1")) is None
+    assert read(target, mx64.LED) == 1
+
+
 def test_secondary_id_acts_without_answer_and_never_on_eeprom() -> None:
     target = servo()
     write(target, mx64.SECONDARY_ID, 9)
@@ -230,6 +348,14 @@ def test_secondary_id_acts_without_answer_and_never_on_eeprom() -> None:
     assert target.secondary_id is None
     write(target, mx64.SECONDARY_ID, 253)
     assert target.secondary_id is None
+
+
+def test_new_id_is_used_from_next_packet() -> None:
+    target = servo()
+    status = target.handle(Packet(1, Instruction.WRITE, bytes([7, 0, 5])))
+    assert status is not None
+    assert dxl.decode(status).id == 1
+    assert target.id == 5
 
 
 @each(
@@ -248,6 +374,77 @@ def test_secondary_id_acts_without_answer_and_never_on_eeprom() -> None:
 )
 def test_invalid_instructions_return_error(code: int, params: bytes, error: int) -> None:
     assert error_of(servo().handle(Packet(1, code, params))) == error
+
+
+# --- registered writes, clear, factory reset, backup
+
+
+def test_reg_write_waits_for_action() -> None:
+    target = servo()
+    assert write(target, mx64.LED, 1, Instruction.REG_WRITE) == 0
+    assert (read(target, mx64.LED), read(target, mx64.REGISTERED_INSTRUCTION)) == (0, 1)
+    assert send(target, Instruction.ACTION).error == 0
+    assert (read(target, mx64.LED), read(target, mx64.REGISTERED_INSTRUCTION)) == (1, 0)
+    assert send(target, Instruction.ACTION).error == ErrorNumber.INSTRUCTION
+
+
+def test_reg_write_is_checked_at_once() -> None:
+    target = servo()
+    assert write(target, mx64.LED, 2, Instruction.REG_WRITE) == ErrorNumber.DATA_RANGE
+    assert read(target, mx64.REGISTERED_INSTRUCTION) == 0
+
+
+def test_clear_folds_position_only_at_rest() -> None:
+    target = servo(closed_at=3010, start=90.0)
+    ready(target, OperatingMode.CURRENT_BASED_POSITION)
+    target.drive.counter -= 8192
+    target.drive.reset_control()
+    write(target, mx64.GOAL_POSITION, read(target, mx64.PRESENT_POSITION) - 1000)
+    run(target, 0.1)
+    assert send(target, Instruction.CLEAR, dxl.CLEAR_POSITION_KEY).error == ErrorNumber.RESULT_FAIL
+    run(target, 1.5)
+    assert send(target, Instruction.CLEAR, dxl.CLEAR_POSITION_KEY).error == 0
+    at = read(target, mx64.PRESENT_POSITION)
+    assert 0 <= at <= 4095
+    run(target, 0.5)  # and it stays there
+    assert read(target, mx64.PRESENT_POSITION) == pytest.approx(at, abs=3)
+
+
+@each(("option", "servo_id", "baud"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 2_000_000)])
+def test_factory_reset_keeps_what_its_option_says(option: int, servo_id: int, baud: int) -> None:
+    target = servo(7, baudrate=2_000_000)
+    write(target, mx64.CURRENT_LIMIT, 100)
+    status = send(target, Instruction.FACTORY_RESET, bytes([option]))
+    assert (status.id, status.error) == (7, 0)
+    assert target.silent
+    run(target, 0.5)
+    assert (target.id, target.baudrate) == (servo_id, baud)
+    assert read(target, mx64.CURRENT_LIMIT) == 1941
+
+
+def test_broadcast_factory_reset_of_everything_is_ignored() -> None:
+    target = servo(7)
+    assert target.handle(Packet(254, Instruction.FACTORY_RESET, b"\xff")) is None
+    assert (target.id, target.silent) == (7, False)
+    assert target.handle(Packet(254, Instruction.FACTORY_RESET, b"\x01")) is None
+    assert target.silent
+
+
+def test_backup_and_restore_when_switched_on() -> None:
+    target = servo(firmware=with_firmware(backup=True))
+    write(target, mx64.CURRENT_LIMIT, 111)
+    backup = Instruction.CONTROL_TABLE_BACKUP
+    assert send(target, backup, b"\x02CTRL").error == ErrorNumber.RESULT_FAIL
+    write(target, mx64.TORQUE_ENABLE, 1)
+    assert send(target, backup, b"\x01CTRL").error == ErrorNumber.RESULT_FAIL
+    write(target, mx64.TORQUE_ENABLE, 0)
+    assert send(target, backup, b"\x01CTRX").error == ErrorNumber.DATA_RANGE
+    assert send(target, backup, b"\x01").error == ErrorNumber.DATA_LENGTH
+    assert send(target, backup, b"\x01CTRL").error == 0
+    write(target, mx64.CURRENT_LIMIT, 222)
+    assert send(target, backup, b"\x02CTRL").error == 0
+    run(target, 0.5)
+    assert read(target, mx64.CURRENT_LIMIT) == 111
 
 
 # --- reboot
@@ -280,6 +477,14 @@ def test_reboot_keeps_eeprom_resets_ram_and_takes_time() -> None:
         assert read(target, item) == value, item
 
 
+def test_realtime_tick_counts_and_wraps() -> None:
+    target = servo()
+    run(target, 0.25)
+    assert read(target, mx64.REALTIME_TICK) == 250
+    run(target, 32.767 - 0.25 + 0.002)
+    assert read(target, mx64.REALTIME_TICK) == 1
+
+
 # --- indirect addressing
 
 
@@ -300,6 +505,39 @@ def test_indirect_data_read_and_write_their_targets(first: int) -> None:
     assert read(target, mx64.GOAL_CURRENT) == 320
     assert read(target, mx64.GOAL_POSITION) == -777
     assert target.read_block(at, 6) == (0, block)
+
+
+def test_indirect_inherits_size_range_and_access() -> None:
+    target = servo()
+    at = mx64.indirect_data(1).address
+    map_bytes(target, 1, [102, 103])
+    assert target.write_block(at, b"\0") == ErrorNumber.DATA_LENGTH
+    assert target.write_block(at, mx64.GOAL_CURRENT.encode(2000)) == ErrorNumber.DATA_RANGE
+    map_bytes(target, 1, [103, 102])
+    assert target.write_block(at, b"\0\0") == ErrorNumber.DATA_LENGTH
+    map_bytes(target, 1, [126, 127])
+    assert target.write_block(at, b"\0\0") == ErrorNumber.ACCESS
+    map_bytes(target, 1, [71, 72])
+    assert target.write_block(at, b"\0\0") == ErrorNumber.ACCESS
+    assert target.read_block(at, 2) == (ErrorNumber.ACCESS, b"")
+
+
+def test_indirect_cannot_reach_eeprom() -> None:
+    assert write(servo(), mx64.indirect_address(1), 38) == ErrorNumber.DATA_RANGE
+
+
+def test_unmapped_indirect_data_is_plain_memory() -> None:
+    target = servo()
+    at = mx64.indirect_data(1).address
+    assert target.write_block(at, b"\1\2\3") == 0
+    assert target.read_block(at, 3) == (0, b"\1\2\3")
+
+
+def test_indirect_cycle_is_harmless() -> None:
+    target = servo()
+    map_bytes(target, 1, [225, 224])
+    assert target.write_block(224, b"\x05\x06") == 0
+    assert target.read_block(224, 2) == (0, b"\x05\x06")
 
 
 # --- bus watchdog
@@ -359,6 +597,13 @@ def test_bus_watchdog_stops_every_mode(mode: OperatingMode) -> None:
     assert target.drive.velocity == pytest.approx(0.0, abs=0.02)
 
 
+def test_bus_watchdog_needs_torque() -> None:
+    target = servo()
+    write(target, mx64.BUS_WATCHDOG, 1)
+    run(target, 1.0)
+    assert read(target, mx64.BUS_WATCHDOG) == 1
+
+
 # --- errors and shutdown
 
 
@@ -382,6 +627,119 @@ def test_shutdown_drops_torque_until_reboot_and_alerts() -> None:
     assert read(target, mx64.HARDWARE_ERROR_STATUS) == 0
     assert write(target, mx64.TORQUE_ENABLE, 1) == 0
     assert read(target, mx64.TORQUE_ENABLE) == 1
+
+
+def test_an_error_outside_the_mask_only_alerts() -> None:
+    target = servo()
+    write(target, mx64.TORQUE_ENABLE, 1)
+    target.raise_error(HardwareError.INPUT_VOLTAGE)
+    assert write(target, mx64.LED, 1) == dxl.ALERT
+    assert read(target, mx64.TORQUE_ENABLE) == 1
+
+
+def test_torque_in_shutdown_can_be_an_error() -> None:
+    target = servo(firmware=with_firmware(refuse_torque_in_shutdown=ErrorNumber.RESULT_FAIL))
+    target.raise_error(HardwareError.ELECTRICAL_SHOCK)
+    assert write(target, mx64.TORQUE_ENABLE, 1) == dxl.ALERT | ErrorNumber.RESULT_FAIL
+
+
+def test_brown_out_resets_ram() -> None:
+    target = servo()
+    write(target, mx64.LED, 1)
+    target.drive.supply = 5.0
+    run(target, 0.05)
+    assert target.silent
+    target.drive.supply = 12.0
+    run(target, 0.05)
+    assert target.silent  # it boots
+    run(target, 0.5)
+    assert not target.silent
+    assert read(target, mx64.LED) == 0
+
+
+def test_voltage_error_follows_the_limits() -> None:
+    target = servo()
+    target.drive.supply = 9.0
+    run(target, 0.05)
+    assert target.hardware_error == HardwareError.INPUT_VOLTAGE
+    assert read(target, mx64.PRESENT_INPUT_VOLTAGE) == 90
+
+
+# --- persistence and set-up
+
+
+def test_eeprom_survives_into_another_run() -> None:
+    target = servo()
+    saved: list[bytes] = []
+    target.on_eeprom = lambda: saved.append(target.eeprom)
+    write(target, mx64.LED, 1)
+    assert saved == []
+    write(target, mx64.CURRENT_LIMIT, 1600)
+    write(target, mx64.CURRENT_LIMIT, 1600)
+    assert len(saved) == 1
+    again = servo(eeprom=saved[-1])
+    assert read(again, mx64.CURRENT_LIMIT) == 1600
+    assert read(again, mx64.LED) == 0
+
+
+@each("eeprom", [b"", bytes(64)])
+def test_wrong_eeprom_is_refused(eeprom: bytes) -> None:
+    with pytest.raises(UsageError):
+        servo(eeprom=eeprom)
+
+
+def test_wrong_values_in_eeprom_are_refused() -> None:
+    good = bytearray(servo().eeprom)
+    for item, value in ((mx64.BAUD_RATE, 9), (mx64.OPERATING_MODE, 2)):
+        bad = good[:]
+        bad[item.address] = value
+        with pytest.raises(UsageError):
+            servo(eeprom=bytes(bad))
+
+
+def test_invalid_servo_options_are_refused() -> None:
+    with pytest.raises(UsageError):
+        Servo(253)
+    with pytest.raises(UsageError):
+        Servo(1, baudrate=123)
+
+
+# --- moving status
+
+
+def test_moving_status_reports_profile_type() -> None:
+    target = servo(start=10.0)
+    ready(target, OperatingMode.EXTENDED_POSITION)
+    at = read(target, mx64.PRESENT_POSITION)
+    shapes = {}
+    for name, velocity, acceleration, distance in (
+        ("rectangle", 50, 0, 500),
+        ("trapezoid", 50, 50, 500),
+        ("triangle", 400, 20, 300),
+    ):
+        write(target, mx64.PROFILE_VELOCITY, velocity)
+        write(target, mx64.PROFILE_ACCELERATION, acceleration)
+        at += distance
+        write(target, mx64.GOAL_POSITION, at)
+        run(target, 0.1)
+        assert read(target, mx64.MOVING) == 1
+        status = MovingStatus(read(target, mx64.MOVING_STATUS))
+        assert status & MovingStatus.PROFILE_ONGOING
+        shapes[name] = int(status) & 0x30
+        run(target, 4.0)
+        status = MovingStatus(read(target, mx64.MOVING_STATUS))
+        assert status == MovingStatus.IN_POSITION
+        assert read(target, mx64.MOVING) == 0
+    assert shapes == {"rectangle": 0x10, "trapezoid": 0x30, "triangle": 0x20}
+
+
+def test_following_error_shows_when_blocked() -> None:
+    target = servo(object_pct=40.0)
+    ready(target, OperatingMode.CURRENT_BASED_POSITION)
+    write(target, mx64.GOAL_CURRENT, 100)
+    write(target, mx64.GOAL_POSITION, read(target, mx64.PRESENT_POSITION) - 1250)
+    run(target, 2.0)
+    assert read(target, mx64.MOVING_STATUS) & MovingStatus.FOLLOWING_ERROR
 
 
 # --- any instructions keep registers within limits

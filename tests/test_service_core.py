@@ -15,7 +15,7 @@ from dexkit.command_age import PAUSE
 from dexkit.errors import CommandRejected, HandError, HandFault, HandLost, HandTimeout
 from dexkit.hand import HandCommand, HandState, MotorError, Side
 from dexkit.models import DEX1_1, DEX3_1
-from dexkit.service.hand_core import HandCore
+from dexkit.service.hand_core import Estimation, HandCore
 from tests.each import each
 
 TIMEOUT = DEX1_1.command_timeout
@@ -79,6 +79,17 @@ def test_the_watchdog_brakes_after_a_second_and_not_before(early: float, late: f
     assert bench.exchange().q[0] == 2.5
 
 
+def test_state_continues_while_braking() -> None:
+    bench = Bench()
+    bench.command(2.0)
+    bench.clock.advance(5.0)
+    bench.q = 1.7
+    bench.exchange()
+    view = bench.core.view()
+    assert view is not None
+    assert (view.state.q[0], view.fault) == (1.7, (0,))
+
+
 @each("field", ["q", "dq", "tau", "kp", "kd"])
 @each("value", [math.nan, math.inf, -math.inf])
 def test_rejected_command_keeps_the_previous_one(field: str, value: float) -> None:
@@ -98,6 +109,13 @@ def test_rejected_commands_do_not_reset_the_watchdog() -> None:
         bench.clock.advance(TIMEOUT / 10)
         bench.command(math.nan)
     assert bench.exchange().is_brake
+
+
+def test_commands_outside_the_limits_are_clamped_and_counted() -> None:
+    bench = Bench()
+    bench.command(99.0)
+    assert bench.exchange().q[0] == pytest.approx(5.4)
+    assert bench.core.counters.clamped == 1
 
 
 class TestPauses:
@@ -208,6 +226,19 @@ class TestFailedExchanges:
         assert bench.exchange().q[0] == 3.0  # it goes on
         assert bench.core.counters.exchange_errors == 1
 
+    def test_missed_exchanges_are_counted_since_the_last_good_one(self) -> None:
+        bench = Bench()
+        for expected in (1, 2):
+            bench.core.failed(HandTimeout("no answer"))
+            view = bench.core.view()
+            assert view is not None
+            assert view.missed == expected
+        bench.exchange()
+        bench.core.failed(HandTimeout("no answer"))
+        view = bench.core.view()
+        assert view is not None
+        assert view.missed == 1
+
     def test_half_a_second_of_timeouts_closes_the_link(self) -> None:
         bench = Bench()
         for _ in range(5):
@@ -276,6 +307,13 @@ class TestFailedExchanges:
         assert view is not None
         assert view.state.q[0] == 1.0
 
+    def test_fault_bits_of_a_state_are_published(self) -> None:
+        bench = Bench()
+        bench.exchange(fault=int(MotorError.CASE_TEMPERATURE))
+        view = bench.core.view()
+        assert view is not None
+        assert view.fault == (0x80,)
+
 
 class TestPrediction:
     def test_auto_estimation_depends_on_the_rate_that_clients_need(self) -> None:
@@ -316,6 +354,10 @@ class TestPrediction:
             bench.clock.advance(1 / 300)
             bench.exchange()
         assert not bench.core.predicting
+
+    def test_off_and_predict_set_the_estimation(self) -> None:
+        assert not Bench(io_rate=5.0, estimation=Estimation.OFF).core.predicting
+        assert Bench(io_rate=900.0, estimation=Estimation.PREDICT).core.predicting
 
     def test_a_slow_link_is_predicted_from_the_command_on(self) -> None:
         bench = Bench(io_rate=5.0, speeds=[(2.0, 2.0)])

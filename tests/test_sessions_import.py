@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import sqlite3
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +17,28 @@ import pyarrow.parquet as pq
 import pytest
 import zstandard
 from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from dexkit.cli import cli
+from dexkit.conformance.kit.recording import Recording
+from dexkit.errors import SessionError
 from dexkit.hand import Side
 from dexkit.messages import message_type
 from dexkit.messages.earlier import EARLIER
 from dexkit.messages.schemas import ros2msg
-from dexkit.messages.unitree_hg import HandState_, MotorState_
+from dexkit.messages.unitree_hg import HandState_, MotorState_, PressSensorState_
 from dexkit.traces import Trace, open_trace, sample_path
-from dexkit.traces.sessions import ros_types
+from dexkit.traces.reader import Definition
+from dexkit.traces.sessions import old_layouts, ros_types
 from dexkit.traces.sessions.edit import Span, cut
 from dexkit.traces.sessions.episodes import parse_document
 from dexkit.traces.sessions.imported import RECORD
-from dexkit.traces.sessions.model import picture_topic, reference_topic
+from dexkit.traces.sessions.model import REST_TOPIC, picture_topic, reference_topic
+from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, streams_of
+from dexkit.traces.writer import RecordingWriter
 from tests.each import each
 from tests.session_helpers import dexkit, document, episode, jpeg, png, streamed, whole
 
@@ -106,6 +116,31 @@ def test_an_interrupted_file_is_read_to_its_last_whole_item(share: float) -> Non
         assert document_.info == found["info"]
 
 
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 255))
+def test_a_damaged_file_is_refused_or_read_in_part(place: int, byte: int) -> None:
+    data = bytearray(streamed(document(frames=3, cameras=0)).encode())
+    data[place % len(data)] = byte
+    try:
+        found = parse_document(data.decode("utf-8", "replace"), "damaged")
+    except SessionError:
+        return
+    assert len(found.items) <= 3
+
+
+def test_a_file_cut_in_a_character_is_read(tmp_path: Path) -> None:
+    found = document(frames=4, cameras=0)
+    for item in found["data"]:
+        item["sim_state"] = "ü"
+    data = whole(found).replace("\\u00fc", "ü").encode()
+    source = episode(tmp_path / "e", "")
+    last = data.rindex("ü".encode())
+    (source / "data.json").write_bytes(data[: last + 1])
+    code, output = dexkit("import", source, tmp_path / "e.mcap")
+    assert (code, "up to its last whole item" in output) == (1, True)
+    assert len(streams(open_trace(tmp_path / "e.mcap"))["left_arm", STATE]) == 3
+
+
 def test_faulty_items_are_reported_and_the_others_kept(tmp_path: Path) -> None:
     found = document(frames=30, cameras=0)
     data = found["data"]
@@ -130,6 +165,27 @@ def test_faulty_items_are_reported_and_the_others_kept(tmp_path: Path) -> None:
     assert t[-1] - t[0] == round(29 * 1e9 / 30)
 
 
+def test_names_and_texts_that_no_file_can_hold_are_kept_as_json(tmp_path: Path) -> None:
+    found = document(frames=3, cameras=0)
+    found["text"]["goal"] = "half \ud800"
+    for item in found["data"]:
+        item["sim_state"] = "\ud800"
+        item["colors"] = {"../a": "x.jpg", "color_0": "\ud800.jpg"}
+        item["states"]["a/b"] = {"qpos": [1.0]}
+        item["states"]["left_arm"]["qpos"][0] = 1e308
+    trace = imported(tmp_path, json.dumps(found))
+    rest = json.loads(ros_types.decode_string(next(trace.messages([REST_TOPIC])).data))
+    assert rest["states"]["a/b"] == {"qpos": [1.0]}
+    assert rest["sim_state"] == "\ud800"
+    assert rest["colors"]["../a"] == "x.jpg"
+    code, output = dexkit("export", tmp_path / "e.mcap", "--to", "lerobot", "--out", tmp_path / "d")
+    assert (code, "no float32 can hold" in output) == (2, True)
+    code, _ = dexkit("export", tmp_path / "e.mcap", "--to", "episodes", "--out", tmp_path / "t")
+    assert code == 0
+    back = json.loads((tmp_path / "t" / "episode_0000" / "data.json").read_text())
+    assert back == found
+
+
 def test_several_episodes_become_a_folder_of_recordings(tmp_path: Path) -> None:
     for task, goal in (("cup", "take the cup"), ("door", "open the door")):
         for i in range(2):
@@ -146,6 +202,15 @@ def test_several_episodes_become_a_folder_of_recordings(tmp_path: Path) -> None:
     assert tasks == {"take the cup", "open the door"}
     assert dexkit("import", tmp_path / "data", tmp_path / "out", "--episode", "x")[0] == 2
     assert dexkit("import", tmp_path / "data" / "cup", tmp_path / "out2")[0] == 0
+
+
+def test_nothing_to_import_is_an_error(tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for source in (empty, tmp_path / "missing", episode(tmp_path / "e", whole({"data": []}))):
+        code, _ = dexkit("import", source, tmp_path / "out.mcap")
+        assert code == 2
+        assert not (tmp_path / "out.mcap").exists()
 
 
 # -- sides, models, pictures ---------------------------------------------------------------------
@@ -171,6 +236,15 @@ def test_swapped_states_are_exchanged_and_reported(tmp_path: Path) -> None:
 def test_grippers_with_swapped_order_are_found_in_the_data(tmp_path: Path) -> None:
     trace = imported(tmp_path, streamed(document(200, "dex1-1", cameras=0, swapped=True)))
     assert "mixed up the order" in trace.metadata[RECORD]["correction 1"]
+
+
+def test_hands_that_stand_still_are_left_as_they_are(tmp_path: Path) -> None:
+    found = document(hand=6, frames=60, cameras=0, swapped=True)
+    for item in found["data"]:
+        for key in ("states", "actions"):
+            for side in Side:
+                item[key][f"{side}_ee"]["qpos"] = [1.0] * 6
+    assert "correction 1" not in imported(tmp_path, whole(found)).metadata[RECORD]
 
 
 def test_a_hand_of_an_unknown_model_is_a_group_of_joints(tmp_path: Path) -> None:
@@ -223,6 +297,28 @@ def test_pictures_elsewhere_are_not_read(tmp_path: Path) -> None:
     assert not [t for t in open_trace(tmp_path / "e.mcap").topics if "color" in t]
 
 
+def test_picture_formats_and_sizes_are_read() -> None:
+    for data, expected in ((jpeg(640, 480), ("jpeg", 640, 480, 3)), (png(4, 2), ("png", 4, 2, 3))):
+        found = parse_picture(data)
+        assert found is not None
+        assert (found.form, found.width, found.height, found.channels) == expected
+        for size in range(20):
+            parse_picture(data[:size])
+    assert parse_picture(b"") is None
+
+
+def test_unknown_episode_data_are_kept_as_json(tmp_path: Path) -> None:
+    found = document(frames=4, cameras=0)
+    for i, item in enumerate(found["data"]):
+        item["tactiles"] = {"left_ee": [i, 2, 3]}
+        item["states"]["torso"] = {"height": 0.5}
+    trace = imported(tmp_path, whole(found))
+    rest = [json.loads(ros_types.decode_string(m.data)) for m in trace.messages([REST_TOPIC])]
+    assert [r["tactiles"]["left_ee"][0] for r in rest] == [0, 1, 2, 3]
+    assert rest[0]["states"]["torso"] == {"height": 0.5}
+    assert "qpos" not in rest[0]["states"]["left_arm"]
+
+
 # -- JSON lines ----------------------------------------------------------------------------------
 
 
@@ -241,6 +337,26 @@ def test_session_in_json_lines_keeps_its_times(tmp_path: Path) -> None:
     assert trace.first_ns == 1_700_000_000 * 10**9
     assert float(trace.metadata[RECORD]["rate_hz"]) == pytest.approx(20, rel=1e-3)
     assert len(streams(trace)["left_hand", STATE]) == 10
+
+
+def test_times_that_no_message_can_hold_are_not_used(tmp_path: Path) -> None:
+    """A ROS stamp ends in January 2038."""
+    late = document(frames=3, cameras=0)
+    for i, item in enumerate(late["data"]):
+        item["timestamp_ns"] = 2**62 - 10 + i
+    late["info"]["date"] = "2099-01-01"
+    far = document(frames=3, cameras=0, fps=0.1)
+    for i, item in enumerate(far["data"]):
+        item["idx"] = 10**9 - 9 + i
+    for name, found, why in (
+        ("late", late, "whose time is missing or none; nominal ones are used (item 0, and 2 more)"),
+        ("far", far, "(idx) are too large"),
+    ):
+        source = episode(tmp_path / name, whole(found))
+        code, output = dexkit("import", source, tmp_path / f"{name}.mcap")
+        assert (code, why in output) == (1, True), output
+        trace = open_trace(tmp_path / f"{name}.mcap")
+        assert trace.duration == pytest.approx(2 / (30 if name == "late" else 0.1))
 
 
 # -- LeRobot -------------------------------------------------------------------------------------
@@ -371,6 +487,70 @@ def test_names_of_lerobots_robots_are_read(tmp_path: Path, end: str) -> None:
     assert {s.model for s in streams_of(open_trace(tmp_path / "a.mcap"))} == {"dex3-1"}
 
 
+def test_lerobot_columns_of_other_kinds_are_reported(tmp_path: Path) -> None:
+    matrix = np.full((5, len(NAMES)), 0.1)
+    cases: dict[str, dict[str, Any]] = {
+        "strings": {"action": ["a"] * 5},
+        "digits": {"action": [["0.1"] * 28] * 5},
+        "mixed": {"action": [[0.1] * 28, [0.1] * 27, *[[0.1] * 28] * 3]},
+        "doubles": {"action": pa.array(matrix.tolist(), pa.list_(pa.float64()))},
+        "nulls": {"action": [[None] * 28] * 5},
+    }
+    for name, columns in cases.items():
+        source = dataset(tmp_path / name, "v2.1", NAMES, matrix, **columns)
+        code, output = dexkit("import", source, tmp_path / f"{name}.mcap")
+        assert code == (0 if name == "doubles" else 1), output
+        got = streams(open_trace(tmp_path / f"{name}.mcap"))
+        assert ("left_hand", STATE) in got
+        assert (("left_hand", COMMAND) in got) == (name == "doubles")
+
+
+@each(
+    "file,content,why",
+    [
+        ("meta/info.json", b"{", "not valid JSON"),
+        ("meta/info.json", b'{"codebase_version": "v1.6", "fps": 30}', "version v1.6"),
+        ("meta/info.json", b'{"codebase_version": "v2.1", "fps": "30", "features": {}}', "no rate"),
+        ("meta/episodes.jsonl", b"", "no list of its episodes"),
+        ("data/chunk-000/episode_000000.parquet", b"PAR1", "cannot be read as Parquet"),
+    ],
+    ids=str,
+)
+def test_datasets_that_cannot_be_read_are_refused(
+    tmp_path: Path, file: str, content: bytes, why: str
+) -> None:
+    source = dataset(tmp_path / "d", "v2.1", NAMES, np.zeros((3, 28)))
+    (source / file).write_bytes(content)
+    code, output = dexkit("import", source, tmp_path / "out.mcap")
+    assert code == 2
+    assert why in output
+
+
+@each("pattern", ["data/{episode_index:9999999999d}", "data/{episode_index:{episode_index}}"])
+def test_no_path_of_a_dataset_fills_the_memory(tmp_path: Path, pattern: str) -> None:
+    source = dataset(tmp_path / "d", "v2.1", NAMES, np.zeros((3, 28)))
+    info = json.loads((source / "meta" / "info.json").read_text())
+    (source / "meta" / "info.json").write_text(json.dumps({**info, "data_path": pattern}))
+    code, output = dexkit("import", source, tmp_path / "out.mcap")
+    assert (code, "no path that can be used" in output) == (2, True), output
+
+
+def test_frame_numbers_beyond_all_times_are_counted(tmp_path: Path) -> None:
+    numbers = [1e300, 2e300, 3e300]
+    source = dataset(tmp_path / "d", "v2.1", NAMES, np.full((3, 28), 0.1), frame_index=numbers)
+    code, output = dexkit("import", source, tmp_path / "out.mcap")
+    assert (code, "frames are counted instead" in output) == (1, True), output
+
+
+def test_a_dataset_does_not_lead_elsewhere(tmp_path: Path) -> None:
+    source = dataset(tmp_path / "d", "v2.1", NAMES, np.zeros((3, 28)))
+    info = json.loads((source / "meta" / "info.json").read_text())
+    info["data_path"] = "../../{episode_index}.parquet"
+    (source / "meta" / "info.json").write_text(json.dumps(info))
+    code, output = dexkit("import", source, tmp_path / "out.mcap")
+    assert (code, "leads out of it" in output) == (2, True)
+
+
 # -- ROS 2 bags ----------------------------------------------------------------------------------
 
 
@@ -432,6 +612,16 @@ def test_bags_of_earlier_layouts_are_read(
     assert trace.samples("rt/chatter").type_name == "std_msgs::msg::dds_::String_"
 
 
+@each("when", ["2024-08", "2024-12", "present"])
+def test_a_bag_without_schemas_is_read_by_the_layout_that_fits(when: str) -> None:
+    state = HandState_([MotorState_(q=0.25)], [PressSensorState_()])
+    payload = message_type(HG).encode(state) if when == "present" else old_state(when, 0.25)
+    found = old_layouts.matching_layout(HG, [payload])
+    assert found is not None
+    assert when in found[0]
+    assert old_layouts.matching_layout(HG, [payload + bytes(12)]) is None
+
+
 def test_a_bag_without_schemas_is_imported(tmp_path: Path) -> None:
     """A .db3 as ROS 2 before Iron writes it: no table of message definitions."""
     path = tmp_path / "old.db3"
@@ -458,6 +648,15 @@ def test_a_bag_without_schemas_is_imported(tmp_path: Path) -> None:
     assert "fit the layout of 2024-08" in output
     got = streams(open_trace(tmp_path / "out.mcap"))
     assert np.allclose(got["left_hand", STATE].q[:, 0], 0.5)
+
+
+def test_a_damaged_bag_is_refused(tmp_path: Path) -> None:
+    for name, content in (("a.db3", b"SQLite format 3\x00" + bytes(50)), ("b.mcap", b"\x89MCAP")):
+        path = tmp_path / name
+        path.write_bytes(content)
+        code, _ = dexkit("import", path, tmp_path / "out.mcap")
+        assert code == 2
+        assert not (tmp_path / "out.mcap").exists()
 
 
 def of_states(path: Path, payload: bytes = b"") -> Path:
@@ -489,6 +688,54 @@ def test_invalid_row_of_a_bag_is_left_out(tmp_path: Path, change: str, why: str)
 # -- the rest ------------------------------------------------------------------------------------
 
 
+def piped(path: Path) -> None:
+    """Put a pipe that nobody writes in a file's place."""
+    path.unlink(missing_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    os.mkfifo(path)
+
+
+def test_no_source_waits_for_a_pipe(tmp_path: Path) -> None:
+    matrix = np.full((3, 28), 0.1)
+
+    def of(version: str, file: str) -> Callable[[Path], None]:
+        return lambda root: piped(dataset(root, version, NAMES, matrix) / file)
+
+    def of_bag(root: Path) -> None:
+        piped(of_states(root))
+
+    def of_tables(file: str) -> Callable[[Path], None]:
+        def make(root: Path) -> None:
+            recording = imported(root.parent / f"{root.name}_of", whole(document(frames=3))).path
+            assert dexkit("export", recording, "--to", "csv", "--out", root)[0] == 0
+            for path in [root / file] if file else root.glob("*.csv"):
+                piped(path)
+
+        return make
+
+    sources: dict[str, tuple[str, Callable[[Path], None]]] = {
+        "lines.jsonl": ("jsonl", piped),
+        "episode": ("episodes", lambda root: piped(root / "data.json")),
+        "info": ("lerobot", of("v2.1", "meta/info.json")),
+        "rows": ("lerobot", of("v2.1", "meta/episodes.jsonl")),
+        "frames": ("lerobot", of("v2.1", "data/chunk-000/episode_000000.parquet")),
+        "bag": ("rosbag2", of_bag),
+        "about": ("tables", of_tables("session.json")),
+        "csv": ("tables", of_tables("")),
+    }
+    for name, (form, make) in sources.items():
+        make(tmp_path / name)
+        code, output = dexkit("import", tmp_path / name, tmp_path / "out.mcap", "--from", form)
+        assert (code, "ordinary file" in output or "no list" in output) == (2, True), output
+
+
+def test_another_format_than_the_sources_is_refused(tmp_path: Path) -> None:
+    source = episode(tmp_path / "e", whole(document(frames=3)))
+    for form in ("jsonl", "lerobot", "rosbag2", "tables"):
+        code, output = dexkit("import", source, tmp_path / "out.mcap", "--from", form)
+        assert (code, str(source) in output) == (2, True), output
+
+
 def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
@@ -502,6 +749,23 @@ def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "a.db3").write_bytes(b"SQLite")
     code, output = dexkit("import", tmp_path / "a.db3", tmp_path / "out.mcap")
     assert (code, "dexkit[rosbag]" in output) == (2, True)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.integers(0, 2**31 * 10**9 - 1),
+    st.lists(st.text(st.characters(blacklist_categories=("Cs",), blacklist_characters="\0"))),
+    st.lists(st.floats(allow_nan=False)),
+    st.binary(),
+)
+def test_the_standard_types_are_coded_both_ways(
+    stamp: int, names: list[str], values: list[float], data: bytes
+) -> None:
+    state = ros_types.JointState(stamp, tuple(names), tuple(values), (), tuple(values))
+    assert ros_types.decode_joint_state(ros_types.encode_joint_state(state)) == state
+    image = ros_types.CompressedImage(stamp, "".join(names), "jpeg", data)
+    assert ros_types.decode_compressed_image(ros_types.encode_compressed_image(image)) == image
+    assert ros_types.decode_string(ros_types.encode_string("".join(names))) == "".join(names)
 
 
 def test_the_standard_types_are_those_of_ros() -> None:
@@ -522,6 +786,13 @@ def test_the_standard_types_are_those_of_ros() -> None:
     )
     data = ros_types.encode_string("text")
     assert store.deserialize_cdr(data, "std_msgs/msg/String").data == "text"
+
+
+def test_check_says_that_a_session_was_imported(tmp_path: Path) -> None:
+    source = episode(tmp_path / "e", streamed(document(frames=90, cameras=0)))
+    assert dexkit("import", source, tmp_path / "e.mcap")[0] == 0
+    notes = Recording.decode(open_trace(tmp_path / "e.mcap")).notes
+    assert any("an imported session" in note for note in notes)
 
 
 @each("hand", ["", "dex3-1"])
@@ -564,6 +835,51 @@ def test_a_bag_whose_metadata_write_the_qos_differently_is_read(
     assert (code, open_trace(tmp_path / "a.mcap").message_count) == (0, len(STATES)), output
 
 
+@pytest.mark.parametrize("storage", StoragePlugin)
+@each("as_file", [True, False])
+def test_messages_that_are_packed_one_by_one_are_unpacked(
+    tmp_path: Path, storage: StoragePlugin, as_file: bool
+) -> None:
+    """Also where a file of the bag is given by itself, whose metadata are elsewhere."""
+    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
+    packed = [zstandard.ZstdCompressor().compress(data) for data in STATES]
+    source = bag(tmp_path / "bag", storage, {t: (n, d, packed) for t, (n, d, _) in topics.items()})
+    path = source / "metadata.yaml"
+    text = path.read_text().replace("compression_mode: ''", "compression_mode: message")
+    path.write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+    if as_file:
+        (source,) = (p for p in source.iterdir() if p != path)
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert code == 0, output
+    assert [m.data for m in open_trace(tmp_path / "a.mcap").messages()] == STATES
+
+
+def test_a_recording_of_the_low_rate_topic_has_observations(tmp_path: Path) -> None:
+    trace = open_trace(sample_path("dex3_pinch"))
+    topics = ["rt/dex3/left/state", "rt/dex3/left/cmd"]
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        numbers = {
+            t: writer.add_channel(
+                replace(d, topic=t.replace("/dex3/left/state", "/lf/dex3/left/state"))
+            )
+            for (t, _), d in trace.definitions.items()
+            if t in topics
+        }
+        for m in trace.messages(topics):
+            writer.put(numbers[m.topic], m.data, m.log_time_ns)
+    found = streams_of(open_trace(tmp_path / "a.mcap"))
+    assert {(s.part, s.kind) for s in found} == {("left_hand", STATE), ("left_hand", "command")}
+
+
+def test_a_bag_that_can_hold_nothing_is_not_written(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        number = writer.add_channel(Definition("rt/a", "cdr", {}, None))
+        writer.put(number, bytes(8), 10**18)
+    code, output = dexkit("export", tmp_path / "a.mcap", "--to", "rosbag2", "--out", tmp_path / "b")
+    assert (code, "no message that a bag can hold" in output) == (2, True)
+    assert not (tmp_path / "b").exists()
+
+
 @each("kind", ["split mcap", "sqlite3", "packed"])
 def test_check_reads_bags_of_every_kind(tmp_path: Path, kind: str) -> None:
     source = tmp_path / "bag"
@@ -600,3 +916,33 @@ def test_check_reads_bags_of_every_kind(tmp_path: Path, kind: str) -> None:
     assert result.exit_code == 0, result.output
     seconds = json.loads((tmp_path / "r.json").read_text())["duration_s"]
     assert seconds > 1.5  # of both halves
+
+
+def test_a_dataset_with_other_columns_is_told_which_it_has(tmp_path: Path) -> None:
+    matrix = np.full((5, 2), 0.1)
+    source = dataset(tmp_path / "d", "v2.1", ["a", "b"], matrix)
+    path = source / "data" / "chunk-000" / "episode_000000.parquet"
+    names = {"observation.state": "state", "action": "actions"}
+    table = pq.read_table(path)
+    pq.write_table(table.rename_columns([names.get(n, n) for n in table.column_names]), path)
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert (code, "it has: state, actions, timestamp" in output) == (2, True), output
+
+
+def test_a_database_whose_clock_steps_back_is_refused(tmp_path: Path) -> None:
+    """The library gives its rows in order of time."""
+    topics = {"/dex3/left/state": ("unitree_hg/msg/HandState", message_type(HG).ros2msg, STATES)}
+    source = bag(tmp_path / "bag", StoragePlugin.SQLITE3, topics)
+    (path,) = source.glob("*.db3")
+    with sqlite3.connect(path) as db:
+        db.execute("UPDATE messages SET timestamp = timestamp - 1000000000 WHERE id > 2")
+    code, output = dexkit("import", source, tmp_path / "a.mcap")
+    assert (code, "its clock steps back by 0.990 s" in output) == (2, True), output
+
+
+def test_a_table_of_plotjuggler_is_named(tmp_path: Path) -> None:
+    (tmp_path / "curves.csv").write_text("__time,/rt/dex1/left/state/states[0]/q\n1.0,0.5\n")
+    code, output = dexkit("import", tmp_path / "curves.csv", tmp_path / "out.mcap")
+    assert code == 2
+    assert "as PlotJuggler writes it" in output
+    assert not (tmp_path / "out.mcap").exists()

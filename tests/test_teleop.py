@@ -31,7 +31,7 @@ from dexkit.teleop import (
     recorded,
     tracking_figures,
 )
-from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN
+from dexkit.teleop.client import LEAD, PINCH_MAX, PINCH_MIN, POLL_PAUSE
 from dexkit.teleop.client_codec import ClientCodec
 from dexkit.traces import open_trace, sample_path
 from tests.each import each
@@ -55,6 +55,48 @@ def q_of(commands: Mapping[Side, tuple[JointCommand, ...]], side: Side) -> float
 # ------------------------------------------------------------------------ the receiving thread
 
 
+def test_states_are_read_left_then_right_and_kept_until_both_are_there() -> None:
+    receiver = StateReceiver([(LEFT,), (RIGHT,)])
+    receiver.receive(0.0, {RIGHT: (1.0,)})
+    assert receiver.latest == {}
+    receiver.receive(0.5, {LEFT: (2.0,)})
+    assert receiver.latest == {LEFT: (2.0,), RIGHT: (1.0,)}
+    assert receiver.wakes_at == 0.5 + POLL_PAUSE
+
+
+def test_receiver_pauses_after_both_sides_and_takes_the_newest() -> None:
+    receiver = StateReceiver([(LEFT,), (RIGHT,)])
+    receiver.receive(0.0, {LEFT: (0.0,)})
+    receiver.receive(0.0, {RIGHT: (0.0,)})
+    for i in (1, 2, 3):  # within the pause; of these the last one is kept
+        receiver.receive(0.0005 * i, {LEFT: (float(i),)})
+        receiver.receive(0.0005 * i, {RIGHT: (10.0 * i,)})
+    assert receiver.latest[LEFT] == (0.0,)
+    receiver.advance(POLL_PAUSE)
+    assert receiver.latest == {LEFT: (3.0,), RIGHT: (30.0,)}
+
+
+def test_silent_side_freezes_the_other_side() -> None:
+    receiver = StateReceiver([(LEFT,), (RIGHT,)])
+    receiver.receive(0.0, {LEFT: (1.0,)})
+    receiver.receive(0.0, {RIGHT: (1.0,)})
+    for i in range(1, 100):
+        receiver.receive(i * 0.01, {RIGHT: (1.0 + i,)})
+    assert receiver.latest == {LEFT: (1.0,), RIGHT: (1.0,)}
+    receiver.receive(1.0, {LEFT: (2.0,)})
+    assert receiver.latest == {LEFT: (2.0,), RIGHT: (100.0,)}
+
+
+def test_left_state_is_old_after_silence_of_the_right_side() -> None:
+    receiver = StateReceiver([(LEFT,), (RIGHT,)])
+    receiver.receive(0.0, {LEFT: (1.0,)})
+    receiver.receive(0.0, {RIGHT: (1.0,)})
+    for i in range(1, 100):
+        receiver.receive(i * 0.01, {LEFT: (1.0 + i,)})
+    receiver.receive(1.0, {RIGHT: (5.0,)})
+    assert receiver.latest == {LEFT: (2.0,), RIGHT: (5.0,)}
+
+
 @given(
     st.lists(st.tuples(st.floats(0.0, 0.004), st.sampled_from([LEFT, RIGHT]), angles), max_size=60)
 )
@@ -74,6 +116,43 @@ def test_states_read_were_published_and_are_in_order(
         assert bool(receiver.latest) <= (count[LEFT] > 0 and count[RIGHT] > 0)
 
 
+# ----------------------------------------------------------------------------------- the filter
+
+
+def test_filter_weights_the_newest_value_most() -> None:
+    smooth = StickyFilter()
+    assert smooth((1.0,)) == (1.0,)
+    assert smooth((2.0,)) == (2.0,)
+    assert smooth((3.0,)) == pytest.approx((0.5 * 3 + 0.3 * 2 + 0.2 * 1,))
+
+
+def test_filter_ignores_repeated_values() -> None:
+    smooth = StickyFilter()
+    values = [smooth((x,)) for x in (2.4, 2.6, 2.7, 2.7, 2.7, 2.7)]
+    assert values[-1] == values[2] != (2.7,)
+
+
+def test_filter_is_updated_for_both_hands_when_one_moves() -> None:
+    smooth = StickyFilter()
+    for x in (0.0, 1.0, 2.0, 3.0, 4.0):
+        out = smooth((min(x, 2.0), x))
+    assert out[0] == pytest.approx(2.0)
+
+
+@given(st.lists(st.tuples(angles, angles), min_size=1, max_size=40))
+def test_the_filter_stays_between_the_last_three_different_values(
+    values: list[tuple[float, float]],
+) -> None:
+    smooth = StickyFilter()
+    distinct: list[tuple[float, float]] = []
+    for value in values:
+        out = smooth(value)
+        if not distinct or value != distinct[-1]:
+            distinct.append(value)
+        for column, y in zip(zip(*distinct[-3:], strict=True), out, strict=True):
+            assert min(column) - 1e-9 <= y <= max(column) + 1e-9
+
+
 # ----------------------------------------------------------------------------- the Dex1 client
 
 
@@ -90,6 +169,14 @@ def test_no_command_before_both_states_arrived() -> None:
     assert not client.ready
     assert set(client.step(0.01, {RIGHT: (0.0,)}, {})) == {LEFT, RIGHT}  # 0 is good enough
     assert client.missing == {}
+
+
+def test_target_is_mid_stroke_before_any_input() -> None:
+    client = Dex1Client()
+    ready(client, 2.6, 0.0)
+    commands = client.step(0.01, {}, {})
+    assert q_of(commands, LEFT) == 2.7  # within the lead
+    assert q_of(commands, RIGHT) == LEAD
 
 
 def test_client_leaves_an_end_stop_although_targets_near_it_mean_the_end() -> None:
@@ -111,6 +198,14 @@ def test_client_leaves_an_end_stop_although_targets_near_it_mean_the_end() -> No
             if step >= 100:
                 here += min(max(obeyed - here, -0.05), 0.05)
         assert here == pytest.approx(goal, abs=1e-9)
+
+
+def test_only_q_and_the_gains_are_set() -> None:
+    client = Dex1Client()
+    ready(client)
+    (command,) = client.step(0.01, {}, {})[LEFT]
+    assert (command.mode, command.dq, command.tau) == (0, 0.0, 0.0)
+    assert (command.kp, command.kd) == (5.0, 0.05)
 
 
 def test_input_of_one_hand_closes_the_other() -> None:
@@ -293,6 +388,20 @@ def test_a_dex3_client_waits_for_a_position_that_is_not_zero_on_both_sides() -> 
     assert client.ready
 
 
+def test_dex3_commands_are_the_targets_independent_of_the_state() -> None:
+    client = client_for("dex3")
+    client.receive(0.0, {LEFT: pose(0.1)})
+    client.receive(0.0, {RIGHT: pose(0.1)})
+    first = client.step(0.01, {}, {LEFT: pose(9.0)})  # one hand alone is no input
+    assert [m.q for m in first[LEFT]] == [0.0] * 7
+    targets = {s: tuple(0.1 * i for i in range(7)) for s in Side}
+    commands = client.step(0.02, {}, targets)
+    assert [m.mode for m in commands[RIGHT]] == list(range(0x10, 0x17))
+    assert tuple(m.q for m in commands[RIGHT]) == targets[RIGHT]
+    assert {(m.dq, m.tau, m.kp, m.kd) for m in commands[LEFT]} == {(0.0, 0.0, 1.5, 0.2)}
+    assert client.step(0.03, {}, {}) == commands
+
+
 def test_the_recorded_dex3_commands_are_those_of_the_model() -> None:
     rec = recording("dex3_pinch")
     wire = ClientCodec(DIALECTS["dex3"])
@@ -443,6 +552,15 @@ def test_delay_is_measured_as_lag_and_reaction() -> None:
     assert found.reaction_s == pytest.approx(0.12, abs=0.01)
 
 
+def test_reaction_of_a_joint_that_is_still_on_its_way_is_when_it_has_turned() -> None:
+    """A tenth of the range after the operator: it goes on for 0.06 s, and brakes for 0.02 s."""
+    t: Floats = np.asarray(np.arange(0.0, 2.0, 0.002))
+    q = np.interp(t, [0.0, 0.9, 1.06, 1.08, 2.0], [2.0, 2.0, 3.6, 3.6, 2.0])
+    found = tracking_figures(t, q, lambda x: 2.0 if x >= 1.0 else 4.0, 5.4)
+    turned = 1.08 - 1.0 + 0.02 * 5.4 / (1.6 / 0.92)
+    assert found.steps[-1].reaction_s == pytest.approx(turned, abs=0.004)
+
+
 def test_hand_at_rest_has_infinite_stroke_time_and_lag() -> None:
     t: Floats = np.asarray(np.arange(0.0, 4.0, 0.002))
     still = tracking_figures(t, np.zeros_like(t), lambda x: 5.4 if x > 1 else 0.0, 5.4)
@@ -452,6 +570,13 @@ def test_hand_at_rest_has_infinite_stroke_time_and_lag() -> None:
     moving = tracking_figures(t, np.zeros_like(t), lambda x: 2.7 + math.sin(3 * x), 5.4)
     assert math.isinf(moving.lag_s)
     assert math.isnan(moving.lag_rms)
+
+
+@given(st.lists(st.floats(-10, 10), min_size=0, max_size=50), st.floats(0.1, 6.0))
+def test_figures_are_never_negative(values: list[float], goal: float) -> None:
+    t: Floats = np.asarray(np.arange(len(values)) * 0.05)
+    found = tracking_figures(t, np.array(values), lambda x: goal if x > 0.5 else None, 5.4)
+    assert all(x >= 0.0 for x in found.figures().values())
 
 
 # --------------------------------------------------------------- what the rate of states does

@@ -6,17 +6,27 @@ from __future__ import annotations
 import json
 import os
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
+from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
+from mcap.writer import CompressionType
 
 from dexkit.cli import main
+from dexkit.cli.info import _print as print_info
+from dexkit.cli.info import summary
+from dexkit.conformance.kit.judge import judge
+from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.stimuli.recorded_session import CommandSession
 from dexkit.errors import DexkitError, TraceError, TraceUnreadable, TraceUnsupported
 from dexkit.messages import message_type
+from dexkit.messages.columns import Columns
+from dexkit.messages.layout import STRUCTS
+from dexkit.messages.unitree_go import MotorState_, MotorStates_
 from dexkit.traces import Recorder, open_trace, sample_path, schemas
 from dexkit.traces.container import MAX_RATIO, SPARE
 from tests.dds_helpers import free_domain
@@ -120,6 +130,41 @@ def test_each_flipped_byte_is_reported(tmp_path: Path) -> None:
     assert flips(tmp_path, sample_path("dex1_legacy_v1_1").read_bytes(), 997) == []
 
 
+def test_every_byte_of_a_finished_recording_is_under_a_checksum(tmp_path: Path) -> None:
+    for path in (recorded(tmp_path / "a.mcap"), sample_path("dex1_pick_place")):
+        trace = open_trace(path)
+        assert (trace.damage, trace.notes) == ([], [])
+        data = path.read_bytes()
+        (at,) = places(data, 15)
+        assert struct.unpack_from("<I", data, at + 9)[0] == zlib.crc32(data[:at])
+
+
+def test_a_chunk_whose_opcode_is_flipped_is_named(tmp_path: Path) -> None:
+    for data_crc in (True, False):
+        data = bytearray(mcap_bytes(rows(), Shape(chunk_size=700), data_crc=data_crc))
+        at = places(data, 6)[3]
+        data[at] ^= 0x80
+        trace = open_trace(write(tmp_path / "a.mcap", bytes(data)))
+        assert any(f"lists a chunk at byte {at}, which is not there" in d for d in trace.damage)
+        assert 0 < len(list(trace.messages())) < len(rows())
+
+
+def test_the_summary_cannot_rename_a_topic(tmp_path: Path) -> None:
+    data = bytearray(mcap_bytes(rows(), Shape(chunk_size=700)))
+    data[data.rindex(CMD.encode()) + 4] ^= 0x01
+    trace = open_trace(write(tmp_path / "a.mcap", bytes(data)))
+    assert trace.topics == [CMD, STATE]
+    assert any("the summary" in d and "checksum" in d for d in trace.damage)
+    assert any("channel" in d and "defined twice" in d for d in trace.damage)
+    # with a checksum that was made right, too
+    begin, offsets, _ = struct.unpack_from("<QQI", data, len(data) - 28)
+    crc = zlib.crc32(data[begin : len(data) - 12])
+    struct.pack_into("<QQI", data, len(data) - 28, begin, offsets, crc)
+    trace = open_trace(write(tmp_path / "a.mcap", bytes(data)))
+    trace.load()
+    assert any("channel" in d and "defined twice" in d for d in trace.damage)
+
+
 def test_records_after_garbage_are_read(tmp_path: Path) -> None:
     for shape in (Shape(chunk_size=700), Shape(chunked=False)):
         whole = mcap_bytes(rows(), shape, data_crc=True)
@@ -137,6 +182,30 @@ def test_records_after_garbage_are_read(tmp_path: Path) -> None:
                     # a message outside of a chunk may itself be the one that is report_damage
                     wrong = {(g[0], g[2], g[3], g[4]) for g in got} - wanted
                     assert len(wrong) <= (not shape.chunked)
+
+
+def test_rest_is_read_after_a_damaged_beginning(tmp_path: Path) -> None:
+    whole = mcap_bytes(rows(), Shape(CompressionType.ZSTD, chunk_size=700), data_crc=True)
+    for at in (0, 7, 8, 9, 16, 18):
+        data = bytearray(whole)
+        data[at] ^= 0xFF
+        trace = open_trace(write(tmp_path / "a.mcap", bytes(data)))
+        assert len(list(trace.messages())) == len(rows()), at
+        assert trace.damage
+
+
+def test_an_attachment_is_checked(tmp_path: Path) -> None:
+    body = struct.pack("<QQ", 1, 1) + text("notes") + text("text/plain")
+    body += struct.pack("<Q", 4) + b"abcd"
+    for crc, report_damage in ((zlib.crc32(body), False), (0, False), (1, True)):
+        data = HEADER + record(9, body + struct.pack("<I", crc)) + END
+        assert bool(open_trace(write(tmp_path / "a.mcap", data)).damage) is report_damage
+
+
+def test_a_foreign_recording_without_checksums_is_read(tmp_path: Path) -> None:
+    trace = open_trace(write(tmp_path / "a.mcap", mcap_bytes(rows())))
+    assert (trace.damage, trace.warnings) == ([], [])
+    assert trace.notes == ["no checksum over the data section: damage there may not be noticed"]
 
 
 def test_invalid_records_in_a_chunk_are_reported(tmp_path: Path) -> None:
@@ -234,6 +303,14 @@ def test_a_schema_text_is_read_once(tmp_path: Path) -> None:
         assert len(trace.channels[0].problem) < 1000
 
 
+def test_a_comment_sign_in_a_text_is_no_comment() -> None:
+    body = '@verbatim (language="c", text="see http://a.b /* # ") octet a;'
+    parsed = schemas.parse(
+        "omgidl", "pkg/msg/T", f"module pkg {{ module msg {{ struct T {{ {body} }}; }}; }};"
+    )
+    assert [f.name for f in parsed.fields] == ["a"]
+
+
 def test_what_chunks_unpack_to_is_bounded_by_the_file(tmp_path: Path) -> None:
     good = chunk(definition() + message(1, 1, bytes(8)), b"zstd")
     for name in (b"zstd", b"lz4"):
@@ -245,6 +322,39 @@ def test_what_chunks_unpack_to_is_bounded_by_the_file(tmp_path: Path) -> None:
         assert trace.message_count >= 1
         if name == b"zstd":
             assert any(f"more than {MAX_RATIO} times" in d for d in trace.damage)
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_left_out(tmp_path: Path) -> None:
+    inner = definition() + message(1, 1)
+    for name in (b"zstd", b"lz4"):
+        data = HEADER + chunk(inner + message(1, 2) * 9, name, len(inner)) + END
+        trace = open_trace(write(tmp_path / "a.mcap", data))
+        assert not trace.message_count
+        assert any("damaged" in d for d in trace.damage)
+
+
+def peak(function: Any) -> int:
+    tracemalloc.start()
+    try:
+        function()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_columns_take_memory_for_the_samples_that_there_are(tmp_path: Path) -> None:
+    encode = message_type(STATE_TYPE).encode
+    samples = [
+        encode(MotorStates_([MotorState_(q=i + j, dq=j, lost=i * j) for j in range(1024 - i)]))
+        for i in range(3)
+    ]
+    size = sum(map(len, samples))
+    assert peak(lambda: Columns(STRUCTS[STATE_TYPE], samples)) < 40 * size
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for i, data in enumerate(samples):
+            recorder.put(STATE, STATE_TYPE, data, T0 + i)
+    trace = open_trace(tmp_path / "a.mcap")
+    assert peak(lambda: judge(Recording.decode(trace))) < 60 * size + 20 * 2**20
 
 
 def work(path: Path, data: bytes) -> int:
@@ -260,6 +370,17 @@ def many_channels(n: int) -> bytes:
     ]
     spread = b"".join(chunk(message(i, i)) for i in range(1, n))
     return HEADER + b"".join(found) + spread + END
+
+
+def test_what_info_shows_takes_as_long_as_there_are_channels(tmp_path: Path) -> None:
+    def printed(n: int) -> int:
+        path = tmp_path / f"{n}.mcap"
+        write(path, many_channels(n))
+        trace = open_trace(path)
+        return count_calls(lambda: print_info(summary(trace)))[1]
+
+    printed(10)  # imports
+    assert printed(400) < 5 * printed(100)
 
 
 def overlapping(n: int) -> bytes:
@@ -284,3 +405,52 @@ def test_pipe_is_refused(tmp_path: Path) -> None:
     for path in (pipe, tmp_path, Path("/dev/zero")):
         with pytest.raises(TraceUnreadable, match="not an ordinary file"):
             open_trace(path)
+
+
+def test_a_recording_that_grows_while_it_is_opened_is_read_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reader may look at any moment of a recorder's writing."""
+    path = recorded(tmp_path / "grows.mcap")
+    whole, cut = path.read_bytes(), tmp_path / "cut.mcap"
+    genuine, shown = os.fstat, len(whole)
+
+    def smaller(descriptor: int) -> os.stat_result:
+        found = genuine(descriptor)
+        if not os.path.samestat(found, path.stat()):
+            return found
+        return os.stat_result((*found[:6], shown, *found[7:10]))
+
+    def read(file: Path) -> object:
+        try:
+            return content(file)
+        except TraceUnreadable as error:
+            return str(error).replace(str(file), "")
+
+    monkeypatch.setattr("dexkit.traces.container.os.fstat", smaller)
+    for size in range(0, len(whole), 19):
+        shown = size
+        cut.write_bytes(whole[:size])
+        assert read(path) == read(cut), size
+
+
+@pytest.mark.parametrize("left_out", [0, 1, -1])
+def test_a_message_that_the_index_leaves_out_is_read_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_out: int
+) -> None:
+    from mcap._chunk_builder import ChunkBuilder
+
+    genuine = ChunkBuilder.end
+
+    def end(self: ChunkBuilder) -> bytes:
+        for index in self.message_indices.values():
+            del index.records[left_out]
+        return genuine(self)
+
+    monkeypatch.setattr(ChunkBuilder, "end", end)
+    path = tmp_path / "index.mcap"
+    every = [row for row in rows(8) if row[0] == STATE]
+    path.write_bytes(mcap_bytes(every, Shape(chunk_size=1 << 20)))
+    trace = open_trace(path)
+    assert sum(len(s) for s in trace.load().values()) == len(every)
+    assert any("the message index of the chunk" in text for text in trace.damage)
