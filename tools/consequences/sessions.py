@@ -37,7 +37,7 @@ _PATIENCE = 5.0
 _NO_GRIP = 0.01
 """N m: a joint that presses with less does not."""
 _SHARE = {Side.LEFT: 1.0, Side.RIGHT: 0.8}
-_TOUCH_UNITS = {"dex3-1": 5e4, "inspire-ftp": 400.0}
+_TOUCH_UNITS = {"dex3-1": 2e4, "inspire-ftp": 400.0}
 """About what a grip adds to an element of touch."""
 
 

@@ -24,6 +24,8 @@ __all__ = ["Client", "Figure", "Stage"]
 
 _STEP = 0.01
 """Seconds from one note of what is true to the next."""
+_FRESH_S = 0.1
+"""Seconds after a client starts, or a pause of the network, for which its state may be old."""
 _RESTART_S = 2.0
 """Seconds that the hand's service takes to start."""
 _LONGEST_END = 30.0
@@ -102,6 +104,7 @@ class Stage:
         self.connected = True
         self.times: list[float] = []
         self._driven: list[bool] = []
+        self._away = -math.inf
         self._contacts: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
         self._q_true: dict[Side, list[Sequence[float]]] = {s: [] for s in self.sides}
         self._shown: dict[Side, list[tuple[float, Sequence[float]]]] = {s: [] for s in self.sides}
@@ -264,8 +267,11 @@ class Stage:
     def _note(self) -> None:
         self._noted = self.now
         self.times.append(self.now)
+        if self.client is None or not self.connected:
+            self._away = self.now
         client = self.client
-        self._driven.append(client is not None and client.began is not None and self.connected)
+        drives = client is not None and client.began is not None
+        self._driven.append(drives and self.now - self._away > _FRESH_S)
         for side in self.sides:
             hand = self.service.hands[side]
             if self.codec.joints == 1:
