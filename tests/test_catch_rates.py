@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from dexkit.conformance import hands
-from dexkit.conformance.kit.catch_rates import CATCH_RATES, wilson
+from dexkit.conformance.kit.catch_rates import BLAME_RATES, CATCH_RATES, wilson
 from dexkit.conformance.kit.results import RunResult
 from dexkit.conformance.report.badge import render_badge
 from dexkit.conformance.report.html import render
@@ -27,21 +27,18 @@ from tests.report_helpers import result_of_every_kind
 
 
 def test_every_hand_of_dexkit_is_measured_in_quick_and_default_runs() -> None:
-    assert set(CATCH_RATES) == {
-        h.model.name for h in hands.BUILT_IN if isinstance(h.model, HandModel)
-    }
-    for rates in CATCH_RATES.values():
+    models = {h.model.name for h in hands.BUILT_IN if isinstance(h.model, HandModel)}
+    assert set(CATCH_RATES) == set(BLAME_RATES) == models
+    for rates in (*CATCH_RATES.values(), *BLAME_RATES.values()):
         assert set(rates) >= {"quick", "default"}
 
 
 def test_sentence_has_the_number_of_each_kind_of_run_with_its_interval() -> None:
-    caught, tried = CATCH_RATES["dex1-1"]["default"]
-    low, high = wilson(caught, tried)
     sentence = catch_sentence(result_of_every_kind())
-    assert (
-        f"default run {caught} of {tried} (95 % interval {100 * low:.0f} to {100 * high:.0f} %)"
-        in (sentence)
-    )
+    for rates in (CATCH_RATES, BLAME_RATES):
+        hits, tried = rates["dex1-1"]["default"]
+        low, high = (f"{100 * bound:.0f}" for bound in wilson(hits, tried))
+        assert f"default run {hits} of {tried} (95 % interval {low} to {high} %)" in sentence
 
 
 def renderings(result: RunResult, folder: Path) -> Iterator[tuple[str, str]]:

@@ -118,6 +118,11 @@ def _try_outsiders(source: str, console: Console, json_path: Path | None, jobs: 
     is_flag=True,
     help="With --generated: in thorough runs, which take ten times as long.",
 )
+@click.option(
+    "--outside",
+    is_flag=True,
+    help="With --generated: judge them as a vendor's own service is: no restart, no object.",
+)
 @dialect_option("With --generated: only hands with this dialect.")
 @click.option("--hand", "names", multiple=True, metavar="NAME", help="Try this generated hand.")
 @click.option(
@@ -143,6 +148,7 @@ def command(
     seed: int,
     quick: bool,
     thorough: bool,
+    outside: bool,
     dialect: str | None,
     names: tuple[str, ...],
     resume: Path | None,
@@ -164,8 +170,14 @@ def command(
     """
     if sum((generated is not None or bool(names), source is not None, bool(require))) > 1:
         raise UsageError("--generated, --hand, --from and --require cannot be combined")
-    if generated is None and not names and (good or dialect or resume or quick or thorough):
-        raise UsageError("--good, --quick, --thorough, --dialect and --resume need --generated")
+    if (
+        generated is None
+        and not names
+        and (good or dialect or resume or quick or thorough or outside)
+    ):
+        raise UsageError(
+            "--good, --quick, --thorough, --outside, --dialect and --resume need --generated"
+        )
     if quick and thorough:
         raise UsageError("--quick and --thorough exclude each other")
     if source is not None and model is not None:
@@ -205,7 +217,7 @@ def command(
                 console.print(f"{grade:5}  {each.name}", markup=False, highlight=False)
             return
         kind = RunKind.QUICK if quick else RunKind.THOROUGH if thorough else RunKind.DEFAULT
-        campaign = Campaign(seed, resume, kind=kind)
+        campaign = Campaign(seed, resume, kind=kind, outside=outside)
         with stop_on_signals() as stop:
             _follow(len(hands), campaign.run(hands, stop, jobs), stop)
         _end_with(campaign, console, json_path, verbose=verbose)

@@ -1,7 +1,9 @@
-"""How many wrong hands a run catches: one measured number for each model and kind of run.
+"""How many wrong hands a run catches, and how many legal ones it blames: measured for each model
+and kind of run.
 
 ``python -m dexkit.conformance.faults --model MODEL --generated 12``, with ``--quick`` for quick
-runs, measures it again on the virtual clock (docs/mutants.md). These are of the levels of
+runs, measures the first again on the virtual clock, and ``--generated 64 --good`` the second
+(docs/mutants.md). These are of the levels of
 2026-11-29; thorough runs were not measured with them. The numbers are about the kit, and not about
 the hand that a report is about.
 """
@@ -10,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["CATCH_RATES", "wilson"]
+__all__ = ["BLAME_RATES", "CATCH_RATES", "wilson"]
 
 CATCH_RATES: dict[str, dict[str, tuple[int, int]]] = {
     "dex1-1": {"quick": (2, 8), "default": (7, 8)},
@@ -21,6 +23,9 @@ CATCH_RATES: dict[str, dict[str, tuple[int, int]]] = {
     "inspire-ftp": {"quick": (2, 3), "default": (3, 3)},
 }
 """Of generated wrong hands that break a MUST: how many were caught, and how many were tried."""
+
+BLAME_RATES: dict[str, dict[str, tuple[int, int]]] = {}
+"""Of generated legal hands: how many failed a MUST, and how many were tried."""
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
-from dexkit.conformance.kit.catch_rates import CATCH_RATES, wilson
+from dexkit.conformance.kit.catch_rates import BLAME_RATES, CATCH_RATES, wilson
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Grade, Overall, RunResult, Verdict, worst
 from dexkit.hand import ROBOT
@@ -137,17 +138,25 @@ def model_title(result: RunResult) -> str:
 
 
 def catch_sentence(result: RunResult) -> str:
-    """How many wrong hands of that model runs of the kit catch, whatever this run has found."""
-    parts = []
-    for kind, (caught, tried) in CATCH_RATES.get(result.subject.get("model", ""), {}).items():
-        low, high = (f"{100 * bound:.0f}" for bound in wilson(caught, tried))
-        parts.append(f"a {kind} run {caught} of {tried} (95 % interval {low} to {high} %)")
-    if not parts:
+    """How many wrong hands of that model runs of the kit catch, and how many legal ones they blame,
+    whatever this run has found.
+    """
+    model = result.subject.get("model", "")
+    caught, blamed = _of_each_kind(CATCH_RATES, model), _of_each_kind(BLAME_RATES, model)
+    if not caught:
         return "A run does not find every fault; how many has not been measured for this model."
     return (
         "A run does not find every fault: of generated wrong hands that break a MUST of a "
-        f"{model_title(result)}, caught {' and '.join(parts)}."
+        f"{model_title(result)}, caught {caught}. Of generated legal ones, failed {blamed}."
     )
+
+
+def _of_each_kind(rates: Mapping[str, Mapping[str, tuple[int, int]]], model: str) -> str:
+    parts = []
+    for kind, (hits, tried) in rates.get(model, {}).items():
+        low, high = (f"{100 * bound:.0f}" for bound in wilson(hits, tried))
+        parts.append(f"a {kind} run {hits} of {tried} (95 % interval {low} to {high} %)")
+    return " and ".join(parts)
 
 
 def subject(result: RunResult, *, many: bool = False) -> str:

@@ -52,6 +52,8 @@ class TopicDevice(ABC):
     """Seconds from there until its publishers have disappeared from the domain; None is never."""
     restarted = False
     """Whether there was a service before this one."""
+    can_be_stopped = True
+    """Whether the kit can end and start it: not one that a vendor runs."""
     loaded = False
     """Whether a slow reliable reader is matched."""
 

@@ -117,7 +117,7 @@ class _Player:
         elif isinstance(action, Restart):
             self._clients += 1
             self._advance(self.now + 0.3)
-        elif isinstance(action, StopService):
+        elif isinstance(action, StopService) and self._service.can_be_stopped:
             self.now += self._service.tick
             self._take(self._service.end())
             self._stopped = {"exit_s": self._service.exit_s, "gone_s": self._service.gone_s}

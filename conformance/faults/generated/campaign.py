@@ -104,17 +104,23 @@ def area_of(requirement: str) -> str:
     return requirement.split("-")[-2]
 
 
-def try_generated(hand: Generated, seed: int = 1, run: RunKind = RunKind.DEFAULT) -> Trial:
+def try_generated(
+    hand: Generated, seed: int = 1, run: RunKind = RunKind.DEFAULT, *, outside: bool = False
+) -> Trial:
     """Examine a hand, and judge it by a conformance run on the virtual clock.
 
     :param seed: of the oracle's random stimulus.
     :param run: which requirements are judged, and how much the hand is provoked.
+    :param outside: judge it as a vendor's own service is: the kit cannot stop it, and knows of no
+        object in the hand.
     """
     service = hand.service()
     trial, opinion = graded(hand, service, seed)
     if not trial.counts:
         return trial
     plan = plan_for(hand.dialect.name, sides=hand.sides, run=run)
+    if outside:
+        plan, service.can_be_stopped = replace(plan, objects={}), False
     trial = judged(trial, service, plan, run, hand.claims)
     if trial.caught or opinion is None:
         return trial
@@ -158,8 +164,8 @@ def judged(
     return replace(trial, failed=failed, warned=warned, errors=errors)
 
 
-def _work(name: str, seed: int, run: RunKind) -> Trial:
-    return try_generated(parse(name), seed, run)
+def _work(name: str, seed: int, run: RunKind, outside: bool) -> Trial:
+    return try_generated(parse(name), seed, run, outside=outside)
 
 
 @dataclass
@@ -169,12 +175,18 @@ class Campaign:
     :param file: where each is added as a line of JSON when it is done; those that are there
         already are not tried again. None for none.
     :param kind: of the conformance runs.
+    :param outside: judge the hands as a vendor's own service is.
     """
 
     seed: int
     file: Path | None = None
     trials: list[Trial] = field(default_factory=list)
     kind: RunKind = RunKind.DEFAULT
+    outside: bool = False
+
+    @property
+    def _run(self) -> str:
+        return f"outside {self.kind}" if self.outside else str(self.kind)
 
     def run(
         self, hands: Sequence[Generated], stop: object = None, jobs: int | None = None
@@ -191,7 +203,7 @@ class Campaign:
                 self.trials.append(done[hand.name])
                 yield self.trials[-1]
         todo = [h for h in hands if h.name not in done]
-        work = partial(_work, seed=self.seed, run=self.kind)
+        work = partial(_work, seed=self.seed, run=self.kind, outside=self.outside)
         for _, trial in in_processes(work, (h.name for h in todo), stop, jobs):
             yield self._add(trial)
 
@@ -199,7 +211,7 @@ class Campaign:
         self.trials.append(trial)
         if self.file is not None:
             with self.file.open("a", encoding="utf-8") as out:
-                about = {"seed": self.seed, "run": str(self.kind)}
+                about = {"seed": self.seed, "run": self._run}
                 out.write(json.dumps({**about, **asdict(trial)}) + "\n")
         return trial
 
@@ -226,9 +238,9 @@ class Campaign:
                 raise UsageError(
                     f"{self.file} has the seed {seed}, not {self.seed}", hint="give its seed"
                 )
-            if run != str(self.kind):
+            if run != self._run:
                 raise UsageError(
-                    f"{self.file} is of {run} runs, not {self.kind} ones", hint="give another file"
+                    f"{self.file} is of {run} runs, not {self._run} ones", hint="give another file"
                 )
             found[trial.name] = trial
         return found
@@ -274,7 +286,7 @@ class Campaign:
         grades = [Severity.BREAKING.value, Severity.LESSER.value]
         return {
             "seed": self.seed,
-            "run": str(self.kind),
+            "run": self._run,
             "perfect": self.perfect,
             "score": {
                 **{g: self.score(g) for g in grades},
@@ -331,6 +343,6 @@ class Campaign:
         if good := self.trials_of(GOOD):
             console.print(
                 f"{len(good)} good hands: {sum(bool(t.failed) for t in good)} fail a MUST, "
-                f"{sum(bool(t.blamed) for t in good)} are warned",
+                f"{sum(bool(t.blamed) for t in good)} are warned of what they do not lack",
                 style="red" if self.blamed else "green",
             )

@@ -62,8 +62,8 @@ _SLUGGISH = frozenset(
     f"{hand}-{number}"
     for hand in ("DEX1", "DEX3", "DEX5", "BRAINCO", "DFX", "FTP")
     for number in (
-        *("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05", "MOVE-04", "MOVE-07", "MODE-05"),
-        *("OPER-01", "OPER-02", "OPER-03", "OPER-04", "OPER-05", "TRACK-02", "SENS-10"),
+        *("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05", "MODE-05", "MOVE-04", "SENS-10"),
+        *("OPER-01", "OPER-02", "OPER-03", "OPER-04", "TRACK-02"),
     )
 )
 """The client's torques are small, so that friction makes a hand slow, and stops it short."""
@@ -171,9 +171,7 @@ _SERVO = frozenset(
 """A position servo uses neither the gains nor the velocity nor the torque of a command."""
 
 
-_FORCE_OF_ITS_OWN = frozenset(
-    f"DEX{n}-{m}" for n in (3, 5) for m in ("FIELD-18", "FORCE-03", "FORCE-05", "FORCE-08")
-)
+_FORCE_OF_ITS_OWN = frozenset(f"DEX{n}-{m}" for n in (3, 5) for m in ("FORCE-05", "FORCE-08"))
 """What it presses with is not the torque that the gains of a command give."""
 
 
@@ -269,7 +267,7 @@ add(
     needs="tau_est",
     lacks={"force"},
     warned={"DEX1-FORCE-01", "BRAINCO-FORCE-03", "FTP-FORCE-03"}
-    | {f"DEX{n}-FORCE-{m}" for n in (3, 5) for m in ("01", "03", "05", "10")},
+    | {f"DEX{n}-FORCE-{m}" for n in (3, 5) for m in ("01", "05")},
 )
 add(
     "mode",
@@ -299,7 +297,7 @@ add(
     needs="tau_est",
     several=True,
     control_law=True,
-    warned={f"DEX{n}-FORCE-{m}" for n in (3, 5) for m in ("02", "04", "05", "07")},
+    warned={f"DEX{n}-FORCE-{m}" for n in (3, 5) for m in ("02", "05")},
 )
 add(
     "force",
@@ -385,7 +383,7 @@ for _rate, _tick, _period in ((44, 0.0025, 0.0225), (100, 0.0025, 0.01)):
         values={"tick": _tick, "period": _period},
         position_servo=True,
         not_of={"brainco-revo2"} if _rate < 100 else frozenset(),
-        warned={"BRAINCO-RATE-02", "DFX-RATE-02", "FTP-RATE-02", "FTP-RATE-04"},
+        warned={"BRAINCO-RATE-02", "DFX-RATE-02", "FTP-RATE-02"},
     )
 add("resolution", Counts, "counts-512", "measures q in 512 steps of a turn", per_turn=512)
 
