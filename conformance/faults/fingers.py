@@ -358,9 +358,9 @@ def OneJointBackwards(hand: Any, rows: Floats) -> None:
 
 @changes(FingerService, "motors", "DEX3-MOVE-02")
 def OtherScale(self: Any, command: Call, side: Side, motors: Motors) -> None:
-    """Moves only 75 % of the way from its rest pose."""
+    """Moves only 60 % of the way from its rest pose."""
     rest = self.hand.model.rest_q[side]
-    scaled = (replace(m, q=r + 0.75 * (m.q - r)) for m, r in zip(motors, rest, strict=True))
+    scaled = (replace(m, q=r + 0.6 * (m.q - r)) for m, r in zip(motors, rest, strict=True))
     command(side, tuple(scaled))
 
 
