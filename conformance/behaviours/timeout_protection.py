@@ -148,6 +148,8 @@ def brakes(ctx: Context) -> Outcome:
 @check("DEX3-GUARD-02")
 def reports_trip(ctx: Context) -> Outcome:
     """Bit 7 of the state's mode byte of each joint before and after the time-out."""
+    if not np.nan_to_num(ctx.states.mode).any():
+        return ctx.absent("mode is not filled (0 throughout)")
     silences = silences_of(ctx, "guard", "silence")
     for silence in silences:
         last, late, end = silence.last, silence.late, silence.end

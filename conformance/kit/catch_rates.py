@@ -25,7 +25,7 @@ CATCH_RATES: dict[str, dict[str, tuple[int, int]]] = {
 
 BLAME_RATES: dict[str, dict[str, tuple[int, int]]] = {
     "dex1-1": {"quick": (0, 26), "default": (0, 26)},
-    "dex3-1": {"quick": (0, 9), "default": (1, 9)},
+    "dex3-1": {"quick": (0, 9), "default": (0, 9)},
     "dex5-1": {"quick": (0, 9), "default": (0, 9)},
     "brainco-revo2": {"quick": (0, 7), "default": (0, 7)},
     "inspire-dfx": {"quick": (0, 6), "default": (0, 6)},
