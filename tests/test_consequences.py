@@ -111,7 +111,7 @@ def test_obvious_faults_have() -> None:
 
 
 def test_a_fault_that_no_client_sees_has_none() -> None:
-    assert not of(made("CountsInReserve"))
+    assert not of(made("NoForce"))
 
 
 # ------------------------------------------------------------------------------------- table
