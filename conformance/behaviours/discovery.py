@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.checks.robot import RobotContext
 from dexkit.models import DIALECTS
 from dexkit.traces import TraceEndpoint
+
+_AHEAD_S = 0.05  # s by which the low-rate topic may be received before the fast one
 
 
 def _endpoints(ctx: Context, topic: str, kind: str) -> list[TraceEndpoint]:
@@ -70,6 +74,46 @@ def command_topic(ctx: Context) -> Outcome:
     return ctx.failed("wrong type", f"{topic} is read as {', '.join(sorted(types))}").because(
         causes.of_type(types, wanted, ctx.recording.dialect)
     )
+
+
+@check("DEX3-TOPIC-04")
+def low_rate_is_fresh(ctx: Context) -> Outcome:
+    """Whether each state of the low-rate topic equals a recent one of the fast topic."""
+    slow, fast = ctx.recording.low_rate.get(ctx.side), ctx.states
+    if slow is None or not len(slow) or not len(fast):
+        return ctx.absent("there is no low-rate topic")
+    age = ctx.tolerance("max_age_s")
+    margin = np.array([ctx.tolerance("margin_stroke", j) for j in range(len(ctx.joints))])
+    odd: list[tuple[float, int, str]] = []
+    judged = 0
+    for i, t in enumerate(slow.t.tolist()):
+        rows = fast.between(t - age, t + _AHEAD_S)
+        q, mode = fast.q[rows], fast.mode[rows]
+        if len(q) < 3 or not np.isfinite(q).all():
+            continue
+        judged += 1
+        with np.errstate(invalid="ignore"):
+            away = np.maximum(q.min(axis=0) - slow.q[i], slow.q[i] - q.max(axis=0))
+            other = (mode.min(axis=0) > slow.mode[i]) | (mode.max(axis=0) < slow.mode[i])
+        off = ~(away <= margin)
+        if off.any():
+            joint = int(np.argmax(np.nan_to_num(away / margin, nan=np.inf)))
+            text = f"q is {away[joint]:.2f} {ctx.unit} from all of the fast topic within {age:g} s"
+            odd.append((t, joint, text))
+        elif other.any():
+            joint = int(np.argmax(other))
+            text = f"mode is {slow.mode[i, joint]:g}, which the fast topic did not have"
+            odd.append((t, joint, text))
+    if judged < 3:
+        return ctx.skipped("too few states on the low-rate topic beside those on the fast one")
+    if len(odd) < ctx.tolerance("min_odd"):
+        return ctx.passed(f"{judged} states", f"{judged} states on {slow.topic}, all as fast ones")
+    _, joint, what = odd[0]
+    text = ctx.named(f"{what}; so in {len(odd)} of {judged} states on {slow.topic}", joint)
+    outcome = ctx.failed(
+        f"{len(odd)} of {judged}", text, *(ctx.at(slow.topic, t) for t, *_ in odd[:5])
+    )
+    return outcome.about(joint).if_late(age)
 
 
 @check("DEX1-QOS-01", "DEX3-QOS-01", "H1-QOS-01")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -61,6 +62,15 @@ class LowRateIsSlow(Dex3Service):
     """Publishes the low-rate copy twice a second: a timer has another unit."""
 
     low_period = 0.5
+
+
+@changes(Dex3Service, "low_rate", "DEX3-TOPIC-04", brief=True)
+def OldLowRate(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
+    """Copies states to the low-rate topic that are 0.45 s old."""
+    new, queue = low_rate(samples), self.memory.setdefault("queue", deque())
+    queue.append(new)
+    old = queue.popleft() if len(queue) > 9 else queue[0]
+    return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
 @wrong_hand("DEX3-START-02")
