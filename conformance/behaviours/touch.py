@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measure
-from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
+from dexkit.conformance.checks.figures import Figure, judged, with_object
 from dexkit.conformance.checks.stands import FEW_STANDS, stands
 from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.kit.motor_messages import Motors
@@ -65,9 +65,6 @@ def _travel(script: FingerScript, targets: Mapping[Side, Mapping[int, float]]) -
 
 
 _WINDOW_S = 1.0
-
-
-_HELD_S = 0.3  # s at the end of a grip in which its counts are taken
 
 
 _NOTHING = "nothing was received on the touch topic"
@@ -230,29 +227,3 @@ def _rows(touch: Touch, begin: float, end: float) -> range:
 def _last(touch: Touch, rise: Floats, begin: float, end: float) -> float:
     """The last rise in [begin, end]."""
     return float(rise[_rows(touch, begin, end)[-1]])
-
-
-@check("FTP-TOUCH-06")
-@with_object
-@worst("counts", "max_part", nothing="no message before the first command, or no touch in a grip")
-def untouched(ctx: Context) -> Figures:
-    """The largest count of an element before the first command, relative to the most in a grip."""
-    touch = _touch(ctx)
-    if touch is None or not len(ctx.commands):
-        yield ctx.absent(_NOTHING)
-        return
-    before = int(np.searchsorted(touch.t, float(ctx.commands.t[0])))
-    held = [touch.median(max(b, e - _HELD_S), e) for b, e in map(ctx.span, ctx.phases())]
-    most = max((float(np.nanmax(m)) for m in held if m is not None), default=0.0)
-    if not before or most <= 0.0:
-        return
-    rest = np.nan_to_num(np.median(touch.values[:before], axis=0))
-    area, element = (int(i) for i in np.unravel_index(int(np.argmax(rest)), rest.shape))
-    level = float(rest[area, element])
-    text = (
-        f"{touch.areas[area].member} has {level:.0f} before the first command, where the most in a "
-        f"grip is {most:.0f}"
-    )
-    limit, shown = ctx.tolerance("max_part") * most, f"{level:.0f}"
-    begin, end = float(touch.t[0]), float(touch.t[before - 1])
-    yield Figure(level, begin, end, text=text, limit=limit, shown=shown, topic=touch.topic)

@@ -60,9 +60,3 @@ def CountsFromTheThumb(self: Any, pressures: Call, hand: FingerHand) -> Any:
     pressure = pressures(hand)
     pressure[_TOPS] = pressure[_TOPS[::-1]]
     return pressure
-
-
-@changes(FtpService, "pressures", "FTP-TOUCH-06", sides=BOTH)
-def CountsWithoutTouch(self: Any, pressures: Call, hand: FingerHand) -> Any:
-    """Publishes areas that have 400 counts too many: they were set to zero under a load."""
-    return pressures(hand) + 400.0

@@ -6,6 +6,7 @@ One bug often fails many requirements. After all of them are judged, the failure
   taken out of the recording, and what failed is judged again. What is met then follows from it.
 * Of the other failures, the one whose check looks most closely comes first (:data:`ORDER`). What is
   seen at the same time and joint, or is only a sum of everything, is listed under it.
+* What only warns comes after what fails.
 
 No verdict changes: a failure stays one, whatever it follows from.
 """
@@ -96,7 +97,9 @@ def stories_of(recording: Recording, results: Iterable[Result], again: Again) ->
     weight = {r.id: 2 if r.requirement.level is Level.MUST else 1 for r in failed}
     most = max((_weight(story, weight) for story in found), default=0)
     before = [story for story in shown if _weight(story, weight) >= most]
-    return [*before, *found, *(story for story in shown if story not in before)]
+    stories = [*before, *found, *(story for story in shown if story not in before)]
+    fails = {r.id for r in failed if r.verdict is Verdict.FAIL}
+    return sorted(stories, key=lambda story: fails.isdisjoint(story.explains))
 
 
 def _weight(story: Story, weights: Mapping[str, int]) -> int:
