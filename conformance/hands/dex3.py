@@ -14,7 +14,7 @@ DEX3_1 = ModelUnderTest(
     prefixes={"DEX3": "dds", "DEX3USB": "usb"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.fingers:Dex3Service"),
-    quick_phases=("burst", "drive", "joint", "late-joiner", "single"),
+    quick_phases=("burst", "joint", "late-joiner", "single"),
     roles=JointRoles(driven=(3, 4), slow=(5, 6), crossed=(4, 6)),
     # nearly as far as the session closes
     objects={Side.RIGHT: 60.0},

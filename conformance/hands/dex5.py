@@ -14,7 +14,7 @@ DEX5_1 = ModelUnderTest(
     prefixes={"DEX5": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.dex5:Dex5Service"),
-    quick_phases=("drive", "joint", "late-joiner"),
+    quick_phases=("joint", "late-joiner"),
     # first flexing joints of four fingers: none of them shares its motor
     roles=JointRoles(driven=(1, 5), slow=(9, 13)),
     # nearly as far as the session closes
