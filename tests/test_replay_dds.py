@@ -31,7 +31,7 @@ from tests.trace_helpers import CMD, CMD_TYPE, mcap_bytes, write
 
 GO = dialect("unitree_go")
 WAVE = np.linspace(2.0, 4.0, 100)
-PATIENT = ("--set", f"max-silence={PATIENCE}")
+PATIENT = ("--set", f"max-silence={PATIENCE}", "--wait", PATIENCE)
 """States may come late on a busy machine."""
 
 
@@ -227,7 +227,8 @@ def test_replay_stopped_by_the_user_leaves_the_hand_at_rest(tmp_path: Path, how:
         )
         try:
             assert process.stdout is not None
-            assert any(line.startswith("ready:") for line in process.stdout)
+            if not any(line.startswith("ready:") for line in process.stdout):
+                pytest.fail(process.communicate(timeout=PATIENCE)[1])
             end = time.monotonic() + PATIENCE
             while not hand.positions and time.monotonic() < end:
                 time.sleep(0.01)
