@@ -33,6 +33,7 @@ __all__ = [
     "cards",
     "near_limits",
     "told",
+    "what_is_wrong",
 ]
 
 
@@ -249,6 +250,12 @@ def told(result: RunResult) -> list[Told]:
         )
         for story in result.stories
     ]
+
+
+def what_is_wrong(result: RunResult) -> str:
+    """The heading of the stories: what only warns is not wrong."""
+    failed = any(r.verdict is Verdict.FAIL for r in result.results)
+    return "What is wrong" if failed else "What is not as recommended"
 
 
 def near_limits(result: RunResult) -> list[str]:

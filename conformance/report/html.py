@@ -30,7 +30,15 @@ from dexkit.conformance.kit.results import (
     overall_of,
     worst,
 )
-from dexkit.conformance.report.card import Card, Told, blocked_groups, cards, near_limits, told
+from dexkit.conformance.report.card import (
+    Card,
+    Told,
+    blocked_groups,
+    cards,
+    near_limits,
+    told,
+    what_is_wrong,
+)
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -127,6 +135,7 @@ def render(result: RunResult, view: Recording | None = None, *, link: str = "") 
         areas=(areas := _areas(result)),
         most=max((sum(n for _, n in counts) for counts in areas.values()), default=0),
         # what is wrong
+        heading=what_is_wrong(result),
         stories=[(each, _shown(each, view)) for each in told(result)],
         follows={
             card.requirement.id: number

@@ -9,7 +9,15 @@ from collections.abc import Iterator, Sequence
 
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Result, RunResult, Verdict, grouped
-from dexkit.conformance.report.card import Card, Fact, blocked_groups, cards, near_limits, told
+from dexkit.conformance.report.card import (
+    Card,
+    Fact,
+    blocked_groups,
+    cards,
+    near_limits,
+    told,
+    what_is_wrong,
+)
 from dexkit.conformance.report.labels import (
     ANSWERS,
     VERDICTS,
@@ -52,6 +60,7 @@ def render_markdown(result: RunResult) -> str:
         harness=about_harness(result),
         catch_sentence=catch_sentence(result),
         areas=_areas(result),
+        heading=what_is_wrong(result),
         stories=told(result)[:MOST_CARDS],
         cards=found[:MOST_CARDS],
         more=len(found) - MOST_CARDS,

@@ -11,7 +11,14 @@ from rich.text import Text
 
 from dexkit.conformance.kit.requirements import Kind
 from dexkit.conformance.kit.results import Overall, Result, RunResult, Verdict, grouped, worst
-from dexkit.conformance.report.card import Card, blocked_groups, cards, near_limits, told
+from dexkit.conformance.report.card import (
+    Card,
+    blocked_groups,
+    cards,
+    near_limits,
+    told,
+    what_is_wrong,
+)
 from dexkit.conformance.report.labels import about_harness, catch_sentence
 from dexkit.console import Console
 from dexkit.console import markup as escape
@@ -159,7 +166,7 @@ def _print_stories(result: RunResult, console: Console) -> None:
     stories = told(result)
     if stories:
         several = ", likeliest first" if len(stories) > 1 else ""
-        console.print(f"\n[bold]What is wrong{several}:[/bold]", highlight=False)
+        console.print(f"\n[bold]{what_is_wrong(result)}{several}:[/bold]", highlight=False)
     for number, each in enumerate(stories, 1):
         text = _hung(console, f"{number:>3}. ", f"{each.story.sentence} ({each.whose})")
         style = "bold red" if number == 1 and result.overall is Overall.FAIL else "default"
