@@ -2,8 +2,9 @@
 
 One bug often fails many requirements. After all of them are judged, the failures are put together:
 
-* A fault that the states show by themselves (:mod:`~.repairs`: all-zero states, a frozen joint) is
-  taken out of the recording, and what failed is judged again. What is met then follows from it.
+* A fault that the states show by themselves (:mod:`~.state_faults`: all-zero states, a frozen
+  joint) is taken out of the recording, and what failed is judged again. What is met then follows
+  from it.
 * Of the other failures, the one whose check looks most closely comes first (:data:`ORDER`). What is
   seen at the same time and joint, or is only a sum of everything, is listed under it.
 * What only warns comes after what fails.
@@ -19,9 +20,9 @@ from dataclasses import replace
 
 from dexkit.conformance.checks import check_of
 from dexkit.conformance.kit.recording import Recording, SideView
-from dexkit.conformance.kit.repairs import Fault, faults
 from dexkit.conformance.kit.requirements import Level
 from dexkit.conformance.kit.results import Evidence, Result, Story, Verdict
+from dexkit.conformance.kit.state_faults import Fault, faults
 
 __all__ = ["FAMILIES", "ORDER", "stories_of"]
 
