@@ -14,8 +14,9 @@ from dexkit.conformance.virtual.topic_run import log_time_ns
 from dexkit.hand import Side
 from dexkit.models import Dialect
 from dexkit.teleop import Operator, Pose, Profile, TeleopClient, client_for
+from dexkit.teleop.client import JointCommand
 
-__all__ = ["ReferenceClient", "run_client"]
+__all__ = ["ReferenceClient", "motors_of", "run_client"]
 
 _BEGIN_S = 0.5
 """Seconds from the start of the hands to that of the client."""
@@ -23,6 +24,19 @@ _AFTER_S = 1.6
 """Seconds of recording after the last command: longer than any time-out."""
 _MOVE_S = 0.6
 """Seconds from one goal of the operator to the next."""
+
+
+def motors_of(
+    commands: Mapping[Side, Sequence[JointCommand]], spoken: Dialect
+) -> dict[Side, list[Motor]]:
+    """What the client of :mod:`dexkit.teleop` commands, as motors of a message of a dialect."""
+    found = {}
+    for side, joints in commands.items():
+        motors = [Motor(**j._asdict()) for j in joints]
+        if not spoken.gains_are_used:
+            motors = [replace(m, kp=0.0, kd=0.0) for m in motors]
+        found[side] = motors
+    return found
 
 
 class ReferenceClient:
@@ -79,13 +93,7 @@ class ReferenceClient:
     def motors(self, now: float) -> dict[Side, list[Motor]]:
         """The commands of this turn; none before there are states."""
         inputs = self.operator.inputs(now, self.sides)
-        found = {}
-        for side, joints in self.client.step(now, {}, inputs).items():
-            motors = [Motor(**j._asdict()) for j in joints]
-            if not self.dialect.gains_are_used:
-                motors = [replace(m, kp=0.0, kd=0.0) for m in motors]
-            found[side] = motors
-        return found
+        return motors_of(self.client.step(now, {}, inputs), self.dialect)
 
     def sends(self, now: float) -> bool:
         """Whether it sends in this turn."""

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 from dexkit.conformance.kit.motor_messages import Motor, MotorCodec
 from dexkit.conformance.kit.recording import joints_of
+from dexkit.conformance.virtual.client import motors_of
 from dexkit.hand import Side
 from dexkit.models import Dialect, model
 from dexkit.teleop import Pose, client_for
@@ -66,13 +67,7 @@ class Teleoperation(Client):
             self._input = frame, self.wanted(now)
         wanted = self._input[1]
         inputs: dict[Side, Pose | None] = {s: self._tracked(q) for s, q in wanted.items()}
-        found = {}
-        for side, joints in self.client.step(now, {}, inputs).items():
-            motors = [Motor(**j._asdict()) for j in joints]
-            if not self.dialect.gains_are_used:
-                motors = [replace(m, kp=0.0, kd=0.0) for m in motors]
-            found[side] = motors
-        return found
+        return motors_of(self.client.step(now, {}, inputs), self.dialect)
 
     def _tracked(self, q: Pose) -> Pose:
         """What hand tracking gives for this goal: of a gripper, a pinch."""
