@@ -37,7 +37,9 @@ _PATIENCE = 5.0
 _NO_GRIP = 0.01
 """N m: a joint that presses with less does not."""
 _SHARE = {Side.LEFT: 1.0, Side.RIGHT: 0.8}
+"""Part of each goal that a side gets: both never do the same, so that swapped sides show."""
 _TOUCH_UNITS = {"dex3-1": 2e4, "inspire-ftp": 400.0}
+"""Counts of an element that are 1 in a figure of touch, of the models whose touch is read."""
 """About what a grip adds to an element of touch."""
 
 

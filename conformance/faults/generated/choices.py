@@ -1,4 +1,4 @@
-"""What makers choose in other ways than the original: more than a client of it would notice.
+"""Choices of makers that a client notices and can work with: what differs from the original.
 
 A hand with friction, a position servo in place of the control law, a hand without force sensors, of
 which one side is served: a client of the original works with each, or knows from the claims what it
@@ -32,7 +32,7 @@ __all__ = ["DEVIATIONS", "GROUPS"]
 
 
 class _Friction(What):
-    """Has so much dry friction, as a part of the joint's torque.
+    """Dry friction, as a part of the joint's torque.
 
     Of a hand that obeys gains, the torque is what the client's give over the joint's range, where
     this is less: friction of a tenth of it leaves a joint a tenth of the range short of its goal.
