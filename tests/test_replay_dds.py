@@ -33,6 +33,8 @@ GO = dialect("unitree_go")
 WAVE = np.linspace(2.0, 4.0, 100)
 PATIENT = ("--set", f"max-silence={PATIENCE}", "--wait", PATIENCE)
 """States may come late on a busy machine."""
+TRIALS = 5
+"""Of what a busy machine can spoil: a program that was suspended for a second ends itself."""
 
 
 class Watched(ScriptedHand):
@@ -210,14 +212,24 @@ def test_after_a_pause_replay_ramps_from_the_present_position(
 
 @pytest.mark.parametrize("how", ["interrupt", pytest.param("key", marks=pytest.mark.soak)])
 def test_replay_stopped_by_the_user_leaves_the_hand_at_rest(tmp_path: Path, how: str) -> None:
-    hand = Watched()
+    path = clip(tmp_path, np.full(50_000, 2.0))
+    for _ in range(TRIALS):
+        hand = Watched()
+        code, out, err = stopped_replay(path, hand, how)
+        if "was suspended" not in err:
+            break
+    assert code == 130, err
+    assert "played" in out
+    assert "Traceback" not in err
+    assert hand.positions[-1] == pytest.approx(hand.q)
+
+
+def stopped_replay(path: Path, hand: Watched, how: str) -> tuple[int, str, str]:
+    """Replay a file to a hand until it moves, and stop by Ctrl-C or a key; exit code, out, err."""
     main, terminal = pty.openpty()
     with served(hand) as domain:
         process = subprocess.Popen(
-            command_line(
-                *("replay", str(clip(tmp_path, np.full(50_000, 2.0))), "--domain", str(domain)),
-                *map(str, PATIENT),
-            ),
+            command_line("replay", str(path), "--domain", str(domain), *map(str, PATIENT)),
             stdin=terminal,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -227,24 +239,20 @@ def test_replay_stopped_by_the_user_leaves_the_hand_at_rest(tmp_path: Path, how:
         )
         try:
             assert process.stdout is not None
-            if not any(line.startswith("ready:") for line in process.stdout):
-                pytest.fail(process.communicate(timeout=PATIENCE)[1])
-            end = time.monotonic() + PATIENCE
-            while not hand.positions and time.monotonic() < end:
-                time.sleep(0.01)
-            if how == "interrupt":
-                process.send_signal(signal.SIGINT)
-            else:
-                os.write(main, b"q")
+            if any(line.startswith("ready:") for line in process.stdout):
+                end = time.monotonic() + PATIENCE
+                while not hand.positions and process.poll() is None and time.monotonic() < end:
+                    time.sleep(0.01)
+                if how == "interrupt":
+                    process.send_signal(signal.SIGINT)
+                else:
+                    os.write(main, b"q")
             out, err = process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
             os.close(main)
             os.close(terminal)
-    assert process.returncode == 130, err
-    assert "played" in out
-    assert "Traceback" not in err
-    assert hand.positions[-1] == pytest.approx(hand.q)
+    return process.returncode, out, err
 
 
 def _take_terminal() -> None:

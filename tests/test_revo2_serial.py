@@ -55,6 +55,8 @@ def test_speed_of_a_command_is_the_devices_and_0_is_no_motion(emulated: Revo2Han
     with driver(emulated, speed=0.5) as hand:
         hand.exchange(to(0.5))
         assert emulated.device.speeds == [500] * N
+        while not all(hand.exchange(to(0.5)).q):  # until each joint moves
+            pass
         hand.exchange(to(0.5, part=0.1))
         assert emulated.device.speeds == [100] * N
         hand.exchange(to(0.0, part=0.0))  # and not the device's highest
