@@ -9,7 +9,8 @@ Here are steps of joints (:mod:`~.steps`), and whether a hand obeys (:mod:`~.obe
 rates (:mod:`~.timing`), goals (:mod:`~.goals`), silences (:mod:`~.silences`); members of a state
 (:mod:`~.members`), and its velocities (:mod:`~.speeds`); contacts of grippers (:mod:`~.contacts`),
 soft grips (:mod:`~.soft_grips`), torque pulses (:mod:`~.nudges`), the law of torque
-(:mod:`~.torque_law`), and stands of position servos (:mod:`~.stands`); robots (:mod:`~.robot`).
+(:mod:`~.torque_law`), and stands of position servos (:mod:`~.stands`); robots (:mod:`~.robot`);
+parts of a requirement put together (:mod:`~.combined`).
 """
 
 from __future__ import annotations
