@@ -277,7 +277,9 @@ def test_the_documented_example_is_tried(tmp_path: Path) -> None:
     found = {h["name"]: h for h in json.loads(path.read_text())["hands"]}
     assert set(found) == {"StopsHalfway", "Heavier"}
     assert found["StopsHalfway"]["failed"]
+    assert found["StopsHalfway"]["story"] in run.output
     assert found["Heavier"]["grade"] == "good"
+    assert not found["Heavier"]["story"]
     assert found["StopsHalfway"]["summary"] == "Goes half of the way only."
 
 

@@ -86,6 +86,7 @@ class Verdicts:
     :param failed: ids of MUSTs that fail; ``warned`` of other requirements that fail or warn;
         ``errors`` of those that could not be judged for a fault of the kit.
     :param problem: why there are none: the hand's own code failed, and where. Empty otherwise.
+    :param story: what the run shows first; empty where nothing fails or warns.
     """
 
     name: str
@@ -97,6 +98,7 @@ class Verdicts:
     warned: tuple[str, ...]
     errors: tuple[str, ...]
     problem: str = ""
+    story: str = ""
 
     @property
     def right(self) -> bool:
@@ -259,13 +261,14 @@ def try_hand(each: Outsider) -> Verdicts:
         raise ConformanceError(
             f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
         ) from error
-    return _verdicts(each, blame(result))
+    story = result.stories[0].sentence if result.stories else ""
+    return _verdicts(each, blame(result), story=story)
 
 
-def _verdicts(each: Outsider, found: Blame, problem: str = "") -> Verdicts:
+def _verdicts(each: Outsider, found: Blame, problem: str = "", story: str = "") -> Verdicts:
     summary = (each.made.__doc__ or "").strip().partition("\n")[0]
     about = each.name, summary, each.dialect.name, each.grade, each.expects
-    return Verdicts(*about, *found, problem)
+    return Verdicts(*about, *found, problem, story)
 
 
 def try_all(
@@ -304,7 +307,9 @@ def _try_one(source: str, index: int) -> Verdicts:
 
 
 def print_verdicts(console: Console, found: Sequence[Verdicts]) -> None:
-    """Print what became of each hand, those that the checks are wrong about first."""
+    """Print what became of each hand and its first story; those that the checks are wrong about
+    first.
+    """
     for v in sorted(found, key=lambda v: v.right):
         ids = v.problem or (", ".join(v.failed + v.warned + v.errors) or "nothing") + " found"
         state = "right" if v.right else "wrong"
@@ -312,6 +317,8 @@ def print_verdicts(console: Console, found: Sequence[Verdicts]) -> None:
         console.print(
             f"[{color}]{state}[/]  {escape(v.name)} ({v.grade}): {escape(ids)}", soft_wrap=True
         )
+        if v.story:
+            console.print(f"       {escape(v.story)}", soft_wrap=True, highlight=False)
     right = sum(v.right for v in found)
     console.print(f"the checks are right about {right} of {len(found)} hands")
 
