@@ -264,7 +264,7 @@ def documented_example() -> str:
 def test_the_documented_example_is_loaded(tmp_path: Path) -> None:
     (tmp_path / "grippers.py").write_text(documented_example())
     loaded = outsiders.load(str(tmp_path / "grippers.py"))
-    assert {o.name for o in loaded} == {"StopsHalfway", "Heavier"}
+    assert {o.name for o in loaded} == {"StopsHalfway", "Heavier", "Alone"}
 
 
 @pytest.mark.soak  # hands of other people are tried in the test of one that fails, below
@@ -275,7 +275,7 @@ def test_the_documented_example_is_tried(tmp_path: Path) -> None:
     run = CliRunner().invoke(command, arguments)
     assert run.exit_code == 0, run.output
     found = {h["name"]: h for h in json.loads(path.read_text())["hands"]}
-    assert set(found) == {"StopsHalfway", "Heavier"}
+    assert set(found) == {"StopsHalfway", "Heavier", "Alone"}
     assert found["StopsHalfway"]["failed"]
     assert found["StopsHalfway"]["story"] in run.output
     assert found["Heavier"]["grade"] == "good"
@@ -286,6 +286,10 @@ def test_the_documented_example_is_tried(tmp_path: Path) -> None:
 _HEAD = """
 from dexkit.conformance.faults.outsiders import hand
 from dexkit.conformance.virtual.gripper import ReferenceService
+"""
+_DFX = """
+from dexkit.conformance.faults.outsiders import hand
+from dexkit.conformance.virtual.inspire import InspireService
 """
 
 
@@ -299,6 +303,9 @@ from dexkit.conformance.virtual.gripper import ReferenceService
         (_HEAD + "@hand('good', dialects='dex3')\nclass A(ReferenceService): pass", "dex3"),
         (_HEAD + "@hand('lesser', expects='DEX9-A')\nclass A(ReferenceService): pass", "DEX9-A"),
         (_HEAD + "class A(ReferenceService): pass", "is marked"),
+        (_HEAD + "@hand('good', lacks='touch')\nclass A(ReferenceService): pass", "no unit"),
+        (_HEAD + "@hand('good', sides='middle')\nclass A(ReferenceService): pass", "no side"),
+        (_DFX + "@hand('good', sides='left')\nclass A(InspireService): pass", "moves both"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_an_error(tmp_path: Path, text: str, why: str) -> None:
@@ -306,6 +313,31 @@ def test_a_file_that_cannot_be_used_is_an_error(tmp_path: Path, text: str, why: 
     path.write_text(text)
     with pytest.raises(DexkitError, match=why):
         outsiders.load(str(path))
+
+
+def test_what_a_hand_lacks_is_not_claimed(tmp_path: Path) -> None:
+    (tmp_path / "hands.py").write_text(
+        "from dexkit.conformance.faults.outsiders import hand\n"
+        "from dexkit.conformance.virtual.dex5 import Dex5Service\n"
+        "from dexkit.conformance.virtual.fingers import Dex3Service\n"
+        "@hand('good', lacks=('force', 'low_rate'), sides='left')\nclass A(Dex3Service): pass\n"
+        "@hand('good', lacks='force')\nclass B(Dex5Service): pass\n"
+        "@hand('good')\nclass C(Dex3Service): pass\n"
+    )
+    a, b, c = outsiders.load(str(tmp_path / "hands.py"))
+    assert a.claims.units is not None
+    assert {u for u, claimed in a.claims.units.items() if not claimed} == {"force", "low_rate"}
+    assert a.sides == (Side.LEFT,)
+    assert b.claims.units is not None
+    assert not b.claims.units["imu"]  # its reference has none
+    assert (c.claims.units, c.sides) == (None, tuple(Side))
+
+
+def test_one_hand_without_force_is_good(tmp_path: Path) -> None:
+    (tmp_path / "grippers.py").write_text(documented_example())
+    (alone,) = (o for o in outsiders.load(str(tmp_path / "grippers.py")) if o.name == "Alone")
+    found = outsiders.try_hand(alone)
+    assert found.right, found
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
@@ -25,7 +25,9 @@ from dexkit.conformance.faults.matrix import in_processes
 from dexkit.conformance.faults.registry import mix
 from dexkit.conformance.faults.trials import plan_for, run_mutant
 from dexkit.conformance.hands import under_test
-from dexkit.conformance.kit.requirements import catalogue
+from dexkit.conformance.kit.claims import Claims
+from dexkit.conformance.kit.recording import sides_of
+from dexkit.conformance.kit.requirements import CAPABILITIES, catalogue
 from dexkit.conformance.kit.results import RunResult, Verdict
 from dexkit.conformance.virtual import Service
 from dexkit.console import Console
@@ -61,6 +63,8 @@ class _Declared:
     grade: str
     expects: tuple[str, ...]
     dialects: tuple[str, ...]
+    lacks: tuple[str, ...]
+    sides: tuple[Side, ...]
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,8 @@ class Outsider:
     :param made: its service.
     :param grade: one of :data:`GRADES`.
     :param expects: prefixes of the ids of requirements, one of which is the right reason.
+    :param claims: what its maker claims of it.
+    :param sides: those that are served.
     """
 
     name: str
@@ -77,6 +83,8 @@ class Outsider:
     dialect: Dialect
     grade: str
     expects: tuple[str, ...] = ()
+    claims: Claims = field(default_factory=Claims)
+    sides: tuple[Side, ...] = tuple(Side)
 
 
 @dataclass(frozen=True)
@@ -112,7 +120,12 @@ class Verdicts:
 
 
 def hand(
-    grade: str, *, expects: str | tuple[str, ...] = (), dialects: str | tuple[str, ...] = ()
+    grade: str,
+    *,
+    expects: str | tuple[str, ...] = (),
+    dialects: str | tuple[str, ...] = (),
+    lacks: str | tuple[str, ...] = (),
+    sides: str = "both",
 ) -> Callable[[C], C]:
     """Mark a class as a hand to be tried.
 
@@ -121,10 +134,20 @@ def hand(
         reason to find it; none for any.
     :param dialects: those that it is tried in; none for the first of each model whose reference it
         changes.
-    :raises ConformanceError: the grade is not known, or what it decorates is no class.
+    :param lacks: units that the hand does not have: its maker claims all others, as in a file of
+        claims (docs/capabilities.md). Without it nothing is claimed or disclaimed.
+    :param sides: those that are served: ``left``, ``right`` or ``both``.
+    :raises ConformanceError: the grade or a unit is not known, or what it decorates is no class.
+    :raises UsageError: there is no such side.
     """
     if grade not in GRADES:
         raise ConformanceError(f"{grade!r} is no grade of a hand", hint=", ".join(GRADES))
+    for unit in _tuple(lacks):
+        if unit not in CAPABILITIES:
+            raise ConformanceError(
+                f"{unit!r} is no unit that a hand can lack", hint=", ".join(CAPABILITIES)
+            )
+    declared = _Declared(grade, _tuple(expects), _tuple(dialects), _tuple(lacks), sides_of(sides))
 
     def declare(made: C) -> C:
         if not isinstance(made, type) or not issubclass(made, Service):
@@ -132,7 +155,7 @@ def hand(
                 f"{getattr(made, '__name__', made)!r} is no service of hands",
                 hint="derive it from a reference service; see docs/mutants.md",
             )
-        setattr(made, _MARK, _Declared(grade, _tuple(expects), _tuple(dialects)))
+        setattr(made, _MARK, declared)
         return made
 
     return declare
@@ -207,6 +230,7 @@ def _outsiders(made: type[Any]) -> Iterator[Outsider]:
                 f"{made.__name__} does not change the reference of {each.model}, whose dialect "
                 f"{each.name} it is tried in"
             )
+        each.check_sides(declared.sides)
         known = [r.id for r in catalogue(each.model)]
         lost = [e for e in declared.expects if not any(r.startswith(e) for r in known)]
         if lost and (named or len(lost) == len(declared.expects)):
@@ -217,7 +241,23 @@ def _outsiders(made: type[Any]) -> Iterator[Outsider]:
             )
         name = made.__name__ if len(spoken) == 1 else f"{made.__name__} ({each.name})"
         reference: type[Any] = under_test(each.model).reference.load()
-        yield Outsider(name, mix(made, reference), each, declared.grade, declared.expects)
+        yield Outsider(
+            name,
+            mix(made, reference),
+            each,
+            declared.grade,
+            declared.expects,
+            _claims(reference, declared.lacks),
+            declared.sides,
+        )
+
+
+def _claims(reference: type[Any], lacks: tuple[str, ...]) -> Claims:
+    """The claims of a hand that differs from a reference, and lacks these units."""
+    if not lacks:
+        return Claims()
+    missing = {*lacks} if any(getattr(reference, "attitude", ())) else {*lacks, "imu"}
+    return Claims({unit: unit not in missing for unit in CAPABILITIES})
 
 
 def _fits(made: type[Any], model_name: str) -> bool:
@@ -250,13 +290,13 @@ def blame(result: RunResult) -> Blame:
 
 
 def try_hand(each: Outsider) -> Verdicts:
-    """Judge a hand by every requirement, in a run of both sides with an object in the right one.
+    """Judge a hand by every requirement, in a run with an object in the right hand.
 
     :raises ConformanceError: the hand's own code failed.
     """
-    plan = plan_for(each.dialect.name, sides=tuple(Side))
+    plan = plan_for(each.dialect.name, sides=each.sides)
     try:
-        result = run_mutant(each.made, plan)
+        result = run_mutant(each.made, plan, claims=each.claims)
     except Exception as error:  # the code of others may raise anything
         raise ConformanceError(
             f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
