@@ -44,3 +44,7 @@ def test_failures_are_told_together_and_the_first_leads() -> None:
 def test_no_part_that_can_be_judged_says_why() -> None:
     assert all_of(UNKNOWN, Outcome(None, reason="no motion")) is UNKNOWN
     assert warning(UNKNOWN) is UNKNOWN
+
+
+def test_what_nothing_fills_is_absent_though_other_parts_are_met() -> None:
+    assert all_of(GOOD, Outcome(None, reason="no packets", absent=True)).absent

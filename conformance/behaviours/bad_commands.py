@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.nudges import STIFFNESS, displacement_noise, is_alike, nudges
 from dexkit.conformance.checks.obedience import sags, silent, stays, unharmed
@@ -571,16 +572,17 @@ def _other_ways(ctx: Context, phase: Phase, joint: int) -> Iterator[Figure]:
         yield Figure(float(back[i]), float(ctx.states.t[later][i]), None, joint, text)
 
 
+_OTHER_LENGTHS = {
+    "empty": "empty commands",
+    "short": "commands with one motor too few",
+    "long": "commands for more motors than there are",
+}
+
+
 @check("DEX1-SAFE-03", "DEX3-SAFE-03")
-def empty(ctx: Context) -> Outcome:
-    """Commands without a motor in them."""
-    return stays(ctx, "empty commands")
-
-
-@check("DEX1-SAFE-04")
-def long(ctx: Context) -> Outcome:
-    """A command with too many motors."""
-    return stays(ctx, "commands for more motors than there are")
+def other_length(ctx: Context) -> Outcome:
+    """Commands without a motor in them, with one too few, and with too many."""
+    return all_of(*(stays(ctx.only(p), _OTHER_LENGTHS[p]) for p in ctx.requirement.phases))
 
 
 @check("DEX1-SAFE-10", "DEX3-SAFE-11")
@@ -632,18 +634,6 @@ def burst(ctx: Context) -> Figures:
                 f"{most:.3f} {ctx.unit} away"
             )
             yield Figure(most, since, end, joint, text)
-
-
-@check("DEX3-SAFE-04")
-def short(ctx: Context) -> Outcome:
-    """A command with one motor too few."""
-    return stays(ctx, "commands with one motor too few")
-
-
-@check("DEX3-SAFE-05")
-def more_motors(ctx: Context) -> Outcome:
-    """A command with too many motors."""
-    return stays(ctx, "commands for more motors than there are")
 
 
 _AFTER_ABUSE = ("recover", "resume", "company", "restart", "service-restart")

@@ -341,7 +341,12 @@ class Context(BaseContext[Recording, SideView]):
 
     def phases(self, name: str | None = None) -> list[Phase]:
         """The phases of this side, by default those that the requirement needs."""
-        return self.recording.phases(name or self.requirement.phase or "", self.side)
+        names = (name,) if name else self.requirement.phases
+        return [p for each in names for p in self.recording.phases(each, self.side)]
+
+    def only(self, phase: str) -> Context:
+        """For the part of a requirement that is judged in this one of its phases."""
+        return replace(self, requirement=replace(self.requirement, needs=f"phase:{phase}"))
 
     def span(self, phase: Phase) -> tuple[float, float]:
         """Begin and end of a phase, seconds."""

@@ -25,7 +25,7 @@ def all_of(*parts: Outcome) -> Outcome:
 
     Met where each part is that could be judged. Where some are not, the first that fails is the
     outcome, or the first that warns, and what the others of that kind observed is added. With no
-    part that could be judged, the first says why.
+    part that could be judged, the first says why. What nothing fills is absent whatever else is met.
     """
     judged = [part for part in parts if part.met is not None]
     if not judged:
@@ -39,6 +39,7 @@ def all_of(*parts: Outcome) -> Outcome:
             figure=_joined(part.figure for part in judged),
             observed=_joined(part.observed for part in judged),
             values=values,
+            absent=any(part.absent for part in parts),
             measures=tuple(measure for part in judged for measure in part.measures),
         )
     return replace(
@@ -48,6 +49,7 @@ def all_of(*parts: Outcome) -> Outcome:
         values=values,
         # each place has the delay of its own part, so only the first part's can stay
         late=worst[0].late if len(worst) == 1 else None,
+        absent=any(part.absent for part in parts),
         joints=tuple(dict.fromkeys(joint for part in worst for joint in part.joints)),
         retry=any(part.retry for part in worst),
     )

@@ -673,7 +673,7 @@ def DiesOfEmpty(self: Any, receive: Call, topic: str, payload: bytes, client: in
     receive(topic, payload, client)
 
 
-@changes(Service, "receive", "DEX1-SAFE-04", "DEX3-SAFE-05")
+@changes(Service, "receive", "DEX1-SAFE-03", "DEX3-SAFE-03", where=takes_floats)
 def TakesTheLast(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Obeys the last motors of an over-long command."""
     message = self.codec.command.decode(payload)

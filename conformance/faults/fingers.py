@@ -805,7 +805,7 @@ class NoLimits(FingerHand):
         self.floor, self.ceiling = self.floor - 0.5, self.ceiling + 0.5
 
 
-@changes(FingerService, "receive", "DEX3-SAFE-04")
+@changes(FingerService, "receive", "DEX3-SAFE-03")
 def FillsUpWithZeros(self: Any, receive: Call, topic: str, payload: bytes, client: int) -> None:
     """Fills a command that is too short with zeros."""
     receive(topic, payload, client)

@@ -165,7 +165,9 @@ def topic_plan(mutant: Mutant, *, short: bool = False) -> Plan[Subject]:
         phases, motion = phases_for(needed), {script_class(mutant.model).motion}
         if robot:
             # every joint in turn takes by far the longest
-            return replace(full, phases=phases - (motion - {r.phase for r in needed}))
+            return replace(
+                full, phases=phases - (motion - {name for r in needed for name in r.phases})
+            )
         # always moved: some faults show only then
         return replace(full, phases=phases | motion)
     if not any(r.id == mutant.kills and r.phase == OPERATOR for r in every):

@@ -119,7 +119,8 @@ class Requirement:
     :param needs: what a recording must hold to judge it: ``nothing`` (absence is the finding),
         ``endpoints`` (what discovery saw), ``state``, ``commands``, ``session`` (commands of
         some length; a live run replays one), ``motion``, or ``phase:NAME``, a phase of the kit's
-        own stimulus (``other-phase:NAME``: one in which the other side is moved).
+        own stimulus (``other-phase:NAME``: one in which the other side is moved), or any of
+        several, with blanks between their names.
     :param after: requirements that must not have failed, or this one is blocked.
     :param dialects: the dialects that it applies to.
     :param tolerances: the figures that the check compares with.
@@ -174,9 +175,14 @@ class Requirement:
     original: str = ""
 
     @property
+    def phases(self) -> tuple[str, ...]:
+        """The stimulus phases that it is judged in, if any."""
+        return tuple(self.needs.partition(":")[2].split())
+
+    @property
     def phase(self) -> str | None:
-        """The stimulus phase that it needs, if any."""
-        return self.needs.partition(":")[2] or None
+        """The first of them."""
+        return next(iter(self.phases), None)
 
     @property
     def moves_other_side(self) -> bool:

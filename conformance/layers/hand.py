@@ -141,15 +141,15 @@ def _missing(context: Context) -> str:
     """Text that names what the recording lacks for this requirement; empty if nothing."""
     requirement, recording = context.requirement, context.recording
     if requirement.phase:
+        stimulus = " or ".join(f"'{name}'" for name in requirement.phases)
         if recording.stimulus is None:
-            return f"needs the stimulus '{requirement.phase}', which only a live run applies"
+            return f"needs the stimulus {stimulus}, which only a live run applies"
         why = _REMEDY.get(requirement.phase, "")
         why = f": {why.format(side=context.side)}" if why else ""
-        if not recording.phases(requirement.phase):
-            return f"the stimulus '{requirement.phase}' was not applied in this run{why}"
+        if not any(recording.phases(name) for name in requirement.phases):
+            return f"the stimulus {stimulus} was not applied in this run{why}"
         if not requirement.moves_other_side and not context.phases():
-            to = f"the {context.side} hand"
-            return f"the stimulus '{requirement.phase}' was not applied to {to}{why}"
+            return f"the stimulus {stimulus} was not applied to the {context.side} hand{why}"
     if requirement.needs_discovery and not recording.endpoints:
         return "the recording does not say who published and subscribed (record dds_endpoints)"
     if requirement.needs_commands and not len(context.commands):

@@ -102,7 +102,7 @@ class _Scene:
 
     @property
     def phases(self) -> list[Phase]:
-        return self.view.phases(self.need.phase or "", self.hand.side)
+        return [p for name in self.need.phases for p in self.view.phases(name, self.hand.side)]
 
     def span_of(self, phase: Phase) -> Span:
         return self.view.seconds(phase.begin_ns), self.view.seconds(phase.end_ns)

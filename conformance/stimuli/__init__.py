@@ -72,8 +72,7 @@ def phases_for(requirements: Iterable[Requirement]) -> frozenset[str]:
             continue
         seen.add(requirement.id)
         todo += [by_id[before] for before in requirement.after]
-        if requirement.phase:
-            names.add(requirement.phase)
+        names.update(requirement.phases)
         if requirement.needs == "session":
             names.add("replay")
         if requirement.needs == "motion":

@@ -116,7 +116,7 @@ def _members(kind: Struct, before: str = "") -> list[str]:
 
 
 def _read_by(requirement: Requirement, recording: Recording) -> Covered:
-    phases = {requirement.phase} if requirement.phase else set()
+    phases = set(requirement.phases)
     members: set[str] = set()
     for subject in recording.judged:
         views: dict[Subject, SideView] = {

@@ -112,9 +112,8 @@ def _judged_from(requirement: Requirement) -> str:
         "motion": "any motion",
     }.get(requirement.needs)
     if where is None:
-        kind, _, name = requirement.needs.partition(":")
-        other = " of the other hand" if kind.startswith("other") else ""
-        where = f"stimulus `{name}`{other}"
+        other = " of the other hand" if requirement.moves_other_side else ""
+        where = f"stimulus {' or '.join(f'`{name}`' for name in requirement.phases)}{other}"
     if len(requirement.dialects) == 3 or requirement.layer == "robot":
         return where
     return f"{where}, in {' and '.join(requirement.dialects)}"
