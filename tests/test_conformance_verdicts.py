@@ -146,11 +146,11 @@ def test_gap_within_the_kits_lateness_is_blocked() -> None:
 def test_slow_client_of_the_kit_does_not_fail_the_hand() -> None:
     plan = replace(plan_for(sides=(Side.LEFT,)), phases=frozenset({"step", OPERATOR}))
     trace = run_virtual(plan, LateState)
-    lag = result_of(judge(Recording.decode(trace)), "DEX1-OPER-02")
+    lag = result_of(judge(Recording.decode(trace)), "DEX1-OPER-01")
     assert lag.verdict is Verdict.WARN
     commands = ("rt/dex1/left/cmd", "unitree_go::msg::dds_::MotorCmds_")
     trace.rows[commands] = trace.rows[commands][::2]
-    starved = result_of(judge(Recording.decode(trace)), "DEX1-OPER-02")
+    starved = result_of(judge(Recording.decode(trace)), "DEX1-OPER-01")
     assert starved.verdict is Verdict.NOT_APPLICABLE
     assert "of 200 commands a second" in starved.reason
 

@@ -66,7 +66,7 @@ class _DeadBand(_PerJoint):
 
 
 # where the client's filter stays within the dead band, nothing moves any more
-@wrong_hand("DEX1-OPER-06", whole=True)
+@wrong_hand("DEX1-OPER-01", whole=True)
 class DeadBand(_DeadBand, ReferenceService):
     """Ignores a goal nearer than 0.16 rad: the client waits there and never moves on."""
 
@@ -80,7 +80,7 @@ def SaturatingGain(self: Any, command: Call, side: Side, motors: Motors) -> None
 
 
 # what it leaves of each step shows in steps of every kind
-@wrong_hand("DEX3-OPER-02", where=obeys_gains)
+@wrong_hand("DEX3-OPER-01", where=obeys_gains)
 class FingerDeadBand(_DeadBand, FingerService):
     """Ignores a goal nearer than a fifteenth of the joint's range."""
 
@@ -96,21 +96,21 @@ class _Coarse(_PerJoint):
         return round(q / grid) * grid
 
 
-@wrong_hand("DEX1-OPER-04")
+@wrong_hand("DEX1-OPER-01")
 class CoarseTargets(_Coarse, ReferenceService):
     """Moves to the nearest of 19 positions."""
 
     grid = 1 / 18
 
 
-@wrong_hand("DEX3-OPER-04", "BRAINCO-OPER-04")
+@wrong_hand("DEX3-OPER-01", "BRAINCO-OPER-01")
 class CoarseFingers(_Coarse, FingerService):
     """Moves to the nearest of 21 positions."""
 
     grid = 1 / 20
 
 
-@reports(ReferenceService, "DEX1-OPER-02")
+@reports(ReferenceService, "DEX1-OPER-01")
 def LateState(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the position of 60 ms ago in fresh messages."""
     past = self.memory.setdefault(hand, [])
@@ -120,7 +120,7 @@ def LateState(self: Any, state: Any, hand: ReferenceHand) -> None:
     state.update(past[0][1])
 
 
-@wrong_hand("DEX1-OPER-03")
+@wrong_hand("DEX1-OPER-01")
 class RunsAhead(_PerJoint, ReferenceService):
     """Extrapolates moving goals by 70 ms, and overshoots when they stop."""
 
@@ -201,7 +201,7 @@ class SlowToLeave(_OpenEnd, FingerService):
         return taken
 
 
-@wrong_hand("DEX3-OPER-03")
+@wrong_hand("DEX3-OPER-01")
 class Springs(_OpenEnd, FingerService):
     """Moves 25 % too far for 0.5 s when it leaves the open end of a joint."""
 
@@ -212,20 +212,20 @@ class Springs(_OpenEnd, FingerService):
         return goal * 1.25 if 0.0 <= self.now - left < 0.5 else goal
 
 
-@wrong_hand("BRAINCO-OPER-02", where=has_speeds)
+@wrong_hand("BRAINCO-OPER-01", where=has_speeds)
 @wrong_hand("DEX3-CMD-01")
 class LateFingers(Delayed, FingerService):
     """Obeys each command 0.15 s late."""
 
 
-@wrong_hand("DFX-OPER-02")
+@wrong_hand("DFX-OPER-01")
 class LaggingFingers(Delayed, FingerService):
     """Obeys each command 0.38 s late, and shows it later still."""
 
     delay = 0.38
 
 
-@wrong_hand("DFX-OPER-02")
+@wrong_hand("DFX-OPER-01")
 class LaterFingers(Delayed, FingerService):
     """Obeys each command 0.39 s late."""
 

@@ -264,7 +264,7 @@ def GoesOnForEver(hand: Any, expire: Call) -> None:
 # -------------------------------------------------------------------------- operator
 
 
-@wrong_hand("BRAINCO-OPER-02", where=has_speeds)
+@wrong_hand("BRAINCO-OPER-01", where=has_speeds)
 class SmoothsGoals(ServoHand):
     """Smooths its goals over 0.15 s."""
 

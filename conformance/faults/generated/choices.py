@@ -63,7 +63,7 @@ _SLUGGISH = frozenset(
     for hand in ("DEX1", "DEX3", "DEX5", "BRAINCO", "DFX", "FTP")
     for number in (
         *("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05", "MODE-05", "MOVE-04", "SENS-10"),
-        *("OPER-01", "OPER-02", "OPER-03", "OPER-04", "TRACK-02"),
+        *("OPER-01", "TRACK-01"),
     )
 )
 """The client's torques are small, so that friction makes a hand slow, and stops it short."""
