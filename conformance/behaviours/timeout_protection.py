@@ -10,6 +10,7 @@ import numpy as np
 from dexkit.conformance.behaviours.gains import drive_fingers
 from dexkit.conformance.behaviours.grip import finger_squeezes, step_beside_grip
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.obedience import arrival
 from dexkit.conformance.checks.silences import mode_bytes, roles_of, silences_of, stops_moving
 from dexkit.conformance.checks.steps import not_driven
@@ -140,13 +141,17 @@ def latch_and_clear(script: FingerScript, guarded: Mapping[Side, frozenset[int]]
 
 
 @check("DEX3-GUARD-01")
-def brakes(ctx: Context) -> Outcome:
-    """Motion after the time-out of protected joints, driven by velocity or to a position."""
-    return stops_moving(ctx, (*roles_of(ctx).driven, *roles_of(ctx).slow), guarded=True)
+def guards(ctx: Context) -> Outcome:
+    """Motion after the time-out of protected joints, driven by velocity or to a position; of those
+    that stop, what they report, and what clears the protection.
+    """
+    stops = stops_moving(ctx, (*roles_of(ctx).driven, *roles_of(ctx).slow), guarded=True)
+    if stops.met is False:
+        return stops
+    return all_of(stops, _reports_trip(ctx), _latches(ctx), _clears(ctx))
 
 
-@check("DEX3-GUARD-02")
-def reports_trip(ctx: Context) -> Outcome:
+def _reports_trip(ctx: Context) -> Outcome:
     """Bit 7 of the state's mode byte of each joint before and after the time-out."""
     if not np.nan_to_num(ctx.states.mode).any():
         return ctx.absent("mode is not filled (0 throughout)")
@@ -182,16 +187,16 @@ def reports_trip(ctx: Context) -> Outcome:
     return ctx.passed("set", f"bit 7 is set in {count} protected motors, and in no other")
 
 
-@check("DEX3-GUARD-03")
-def latches(ctx: Context) -> Outcome:
+def _latches(ctx: Context) -> Outcome:
     """Motion by commands that do not clear the protection."""
-    return not_driven(ctx, "while the time-out protection was tripped and not cleared")
+    how = "while the time-out protection was tripped and not cleared"
+    return not_driven(ctx.only("guard-latch"), how, "max_towards_stroke")
 
 
-@check("DEX3-GUARD-04")
-def clears(ctx: Context) -> Outcome:
+def _clears(ctx: Context) -> Outcome:
     """The step after the protection was cleared."""
-    return arrival(ctx, "commanded without bit 7 after the protection had tripped")
+    when = "commanded without bit 7 after the protection had tripped"
+    return arrival(ctx, when, ctx.phases("guard-clear"))
 
 
 # ---------------------------------------------------------------------------------------- USB

@@ -27,6 +27,7 @@ from dexkit.conformance.behaviours.grip import (
 from dexkit.conformance.behaviours.motion import robot_follows
 from dexkit.conformance.behaviours.timeout_protection import latch_and_clear
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.obedience import arrival, away_first, silent, stopped
 from dexkit.conformance.checks.robot import RobotContext, no_state, only_phase, speed_between
@@ -348,7 +349,13 @@ def _silences(ctx: Context, *names: str) -> list[tuple[float, float]]:
     return found
 
 
-@check("DEX1-WDOG-01", "DEX1-WDOG-04")
+@check("DEX1-WDOG-01")
+def brakes_in_time(ctx: Context) -> Outcome:
+    """Whether the hand brakes at the time-out, and is in force until then."""
+    return all_of(brakes(ctx), in_force(ctx))
+
+
+@check("DEX1-WDOG-04")
 def brakes(ctx: Context) -> Outcome:
     """Motion and force after the time-out of a hand that moved or pressed when silence began.
 
@@ -582,7 +589,6 @@ _AT_A_STOP = 0.05
 """Distance from an end of the stroke, as a part of it, at which a gripper may be at its stop."""
 
 
-@check("DEX1-WDOG-06")
 @worst("part", "min_part", nothing="it neither pressed nor moved when the commands stopped")
 def in_force(ctx: Context) -> Figures:
     """Force or speed shortly before the time-out, relative to that at the last command."""
@@ -601,7 +607,7 @@ def in_force(ctx: Context) -> Figures:
         what = ""
         if ctx.object_at is not None:
             before, after = (median(np.abs(states.tau[s, 0])) for s in spans)
-            if before >= ctx.tolerance("min_tau_nm"):
+            if before >= ctx.tolerance("min_force_nm"):
                 part, what = after / before, f"presses with {after:.2f} N m, {before:.2f} N m"
         if not what:
             before, after = (_speed(states.t[s], states.q[s, 0]) for s in spans)

@@ -25,7 +25,8 @@ def all_of(*parts: Outcome) -> Outcome:
 
     Met where each part is that could be judged. Where some are not, the first that fails is the
     outcome, or the first that warns, and what the others of that kind observed is added. With no
-    part that could be judged, the first says why. What nothing fills is absent whatever else is met.
+    part that could be judged, the first says why. What nothing fills is absent whatever else is
+    met.
     """
     judged = [part for part in parts if part.met is not None]
     if not judged:

@@ -345,8 +345,11 @@ def rests_before(ctx: Context, step: Step) -> bool:
     return not len(q) or bool(np.ptp(q) < 0.01 * step.stroke)
 
 
-def not_driven(ctx: Context, how: str) -> Outcome:
-    """Motion of each joint towards a q that must have no effect."""
+def not_driven(ctx: Context, how: str, limit: str = "max_motion_stroke") -> Outcome:
+    """Motion of each joint towards a q that must have no effect.
+
+    :param limit: the tolerance that limits it.
+    """
     given = steps(ctx)
     if not given:
         return ctx.skipped("no state during this stimulus")
@@ -355,7 +358,7 @@ def not_driven(ctx: Context, how: str) -> Outcome:
     ways: dict[int, dict[bool, Figure]] = {}
     for s in given:
         # joints already at q prove nothing
-        if abs(s.size) <= 2 * ctx.tolerance("max_motion_stroke", s.joint):
+        if abs(s.size) <= 2 * ctx.tolerance(limit, s.joint):
             continue
         towards = max(float(np.max((s.q - s.start) * np.sign(s.size))), 0.0)
         text = f"moved {towards:.3f} {ctx.unit} towards q = {s.target:.2f} {how}, which was "
@@ -367,7 +370,7 @@ def not_driven(ctx: Context, how: str) -> Outcome:
         ctx,
         [min(found.values(), key=lambda f: f.value) for found in ways.values()],
         "motion_rad",
-        "max_motion_stroke",
+        limit,
         nothing="the hand was already at the q that must have no effect",
     )
 

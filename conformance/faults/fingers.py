@@ -985,7 +985,7 @@ class HoldsWhenGuarded(FingerHand):
             self.late = None
 
 
-@changes(FingerHand, "changed", "DEX3-GUARD-02")
+@changes(FingerHand, "changed", "DEX3-GUARD-01")
 def TripsInSecret(hand: Any, changed: Call) -> None:
     """Does not publish that the protection has tripped."""
     changed()
@@ -1027,14 +1027,14 @@ class TripsOnce(Dex3Hand):
             self.tripped = before
 
 
-@changes(Dex3Hand, "command", "DEX3-GUARD-02", sides=BOTH)
+@changes(Dex3Hand, "command", "DEX3-GUARD-01", sides=BOTH)
 def DropsEqualCommands(hand: Any, command: Call, motors: Motors) -> None:
     """Drops commands that equal the last, before they feed the time-out."""
     if motors != hand.newest:
         command(motors)
 
 
-@changes(FingerHand, "take", "DEX3-GUARD-03")
+@changes(FingerHand, "take", "DEX3-GUARD-01")
 def ClearsByItself(hand: Any, take: Call, rows: Floats, mode: Ints) -> None:
     """Obeys the next command after a trip, whether or not bit 7 is set."""
     take(rows, mode)
@@ -1056,7 +1056,7 @@ def ProtectedKeepsItsGoal(hand: Any, take: Call, rows: Floats, mode: Ints) -> No
     hand.goal = np.where(hand.guarded, before, hand.goal)
 
 
-@wrong_hand("DEX3-GUARD-04", whole=True)
+@wrong_hand("DEX3-GUARD-01", whole=True)
 class NeverClears(FingerHand):
     """A motor whose protection has tripped never reacts again."""
 
@@ -1072,7 +1072,7 @@ class NeverClears(FingerHand):
         self.dead = tripped if self.dead is None else self.dead | tripped
 
 
-@wrong_hand("DEX3-GUARD-04", whole=True)
+@wrong_hand("DEX3-GUARD-01", whole=True)
 class SlowToClear(FingerHand):
     """Stays tripped for 2 s after it was cleared."""
 

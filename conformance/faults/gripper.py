@@ -608,7 +608,7 @@ class BrakesLate(ReferenceHand):
     timeout = 1.38 * ReferenceHand.timeout
 
 
-@wrong_hand("DEX1-WDOG-06")
+@wrong_hand("DEX1-WDOG-01")
 class BrakesEarly(ReferenceHand):
     """Brakes 0.6 s after the last command."""
 
