@@ -19,7 +19,7 @@ from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 
 PAUSE, EVERY = 0.072, 1.0  # seconds
-MADE_ONCE = {"DEX1-LIFE-05", "DEX3-GAIN-05", "DEX5-GAIN-05", "DEX3-OPER-01"}
+MADE_ONCE = {"DEX1-LIFE-05", "DEX3-GAIN-02", "DEX5-GAIN-02", "DEX3-OPER-01"}
 """Requirements about an event that a run has only once, which a pause may hide: a service that is
 stopped in motion, a step with a tenth of the stiffness, a full stroke of the operator.
 """
@@ -58,7 +58,7 @@ def without(trace: MemoryTrace, commands: str, at: float) -> MemoryTrace:
                 ("dex1-1/unitree_hg:backlash-more+soft-start", (0.52,)),
                 # that it moves before a step
                 ("dex3-1/dex3:backlash-more+latency-20", (0.64, 0.8)),
-                # DEX5-GAIN-05: how a step gets half-way
+                # DEX5-GAIN-02: how a step gets half-way
                 ("dex5-1/dex5:backlash-more+state-late-10", (0.66, 0.78)),
             )
         ),

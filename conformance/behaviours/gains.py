@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
-from dexkit.conformance.checks.nudges import STIFFNESS, nudges
+from dexkit.conformance.checks.nudges import STIFFNESS, displacement_noise, is_alike, nudges
 from dexkit.conformance.checks.obedience import sags
 from dexkit.conformance.checks.robot import (
     LATE_S,
@@ -243,9 +244,7 @@ def step_stiff_and_soft(script: FingerScript) -> Steps:
     """A step with the client's gains, with a tenth of its stiffness and with a third of it."""
     script.report("a stiff step and a soft one: the gains must make a difference")
     yield from script.to("center", OPEN)
-    kinds = [("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, _SOFTER)]
-    if "mild" in script.plan.phases:
-        kinds.append(("mild", CLOSED - 5.0, _MILD))
+    kinds = ("stiff", CLOSED - 5.0, 1.0), ("soft", OPEN, _SOFTER), ("mild", CLOSED - 5.0, _MILD)
     for name, percent, part in kinds:
         poses = {s: script.pose(s, percent) for s in script.plan.sides}
         motors = {
@@ -254,8 +253,7 @@ def step_stiff_and_soft(script: FingerScript) -> Steps:
         }
         yield from script.hold_as(name, script.plan.sides, 0.6, motors, targets=poses)
         script.goal.update(poses)
-    if "soft" in script.plan.phases:
-        yield from _step_unevenly(script)
+    yield from _step_unevenly(script)
 
 
 def _step_unevenly(script: FingerScript) -> Steps:
@@ -470,13 +468,16 @@ def least_half_way(step: Step) -> float:
     return (step.end - step.begin) * max(1.0, 0.5 / max(progress, 1e-3))
 
 
-def slower(ctx: Context, joint: int, took: float, quick: float, how: str) -> Figure:
-    """How many times as long a softer step takes to half-way, with the seconds of both."""
+def slower(joint: int, took: float, quick: float, least: float, how: str) -> Figure:
+    """How many times as long a softer step takes to half-way, with the seconds of both.
+
+    :param least: how many times as long it has to take.
+    """
     return Figure(
         took / quick,
         joint=joint,
         text=f"a step {how} takes {took / quick:.1f} times as long to half-way",
-        measure=Measure(took, ctx.tolerance("min_ratio") * quick, larger_is_worse=False),
+        measure=Measure(took, least * quick, larger_is_worse=False),
     )
 
 
@@ -514,19 +515,12 @@ def _driven_ways(ctx: Context) -> Iterator[tuple[float, int, Phase]]:
 @check("DEX1-GAIN-02", "DEX3-GAIN-03")
 @worst("motion_rad", "min_motion_stroke", nothing="no state while a velocity was commanded")
 def velocity_drives(ctx: Context) -> Figures:
-    """Motion by a commanded velocity without a position gain."""
+    """Motion by a commanded velocity without a position gain, negative the other way."""
     for moved, joint, phase in _driven_ways(ctx):
-        text = f"moved by {moved:.2f} {ctx.unit} while a velocity was commanded"
+        against = moved <= -ctx.tolerance("min_motion_stroke", joint)
+        way = f"{-moved:.2f} {ctx.unit} the other way" if against else f"{moved:.2f} {ctx.unit}"
+        text = f"moved by {way} while a velocity was commanded"
         yield Figure(moved, *ctx.span(phase), joint, text)
-
-
-@check("DEX1-GAIN-06", "DEX3-GAIN-06")
-@worst("motion_rad", "max_motion_stroke", nothing="no state while a velocity was commanded")
-def velocity_way(ctx: Context) -> Figures:
-    """Motion against a commanded velocity without a position gain."""
-    for moved, joint, phase in _driven_ways(ctx):
-        text = f"moved by {moved:.2f} {ctx.unit} with a commanded velocity"
-        yield Figure(max(0.0, -moved), *ctx.span(phase), joint, text)
 
 
 _REST_S, _REST_PART = 0.1, 0.01  # before a step: seconds, and part of the stroke that q may vary
@@ -587,10 +581,13 @@ def _noise(ctx: Context, joint: int) -> float:
 
 @check("DEX1-GAIN-03", "DEX3-GAIN-04")
 def torque_drives(ctx: Context) -> Outcome:
-    """Motion by a commanded torque without a position gain.
+    """Motion by a commanded torque: never against it, and with it, which only warns."""
+    return all_of(warning(_moves_with_torque(ctx)), _moves_against_torque(ctx))
 
-    A torque towards larger q (of a gripper) or closing (of fingers) must move the joint; the
-    opposite one must not move it the wrong way.
+
+def _moves_with_torque(ctx: Context) -> Outcome:
+    """Motion of a gripper towards larger q and of fingers towards closing, without a position
+    gain.
     """
     found = list(_pushes(ctx))
     if not found:  # a part of a push can show that a joint moves enough, not that it does not
@@ -603,15 +600,6 @@ def torque_drives(ctx: Context) -> Outcome:
         ]
     if not found:
         return ctx.skipped("no state shows the begin and the end of a torque command")
-    for phase in ctx.phases("pull"):
-        for joint, moved in _pushed(ctx, phase, after=_LATE):
-            most = ctx.tolerance("max_against_stroke", joint) + _noise(ctx, joint)
-            if moved < -most:
-                text = ctx.named(
-                    f"moved by {-moved:.2f} {ctx.unit} against a torque that was commanded", joint
-                )
-                place = ctx.at(ctx.states.topic, *ctx.span(phase))
-                return ctx.failed("against it", text, place, motion_rad=moved).about(joint)
     if "max_speed_part" in ctx.requirement.tolerances:
         nothing = ctx.passed("no damping")
         fast = judged(ctx, _speeds(ctx), "speed_rad_s", "max_speed_part", nothing=nothing)
@@ -649,13 +637,12 @@ def _speeds(ctx: Context) -> Iterator[Figure]:
                 yield Figure(speed, late, end, joint, text, limit=limit)
 
 
-@check("DEX1-GAIN-07", "DEX3-GAIN-07")
 @worst(
-    "motion_rad",
+    "against_rad",
     "max_motion_stroke",
     nothing="no state shows the begin and the end of a torque command",
 )
-def torque_way(ctx: Context) -> Figures:
+def _moves_against_torque(ctx: Context) -> Figures:
     """Motion against a commanded torque, without a position gain and beside one.
 
     A joint that sags with zero gains may sag here.
@@ -675,8 +662,7 @@ def torque_way(ctx: Context) -> Figures:
         yield Figure(against, begin, end, joint, text)
 
 
-@check("DEX3-GAIN-05")
-def grades_of_stiffness(ctx: Context) -> Outcome:
+def _grades_of_stiffness(ctx: Context) -> Outcome:
     """Time to half of a step with a third of the client's stiffness, compared with the client's
     stiffness, and with a tenth of it, compared with a third.
 
@@ -689,8 +675,8 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
         for step in steps_of(ctx, phase):
             soft.setdefault(step.joint, step)
     figures: list[Figure] = []
-    nothing = "no state shows how the steps got half-way"
-    for step in steps(ctx):
+    least, nothing = ctx.tolerance("min_grade_ratio"), "no state shows how the steps got half-way"
+    for step in (s for p in ctx.phases("mild") for s in steps_of(ctx, p)):
         reference = stiff.get(step.joint)
         quick = half_way(reference) if reference is not None else None
         if reference is None or quick is None:
@@ -698,17 +684,17 @@ def grades_of_stiffness(ctx: Context) -> Outcome:
         took, quick = least_half_way(step), max(quick, 1e-3)
         if not (_seen_to_half(ctx, step) and _seen_to_half(ctx, reference)):
             continue
-        soon = took < ctx.tolerance("min_ratio") * quick
+        soon = took < least * quick
         if soon and any(by(ctx, reference) for by in (limited_by_speed, limited_by_start)):
             nothing = "its own speed or start limits every joint's steps, whatever their gains are"
             continue
-        figures.append(slower(ctx, step.joint, took, quick, "with a third of the stiffness"))
+        figures.append(slower(step.joint, took, quick, least, "with a third of the stiffness"))
         softer = soft.get(step.joint)
         if softer is not None and half_way(step) is not None and _seen_to_half(ctx, softer):
             how = "with a tenth of the stiffness, compared with a third,"
             took, quick = least_half_way(softer), max(took, 1e-3)
-            figures.append(slower(ctx, step.joint, took, quick, how))
-    return judged(ctx, figures, "ratio", "min_ratio", nothing=nothing)
+            figures.append(slower(step.joint, took, quick, least, how))
+    return judged(ctx, figures, "grade_ratio", "min_grade_ratio", nothing=nothing)
 
 
 def _seen_to_half(ctx: Context, step: Step) -> bool:
@@ -744,6 +730,11 @@ _TOO_SOFT = "Dry friction takes what so little stiffness gives; or the gain was 
 
 @check("DEX3-GAIN-02")
 def soft_steps(ctx: Context) -> Outcome:
+    """Time to half of steps with a tenth and with a third of the client's stiffness."""
+    return all_of(_soft_steps(ctx), _grades_of_stiffness(ctx))
+
+
+def _soft_steps(ctx: Context) -> Outcome:
     """Time to half of a step with low gains, compared with the client's gains.
 
     In some steps other joints keep the client's gains: a joint that uses theirs is as quick as they
@@ -773,14 +764,20 @@ def soft_steps(ctx: Context) -> Outcome:
         if took < ctx.tolerance("min_ratio") * quick and limited_by_speed(ctx, reference):
             nothing = "its own speed limits every joint's steps, whatever their gains are"
             continue
-        figures.append(slower(ctx, step.joint, took, quick, "with soft gains"))
+        least = ctx.tolerance("min_ratio")
+        figures.append(slower(step.joint, took, quick, least, "with soft gains"))
     outcome = judged(ctx, figures, "ratio", "min_ratio", nothing=nothing)
     return outcome if outcome.met is False or stuck is None else stuck
 
 
 @check("DEX1-GAIN-05")
+def spring(ctx: Context) -> Outcome:
+    """Displacement by a torque, and whether it is still the same after a long hold."""
+    return all_of(_displaced(ctx), _still_held(ctx))
+
+
 @worst("part", "max_part", nothing="no state while it was pushed")
-def spring(ctx: Context) -> Figures:
+def _displaced(ctx: Context) -> Figures:
     """The largest displacement by a torque, relative to torque / kp."""
     for nudge in nudges(ctx, [*ctx.phases(), *ctx.phases(STIFFNESS)]):
         limit = ctx.tolerance("max_part") * nudge.asked
@@ -792,6 +789,33 @@ def spring(ctx: Context) -> Figures:
             f"{nudge.asked:.3f} {ctx.unit}",
             measure=Measure(nudge.way, limit, "rad", Quantity.POSITION),
         )
+
+
+def _still_held(ctx: Context) -> Outcome:
+    """The displacement by a torque after a long hold, compared with that before it."""
+    found = nudges(ctx)
+    if len(found) < 2:
+        return ctx.skipped("no state during two pushes")
+    least, most = ctx.tolerance("min_later_part"), ctx.tolerance("max_later_part")
+    shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
+    if not shown:
+        return ctx.skipped(
+            "a torque does not displace this hand: it does not show whether it holds"
+        )
+    noise = displacement_noise(ctx, ctx.phases())
+    pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
+    for first, last in pairs:
+        text = (
+            f"a torque displaced it by {first.way:.3f} {ctx.unit}, and after "
+            f"{last.begin - first.end:.1f} "
+            f"s of equal commands by {last.way:.3f} {ctx.unit}"
+        )
+        if not is_alike(first, last, (least, most), noise):
+            place = ctx.at(ctx.states.topic, last.begin, last.end)
+            return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
+    if not pairs:
+        return ctx.skipped("the first push displaced it too little to compare the last with it")
+    return ctx.passed(f"{last.way:.3f} {ctx.unit}", text, motion_rad=last.way)
 
 
 _SOME = 20  # states before a phase or at its end that are averaged

@@ -12,7 +12,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.goals import OWN_RULE, Goals, goals_of
-from dexkit.conformance.checks.nudges import displacement_noise, is_alike, nudges
 from dexkit.conformance.checks.silences import Silence, motions_in, roles_of, silences_of
 from dexkit.hand import Floats
 
@@ -299,31 +298,3 @@ def _turns(q: Floats, least: float) -> int:
         elif (value - extreme) * (way or 1) > 0:
             extreme = value
     return turns
-
-
-@check("DEX1-HOLD-01")
-def held(ctx: Context) -> Outcome:
-    """The displacement by a torque after a long hold, compared with that before it."""
-    found = nudges(ctx)
-    if len(found) < 2:
-        return ctx.skipped("no state during two pushes")
-    least, most = ctx.tolerance("min_part"), ctx.tolerance("max_part")
-    shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
-    if not shown:
-        return ctx.skipped(
-            "a torque does not displace this hand: it does not show whether it holds"
-        )
-    noise = displacement_noise(ctx, ctx.phases())
-    pairs = [(a, b) for a, b in zip(found[::2], found[1::2], strict=False) if a in shown]
-    for first, last in pairs:
-        text = (
-            f"a torque displaced it by {first.way:.3f} {ctx.unit}, and after "
-            f"{last.begin - first.end:.1f} "
-            f"s of equal commands by {last.way:.3f} {ctx.unit}"
-        )
-        if not is_alike(first, last, (least, most), noise):
-            place = ctx.at(ctx.states.topic, last.begin, last.end)
-            return ctx.failed(f"{last.way:.3f} {ctx.unit}", text, place, motion_rad=last.way)
-    if not pairs:
-        return ctx.skipped("the first push displaced it too little to compare the last with it")
-    return ctx.passed(f"{last.way:.3f} {ctx.unit}", text, motion_rad=last.way)

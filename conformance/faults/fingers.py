@@ -504,19 +504,19 @@ def DeafToTorque(hand: Any, rows: Floats) -> None:
     rows[TAU] = 0.0
 
 
-@commands(FingerHand, "DEX3-GAIN-07")
+@commands(FingerHand, "DEX3-GAIN-04")
 def TurnedTorque(hand: Any, rows: Floats) -> None:
     """Obeys the torque of a command with the wrong sign."""
     rows[TAU] = -rows[TAU]
 
 
-@commands(FingerHand, "DEX3-GAIN-07")
+@commands(FingerHand, "DEX3-GAIN-04")
 def TorqueOfTheMotorBefore(hand: Any, rows: Floats) -> None:
     """Adds the torque that is commanded to the motor before, in each."""
     rows[TAU] = np.roll(rows[TAU], 1)
 
 
-@commands(Dex3Hand, "DEX3-GAIN-07")
+@commands(Dex3Hand, "DEX3-GAIN-04")
 def SwappedTorque(hand: Any, rows: Floats) -> None:
     """Adds the torques of index and middle finger to each other's."""
     rows[TAU] = rows[TAU][[0, 1, 2, 5, 6, 3, 4]]
@@ -528,20 +528,20 @@ def TorqueOfAnotherGear(hand: Any, rows: Floats) -> None:
     rows[TAU, -1] *= 5.0
 
 
-@commands(FingerHand, "DEX3-GAIN-06")
+@commands(FingerHand, "DEX3-GAIN-03")
 def TurnedVelocityCommand(hand: Any, rows: Floats) -> None:
     """Obeys the velocity of a command with the wrong sign."""
     rows[DQ] = -rows[DQ]
 
 
-@commands(FingerHand, "DEX3-GAIN-05")
+@commands(FingerHand, "DEX3-GAIN-02")
 def TwoGrades(hand: Any, rows: Floats) -> None:
     """Has only a soft and a firm stiffness: from a quarter of the client's on, the full one."""
     between = (rows[KP] > 0.25 * hand.client_kp) & (rows[KP] < hand.client_kp)
     rows[KP] = np.where(between, hand.client_kp, rows[KP])
 
 
-@commands(FingerHand, "DEX3-GAIN-05")
+@commands(FingerHand, "DEX3-GAIN-02")
 def LeastStiffness(hand: Any, rows: Floats) -> None:
     """Raises each kp above 0 to 35 % of the client's at least: soft joints are not soft."""
     least = np.maximum(rows[KP], 0.35 * hand.client_kp)

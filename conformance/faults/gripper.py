@@ -334,7 +334,7 @@ def DeafToVelocity(hand: Any, accept: Call, motor: Motor) -> Any:
     return accepted if accepted.kp > 0 else replace(accepted, dq=0.0)
 
 
-@changes(ReferenceHand, "accept", "DEX1-GAIN-06")
+@changes(ReferenceHand, "accept", "DEX1-GAIN-02")
 def TurnedVelocityCommand(hand: Any, accept: Call, motor: Motor) -> Any:
     """Obeys dq with the wrong sign where there is no position gain."""
     accepted = accept(motor)
@@ -397,21 +397,21 @@ def UnsignedTorque(hand: Any, accept: Call, motor: Motor) -> Any:
     return replace(accept(motor), tau=abs(motor.tau))
 
 
-@changes(ReferenceHand, "accept", "DEX1-GAIN-07", dialect="unitree_actuator")
+@changes(ReferenceHand, "accept", "DEX1-GAIN-03", dialect="unitree_actuator")
 def TurnedTorque(hand: Any, accept: Call, motor: Motor) -> Any:
     """Obeys the torque of a command with the wrong sign, in one dialect."""
     accepted = accept(motor)
     return replace(accepted, tau=-accepted.tau)
 
 
-@changes(ReferenceHand, "accept", "DEX1-GAIN-07")
+@changes(ReferenceHand, "accept", "DEX1-GAIN-03")
 def TurnedTorqueWhileHeld(hand: Any, accept: Call, motor: Motor) -> Any:
     """Obeys the torque of a command with the wrong sign where a position gain holds it."""
     accepted = accept(motor)
     return replace(accepted, tau=-accepted.tau) if accepted.kp > 0 else accepted
 
 
-@changes(ReferenceService, "command", "DEX1-GAIN-07", sides=BOTH)
+@changes(ReferenceService, "command", "DEX1-GAIN-03", sides=BOTH)
 def TorqueOfTheOtherSide(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Adds the torque that the other gripper is commanded."""
     if math.isfinite(motor.tau):
@@ -705,7 +705,7 @@ def GripGrows(hand: Any, torque: Call) -> float:
     return float(min(max(tau, -hand.tau_max), hand.tau_max))
 
 
-@wrong_hand("DEX1-HOLD-01")
+@wrong_hand("DEX1-GAIN-05")
 class SleepsWhileHeld(ReferenceHand):
     """Switches its motor off when the goal has been the same for three seconds."""
 

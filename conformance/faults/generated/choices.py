@@ -163,8 +163,8 @@ _SERVO = frozenset(
     f"{hand}-{number}"
     for hand, numbers in {
         "DEX1": ("GAIN-02", "GAIN-03", "GAIN-05"),
-        "DEX3": ("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05"),
-        "DEX5": ("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05"),
+        "DEX3": ("GAIN-02", "GAIN-03", "GAIN-04"),
+        "DEX5": ("GAIN-02", "GAIN-03", "GAIN-04"),
     }.items()
     for number in numbers
 )
