@@ -15,7 +15,7 @@ from dexkit.conformance.virtual import Service
 from dexkit.hand import Side
 from dexkit.models import DEX1_1, model
 from tools.consequences.kinds import KINDS, Consequence, consequences
-from tools.consequences.sessions import grasp
+from tools.consequences.sessions import example, grasp
 from tools.consequences.stage import Figure
 from tools.consequences.table import FILE, Table, told
 from tools.consequences.work import known, tasks
@@ -50,7 +50,7 @@ def test_each_kind_has_its_limit(kind: str, good: float, harmless: float, harmfu
     (found,) = consequences({figure(kind): harmful}, {figure(kind): good}).values()
     assert (found.kind, found.good) == (kind, good)
     assert found.size > 1.0
-    assert told(found)
+    assert told(found, "dex1-1")
 
 
 def test_the_worst_joint_counts() -> None:
@@ -78,15 +78,31 @@ def reference(name: str) -> dict[Figure, float]:
     return grasp(layer("dds").reference(name), model(name).dialects[0], (Side.LEFT,)).figures
 
 
-@pytest.mark.parametrize("name", ["dex1-1", "dex3-1"])
+@pytest.mark.parametrize("name", ["dex1-1", "dex3-1", "inspire-ftp"])
 def test_a_client_grasps_with_the_reference(name: str) -> None:
     figures = reference(name)
-    # without its protection, a Dex3-1 holds an object when its client has gone
+    # a position servo holds an object when its client has gone, and a Dex3-1 without its protection
     least, most = (0.0, 0.3) if name == "dex1-1" else (0.9, 1.1)
     held = figures[Figure("drops", "xr_teleoperate", "lift", "left", 0)]
     left = figures[Figure("lets go", "xr_teleoperate", "stopped in a grip", "left", 0)]
     assert held > 0.3
     assert least <= left <= most
+
+
+def test_a_client_of_position_servos_sends_no_nan_in_integers_and_has_no_gains() -> None:
+    tasks = {f.task for f in reference("inspire-ftp")}
+    assert not {task for task in tasks if "NaN" in task or "gains" in task}
+
+
+def test_other_models_have_no_example() -> None:
+    spoken = model("inspire-dfx").dialects[0]
+    assert not example(layer("dds").reference("inspire-dfx"), spoken, tuple(Side)).figures
+
+
+def test_forces_are_told_in_units_of_the_model() -> None:
+    found = Consequence(*figure("presses"), 0.0, 1.0, 9.0)
+    assert "0 N m instead of 1 N m" in told(found, "dex1-1")
+    assert "0 A instead of 1 A" in told(found, "brainco-revo2")
 
 
 def of(made: type[Service]) -> dict[str, Consequence]:

@@ -62,7 +62,7 @@ def main(
         for name, kinds in table.hands.items():
             console.print(name, markup=False, highlight=False)
             for found in kinds.values():
-                console.print(f"    {told(found)}", markup=False, highlight=False)
+                console.print(f"    {told(found, name.split()[1])}", markup=False, highlight=False)
     if not only:
         table.save()
         console.print(f"{FILE}: {len(table.hands)} wrong hands", soft_wrap=True)

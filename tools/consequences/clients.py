@@ -55,6 +55,7 @@ class Teleoperation(Client):
         self.client = client_for(spoken, sides)
         self.period = self.client.period
         self._input = (-1, self.goals)
+        self._sent: tuple[object, Mapping[Side, Sequence[Motor]]] = (None, {})
 
     def receive(self, now: float, states: Mapping[Side, Sequence[float]]) -> None:
         """Take a state: reads of both sides take turns."""
@@ -67,7 +68,10 @@ class Teleoperation(Client):
             self._input = frame, self.wanted(now)
         wanted = self._input[1]
         inputs: dict[Side, Pose | None] = {s: self._tracked(q) for s, q in wanted.items()}
-        return motors_of(self.client.step(now, {}, inputs), self.dialect)
+        commands = self.client.step(now, {}, inputs)
+        if commands != self._sent[0]:
+            self._sent = commands, motors_of(commands, self.dialect)
+        return self._sent[1]
 
     def _tracked(self, q: Pose) -> Pose:
         """What hand tracking gives for this goal: of a gripper, a pinch."""
@@ -112,6 +116,8 @@ class Example(Script):
     """
 
     TURN, GRIP, STOP = (0.5, 0.1), (1.5, 0.1), (0.0, 0.0)
+    MODELS = ("dex1-1", "dex3-1")
+    """Those that it was written for."""
     fast = 0.0005
     """Seconds between commands of a loop without a pause, as far as a computer comes."""
 

@@ -9,10 +9,13 @@ from typing import NamedTuple
 
 from tools.consequences.stage import Figure
 
-__all__ = ["KINDS", "NO_END", "Consequence", "Kind", "consequences"]
+__all__ = ["FORCE", "KINDS", "NO_END", "Consequence", "Kind", "consequences"]
 
 NO_END = 99.0
 """What is written of a figure, and of a size, that has no end."""
+
+FORCE = "force"
+"""The unit of forces: N m, and of position servos what their model has in its place."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ KINDS: Mapping[str, Kind] = {
         Kind(
             "presses",
             "an object is pressed with {found} instead of {good}",
-            "N m",
+            FORCE,
             _ratio(2.5, 0.5),
             "Clients set no force, but a lead or a depth, and the stiffness of vendors differs by "
             "two; from 2.5 times on, or below half, an object is crushed or is not held.",
@@ -97,7 +100,7 @@ KINDS: Mapping[str, Kind] = {
         Kind(
             "drops",
             "a grip falls to {found} instead of {good}, and the object is dropped",
-            "N m",
+            FORCE,
             lambda found, good: 0.5 * good / max(found, 1e-6) if good > 0.01 else 0.0,
             "Grips are made with about twice the force at which an object slips.",
         ),

@@ -137,7 +137,7 @@ class Session:
                 there = np.flatnonzero(progress >= 0.9)
                 late = math.inf if settles else math.nan  # too soon to say
                 took[joint] = t[there[0]] if len(there) else late
-                made[joint] = max(float(progress.max()), 0.0)
+                made[joint] = max(0.0, float(progress.max()))
             self.add("lags", task, side, took)
             self.add("misses", task, side, made)
             if not hurried:
@@ -251,15 +251,6 @@ class Session:
             shown = np.concatenate((shown, shown[newest[held]]))
             window = np.stack([places[np.maximum(rows - i, 0)] for i in range(11)])
             self.add("reads", task, side, _apart(shown, window))
-
-    def other_readers(self) -> None:
-        """Whether a ROS 2 node with the usual, reliable, reader gets a state, and the example."""
-        service = self.stage.service
-        node = self.stage.published and service.writer_reliability == "reliable"
-        low = not self.dialect.low_rate_topic or self.stage.low
-        for task, there in (("a ROS 2 node listens", node), ("the low-rate copy", low)):
-            for side in self.sides:
-                self.add("starts", task, side, [0.0 if there else math.inf])
 
     def low_rate(self) -> None:
         """What the low-rate copies held, against what was true within 0.2 s."""
@@ -378,21 +369,11 @@ def _events(s: Session, client: Teleoperation) -> None:
         s.move(f"open after {seconds} s", _both(s, _OPEN), stroke)
         s.move(f"half way after {seconds} s", mid, _HALF)
 
-    # inverse kinematics fails: NaN for one joint, for one cycle and for long
     hold = Script(s.dialect, s.sides)
     good = {side: hold.motors(side, q) for side, q in mid.items()}
-    bad = {side: [replace(m[0], q=math.nan), *m[1:]] for side, m in good.items()}
-    s.still("one NaN", 0.5, after=_burst(s, bad, 1))
-    s.still("a second of NaN", 0.6, after=_burst(s, bad, 100))
-    s.move("close after NaN", _both(s, _SHUT), stroke)
-    s.move("open after NaN", _both(s, _OPEN), stroke)
-
-    if len(s.sides) > 1:
-        mixed = {side: hold.motors(side, q) for side, q in _both(s, _SHUT).items()}
-        mixed[s.sides[0]] = bad[s.sides[0]]
-        _burst(s, mixed, round(100 * stroke))
-        s.add("ends", "NaN for the other side", s.sides[1], stage.places(s.sides[1])[-1])
-        s.move("half way after NaN for one side", mid, _HALF)
+    bad = _with_nan(good)
+    if codec.holds_nan:
+        _nan(s, bad)
 
     # a script sends degrees, then radians again; or beyond the range a little
     far = {side: [replace(m, q=m.q * 57.3 + 300.0) for m in ms] for side, ms in good.items()}
@@ -452,7 +433,8 @@ def _events(s: Session, client: Teleoperation) -> None:
     s.start(second, "a second client")
     s.move("close, second client", _both(s, _SHUT), stroke)
     s.move("open, second client", _both(s, _OPEN), stroke)
-    s.still("a NaN of the second client", 0.4, after=_burst(s, bad, 10, 1))
+    if codec.holds_nan:
+        s.still("a NaN of the second client", 0.4, after=_burst(s, bad, 10, 1))
 
     # the hand's service is restarted; the client goes on, if it can
     s.move("to rest before the restart", mid, _HALF)
@@ -471,6 +453,26 @@ def _events(s: Session, client: Teleoperation) -> None:
     second.stamp_age = 5.0
     s.move("close, with a clock that is behind", _both(s, _SHUT), stroke)
     s.move("open, with a clock that is behind", _both(s, _OPEN), stroke)
+
+
+def _with_nan(good: Mapping[Side, list[Motor]]) -> dict[Side, list[Motor]]:
+    """Inverse kinematics fails for one joint."""
+    return {side: [replace(m[0], q=math.nan), *m[1:]] for side, m in good.items()}
+
+
+def _nan(s: Session, bad: Mapping[Side, list[Motor]]) -> None:
+    """NaN for one joint, for one cycle and for long; then for one side alone."""
+    stroke, hold = _stroke(s.dialect), Script(s.dialect, s.sides)
+    s.still("one NaN", 0.5, after=_burst(s, bad, 1))
+    s.still("a second of NaN", 0.6, after=_burst(s, bad, 100))
+    s.move("close after NaN", _both(s, _SHUT), stroke)
+    s.move("open after NaN", _both(s, _OPEN), stroke)
+    if len(s.sides) > 1:
+        first, other = s.sides
+        mixed = {side: hold.motors(side, q) for side, q in _both(s, _SHUT).items()}
+        _burst(s, {**mixed, first: bad[first]}, round(100 * stroke))
+        s.add("ends", "NaN for the other side", other, s.stage.places(other)[-1])
+        s.move("half way after NaN for one side", _both(s, 0.5), _HALF)
 
 
 def _beyond(s: Session, good: Mapping[Side, list[Motor]]) -> dict[Side, list[Motor]]:
@@ -521,13 +523,13 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
             s.move(task, {sides[0]: closed(spoken, sides[0], (part,))}, _HALF)
             s.feel(task)
     hold = Script(spoken, sides)
-    good = {side: hold.motors(side, q) for side, q in deep.items()}
-    bad = {side: [replace(m[0], q=math.nan), *m[1:]] for side, m in good.items()}
-    stage.send(stage.codec.encode(bad), 0)
-    s.held_through("NaN in a grip", 0.3)
-    _burst(s, bad, 220)
-    s.left("two seconds of NaN in a grip")
-    s.move("grasp after NaN", deep, _HALF)
+    if stage.codec.holds_nan:
+        bad = _with_nan({side: hold.motors(side, q) for side, q in deep.items()})
+        stage.send(stage.codec.encode(bad), 0)
+        s.held_through("NaN in a grip", 0.3)
+        _burst(s, bad, 220)
+        s.left("two seconds of NaN in a grip")
+        s.move("grasp after NaN", deep, _HALF)
     stage.connected = False
     s.held_through("network away for 0.9 s in a grip", 0.9)
     stage.connected = True
@@ -542,35 +544,53 @@ def grasp(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessio
     s.hold("lift once more", 0.4)
     stage.connect(None)
     stage.restart()
-    s.still("the service has ended in a grip", 1.9, kind="left moving")
-    s.left("the service has ended in a grip")
-    s.still("the service starts in a grip", 0.9, kind="left moving")
-    s.left("the service starts in a grip")
+    # genuine servos keep their last goal, and with it the grip (docs/sources/unitree-dex.md#j2)
+    lets_go = not spoken.position_servo
+    for task, seconds in (("has ended", 1.9), ("starts", 0.9)):
+        s.still(f"the service {task} in a grip", seconds, kind="left moving")
+        if lets_go:
+            s.left(f"the service {task} in a grip")
     third = Teleoperation(spoken, sides, 2)
     third.goals = deep
     s.start(third, "a client after a restart in a grip")
     s.hold("lift after the restart", 0.6)
     s.move("let go after the restart", _both(s, 0.1), _HALF)
     s.move("grasp after the restart", deep, _HALF)
-    # LeRobot disconnects: one command without gains, where the hand is (docs/sources/lerobot.md#a1)
-    stage.connect(None)
-    limp = {
-        side: [replace(m, kp=0.0, kd=0.0) for m in hold.motors(side, q)]
-        for side, q in s.seen().items()
-    }
-    stage.send(stage.codec.encode(limp), 2)
-    stage.run(0.6)
-    s.left("disconnected without gains")
+    if not spoken.position_servo:
+        # LeRobot disconnects: one command without gains, where the hand is
+        # (docs/sources/lerobot.md#a1)
+        stage.connect(None)
+        limp = {
+            side: [replace(m, kp=0.0, kd=0.0) for m in hold.motors(side, q)]
+            for side, q in s.seen().items()
+        }
+        stage.send(stage.codec.encode(limp), 2)
+        stage.run(0.6)
+        s.left("disconnected without gains")
     s.records("all that it reads with an object")
     return s
 
 
+def listen(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Session:
+    """A ROS 2 node with the usual, reliable, reader listens: whether it gets a state."""
+    s = Session("a ROS 2 node", made, spoken, sides, {})
+    s.stage.run(0.8)
+    heard = s.stage.published and s.stage.service.writer_reliability == "reliable"
+    for side in sides:
+        s.add("starts", "listens", side, [0.0 if heard else math.inf])
+    return s
+
+
 def example(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Session:
-    """Unitree's example program: turns, grips and stops one hand."""
+    """Unitree's example program: turns, grips and stops one hand; other models have none."""
     s = Session("Unitree's example", made, spoken, sides, {})
+    if spoken.model not in Example.MODELS:
+        return s
     stage = s.stage
     stage.run(0.8)
-    s.other_readers()
+    if spoken.low_rate_topic:
+        for side in sides:
+            s.add("starts", "the low-rate copy", side, [0.0 if stage.low else math.inf])
     used = sides if spoken.commands_both else sides[:1]
     client = Example(spoken, used)
 
@@ -622,6 +642,7 @@ def replay(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sessi
 SESSIONS: tuple[Callable[[type[Service], Dialect, Sequence[Side]], Session], ...] = (
     teleoperate,
     grasp,
+    listen,
     example,
     replay,
 )

@@ -12,8 +12,8 @@ from typing import Any
 from dexkit.conformance.faults import mutants
 from dexkit.conformance.kit.requirements import Level, Requirement, catalogue
 from dexkit.documents import write_file
-from dexkit.models import MODELS
-from tools.consequences.kinds import KINDS, NO_END, Consequence
+from dexkit.models import MODELS, model
+from tools.consequences.kinds import FORCE, KINDS, NO_END, Consequence
 
 __all__ = ["FILE", "Row", "Table", "sentence"]
 
@@ -151,15 +151,18 @@ def sentence(requirement_id: str) -> str:
             "genuine client."
         )
     name, found = worst
-    return f"With `{name.split()[2]}` {told(found)}."
+    _, hand, fault, *_ = name.split()
+    return f"With `{fault}` {told(found, hand)}."
 
 
-def told(found: Consequence) -> str:
-    """A consequence in words, with both figures."""
+def told(found: Consequence, hand: str) -> str:
+    """A consequence in words, with both figures.
+
+    :param hand: the hand's model, in whose units forces are.
+    """
     kind = KINDS[found.kind]
-    words = kind.words.format(
-        found=_amount(found.found, kind.unit), good=_amount(found.good, kind.unit)
-    )
+    unit = model(hand).torque_unit if kind.unit == FORCE else kind.unit
+    words = kind.words.format(found=_amount(found.found, unit), good=_amount(found.good, unit))
     joint = "" if found.kind == "starts" else f" joint {found.joint}"
     return f"{words} ({found.client}, {found.task}; {found.side}{joint})"
 

@@ -28,7 +28,6 @@ _WITHOUT = {
     "dexkit.conformance.stimuli": "of the scripts, only a recorded session and an object are used",
 }
 _REFERENCE = "reference"
-_UNITREE = ("dex1-1", "dex3-1", "dex5-1")
 
 
 def default_folder() -> Path:
@@ -62,8 +61,8 @@ def musts() -> frozenset[str]:
 def tasks(folder: Path, only: tuple[str, ...]) -> list[Task]:
     """The wrong hands whose name has one of the texts, and the references that they need.
 
-    First is one hand of each MUST, then a second one, and so on: a run that is stopped knows
-    something of all of them.
+    First is one hand of each MUST, then a second one, and so on, and last those that fail none: a
+    run that is stopped knows something of all of them.
     """
     every = musts()
     found = [m for m in mutants("dds") if m.model in MODELS]
@@ -72,7 +71,8 @@ def tasks(folder: Path, only: tuple[str, ...]) -> list[Task]:
 
     def order(mutant: Mutant) -> tuple[bool, bool, int]:
         turns[mutant.kills] = turn = turns.get(mutant.kills, 0) + 1
-        return mutant.kills not in every, mutant.model not in _UNITREE, turn
+        fails_none = every.isdisjoint((mutant.pinned or frozenset()) | {mutant.kills})
+        return fails_none, mutant.kills not in every, turn
 
     hands = [_task(m, folder) for m in sorted(found, key=order)]
     references = {(t.model, t.dialect, t.sides): _reference(t, folder) for t in hands}
