@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dexkit.conformance.behaviours.grip import finger_squeezes
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, with_object, worst
 from dexkit.conformance.checks.steps import steps_of
 from dexkit.conformance.kit.motor_messages import Motor, Motors
@@ -93,6 +94,12 @@ def _pressure(ctx: Context, packet: int, rows: slice = slice(None)) -> Floats:
 
 @check("DEX3-SENS-01")
 def packets(ctx: Context) -> Outcome:
+    """The number of sensor packets, their values, and which slots hold one."""
+    parts = [_count(ctx), _numbers(ctx)]
+    return all_of(*parts, _same_slots(ctx)) if ctx.phases("squeeze") else all_of(*parts)
+
+
+def _count(ctx: Context) -> Outcome:
     """Number of sensor packets."""
     found = np.unique(_packets(ctx))
     most = ctx.tolerance("max_packets")
@@ -105,8 +112,7 @@ def packets(ctx: Context) -> Outcome:
     return outcome.because("A packet is published only when its sensor has a new value.")
 
 
-@check("DEX3-SENS-02")
-def pressures(ctx: Context) -> Outcome:
+def _numbers(ctx: Context) -> Outcome:
     """Every pressure is a number that is not negative."""
     count = int(_packets(ctx).max(initial=0))
     if not count:
@@ -128,6 +134,26 @@ def pressures(ctx: Context) -> Outcome:
                 ctx.at(ctx.states.topic, float(ctx.states.t[i])),
             )
     return ctx.passed("all finite", f"{count} packets of {_SLOTS}")
+
+
+def _same_slots(ctx: Context) -> Outcome:
+    """Whether a slot that held a value becomes a slot without a sensor, or the other way round."""
+    columns = ctx.states.columns
+    assert columns is not None
+    count = columns.count("press_sensor_state")
+    full = count == count.max(initial=0)
+    for packet in range(int(count.max(initial=0))):
+        marked = columns[f"press_sensor_state[{packet}].pressure"][full] == NO_VALUE
+        changes = (marked != marked[:1]).any(axis=1)
+        if changes.any():
+            at = float(ctx.states.t[full][int(np.argmax(changes))])
+            return ctx.failed(
+                "changes",
+                f"at {at:.2f} s an element of packet {packet} begins or ends to hold "
+                f"{NO_VALUE:g}, which means that there is no sensor",
+                ctx.at(ctx.states.topic, at),
+            )
+    return ctx.passed("constant", "the same slots hold a value throughout")
 
 
 @check("DEX3-SENS-03")
@@ -297,34 +323,18 @@ def touch(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX3-SENS-07")
-def saturates(ctx: Context) -> Outcome:
-    """Whether a slot that held a value becomes a slot without a sensor, or the other way round."""
-    columns = ctx.states.columns
-    assert columns is not None
-    count = columns.count("press_sensor_state")
-    full = count == count.max(initial=0)
-    for packet in range(int(count.max(initial=0))):
-        marked = columns[f"press_sensor_state[{packet}].pressure"][full] == NO_VALUE
-        changes = (marked != marked[:1]).any(axis=1)
-        if changes.any():
-            at = float(ctx.states.t[full][int(np.argmax(changes))])
-            return ctx.failed(
-                "changes",
-                f"at {at:.2f} s an element of packet {packet} begins or ends to hold "
-                f"{NO_VALUE:g}, which means that there is no sensor",
-                ctx.at(ctx.states.topic, at),
-            )
-    return ctx.passed("constant", "the same slots hold a value throughout")
-
-
 @check("DEX3-SENS-08")
 @with_object
-def releases(ctx: Context) -> Outcome:
+def follows_the_grip(ctx: Context) -> Outcome:
+    """The pressure in a grip, where its force changes, and after it."""
+    return all_of(_lasts(ctx), _follows_the_force(ctx), _releases(ctx))
+
+
+def _releases(ctx: Context) -> Outcome:
     """Remaining pressure of each element some time after the object was released."""
     rest = [ctx.span(p)[0] for p in (ctx.phases("touch") or ctx.phases("squeeze"))[:1]]
     held = [ctx.span(p) for p in ctx.phases("squeeze")]
-    let_go = [ctx.span(p)[0] for p in ctx.phases()]
+    let_go = [ctx.span(p)[0] for p in ctx.phases(ctx.requirement.phases[-1])]
     if not rest or not held or not let_go:
         return ctx.skipped("the hand held no object")
     free = _pressures(ctx, rest[0] - 2 * _BEFORE_S, rest[0])
@@ -347,8 +357,8 @@ def releases(ctx: Context) -> Outcome:
         f"{ctx.tolerance('release_s'):g} s after the release"
     )
     if worst <= ctx.tolerance("max_part"):
-        return ctx.passed(f"{worst:.0%}", text, part=worst)
-    return ctx.failed(f"{worst:.0%}", text, ctx.at(ctx.states.topic, at), part=worst)
+        return ctx.passed(f"{worst:.0%}", text, left_part=worst)
+    return ctx.failed(f"{worst:.0%}", text, ctx.at(ctx.states.topic, at), left_part=worst)
 
 
 def _untouched(ctx: Context, begin: float) -> float:
@@ -357,12 +367,10 @@ def _untouched(ctx: Context, begin: float) -> float:
     return min((b for b in before if b < begin), default=begin)
 
 
-@check("DEX3-SENS-09")
-@with_object
-@worst("part", "min_part", nothing="no pressure changed at the object")
-def pressure_lasts(ctx: Context) -> Figures:
+@worst("kept_part", "min_part", nothing="no pressure changed at the object")
+def _lasts(ctx: Context) -> Figures:
     """The smallest remaining part of an element's pressure at the end of a grip."""
-    for phase in ctx.phases():
+    for phase in ctx.phases("squeeze"):
         begin, end = ctx.span(phase)
         if end - begin < ctx.tolerance("min_hold_s"):
             continue
@@ -387,16 +395,18 @@ def pressure_lasts(ctx: Context) -> Figures:
         yield Figure(left, begin, end, text=text)
 
 
-@check("DEX3-SENS-10")
-@with_object
-@worst("part", "min_part", nothing="no finger's torque changed while it held the object")
-def follows_the_force(ctx: Context) -> Figures:
+@worst(
+    "followed_part",
+    "min_follow_part",
+    nothing="no finger's torque changed while it held the object",
+)
+def _follows_the_force(ctx: Context) -> Figures:
     """Change of a finger's pressure relative to that of its torque, while it holds the object.
 
     Gear friction keeps the pressure, so a rise counts only above the largest torque of the grip so
     far, and a fall only where the finger gives way by a part of its former advance.
     """
-    phases = sorted(ctx.phases(), key=lambda p: p.begin_ns)
+    phases = sorted(ctx.phases("firmer"), key=lambda p: p.begin_ns)
     if not phases:
         yield ctx.skipped("the fingers did not press in turn")
     rest = _untouched(ctx, ctx.span(phases[0])[0])
@@ -408,7 +418,7 @@ def follows_the_force(ctx: Context) -> Figures:
         if not finger:  # they are all soft again
             continue
         for word, limit, a, b in (
-            ("rises", "min_part", begin, end),
+            ("rises", "min_follow_part", begin, end),
             ("falls", "min_fall_part", end, later),
         ):
             if word == "falls" and not _gives_way(ctx, finger, begin, end, later):
@@ -448,7 +458,7 @@ def _share(
             return None
     felt, feels = _changes(was, free)[mine], _changes(now, free)[mine]
     most = float(max(felt.max(initial=0.0), feels.max(initial=0.0)))
-    touched = np.maximum(felt, feels) >= ctx.tolerance("min_rise_part") * most
+    touched = np.maximum(felt, feels) >= ctx.tolerance("min_touched_part") * most
     if most <= noise:
         return 0.0
     changed = (feels[touched] - felt[touched]) / np.maximum(felt[touched], 1e-3 * most)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from dexkit.conformance.checks import Context, Late, Outcome, check, rate_measure
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, judged, with_object
 from dexkit.conformance.checks.stands import FEW_STANDS, stands
 from dexkit.conformance.checks.timing import gap_beside_states
@@ -76,29 +78,11 @@ def _touch(ctx: Context) -> Touch | None:
 
 
 @check("FTP-TOUCH-01")
-def touch_topic(ctx: Context) -> Outcome:
-    """Whether the tactile areas are published on their topic, with their type."""
-    dialect = ctx.recording.dialect
-    topic, kind = dialect.touch_topic_of(ctx.side), dialect.touch_type
-    if (touch := _touch(ctx)) is not None:
-        return ctx.passed(kind.rpartition("::")[2], f"{len(touch)} samples on {topic}")
-    others = {
-        *(e.type_name for e in ctx.recording.endpoints if e.topic == topic and e.kind == "writer"),
-        *(c.type_name for c in ctx.recording.channels if c.topic == topic),
-    }
-    if kind in others:
-        return ctx.failed("no samples", f"{topic} is announced, and nothing comes on it")
-    if others:
-        return ctx.failed("other type", f"{topic} has {', '.join(sorted(others))}, not {kind}")
-    return ctx.failed("no topic", f"no process publishes {topic}")
-
-
-@check("FTP-TOUCH-02")
-def touch_sizes(ctx: Context) -> Outcome:
-    """Whether each area always has as many elements as its matrix."""
+def touch_messages(ctx: Context) -> Outcome:
+    """Whether each area always has as many elements as its matrix, where there are any."""
     touch = _touch(ctx)
     if touch is None:
-        return ctx.absent(_NOTHING)
+        return _no_touch(ctx) if ctx.recording.endpoints else ctx.absent(_NOTHING)
     want = np.array([area.elements for area in touch.areas])
     wrong = touch.lengths != want
     if not wrong.any():
@@ -121,8 +105,29 @@ def touch_sizes(ctx: Context) -> Outcome:
     )
 
 
+def _no_touch(ctx: Context) -> Outcome:
+    """The warning of a hand without touch on its topic."""
+    dialect = ctx.recording.dialect
+    topic, kind = dialect.touch_topic_of(ctx.side), dialect.touch_type
+    others = {
+        *(e.type_name for e in ctx.recording.endpoints if e.topic == topic and e.kind == "writer"),
+        *(c.type_name for c in ctx.recording.channels if c.topic == topic),
+    }
+    figure, text = "no topic", f"no process publishes {topic}"
+    if kind in others:
+        figure, text = "no samples", f"{topic} is announced, and nothing comes on it"
+    elif others:
+        figure, text = "other type", f"{topic} has {', '.join(sorted(others))}, not {kind}"
+    return replace(ctx.failed(figure, text).tolerated(), absent=True)
+
+
 @check("FTP-TOUCH-03")
-def touch_goes_on(ctx: Context) -> Outcome:
+def touch_comes_often(ctx: Context) -> Outcome:
+    """The longest time without touch, and its rate, while there were states."""
+    return all_of(_goes_on(ctx), warning(_rate(ctx)))
+
+
+def _goes_on(ctx: Context) -> Outcome:
     """The longest time without touch while there were states."""
     touch = _touch(ctx)
     if touch is None or not len(ctx.states):
@@ -133,8 +138,7 @@ def touch_goes_on(ctx: Context) -> Outcome:
     return judged(ctx, [figure], "gap_s", "max_gap_s", nothing="")
 
 
-@check("FTP-TOUCH-04")
-def touch_rate(ctx: Context) -> Outcome:
+def _rate(ctx: Context) -> Outcome:
     """The rate of the touch topic in most seconds in which there were states."""
     touch = _touch(ctx)
     if touch is None or len(ctx.states) < 2:

@@ -25,12 +25,12 @@ def all_of(*parts: Outcome) -> Outcome:
 
     Met where each part is that could be judged. Where some are not, the first that fails is the
     outcome, or the first that warns, and what the others of that kind observed is added. With no
-    part that could be judged, the first says why. What nothing fills is absent whatever else is
-    met.
+    part that could be judged, the first says why, or one that nothing fills. Then all of it is
+    absent, whatever else is met.
     """
     judged = [part for part in parts if part.met is not None]
     if not judged:
-        return parts[0]
+        return next((part for part in parts if part.absent), parts[0])
     values = {name: value for part in judged for name, value in part.values.items()}
     worst = [part for part in judged if not part.met and not part.tolerable]
     worst = worst or [part for part in judged if not part.met]

@@ -237,7 +237,7 @@ class OddPackets(FingerService):
         return np.concatenate((pressure, pressure[:1]))
 
 
-@changes(FingerService, "pressures", "DEX3-SENS-02", sides=BOTH, brief=True)
+@changes(FingerService, "pressures", "DEX3-SENS-01", sides=BOTH, brief=True)
 def NanPressure(self: Any, pressures: Call, hand: FingerHand) -> Floats:
     """Publishes NaN where there is no sensor."""
     pressure = pressures(hand)
@@ -270,7 +270,7 @@ def CrossedCables(self: Any, pressures: Call, hand: FingerHand) -> Any:
     return pressures(hand)[[0, 1, 4, 5, 2, 3, 6, 7, 8]]
 
 
-@changes(FingerService, "pressures", "DEX3-SENS-07", sides=BOTH)
+@changes(FingerService, "pressures", "DEX3-SENS-01", sides=BOTH)
 def SaturatesToNothing(self: Any, pressures: Call, hand: FingerHand) -> Floats:
     """Publishes a pressure at the end of the converter's range as a slot without a sensor."""
     pressure = pressures(hand)
@@ -303,7 +303,7 @@ class SlowFoam(_PressureWithTime):
         return rest + change
 
 
-@changes(Dex3Service, "pressures", "DEX3-SENS-10", sides=BOTH)
+@changes(Dex3Service, "pressures", "DEX3-SENS-08", sides=BOTH)
 def FeelsMotionOnly(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Reads its sensors in the task that moves the joints: at rest the pressures are constant."""
     if hand.side not in self.memory or max(map(abs, hand.dq)) > 0.5:
@@ -311,7 +311,7 @@ def FeelsMotionOnly(self: Any, pressures: Call, hand: FingerHand) -> Any:
     return self.memory[hand.side]
 
 
-@changes(Dex3Service, "pressures", "DEX3-SENS-10", sides=BOTH)
+@changes(Dex3Service, "pressures", "DEX3-SENS-08", sides=BOTH)
 def KeepsTheMost(self: Any, pressures: Call, hand: FingerHand) -> Any:
     """Publishes the largest pressure of each element since it was last untouched."""
     pressure = np.array(pressures(hand))
@@ -328,7 +328,7 @@ def OneSensorBuffer(self: Any, pressures: Call, hand: FingerHand) -> Any:
     return pressures(right)
 
 
-@wrong_hand("DEX3-SENS-09", sides=BOTH)
+@wrong_hand("DEX3-SENS-08", sides=BOTH)
 class TaresInAGrip(_PressureWithTime):
     """Treats a pressure that is constant for a second as drift, and takes it as the new zero."""
 

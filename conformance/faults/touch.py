@@ -34,7 +34,7 @@ def SpellsSideOut(self: Any, touch_topic: Call, side: Side) -> str:
     return f"rt/inspire_hand/touch/{side}"
 
 
-@wrong_hand("FTP-TOUCH-02", brief=True)
+@wrong_hand("FTP-TOUCH-01", brief=True)
 class NoPalm(FtpService):
     """Leaves the list of the palm empty."""
 
@@ -47,7 +47,7 @@ def TouchPauses(self: Any, touch: Call) -> Any:
     return [] if 2.0 < self.now < 2.5 else touch()
 
 
-@wrong_hand("FTP-TOUCH-04", brief=True)
+@wrong_hand("FTP-TOUCH-03", brief=True)
 class RareTouch(FtpService):
     """Publishes touch ten times a second."""
 

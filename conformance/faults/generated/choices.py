@@ -62,7 +62,7 @@ _SLUGGISH = frozenset(
     f"{hand}-{number}"
     for hand in ("DEX1", "DEX3", "DEX5", "BRAINCO", "DFX", "FTP")
     for number in (
-        *("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05", "MODE-05", "MOVE-04", "SENS-10"),
+        *("GAIN-02", "GAIN-03", "GAIN-04", "GAIN-05", "MODE-05", "MOVE-04", "SENS-08"),
         *("OPER-01", "TRACK-01"),
     )
 )
