@@ -89,7 +89,9 @@ def test_check_judges_only_the_selected_requirements(capsys: pytest.CaptureFixtu
     every = catalogue("dex1-1")
     assert f"(3 of {len(every)} requirements: 3 pass)" in out
     assert check(sample_path("dex1_pick_place"), "--require", "DEX7") == 2
-    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-QOS-02", "--level", "must") == 2
+    assert (
+        check(sample_path("dex1_pick_place"), "--require", "DEX1-FIELD-08", "--level", "must") == 2
+    )
 
 
 def test_the_selection_is_listed_without_a_recording(capsys: pytest.CaptureFixture[str]) -> None:

@@ -138,7 +138,7 @@ def blamed(result: RunResult) -> set[str]:
     ("service", "warned"),
     [
         (JustFastEnough, {"DEX1-RATE-02"}),
-        (Plain, {"DEX1-QOS-02"}),
+        (Plain, {"DEX1-QOS-01"}),
         (Quick, set()),
         # slow, which gives warnings; but it arrives, opens, closes and obeys
         (Unhurried, {"DEX1-MOVE-04"}),
@@ -183,7 +183,7 @@ def test_fast_gripper_is_not_judged_as_percent() -> None:
 
 def test_units_that_are_not_claimed_do_not_fail() -> None:
     result = judged(Plain, Claims.parse('[hand]\nmodel = "dex1-1"'))
-    assert blamed(result) == {"DEX1-QOS-02"}
+    assert blamed(result) == {"DEX1-QOS-01"}
     assert result_of(result, "DEX1-FIELD-04").verdict is Verdict.NOT_CLAIMED
 
 
@@ -305,8 +305,8 @@ PASS, WARN, FAIL = Verdict.PASS, Verdict.WARN, Verdict.FAIL
         # what is asked for is the largest of the goals that it may follow
         (STRONGER, RIGHT, {"FORCE-18": PASS}),
         # TRACK allows for the top speed of a hand that meets MOVE-04
-        (AsFastAsRequired, LEFT, {"MOVE-04": PASS, "TRACK-01": PASS, "TRACK-02": PASS}),
-        (Faster, LEFT, {"MOVE-04": PASS, "TRACK-01": PASS, "TRACK-02": PASS}),
+        (AsFastAsRequired, LEFT, {"MOVE-04": PASS, "TRACK-01": PASS}),
+        (Faster, LEFT, {"MOVE-04": PASS, "TRACK-01": PASS}),
         (mix(any_model.WaitsForRest, Faster), LEFT, {"MOVE-04": PASS, "TRACK-01": FAIL}),
         (Saturated, LEFT, {"FORCE-04": PASS}),
         (NearlySaturated, LEFT, {"FORCE-04": PASS}),

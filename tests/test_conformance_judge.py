@@ -102,7 +102,7 @@ def test_endpoints_are_not_judged_without_discovery_data() -> None:
     trace = copy_of(short_run())
     trace.endpoints.clear()
     result = judged(trace)
-    for requirement in ("DEX1-TOPIC-02", "DEX1-QOS-01", "DEX1-QOS-02"):
+    for requirement in ("DEX1-TOPIC-02", "DEX1-QOS-01"):
         assert result_of(result, requirement).verdict is Verdict.NOT_APPLICABLE
     assert result.overall is Overall.PASS
 

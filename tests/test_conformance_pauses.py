@@ -19,7 +19,7 @@ from dexkit.conformance.virtual.gripper import ReferenceService
 from dexkit.conformance.virtual.memory_trace import MemoryTrace
 
 PAUSE, EVERY = 0.072, 1.0  # seconds
-MADE_ONCE = {"DEX1-LIFE-05", "DEX3-GAIN-02", "DEX5-GAIN-02", "DEX3-OPER-01"}
+MADE_ONCE = {"DEX1-LIFE-04", "DEX3-GAIN-02", "DEX5-GAIN-02", "DEX3-OPER-01"}
 """Requirements about an event that a run has only once, which a pause may hide: a service that is
 stopped in motion, a step with a tenth of the stiffness, a full stroke of the operator.
 """

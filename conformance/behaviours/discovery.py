@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.robot import RobotContext
 from dexkit.models import DIALECTS
 from dexkit.traces import TraceEndpoint
@@ -117,7 +118,12 @@ def low_rate_is_fresh(ctx: Context) -> Outcome:
 
 
 @check("DEX1-QOS-01", "DEX3-QOS-01", "H1-QOS-01")
-def command_qos(ctx: Context) -> Outcome:
+def qos(ctx: Context) -> Outcome:
+    """What the command reader asks for, and what the state writer offers."""
+    return all_of(_command_qos(ctx), warning(_state_qos(ctx)))
+
+
+def _command_qos(ctx: Context) -> Outcome:
     """The command reader is compatible with a RELIABLE, VOLATILE writer."""
     readers = _endpoints(ctx, ctx.commands.topic, "reader")
     if not any(r.durability for r in readers):
@@ -132,8 +138,7 @@ def command_qos(ctx: Context) -> Outcome:
     return ctx.passed(shown.durability.lower(), f"the reader asks for {_qos(shown)}")
 
 
-@check("DEX1-QOS-02", "DEX3-QOS-02", "H1-QOS-02")
-def state_qos(ctx: Context) -> Outcome:
+def _state_qos(ctx: Context) -> Outcome:
     """The state writer is reliable."""
     writers = _endpoints(ctx, ctx.states.topic, "writer")
     if not writers:

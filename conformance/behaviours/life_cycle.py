@@ -10,6 +10,7 @@ from dexkit.conformance.behaviours.gains import drive_fingers, drive_gripper, pu
 from dexkit.conformance.behaviours.grip import gripper_squeeze
 from dexkit.conformance.behaviours.speed import move_at_own_speeds
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import arrival, away_first
 from dexkit.conformance.kit.measurement_error import Measure
@@ -240,6 +241,14 @@ def restarted_service(ctx: Context) -> Outcome:
 
 @check("DEX1-LIFE-04", "DEX3-LIFE-04")
 def shutdown(ctx: Context) -> Outcome:
+    """Whether a service that ends leaves the hand undriven, and how long it takes; that of a
+    position servo may hold it.
+    """
+    ends = warning(_ends(ctx))
+    return ends if ctx.recording.dialect.position_servo else all_of(_last_state(ctx), ends)
+
+
+def _ends(ctx: Context) -> Outcome:
     """Time from SIGTERM to the end of the service, and until its publisher disappears."""
     phase = ctx.phases()[-1]
     begin, end = ctx.span(phase)
@@ -271,8 +280,7 @@ def shutdown(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-LIFE-05", "DEX3-LIFE-05")
-def last_state(ctx: Context) -> Outcome:
+def _last_state(ctx: Context) -> Outcome:
     """The mode of the last state before the service ended, and the hand's position after the
     restart.
 
@@ -342,7 +350,7 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
 def no_new_goal(ctx: Context) -> Figures:
     """Distance of the hand, after a restart of its service, from where it may be.
 
-    A motor may continue to its last goal (DEX1-LIFE-05), but must not move elsewhere.
+    A motor may continue to its last goal (DEX1-LIFE-04), but must not move elsewhere.
     """
     for phase in ctx.phases():
         begin, end = ctx.span(phase)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import silent
 from dexkit.conformance.checks.steps import obeyed_before, rest_error, steps_of
@@ -49,7 +50,15 @@ def apply_load(script: HandScript) -> Steps:
 
 
 @check("DEX1-LOAD-01", "DEX3-LOAD-01")
-def load(ctx: Context) -> Outcome:
+def under_load(ctx: Context) -> Outcome:
+    """States, motion and, of hands with gains, how old q is under load."""
+    parts = [_states(ctx), _obeys(ctx)]
+    if not ctx.recording.dialect.position_servo and all(part.met for part in parts):
+        parts.append(_late(ctx))
+    return all_of(*parts)
+
+
+def _states(ctx: Context) -> Outcome:
     """Rate and gaps of the state under load."""
     limit = ctx.tolerance("max_gap_s")
     for phase in ctx.phases():
@@ -73,9 +82,8 @@ def load(ctx: Context) -> Outcome:
     return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))
 
 
-@check("DEX1-LOAD-03", "DEX3-LOAD-03")
 @worst("more_s", "max_more_s", nothing="no motion under load, or none without it to compare with")
-def late_under_load(ctx: Context) -> Figures:
+def _late(ctx: Context) -> Figures:
     """How much later than without load the states show a motion that is commanded under load."""
     usual = _usual_lags(ctx)
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
@@ -140,9 +148,8 @@ def _lag(ctx: Context, joint: int, begin: float, end: float) -> float | None:
     return float(_LAGS[best]) if alike[best] >= _FOLLOWS_PART else None
 
 
-@check("DEX1-LOAD-02", "DEX3-LOAD-02")
 @worst("part", "min_part", nothing="no way under load, or the hand had stopped obeying before")
-def obeys_under_load(ctx: Context) -> Figures:
+def _obeys(ctx: Context) -> Figures:
     """How far the hand follows the way out and back that it is commanded under load."""
     for phase in (p for p in ctx.phases() if obeyed_before(ctx, p)):
         begin, end = ctx.span(phase)

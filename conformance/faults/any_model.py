@@ -76,7 +76,7 @@ class DemandsHistory(Service):
     reader_durability = "TransientLocal"
 
 
-@wrong_hand("DEX1-QOS-02", "DEX3-QOS-02")
+@wrong_hand("DEX1-QOS-01", "DEX3-QOS-01")
 class BestEffortWriter(Service):
     """Publishes its state with best-effort reliability."""
 
@@ -825,7 +825,7 @@ class StuttersUnderLoad(Service):
         return [] if busy and self.cycle % _too_slow(self) else super().publish()
 
 
-@changes(Service, "motors", "DEX1-LOAD-02", "DEX3-LOAD-02")
+@changes(Service, "motors", "DEX1-LOAD-01", "DEX3-LOAD-01")
 def DeafToThousands(self: Any, command: Call, side: Side, motors: Motors) -> None:
     """Takes no command while more than 700 a second arrive, as its inbox overflows."""
     came = self.memory.setdefault(side, deque(maxlen=70))
@@ -869,7 +869,7 @@ def WaitsForItsReaders(self: Any, publish: Call) -> Any:
     return [] if self.loaded and self.now % 0.5 < 0.2 else publish()
 
 
-@wrong_hand("DEX1-LOAD-03", "DEX3-LOAD-03")
+@wrong_hand("DEX1-LOAD-01", "DEX3-LOAD-01", where=obeys_gains)
 class OldUnderLoad(Service):
     """Queues its states for a slow reliable reader: they are 0.3 s old when they leave."""
 
@@ -889,7 +889,7 @@ class OldUnderLoad(Service):
         return [replace(s, sent=self.now) for s in self.queue[0][1]]
 
 
-@wrong_hand("DEX1-LOAD-03", "DEX3-LOAD-03")
+@wrong_hand("DEX1-LOAD-01", "DEX3-LOAD-01", where=obeys_gains)
 class OldUnderThousands(OldUnderLoad):
     """Its states wait behind its commands: 0.3 s from 1000 commands a second on."""
 
@@ -906,7 +906,7 @@ class OldUnderThousands(OldUnderLoad):
         super().motors(side, motors)
 
 
-@wrong_hand("DEX1-LOAD-03", "DEX3-LOAD-03")
+@wrong_hand("DEX1-LOAD-01", "DEX3-LOAD-01", where=obeys_gains)
 class LateUnderLoad(Service):
     """Puts commands in force 0.3 s late while a slow reader is there."""
 
@@ -1008,7 +1008,7 @@ class LeavesItsName(Service):
     gone_s = 10.0
 
 
-@changes(Service, "brake", "DEX1-LIFE-05", "DEX3-LIFE-05")
+@changes(Service, "brake", "DEX1-LIFE-04", "DEX3-LIFE-04", where=obeys_gains)
 def LeavesItDriven(self: Any, brake: Call) -> None:
     """Ends without braking, and took the time-out with it."""
     for hand in self.hands.values():
@@ -1065,7 +1065,7 @@ def WaitsForRest(self: Any, command: Call, side: Side, motors: Motors) -> None:
     command(side, tuple(replace(m, q=q) for m, q in zip(motors, goals, strict=True)))
 
 
-@wrong_hand("DEX1-TRACK-02", "DEX3-TRACK-02")
+@wrong_hand("DEX1-TRACK-01", "DEX3-TRACK-01")
 class Delayed(Service):
     """Obeys each command 0.15 s late."""
 

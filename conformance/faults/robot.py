@@ -64,7 +64,7 @@ class AsksForMore(ReferenceRobot):
     reader_durability = "TransientLocal"
 
 
-@wrong_hand("H1-QOS-02")
+@wrong_hand("H1-QOS-01")
 class BestEffort(ReferenceRobot):
     """Publishes its state with best-effort reliability."""
 

@@ -35,7 +35,7 @@ ORDER = (
     *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.dead_zones"),
     *("motion.ends",),
     *("bad_commands.unchanged", "speed", "motion.speed", "sides", "watchdog.state_in_silence"),
-    *("load.load", "load.late_under_load", "stillness.still", "two_clients", "order.old_stamps"),
+    *("stillness.still", "two_clients", "order.old_stamps"),
     *("life_cycle.restarted_client", "life_cycle.restarted_service", "watchdog.resumes"),
     *("mode_byte", "bad_commands", "watchdog", "timeout_protection", "life_cycle", "rate"),
     *("grip.stops_at_object", "position.not_the_command"),
