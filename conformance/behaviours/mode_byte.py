@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import stays
 from dexkit.conformance.checks.robot import RobotContext, joint_of
@@ -105,7 +106,12 @@ def lock_usb_joints(script: UsbScript) -> UsbSteps:
 
 
 @check("DEX3-MODE-01", rests_on=("mode",))
-def ids(ctx: Context) -> Outcome:
+def reported(ctx: Context) -> Outcome:
+    """The id and the status in the mode bytes of states."""
+    return all_of(_ids(ctx), _reported_status(ctx))
+
+
+def _ids(ctx: Context) -> Outcome:
     """Bits 0 to 3 of each motor's mode byte."""
     states, due = ctx.states.mode, np.arange(len(ctx.joints))
     if len(states) and (states == states[0]).all() and (states[0].astype(int) & 15 == due).all():
@@ -135,10 +141,10 @@ def ids(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX3-MODE-02")
-def status(ctx: Context) -> Outcome:
-    """Bits 4 to 6 while driven and while locked."""
-    for phase in ctx.phases():
+def _reported_status(ctx: Context) -> Outcome:
+    """Bits 4 to 6, or the mode, while driven and while locked."""
+    phases = ctx.phases("lock")
+    for phase in phases:
         begin, end = ctx.span(phase)
         for a, b, wanted, when in (
             (begin - 0.1, begin - 0.01, JointMode.FOC, "driven"),
@@ -155,6 +161,8 @@ def status(ctx: Context) -> Outcome:
                     ctx.named(f"status {found[joint]:g} while {when}", joint),
                     ctx.at(ctx.states.topic, a, b),
                 ).about(joint)
+    if not phases:
+        return ctx.skipped("no motor was locked")
     return ctx.passed("1, then 0", "1 while driven, 0 while locked")
 
 
@@ -184,8 +192,13 @@ def plain_mode(ctx: Context) -> Outcome:
 
 @check("DEX3-MODE-03")
 def locked(ctx: Context) -> Outcome:
-    """Motion towards q while the motors are locked."""
-    return not_driven(ctx, "with status 0, which locks the motor")
+    """Motion towards q while the motors are locked; and whether they stop under way, or say that
+    they are locked.
+    """
+    how = "with status 0, which locks the motor"
+    driven = not_driven(ctx.only("lock"), how, "max_towards_stroke")
+    ris = ctx.recording.dialect.mode_byte is ModeByte.RIS
+    return all_of(driven, _stops(ctx) if ris else _reported_status(ctx))
 
 
 @check("DEX3-MODE-04")
@@ -260,16 +273,15 @@ def own_mode(ctx: Context) -> Figures:
             yield Figure(part, begin, end, joint, text)
 
 
-@check("DEX3-MODE-06")
 @worst("motion_rad", "max_run_stroke", nothing="no state while joints were locked under way")
-def lock_stops(ctx: Context) -> Figures:
+def _stops(ctx: Context) -> Figures:
     """Run-out of a joint that is locked while it moves, and whether it then stands still.
 
     It may take as long to obey the lock as it took to begin the step.
     """
     # of the first one: it begins at rest
-    delay = max((_delay(ctx, *ctx.span(p)) for p in ctx.phases()[:1]), default=0.0)
-    for phase in ctx.phases():
+    delay = max((_delay(ctx, *ctx.span(p)) for p in ctx.phases("mixed")[:1]), default=0.0)
+    for phase in ctx.phases("mixed"):
         begin, end = ctx.span(phase)
         mode = _mode_at(ctx, begin, end)
         rows = ctx.states.between(begin, end)

@@ -551,7 +551,7 @@ def LeastStiffness(hand: Any, rows: Floats) -> None:
 # --------------------------------------------------------------------------------- mode byte
 
 
-@reports(FingerService, "DEX3-MODE-02")
+@reports(FingerService, "DEX3-MODE-01", "DEX5-MODE-03")
 def AlwaysDriven(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes that its motors are driven, whatever their state."""
     motors["mode"] |= self.codec.mode(0)
@@ -610,7 +610,7 @@ def StatusOfOneJoint(hand: Any, understood: Call, mode: Ints) -> tuple[Ints, Fla
     return np.full_like(status, status[2]), guarded
 
 
-@changes(Dex3Hand, "changed", "DEX3-MODE-06")
+@changes(Dex3Hand, "changed", "DEX3-MODE-03")
 def LimpLock(hand: Any, changed: Call) -> None:
     """Switches the driver of one joint off where it should lock."""
     changed()

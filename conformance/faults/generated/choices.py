@@ -276,7 +276,7 @@ add(
     "reports no mode",
     members=("mode",),
     control_law=True,
-    warned={"DEX3-MODE-01", "DEX3-MODE-02", "DEX5-MODE-02"},
+    warned={"DEX3-MODE-01", "DEX5-MODE-03"},
 )
 
 

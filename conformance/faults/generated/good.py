@@ -376,7 +376,7 @@ class _Coasts(What):
                 hand.changed()
 
 
-# a status of 0 locks a hand of several joints (DEX3-MODE-06): coasting is a fault there
+# a status of 0 locks a hand of several joints (DEX3-MODE-03): coasting is a fault there
 add("brake", _Coasts, "brake-coast", "coasts when it brakes", **_ONE)
 
 
