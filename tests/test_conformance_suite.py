@@ -442,7 +442,6 @@ def test_emulated_ezgripper_passes_from_the_command_line(tmp_path: Path) -> None
         "DEX1-FIELD-03": "pass",
         "DEX1-FORCE-02": "pass",
         "DEX1-FORCE-04": "pass",
-        "DEX1-FORCE-05": "not applicable",  # of the dialect unitree_hg alone
     }
     wanted = [word for name in verdicts for word in ("--require", name)]
     for _ in range(ATTEMPTS):

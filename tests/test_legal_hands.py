@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 
 from dexkit.conformance.checks import Outcome
+from dexkit.conformance.checks.combined import warning
 from dexkit.conformance.faults.generated import parse
 from dexkit.conformance.faults.generated.campaign import try_generated
 from dexkit.conformance.kit.claims import Claims
@@ -78,8 +79,8 @@ CLAIMED = Claims(dict.fromkeys(CAPABILITIES, True))
 def test_what_cannot_be_judged_of_a_claimed_unit_is_no_failure() -> None:
     """Only a unit that nothing fills is: most hands lack what some requirement asks for."""
     own = Outcome(None, reason="this gripper has a force of its own")
-    assert concluded(own, "DEX1-FORCE-14", CLAIMED).verdict is Verdict.NOT_APPLICABLE
-    absent = concluded(replace(own, absent=True), "DEX1-FORCE-14", CLAIMED)
+    assert concluded(own, "DEX1-FORCE-11", CLAIMED).verdict is Verdict.NOT_APPLICABLE
+    absent = concluded(replace(own, absent=True), "DEX1-FORCE-11", CLAIMED)
     assert absent.verdict is Verdict.FAIL
     assert "Nothing fills it" in absent.cause
 
@@ -96,6 +97,12 @@ def test_what_real_hands_do_is_a_warning_of_a_must_too() -> None:
     gap = Outcome(False, "1.004 s", "a gap")
     assert concluded(gap, "DEX3-RATE-03", Claims()).verdict is Verdict.FAIL
     assert concluded(gap.tolerated(), "DEX3-RATE-03", Claims()).verdict is Verdict.WARN
+
+
+def test_a_part_that_warns_fails_where_its_unit_is_claimed() -> None:
+    part = warning(Outcome(False, "1.2 N m", "more than asked for"), unless_claimed=True)
+    assert concluded(part, "DEX1-FORCE-11", Claims()).verdict is Verdict.WARN
+    assert concluded(part, "DEX1-FORCE-11", CLAIMED).verdict is Verdict.FAIL
 
 
 @each(("seconds", "verdict"), [(0.08, Verdict.PASS), (1.004, Verdict.WARN), (1.6, Verdict.FAIL)])

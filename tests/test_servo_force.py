@@ -113,12 +113,12 @@ def test_squeezes_are_compared_that_begin_away_from_the_object(
 ) -> None:
     plan = plan_for("inspire_ftp", sides=(Side.RIGHT,))
     plan = replace(plan, phases=frozenset({"joint", "restart", "silence", "squeeze", "touch"}))
-    wanted = select(catalogue("inspire-ftp"), prefixes=("FTP-FORCE-07",))
+    wanted = select(catalogue("inspire-ftp"), prefixes=("FTP-FORCE-05",))
     recording = recording_of(run_virtual(plan, hand), plan.dialect.name, plan.sides)
     (found,) = (
         r
         for r in judge(recording, requirements=wanted).results
-        if r.requirement.id == "FTP-FORCE-07"
+        if r.requirement.id == "FTP-FORCE-05"
     )
     assert found.verdict is verdict, found.observed
     assert len(recording.phases("squeeze", Side.RIGHT)) == 3

@@ -18,9 +18,10 @@ import numpy as np
 
 from dexkit.conformance.behaviours.gains import NUDGE_SECONDS, nudged, push_held, step_softly
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.contacts import contacts
 from dexkit.conformance.checks.figures import Figure, Figures, judged, with_object, worst
-from dexkit.conformance.checks.nudges import has_own_force, nudges
+from dexkit.conformance.checks.nudges import STIFFNESS, has_own_force, nudges
 from dexkit.conformance.checks.soft_grips import soft_grips_of, softer_grips, usual_part
 from dexkit.conformance.checks.stands import (
     _GRID_S,
@@ -314,11 +315,16 @@ def _felt(
 
 @check("DEX1-FORCE-10")
 @with_object
+def lasts(ctx: Context) -> Outcome:
+    """The force of a long grip, and of later ones."""
+    return all_of(_stays(ctx), _comes_back(ctx))
+
+
 @worst("change_part", "max_change_part", nothing="it did not press on the object for long enough")
-def lasts(ctx: Context) -> Figures:
+def _stays(ctx: Context) -> Figures:
     """Rise and fall of the force of a long grip under a constant command."""
     window = ctx.tolerance("window_s")
-    for phase in ctx.phases():
+    for phase in ctx.phases("grip"):
         begin, end = ctx.span(phase)
         touched = _touched(ctx, begin, end)
         if touched is None:
@@ -354,21 +360,19 @@ def _touched(ctx: Context, begin: float, end: float) -> float | None:
     return float(t[np.argmax(there)]) if there.any() else None
 
 
-@check("DEX1-FORCE-17")
-@with_object
 @worst("part", "min_part", nothing="no state during a later grip")
-def again(ctx: Context) -> Figures:
+def _comes_back(ctx: Context) -> Figures:
     """The smallest force of later grips, relative to the first."""
     grips = ctx.phases("grip")
     first = _force(ctx, grips[0]) if grips else None
     if first is None or first < ctx.tolerance("min_tau_nm"):
         yield ctx.skipped("it did not grip before")
         return
-    # a driver may lower its effort at first (DEX1-FORCE-10): the least of the first grip's end
+    # a driver may lower its effort at first: the least of the first grip's end
     begin, end = ctx.span(grips[0])
     pieces = _felt(ctx, max(begin, end - 0.5), end, 0.1)
     first = max(min((tau for _, tau, _ in pieces), default=first), ctx.tolerance("min_tau_nm"))
-    for phase in (*grips[1:], *ctx.phases(), *ctx.phases("regrip")):
+    for phase in (*grips[1:], *ctx.phases("squeeze"), *ctx.phases("regrip")):
         tau = _force(ctx, phase)
         if tau is not None and obeyed_before(ctx, phase):
             text = f"tau_est of {tau:.2f} N m in a later grip, {first:.2f} N m in the first"
@@ -387,8 +391,13 @@ def _force(ctx: Context, phase: Phase) -> float | None:
 
 @check("DEX1-FORCE-11")
 @with_object
+def soft_grips(ctx: Context) -> Outcome:
+    """The force of grips with low stiffness: enough of it, and no more than asked for."""
+    return all_of(_presses_softly(ctx), warning(_no_more_than_asked(ctx), unless_claimed=True))
+
+
 @worst("tau_nm", "min_tau_nm", nothing="no state during grips with little stiffness")
-def soft_grips(ctx: Context) -> Figures:
+def _presses_softly(ctx: Context) -> Figures:
     """The smallest tau_est of grips with low stiffness."""
     if (none := no_torque(ctx)) is not None:
         yield none
@@ -404,9 +413,8 @@ def soft_grips(ctx: Context) -> Figures:
 _OWN = "this gripper has a force of its own"
 
 
-@check("DEX1-FORCE-14")
 @worst("part", "max_part", nothing="no grips to compare, one of them with the client's stiffness")
-def no_more_than_asked(ctx: Context) -> Figures:
+def _no_more_than_asked(ctx: Context) -> Figures:
     """The greatest force of soft grips, relative to the commanded one."""
     soft, usual = softer_grips(ctx), usual_part(ctx)
     if not soft or usual is None:
@@ -442,19 +450,6 @@ def releases_with_zero_gains(ctx: Context) -> Figures:
         yield Figure(left / had, begin, end, text=text, measure=measure)
 
 
-@check("DEX1-FORCE-05")
-@worst("tau_nm", "max_below_nm", nothing="no state with a tau_est")
-def unsigned(ctx: Context) -> Figures:
-    """The smallest tau_est in a dialect where it is the strength of the grip."""
-    tau = ctx.states.tau[:, 0]
-    if np.isfinite(tau).any():
-        i = int(np.nanargmin(tau))
-        text = f"tau_est from {tau[i]:.2f} to {float(np.nanmax(tau)):.2f} N m"
-        limit, shown = ctx.tolerance("min_tau_nm"), f"{tau[i]:.2f} N m"
-        at = float(ctx.states.t[i])
-        yield Figure(-float(tau[i]), at, text=text, limit=limit, shown=shown)
-
-
 @check("DEX1-FORCE-09")
 @with_object
 @worst("part", "min_part", nothing="it never pressed on the object for long enough")
@@ -477,20 +472,19 @@ def as_commanded(ctx: Context) -> Figures:
             )
 
 
-@check(
-    "DEX3-FORCE-05",
-)
+@check("DEX3-FORCE-05")
 @with_object
+def joints_as_commanded(ctx: Context) -> Outcome:
+    """tau_est of pressing joints, at the end of a grip and in each piece of every one."""
+    return all_of(_presses_as_commanded(ctx), _presses_as_it_moves(ctx))
+
+
 @worst("part", "max_part", nothing="no joint was held back by the object")
-def joints_as_commanded(ctx: Context) -> Figures:
+def _presses_as_commanded(ctx: Context) -> Figures:
     """The smallest and largest tau_est of pressing joints, relative to kp times the distance to the
     goal.
-
-    A requirement without ``max_part`` has no upper limit.
     """
-    limits = [(ctx.tolerance("min_part"), True)]
-    if "max_part" in ctx.requirement.tolerances:
-        limits.append((ctx.tolerance("max_part"), False))
+    limits = (ctx.tolerance("min_part"), True), (ctx.tolerance("max_part"), False)
     scales = torque_scales(ctx, ctx.tolerance("min_asked_nm"))
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
@@ -626,8 +620,15 @@ _AWAY = 0.15  # of the stroke: way to the object of a squeeze that is compared w
 
 @check("BRAINCO-FORCE-05")
 @with_object
+def grips_alike(ctx: Context) -> Outcome:
+    """The weakest grip of each joint; and the weakest squeeze, where these are limited."""
+    if "min_squeeze_part" not in ctx.requirement.tolerances:
+        return _grips_alike(ctx)
+    return all_of(_grips_alike(ctx), _squeezes_alike(ctx))
+
+
 @worst("part", "min_part", nothing="no joint pressed with enough force to compare")
-def grips_alike(ctx: Context) -> Figures:
+def _grips_alike(ctx: Context) -> Figures:
     """The weakest stretch of a joint's grips, relative to the strongest."""
     if (skipped := no_stand(ctx) or no_torque(ctx)) is not None:
         yield skipped
@@ -654,12 +655,12 @@ def _compared(
     return Figure(weakest / strongest, begin, end, joint, text)
 
 
-@check("FTP-FORCE-07")
-@with_object
 @worst(
-    "part", "min_part", nothing="no joint squeezed the object twice with enough force to compare"
+    "squeeze_part",
+    "min_squeeze_part",
+    nothing="no joint squeezed the object twice with enough force to compare",
 )
-def squeezes_alike(ctx: Context) -> Figures:
+def _squeezes_alike(ctx: Context) -> Figures:
     """The weakest squeeze of a joint, relative to its strongest one that began as far away."""
     if (skipped := no_stand(ctx) or no_torque(ctx)) is not None:
         yield skipped
@@ -729,13 +730,20 @@ def _hammers(ctx: Context, peaks: list[_Peak]) -> Outcome | None:
 
 @check("DEX1-FORCE-18")
 @with_object
-def contact_force_fits_stiffness(ctx: Context) -> Outcome:
+def grips_as_it_moves(ctx: Context) -> Outcome:
+    """tau_est of each piece of contact, relative to the stiffness without contact."""
+    if ctx.recording.dialect.gains_are_used:
+        return warning(_fits_displacement(ctx), unless_claimed=True)
+    return _fits_free_motion(ctx)
+
+
+def _fits_displacement(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, relative to the hand's measured stiffness times the
     error.
     """
     if (none := no_torque(ctx)) is not None:
         return none
-    found = nudges(ctx, [*ctx.phases(), *ctx.phases("nudge")])
+    found = nudges(ctx, [*ctx.phases(STIFFNESS), *ctx.phases("nudge")])
     shown = [n for n in found if n.way >= ctx.tolerance("min_motion_stroke")]
     if not found:
         return ctx.skipped("no state while it was pushed")
@@ -803,10 +811,8 @@ def pressed(
         yield Figure(value, begin, end, joint, shown, limit=limit, at_least=least)
 
 
-@check("DEX3-FORCE-08")
-@with_object
 @worst("tau_nm", "max_tau_nm", nothing="no joint was held back by the object")
-def presses_as_it_moves(ctx: Context) -> Figures:
+def _presses_as_it_moves(ctx: Context) -> Figures:
     """tau_est of each standing joint that presses on the object, relative to the law."""
     for phase in (p for name in ("squeeze", "touch", "firmer", "regrip") for p in ctx.phases(name)):
         yield from _presses(ctx, *ctx.span(phase))
@@ -990,9 +996,7 @@ def _fitted(x: Floats, y: Floats) -> _Spring | None:
     return _Spring(float(fit[0]), float(error), float(residual), least, most)
 
 
-@check("DEX1-FORCE-19")
-@with_object
-def grips_as_it_moves(ctx: Context) -> Outcome:
+def _fits_free_motion(ctx: Context) -> Outcome:
     """tau_est of each piece of contact, relative to the spring that moves the gripper freely."""
     spring = _spring(ctx)
     if (

@@ -110,6 +110,7 @@ class Outcome:
     :param tolerable: not met, but no more than a warning, whatever the level, which spoils nothing
         else: real hands do it, what depends on it works all the same, or the part that is not met
         rests on less than the rest of the requirement.
+    :param unless_claimed: tolerable only where the vendor does not claim the requirement's unit.
     :param joints: indices of the joints concerned, the most important first; empty if none in
         particular.
     :param plots: the plots that show it, if they differ from the requirement's.
@@ -127,6 +128,7 @@ class Outcome:
     late: Late | None = None
     absent: bool = False
     tolerable: bool = False
+    unless_claimed: bool = False
     joints: tuple[int, ...] = ()
     plots: tuple[Plot, ...] = ()
     retry: bool = False

@@ -15,9 +15,14 @@ from dexkit.conformance.checks import Outcome
 __all__ = ["all_of", "warning"]
 
 
-def warning(part: Outcome) -> Outcome:
-    """The part with what it does not meet turned into a warning, whatever the level."""
-    return part.tolerated() if part.met is False else part
+def warning(part: Outcome, *, unless_claimed: bool = False) -> Outcome:
+    """The part with what it does not meet turned into a warning, whatever the level.
+
+    :param unless_claimed: where the vendor claims the requirement's unit, it fails all the same.
+    """
+    if part.met is not False:
+        return part
+    return replace(part, tolerable=True, unless_claimed=unless_claimed)
 
 
 def all_of(*parts: Outcome) -> Outcome:

@@ -324,7 +324,7 @@ def TurnedVelocity(self: Any, state: Any, hand: Any) -> None:
     state["dq"] = -state["dq"]
 
 
-@wrong_hand("BRAINCO-FORCE-03", sides=BOTH)
+@wrong_hand("BRAINCO-FORCE-01", sides=BOTH)
 @reports(Service, "DEX1-FORCE-01")
 def NoForce(self: Any, state: Any, hand: Any) -> None:
     """Publishes no force."""

@@ -69,14 +69,14 @@ def WeakThumb(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     move(dt, [0.3 * p if i >= 16 else p for i, p in enumerate(pull)])
 
 
-@wrong_hand("DEX5-FORCE-08", sides=BOTH)
+@wrong_hand("DEX5-FORCE-05", sides=BOTH)
 class LittleFingerBoosts(fingers.Boosts, Dex5Hand):
     """Its little finger presses with two and a half times the torque where it is blocked."""
 
     joints = (13, 14, 15)
 
 
-@wrong_hand("DEX5-FORCE-08", sides=BOTH)
+@wrong_hand("DEX5-FORCE-05", sides=BOTH)
 class RingFingerGivesIn(fingers.OtherInContact, Dex5Hand):
     """Its ring finger presses with a third of the torque where it is blocked."""
 

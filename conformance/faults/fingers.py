@@ -713,14 +713,14 @@ class Boosts(OtherInContact):
         self.changed()
 
 
-@wrong_hand("DEX3-FORCE-08", sides=BOTH, whole=True)
+@wrong_hand("DEX3-FORCE-05", sides=BOTH, whole=True)
 class OneFingerBoosts(Boosts, Dex3Hand):
     """Its index finger presses with two and a half times the torque where it is blocked."""
 
     joints = (5, 6)
 
 
-@wrong_hand("DEX3-FORCE-08", sides=BOTH)
+@wrong_hand("DEX3-FORCE-05", sides=BOTH)
 class ThumbGivesIn(OtherInContact, Dex3Hand):
     """Its thumb presses with a third of the torque where it is blocked."""
 

@@ -372,7 +372,7 @@ def KeepsGainsAtTheSamePlace(hand: Any, accept: Call, motor: Motor) -> Any:
 # ------------------------------------------------------------------------------------ force
 
 
-@wrong_hand("DEX1-FORCE-14", sides=BOTH)
+@wrong_hand("DEX1-FORCE-11", sides=BOTH)
 class GripsHarderWhenSoft(ReferenceHand):
     """Mistakes a softer grip for slip, and doubles its force until it lets go."""
 
@@ -434,7 +434,7 @@ def UnsignedForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     state["tau_est"] = abs(state["tau_est"])
 
 
-@reports(ReferenceService, "DEX1-FORCE-20", whole=True)
+@reports(ReferenceService, "DEX1-FORCE-03", whole=True)
 def SignTurns(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes tau_est with the other sign from 5 s on: its motor was enabled again."""
     if self.now > 5.0:
@@ -457,7 +457,7 @@ class ChatteringLimit(ReferenceHand):
         self.load = self.load + dt if pressing else 0.0
 
 
-@wrong_hand("DEX1-FORCE-17", sides=BOTH, whole=True)
+@wrong_hand("DEX1-FORCE-10", sides=BOTH, whole=True)
 class SecondGripWeak(ReferenceHand):
     """Pushes with 0.4 N m at most towards closing after the first long grip has ended."""
 
@@ -480,7 +480,7 @@ def NoDeadZones(self: Any, command: Call, side: Side, motor: Motor) -> None:
     self.hands[side].command(Motor(q=motor.q) if math.isfinite(motor.q) else motor)
 
 
-@reports(ReferenceService, "DEX1-FORCE-05", dialect="unitree_hg")
+@reports(ReferenceService, "DEX1-FORCE-04", dialect="unitree_hg")
 def SignedForce(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Publishes the signed torque where the strength of the grip is expected."""
     state["tau_est"] = hand.tau
@@ -519,14 +519,14 @@ def BoostsWhereItIsBlocked(hand: Any, torque: Call) -> float:
 
 
 @changes(
-    ReferenceHand, "motor_torque", "DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True
+    ReferenceHand, "motor_torque", "DEX1-FORCE-18", dialect="unitree_hg", sides=BOTH, whole=True
 )
 def BoostsByItsOwnGains(hand: Any, torque: Call) -> float:
     """Presses with two and a half times the torque of its own gains where it is blocked."""
     return float(torque()) * (2.6 if hand.contact() > 0.0 else 1.0)
 
 
-@wrong_hand("DEX1-FORCE-19", dialect="unitree_hg", sides=BOTH, whole=True)
+@wrong_hand("DEX1-FORCE-18", dialect="unitree_hg", sides=BOTH, whole=True)
 class HoldingCurrent(ReferenceHand):
     """Holds an object with a third of the torque from 0.3 s on, as the driver of a stepper does."""
 

@@ -453,7 +453,7 @@ class _WeakForOthers(_Weak):
         return self.other_client
 
 
-@wrong_hand("FTP-FORCE-07", sides=BOTH, whole=True)
+@wrong_hand("FTP-FORCE-05", sides=BOTH, whole=True)
 class WeakForNewClients(_FeelingService):
     """Presses with less than half of its force since a second program has commanded it."""
 

@@ -267,6 +267,8 @@ class Judgement:
             outcome = replace(
                 outcome, met=False, tolerable=False, figure="absent", observed=claim, reason=""
             ).because(f"Nothing fills it: either do, or do not claim '{unit}'.")
+        if outcome.unless_claimed and self._claimed:
+            outcome = replace(outcome, tolerable=False)
         if outcome.met is None:
             return self.result(Verdict.NOT_APPLICABLE, outcome)
         if outcome.met:

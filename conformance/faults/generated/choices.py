@@ -171,7 +171,7 @@ _SERVO = frozenset(
 """A position servo uses neither the gains nor the velocity nor the torque of a command."""
 
 
-_FORCE_OF_ITS_OWN = frozenset(f"DEX{n}-{m}" for n in (3, 5) for m in ("FORCE-05", "FORCE-08"))
+_FORCE_OF_ITS_OWN = frozenset({"DEX3-FORCE-05", "DEX5-FORCE-05"})
 """What it presses with is not the torque that the gains of a command give."""
 
 
@@ -266,7 +266,7 @@ add(
     members=("tau",),
     needs="tau_est",
     lacks={"force"},
-    warned={"DEX1-FORCE-01", "BRAINCO-FORCE-03", "FTP-FORCE-03"}
+    warned={"DEX1-FORCE-01", "BRAINCO-FORCE-01", "FTP-FORCE-01"}
     | {f"DEX{n}-FORCE-{m}" for n in (3, 5) for m in ("01", "05")},
 )
 add(
