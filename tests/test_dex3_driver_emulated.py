@@ -102,8 +102,13 @@ def test_both_hands_reach_their_goals() -> None:
             assert rest.q == pytest.approx(np.array(DEX3_1.rest_q[side]), abs=0.01)
         for side, hand in hands.items():
             goal = GOAL[side]
-            state = drive(hand, go(goal), lambda s, q=goal: np.abs(s.q - q).max() < 0.02)  # type: ignore[misc]
-            assert state.mode.tolist() == [JointMode.FOC] * 7
+
+            def there(state: HandState, goal: Any = goal) -> bool:
+                # on a busy machine the protection may have stopped the motors just there
+                driven = state.mode.tolist() == [JointMode.FOC] * 7
+                return driven and bool(np.abs(state.q - goal).max() < 0.02)
+
+            state = drive(hand, go(goal), there)
             assert not state.fault.any()
             assert state.voltage == pytest.approx(np.full(7, 24.0), abs=1.0)
             assert state.supply is not None
