@@ -10,6 +10,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -134,7 +135,8 @@ class Session:
                 if abs(length) < 0.2:
                     continue
                 progress = (places[:, joint] - places[0, joint]) / length
-                there = np.flatnonzero(progress >= 0.9)
+                # a hand that ends short by less than counts has arrived
+                there = np.flatnonzero(progress >= 1.0 - max(0.1, 0.05 / abs(length)))
                 late = math.inf if settles else math.nan  # too soon to say
                 took[joint] = t[there[0]] if len(there) else late
                 made[joint] = max(0.0, float(progress.max()))
@@ -290,9 +292,29 @@ def _delay(goal: Floats, place: Floats) -> float:
     return 0.01 * float(np.argmin(errors))
 
 
-def _stroke(spoken: Dialect) -> float:
-    """Seconds for a whole stroke: of a gripper, that of a slow one at xr_teleoperate's lead."""
-    return 1.8 if spoken.is_gripper else 1.2
+class Pace(NamedTuple):
+    """How quickly an operator moves a hand: no quicker than good ones follow.
+
+    :ivar stroke: seconds for a whole stroke.
+    :ivar quick: for a stroke that is not waited for.
+    :ivar joint: for a joint alone.
+    :ivar settled: after which a hand that hears nothing has arrived.
+    """
+
+    stroke: float = 1.2
+    quick: float = 0.5
+    joint: float = 0.35
+    settled: float = 0.3
+
+
+def _pace(spoken: Dialect) -> Pace:
+    """That of a gripper is for a slow one at xr_teleoperate's lead; that of a position servo for
+    one of half the speed, or that obeys 0.2 s late as real ones do
+    (docs/sources/real-hands.md#dfx-begin).
+    """
+    if spoken.position_servo:
+        return Pace(stroke=1.8, quick=0.9, joint=0.9, settled=0.9)
+    return Pace(stroke=1.8) if spoken.is_gripper else Pace()
 
 
 def _both(session: Session, *parts: float) -> dict[Side, Pose]:
@@ -308,7 +330,8 @@ def _both(session: Session, *parts: float) -> dict[Side, Pose]:
 def teleoperate(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Session:
     """A day with xr_teleoperate and free hands."""
     s = Session("xr_teleoperate", made, spoken, sides, {})
-    stroke = _stroke(spoken)
+    pace = _pace(spoken)
+    stroke = pace.stroke
     s.still("before the first client", 1.2)
     client = Teleoperation(spoken, sides)
     client.goals = _both(s, 0.5)
@@ -322,8 +345,8 @@ def teleoperate(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> 
     s.follow("follow slowly", 0.1, 0.9, 3.0, 4.5)
     s.move("half way again", _both(s, 0.5), _HALF)
     for i, part in enumerate((_SHUT, _OPEN, _SHUT, _OPEN)):
-        s.move(f"quickly {i + 1}", _both(s, part), 0.5, settles=False, hurried=True)
-    s.move("to rest", _both(s, 0.5), _HALF)
+        s.move(f"quickly {i + 1}", _both(s, part), pace.quick, settles=False, hurried=True)
+    s.move("to rest", _both(s, 0.5), _HALF, hurried=True)
     _one_at_a_time(s, client)
     _events(s, client)
     s.records("all that it reads")
@@ -336,20 +359,21 @@ def _one_at_a_time(s: Session, client: Teleoperation) -> None:
         for side in s.sides:
             s.move(f"only {side}", {side: closed(s.dialect, side, (_SHUT,))}, _HALF)
             s.move(f"only {side} back", {side: closed(s.dialect, side, (0.5,))}, _HALF)
-    joints = s.stage.codec.joints
+    joints, seconds = s.stage.codec.joints, _pace(s.dialect).joint
     if joints == 1:
         return
     for joint in range(joints):
         parts = [0.5] * joints
         parts[joint] = 0.9
-        s.move(f"joint {joint} alone", _both(s, *parts), 0.35, settles=False)
+        s.move(f"joint {joint} alone", _both(s, *parts), seconds, settles=False)
     s.move("all back", _both(s, 0.5), 0.8)
 
 
 def _events(s: Session, client: Teleoperation) -> None:
     """What goes wrong in a life."""
     stage, codec = s.stage, s.stage.codec
-    mid, stroke = _both(s, 0.5), _stroke(s.dialect)
+    mid, pace = _both(s, 0.5), _pace(s.dialect)
+    stroke = pace.stroke
 
     # a slow subscriber joins: a viewer that does not keep up
     stage.service.loaded = True
@@ -362,7 +386,9 @@ def _events(s: Session, client: Teleoperation) -> None:
         client.goals = _both(s, _SHUT)
         stage.run(0.15)
         stage.connected = False
-        s.still(f"network away for {seconds} s", seconds - 0.3, after=0.3)
+        stage.run(min(seconds, pace.settled))
+        if seconds > pace.settled:
+            s.still(f"network away for {seconds} s", seconds - pace.settled)
         client.goals = _both(s, 0.3)
         stage.run(0.1)
         stage.connected = True
@@ -462,7 +488,7 @@ def _with_nan(good: Mapping[Side, list[Motor]]) -> dict[Side, list[Motor]]:
 
 def _nan(s: Session, bad: Mapping[Side, list[Motor]]) -> None:
     """NaN for one joint, for one cycle and for long; then for one side alone."""
-    stroke, hold = _stroke(s.dialect), Script(s.dialect, s.sides)
+    stroke, hold = _pace(s.dialect).stroke, Script(s.dialect, s.sides)
     s.still("one NaN", 0.5, after=_burst(s, bad, 1))
     s.still("a second of NaN", 0.6, after=_burst(s, bad, 100))
     s.move("close after NaN", _both(s, _SHUT), stroke)
@@ -600,7 +626,7 @@ def example(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> Sess
     client.goals = every(_OPEN)
     stage.connect(client)
     if spoken.is_gripper:
-        stage.run(_stroke(spoken))
+        stage.run(_pace(spoken).stroke)
         s.follow("to and fro", _OPEN, _SHUT, 4.0, 6.0)
     else:
         client.gains, client.period = client.TURN, client.fast
