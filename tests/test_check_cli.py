@@ -82,12 +82,13 @@ def test_check_without_a_verdict_does_not_pass(capsys: pytest.CaptureFixture[str
 
 
 def test_check_judges_only_the_selected_requirements(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check(sample_path("dex1_pick_place"), "--require", "DEX1-RATE", "--level", "must") == 0
+    chosen = ("--require", "DEX1-RATE", "--require", "DEX1-FIELD-08", "--level", "must")
+    assert check(sample_path("dex1_pick_place"), *chosen) == 0
     out = capsys.readouterr().out
     assert "DEX1-RATE-01" in out
-    assert "DEX1-RATE-02" not in out
+    assert "DEX1-FIELD-08" not in out
     every = catalogue("dex1-1")
-    assert f"(3 of {len(every)} requirements: 3 pass)" in out
+    assert f"(2 of {len(every)} requirements: 2 pass)" in out
     assert check(sample_path("dex1_pick_place"), "--require", "DEX7") == 2
     assert (
         check(sample_path("dex1_pick_place"), "--require", "DEX1-FIELD-08", "--level", "must") == 2

@@ -137,7 +137,7 @@ def blamed(result: RunResult) -> set[str]:
 @pytest.mark.parametrize(
     ("service", "warned"),
     [
-        (JustFastEnough, {"DEX1-RATE-02"}),
+        (JustFastEnough, {"DEX1-RATE-01"}),
         (Plain, {"DEX1-QOS-01"}),
         (Quick, set()),
         # slow, which gives warnings; but it arrives, opens, closes and obeys

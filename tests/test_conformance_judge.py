@@ -177,11 +177,11 @@ def test_exception_in_check_is_verdict_error(monkeypatch: pytest.MonkeyPatch) ->
     def broken(context: object) -> None:
         raise ZeroDivisionError("1/0")
 
-    monkeypatch.setitem(REGISTRY, "DEX1-RATE-01", broken)
+    monkeypatch.setitem(REGISTRY, "DEX1-TOPIC-01", broken)
     result = judged(short_run())
-    assert result_of(result, "DEX1-RATE-01").verdict is Verdict.ERROR
-    assert "ZeroDivisionError: 1/0" in result_of(result, "DEX1-RATE-01").reason
-    assert result_of(result, "DEX1-RATE-02").reason == "blocked by DEX1-RATE-01"
+    assert result_of(result, "DEX1-TOPIC-01").verdict is Verdict.ERROR
+    assert "ZeroDivisionError: 1/0" in result_of(result, "DEX1-TOPIC-01").reason
+    assert result_of(result, "DEX1-RATE-01").reason == "blocked by DEX1-TOPIC-01"
     assert result.overall is Overall.INCONCLUSIVE
 
 

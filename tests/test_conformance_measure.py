@@ -25,7 +25,7 @@ from tests.each import each
 
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]  # a MUST
-JITTER = BY_ID["DEX1-RATE-02"]  # a SHOULD
+WARNS = BY_ID["DEX1-FIELD-08"]  # a SHOULD
 
 
 class Clock:
@@ -96,7 +96,7 @@ def test_figure_without_end_is_not_hidden_by_one_near_the_limit() -> None:
 
 
 def test_should_within_the_kits_error_warns_all_the_same() -> None:
-    found = judged(0.101, 0.002, JITTER.id)
+    found = judged(0.101, 0.002, WARNS.id)
     assert found.verdict is Verdict.WARN
     assert "fails by less than the kit's measurement error" in Card.from_results([found]).as_text()
 

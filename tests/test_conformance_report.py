@@ -191,7 +191,7 @@ WRONG = {m.name: m.made for m in mutants() if m.model == "dex1-1"}
         (
             "HalfRate",
             {"step"},
-            "RATE-02",
+            "RATE-01",
             ["rate of the state", "how often", "time from each"],
         ),
         ("StaleState", {"step"}, "FRESH-01", ["each sample of the state"]),

@@ -108,7 +108,7 @@ def test_selection_includes_stimuli_of_dependencies() -> None:
 
 def test_requirements_are_selected_by_prefix_and_level() -> None:
     rates = select(catalogue(), prefixes=["dex1-rate"])
-    assert {r.id for r in rates} == {f"DEX1-RATE-0{i}" for i in (1, 2, 3, 5)}
+    assert {r.id for r in rates} == {"DEX1-RATE-01", "DEX1-RATE-03"}
     musts = select(catalogue(), level="must")
     assert musts
     assert {r.level for r in musts} == {Level.MUST}

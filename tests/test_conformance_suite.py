@@ -109,7 +109,7 @@ ENDS = [
     (
         (*SIM, "--side", "left", "--require", "DEX1-RATE", "--collect-only"),
         0,
-        [f"test_requirement[{i}-left]" for i in ("DEX1-RATE-01", "DEX1-RATE-05")],
+        [f"test_requirement[{i}-left]" for i in ("DEX1-RATE-01", "DEX1-RATE-03")],
         "",
     ),
     (("--list", "--capabilities", "wrong.toml"), 4, [], "Object contains unknown field speed"),

@@ -57,7 +57,8 @@ def test_rate_that_falls_for_the_second_half_fails_with_the_second_in_which_it_b
 
 def test_one_late_state_does_not_fail_the_rate() -> None:
     times = _at(210, 0, 5) + _at(210, 5.09, 10)
-    assert _result(_recorded(times), "DEX1-RATE-01").verdict is Verdict.PASS
+    # the original is quicker
+    assert _result(_recorded(times), "DEX1-RATE-01").verdict is Verdict.WARN
 
 
 def test_states_that_arrive_late_are_a_gap_in_a_run_of_the_kit_alone() -> None:
@@ -75,18 +76,18 @@ def test_states_that_arrive_late_are_a_gap_in_a_run_of_the_kit_alone() -> None:
 def test_long_bursts_fail_in_a_run_of_the_kit_although_their_stamps_are_good() -> None:
     sent = np.array(_at(500, 0, 6))
     received = np.where((sent > 2.0) & (sent < 4.0), np.ceil(sent / 0.08) * 0.08, sent)
-    result = _result(_recorded(sent.tolist(), received.tolist(), kit=True), "DEX1-RATE-05")
+    result = _result(_recorded(sent.tolist(), received.tolist(), kit=True), "DEX1-RATE-03")
     assert result.verdict is Verdict.FAIL
     assert result.evidence[0].time_s == pytest.approx(2.0, abs=0.1)
     assert result.values["intervals"] == pytest.approx(12, abs=1)
     # another recorder may have been late itself
     offline = _recorded(sent.tolist(), received.tolist())
-    assert _result(offline, "DEX1-RATE-05").verdict is Verdict.PASS
+    assert _result(offline, "DEX1-RATE-03").verdict is Verdict.PASS
 
 
 def test_four_long_intervals_in_a_second_are_no_bursts() -> None:
     times = np.array(_at(500, 0, 6))
     for begin in (2.0, 2.2, 2.4, 2.6):
         times = times[(times < begin) | (times > begin + 0.06)]
-    result = _result(_recorded(times.tolist()), "DEX1-RATE-05")
+    result = _result(_recorded(times.tolist()), "DEX1-RATE-03")
     assert (result.verdict, result.values["intervals"]) == (Verdict.PASS, 4)

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.checks.timing import (
     gap_measures,
@@ -58,8 +59,7 @@ def _spans(ctx: Context, names: tuple[str, ...]) -> list[tuple[float, float]]:
 def _slow_stretches(ctx: Context) -> list[tuple[float, float, Floats]]:
     """Begin, end and intervals of each stretch with too low a rate in every window.
 
-    The longest interval of a window is left out, because RATE-03 and RATE-04 judge a single late
-    state.
+    The longest interval of a window is left out, because RATE-03 judges a single late state.
     """
     clock = ctx.states.clock
     lengths, starts = np.diff(clock), clock[:-1]
@@ -143,6 +143,11 @@ def _too_short(ctx: Context) -> Outcome:
 
 @check("DEX1-RATE-01", "DEX3-RATE-01", "H1-RATE-01", rests_on=(TIMES,))
 def rate(ctx: Context) -> Outcome:
+    """The rate in sliding windows; a mean rate that is not the original's only warns."""
+    return all_of(_rate_in_windows(ctx), warning(_usual_rate(ctx)))
+
+
+def _rate_in_windows(ctx: Context) -> Outcome:
     """Rate in sliding windows, outside of gaps."""
     clock = ctx.states.clock
     measured = _rate(ctx)
@@ -185,31 +190,41 @@ def rate(ctx: Context) -> Outcome:
     return outcome.if_late(*(1 / r - period for r in rates), how="mean")
 
 
-@check("DEX1-RATE-02", "DEX3-RATE-02", "H1-RATE-02", rests_on=(TIMES,))
-def vendor_rate(ctx: Context) -> Outcome:
+def _usual_rate(ctx: Context) -> Outcome:
     """Mean rate compared with the vendor's.
 
-    One interval in each second is left out if it is the longest there by far: RATE-03 to RATE-05
-    judge single late states.
+    One interval in each second is left out if it is the longest there by far: RATE-03 judges single
+    late states.
     """
     measured = _rate(ctx)
     if measured is None:
         return _too_short(ctx)
     rate, seconds = measured
-    if rate < ctx.tolerance("min_rate_hz"):
+    least, most = ctx.tolerance("usual_min_hz"), ctx.tolerance("usual_max_hz")
+    if rate < least:
         rate, seconds = _rate_without_pauses(ctx)
     text = f"{rate:.1f} Hz over {seconds:.1f} s"
-    least, most = ctx.tolerance("min_rate_hz"), ctx.tolerance("max_rate_hz")
     if least <= rate <= most:
-        return ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate).rated(rate, least, seconds)
+        return ctx.passed(f"{rate:.1f} Hz", text, mean_hz=rate).rated(rate, least, seconds)
     # load of the machine cannot cause too high a rate
-    outcome = ctx.failed(f"{rate:.1f} Hz", text, rate_hz=rate)
+    outcome = ctx.failed(f"{rate:.1f} Hz", text, mean_hz=rate)
     if rate > most:
         return outcome.rated(rate, most, seconds, at_most=True).if_late(math.inf)
-    return too_slow(ctx, outcome.rated(rate, least, seconds), rate)
+    return outcome.rated(rate, least, seconds).if_late(1 / rate - 1 / least, how="mean")
 
 
-@check("DEX1-RATE-03", "DEX3-RATE-03", "H1-RATE-03", rests_on=(TIMES,))
+@check("DEX1-RATE-03", "DEX3-RATE-03", rests_on=(TIMES,))
+def steady(ctx: Context) -> Outcome:
+    """Gaps, and bursts of a state that has no gap, arrives in order and has a good mean rate."""
+    gap = no_gap(ctx)
+    if not gap.met or (np.diff(ctx.states.sent) <= 0).any() or not _rate_in_windows(ctx).met:
+        return gap
+    bursts = _bursts(ctx)
+    survived = ctx.requirement.tolerances.get("survived_count", 0.0)
+    return all_of(gap, warning(bursts) if bursts.values["intervals"] <= survived else bursts)
+
+
+@check("H1-RATE-03", rests_on=(TIMES,))
 def no_gap(ctx: Context) -> Outcome:
     """Longest interval without a state."""
     limit = ctx.tolerance("max_gap_s")
@@ -243,21 +258,10 @@ def no_gap(ctx: Context) -> Outcome:
     ).timed(longest, limit)
 
 
-@check("DEX1-RATE-05", "DEX3-RATE-05", rests_on=(TIMES,))
-def spread(ctx: Context) -> Outcome:
+def _bursts(ctx: Context) -> Outcome:
     """The largest number of long intervals in a window, as published and as received."""
-    return _long_intervals(
-        ctx, ctx.tolerance("max_interval_s"), ctx.tolerance("window_s"), ctx.tolerance("max_count")
-    )
-
-
-def _long_intervals(ctx: Context, limit: float, window: float, allowed: float) -> Outcome:
-    """Compare the number of long intervals between states with what is allowed.
-
-    :param limit: s, above which an interval is long.
-    :param window: s, in which they are counted.
-    :param allowed: how many of them there may be.
-    """
+    limit, window = ctx.tolerance("max_interval_s"), ctx.tolerance("window_s")
+    allowed = ctx.tolerance("max_count")
     excluded = _spans(ctx, OWN_RATE_RULE)
     most = 0
     for clock in state_clocks(ctx):
@@ -278,14 +282,14 @@ def _long_intervals(ctx: Context, limit: float, window: float, allowed: float) -
         ]
         begin, end = found[0][0], found[-1][1]
         outcome = ctx.failed(
-            f"{most} in {window:g} s",
+            f"{most} late in {window:g} s",
             f"{len(found)} intervals of more than {limit:g} s from {begin:.2f} s to {end:.2f} s",
             *(ctx.at(ctx.states.topic, a, b) for a, b in found),
             intervals=most,
         ).resting_on(*gap_measures(found, limit))
         return outcome.if_late(*(b - a - limit for a, b in found))
     return ctx.passed(
-        f"{most} in {window:g} s",
+        f"{most} late in {window:g} s",
         f"at most {most} intervals of more than {limit:g} s in {window:g} s",
         intervals=most,
     )

@@ -103,7 +103,7 @@ class SilentUntilCommanded(Service):
 # --------------------------------------------------------------------------- rate and order
 
 
-@wrong_hand("BRAINCO-RATE-02")
+@wrong_hand("BRAINCO-RATE-01")
 @wrong_hand("DEX1-RATE-01", "DEX3-RATE-01")
 class SlowPublisher(Service):
     """Publishes at 125 Hz, or at 1.15 times the least rate where that is less."""
@@ -141,7 +141,7 @@ def _publishes_hundreds(hand: HandModel) -> bool:
     return hand.state_rate >= 400.0 and hand is not BRAINCO_REVO2
 
 
-@wrong_hand("DEX1-RATE-02", "DEX3-RATE-02", where=_publishes_hundreds)
+@wrong_hand("DEX1-RATE-01", "DEX3-RATE-01", where=_publishes_hundreds)
 class HalfRate(Service):
     """Publishes at 222 Hz: enough for clients, but slower than the vendor's service."""
 
@@ -185,7 +185,7 @@ class BurstsWithGoodStamps(Service):
         return super().end()
 
 
-@changes(BurstsWithGoodStamps, "publish", "DEX1-RATE-05", "DEX3-RATE-05")
+@changes(BurstsWithGoodStamps, "publish", "DEX1-RATE-03", "DEX3-RATE-03")
 def BurstsForTwoSeconds(self: Any, publish: Call) -> Any:
     """Delivers its states in bursts of twenty for two seconds, with the right timestamps."""
     self.together = 20 if 2.0 < self.now < 4.0 else 1

@@ -118,7 +118,7 @@ class Slow(ReferenceRobot):
     period = 0.01
 
 
-@wrong_hand("H1-RATE-02")
+@wrong_hand("H1-RATE-01")
 class StateAt333Hz(ReferenceRobot):
     """Publishes at 333 Hz."""
 

@@ -210,10 +210,12 @@ def _after(recording: Recording, root: Sequence[Result]) -> str:
 
 
 def _check(result: Result) -> tuple[str, str]:
-    """The behaviour that the check of a result belongs to, and the check's full name."""
+    """The behaviour that the check of a result belongs to, and the check's full name: of what only
+    warns by a part of its requirement the behaviour alone.
+    """
     check = check_of(result.requirement)
     behaviour = check.__module__.rpartition(".")[2]
-    return behaviour, f"{behaviour}.{check.__name__}"
+    return behaviour, behaviour if result.tolerated else f"{behaviour}.{check.__name__}"
 
 
 def _rank(result: Result) -> tuple[int, bool]:

@@ -161,9 +161,16 @@ class _Limit:
 _PERIODS = (
     _Limit("min_rate_hz", "{0:g} Hz: {1:.2g} ms", lambda hz: 1e3 / hz),
     _Limit("max_rate_hz", "{0:g} Hz: {1:.2g} ms", lambda hz: 1e3 / hz),
+    _Limit("usual_min_hz", "usual {0:g} Hz: {1:.2g} ms", lambda hz: 1e3 / hz),
+    _Limit("usual_max_hz", "to {0:g} Hz: {1:.2g} ms", lambda hz: 1e3 / hz),
     _Limit("max_gap_s", "longest gap allowed: {1:g} ms", lambda s: 1e3 * s),
 )
-_RATES = (_Limit("min_rate_hz", "at least {0:g} Hz"), _Limit("max_rate_hz", "at most {0:g} Hz"))
+_RATES = (
+    _Limit("min_rate_hz", "at least {0:g} Hz"),
+    _Limit("max_rate_hz", "at most {0:g} Hz"),
+    _Limit("usual_min_hz", "usual from {0:g} Hz"),
+    _Limit("usual_max_hz", "to {0:g} Hz"),
+)
 _TORQUES = (
     _Limit("min_tau_nm", "at least {0:g} N m in size"),
     _Limit("min_tau_nm", "at least {0:g} N m in size", float.__neg__),

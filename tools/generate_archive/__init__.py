@@ -281,8 +281,8 @@ def _damage(data: bytes, random: Random) -> bytes:
 
 FAULTS = (
     # TRACK-01: where q is missing or wrong, the hand seems not to follow
-    Fault("gap", _gap, ("RATE-03",), ("FIELD-15", "RATE-05", "RATE-04", "TRACK-01")),
-    Fault("slow", _slow, ("RATE-01",), ("RATE-02", "RATE-04", "FRESH-01", "RATE-05")),
+    Fault("gap", _gap, ("RATE-03",), ("FIELD-15", "TRACK-01")),
+    Fault("slow", _slow, ("RATE-01",), ("FRESH-01", "RATE-03")),
     Fault("nan", _nan, ("FIELD-02",)),
     Fault(
         "out-of-stroke",
@@ -299,7 +299,7 @@ FAULTS = (
     Fault("order", _order, ("ORDER-01",)),
     Fault("turned", _turned, ("FIELD-04", "FIELD-16"), ("FIELD-17",)),
     Fault("short", _short, ("FIELD-01",)),
-    Fault("late", _late, ("RATE-04", "RATE-05"), ("RATE-01", "FRESH-01")),
+    Fault("late", _late, ("RATE-03",), ("RATE-01", "FRESH-01")),
     Fault("strong", _strong, ("FORCE-04", "FORCE-02"), ("FORCE-07",)),
     Fault("cut", spoil=_cut, state="truncated"),
     Fault("damage", spoil=_damage, state="damaged"),

@@ -372,7 +372,7 @@ for _rate, _tick, _period in ((200, 0.0025, 0.005), (250, 0.002, 0.004), (1000, 
         f"publishes {_rate} times a second",
         values={"tick": _tick, "period": _period},
         control_law=True,
-        warned={f"DEX{n}-RATE-02" for n in (1, 3, 5)},
+        warned={f"DEX{n}-RATE-01" for n in (1, 3, 5)},
     )
 for _rate, _tick, _period in ((44, 0.0025, 0.0225), (100, 0.0025, 0.01)):
     add(
@@ -383,7 +383,7 @@ for _rate, _tick, _period in ((44, 0.0025, 0.0225), (100, 0.0025, 0.01)):
         values={"tick": _tick, "period": _period},
         position_servo=True,
         not_of={"brainco-revo2"} if _rate < 100 else frozenset(),
-        warned={"BRAINCO-RATE-02", "DFX-RATE-02", "FTP-RATE-02"},
+        warned={"BRAINCO-RATE-01", "DFX-RATE-01", "FTP-RATE-01"},
     )
 add("resolution", Counts, "counts-512", "measures q in 512 steps of a turn", per_turn=512)
 
