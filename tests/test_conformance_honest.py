@@ -176,7 +176,7 @@ def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
 
 
 def test_fast_gripper_is_not_judged_as_percent() -> None:
-    speed = result_of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-14")
+    speed = result_of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-15")
     assert speed.verdict is Verdict.PASS
     assert 30 < speed.values["speed_rad_s"] < 60
 

@@ -18,7 +18,7 @@ from dexkit.hand import Side
 # ----------------------------------------------------------------------------------- fields
 
 
-@reports(ReferenceService, "DEX1-FIELD-02")
+@reports(ReferenceService, "DEX1-FIELD-01")
 def NanVelocity(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Divides by a time step of zero at rest."""
     state["dq"] = state["dq"] or math.nan
@@ -101,7 +101,7 @@ class PercentBothWays(ReferenceService):
     hand = _OtherScale
 
 
-@changes(PercentBothWays, "command", "DEX1-FIELD-14", sides=LEFT)
+@changes(PercentBothWays, "command", "DEX1-FIELD-15", sides=LEFT)
 def PercentWithin(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Obeys and publishes percent, after it has clamped q to 0 to 5.4."""
     q = min(max(motor.q, 0.0), self.dialect.q_open) if math.isfinite(motor.q) else motor.q

@@ -27,7 +27,7 @@ from dexkit.conformance.kit.state_faults import Fault, faults
 __all__ = ["FAMILIES", "ORDER", "stories_of"]
 
 ORDER = (
-    *("discovery", "start_up", "fields.length", "fields.finite", "checksums", "order.order"),
+    *("discovery", "start_up", "fields.complete", "checksums", "order.order"),
     *("freshness.fresh", "rate.rate", "position.in_stroke"),
     *("sides.independent", "sides.by_its_own", "motion.order", "mode_byte.locked"),
     *("motion.direction", "motion.begins", "motion.every_command", "motion.arrives"),
