@@ -139,7 +139,7 @@ def test_missed_and_extra_failures_are_errors() -> None:
     survivor = score_of(WrongHandResult(nan, missed=("DEX1-FIELD-01",)))
     assert survivor.unproven
     assert not survivor.perfect
-    assert not score_of(WrongHandResult(nan, wrongly=("DEX1-MOVE-01",))).perfect
+    assert not score_of(WrongHandResult(nan, wrongly=("DEX1-MOVE-02",))).perfect
 
 
 def test_selection_by_model_includes_usb_and_topics() -> None:

@@ -360,7 +360,7 @@ def CoupledFinger(self: Any, command: Call, side: Side, motors: Motors) -> None:
     command(side, (*motors[:4], coupled, *motors[5:]))
 
 
-@commands(FingerHand, "DEX3-MOVE-01", where=obeys_gains)
+@commands(FingerHand, "DEX3-MOVE-02", where=obeys_gains)
 def OneJointBackwards(hand: Any, rows: Floats) -> None:
     """Moves one joint backwards."""
     rows[Q, 2] = 2 * hand.model.rest_q[hand.side][2] - rows[Q, 2]
