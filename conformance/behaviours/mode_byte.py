@@ -234,6 +234,14 @@ def _status(ctx: Context, mode: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDA
 _GOING = 0.8  # of a phase's time; a step may begin with it
 
 
+_CIRCUMSTANCES = {
+    "mixed": "while other joints were locked",
+    "guard-latch": "while other joints had tripped",
+    "guarded-step": "with time-out protection (bit 7) while commands came",
+}
+"""Phases in which some joints are driven in special circumstances."""
+
+
 @check("DEX3-MODE-05")
 @worst("part", "min_progress", nothing="no state while some joints were driven and others were not")
 def own_mode(ctx: Context) -> Figures:
@@ -267,8 +275,7 @@ def own_mode(ctx: Context) -> Figures:
                 size = math.copysign(min(abs(size), max(reach, least)), size)
             part = float(final[joint] - start[joint]) / size
             text = (
-                f"made {part:.0%} of a step of {size:.2f} {ctx.unit} while other joints were "
-                "locked, had tripped or were protected"
+                f"made {part:.0%} of a step of {size:.2f} {ctx.unit} " + _CIRCUMSTANCES[phase.name]
             )
             yield Figure(part, begin, end, joint, text)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dexkit.conformance.kit.recording import Recording, SideView, States
 from dexkit.hand import Floats
 
-__all__ = ["Fault", "faults"]
+__all__ = ["Fault", "faults", "joints_in_words"]
 
 Span = tuple[float, float]
 Run = tuple[int, int]
@@ -31,6 +31,8 @@ _FASTEST = 8.0
 """Strokes per second that no hand moves with."""
 _LEAST_JUMP = 0.015
 """Part of the stroke that q has to jump by."""
+_WRAPS = 0.5
+"""Part of the stroke that q jumps by where it wraps around."""
 _SAME_JUMP = 0.35
 """Part of a jump by which the jump back may differ: the joint moves on meanwhile."""
 _AT_LEAST = 3
@@ -70,6 +72,8 @@ def faults(recording: Recording, view: SideView) -> Iterator[Fault]:
         return
     for found in (
         _all_zero(view),
+        _zero_at_first(view),
+        _wraps(recording, view),
         _old_values(view),
         _jumps_and_returns(recording, view),
         _frozen_joints(view),
@@ -89,26 +93,85 @@ def _all_zero(view: SideView) -> Fault | None:
     runs = [(a, b) for a, b in _runs(np.asarray(zero)) if states.t[b - 1] - states.t[a] <= _AWAY_S]
     if not runs or not states.q[~zero].any():
         return None
-    what = f"q, dq and tau_est{_of(view, range(len(view.joints)))}"
+    what = f"q, dq and tau_est{joints_in_words(view, range(len(view.joints)))}"
     text = f"{what} are exactly 0 in {_counted(states, runs)}"
     return Fault("zero", text, _spans(states, runs), _bridged(states, _flags(states, runs)))
+
+
+def _zero_at_first(view: SideView) -> Fault | None:
+    """States whose q is exactly 0 until the first command, and then jumps to where the hand is."""
+    states, commands = view.states, view.commands
+    strokes = np.array([j.stroke for j in view.joints])
+    found = []
+    for begin, end in _runs(np.asarray(~states.q.any(axis=1))):
+        began = begin == 0 or states.t[begin] - states.t[begin - 1] > _AWAY_S
+        if not began or end == len(states) or end - begin < _HELD_STATES:
+            continue
+        at = float(states.t[end])
+        given = commands.t[commands.t <= at]
+        fresh = given[given > at - _AWAY_S]
+        older = len(fresh) < len(given) and given[-len(fresh) - 1] >= states.t[begin]
+        jumps = (np.abs(states.q[end]) > _LEAST_JUMP * strokes).any()
+        if jumps and len(fresh) and not older:
+            found.append((begin, end))
+    if not found:
+        return None
+    begin, end = found[0]
+    text = (
+        f"q{joints_in_words(view, range(len(strokes)))} is exactly 0 in all {end - begin} states "
+        f"before the first command, and then {states.q[end][np.abs(states.q[end]).argmax()]:.2f}"
+    )
+    return Fault("asleep", text, _spans(states, found), _bridged(states, _flags(states, found)))
+
+
+def _wraps(recording: Recording, view: SideView) -> Fault | None:
+    """A q that wraps around: it jumps by the same number down and up."""
+    states = view.states
+    q, times, joints, sizes, spans = states.q.copy(), 0, [], [], []
+    for joint, spec in enumerate(view.joints):
+        step = np.diff(q[:, joint])
+        fast = np.abs(step) > _FASTEST * spec.stroke * np.minimum(np.diff(states.t), 0.01)
+        jumps = np.flatnonzero(fast & (np.abs(step) > _WRAPS * spec.stroke))
+        if len(jumps) < _AT_LEAST:
+            continue
+        size = float(np.median(np.abs(step[jumps])))
+        places = np.maximum(q[jumps, joint], q[jumps + 1, joint])
+        alike = np.abs(np.abs(step[jumps]) - size) < 0.05 * size
+        if alike.mean() < 0.9 or np.ptp(np.quantile(places, [0.1, 0.9])) > 0.1 * size:
+            continue
+        turns = np.zeros(len(q))
+        turns[jumps + 1] = -np.sign(step[jumps])
+        turns[:] = np.cumsum(turns)
+        q[:, joint] += size * (turns - turns.min())
+        joints.append(joint)
+        sizes.append(size)
+        spans += [(float(states.t[i]), float(states.t[i + 1])) for i in jumps]
+        times = max(times, len(jumps))
+        at = float(np.median(places))
+    if not joints:
+        return None
+    text = (
+        f"q{joints_in_words(view, joints)} wraps around: at {at:.2f} {recording.unit} it jumps by "
+        f"{np.median(sizes):.2f} {recording.unit}, {times} times"
+    )
+    return Fault("wraps", text, tuple(sorted(spans)), replace(states, q=q))
 
 
 def _old_values(view: SideView) -> Fault | None:
     """States with exactly the values of an earlier one, between new ones."""
     states = view.states
     values = np.nan_to_num(np.hstack((states.q, states.dq, states.tau)))
-    _, numbers = np.unique(values, axis=0, return_inverse=True)
-    newest: dict[int, int] = {}
+    newest: dict[bytes, int] = {}
     old = np.zeros(len(states), dtype=np.bool_)
     ages = []
-    for row, number in enumerate(numbers.reshape(-1).tolist()):
-        before = newest.get(number, row)
+    for row, value in enumerate(values + 0.0):  # -0.0 is 0.0
+        key = value.tobytes()
+        before = newest.get(key, row)
         if before < row - 2:
             old[row] = True
             ages.append(float(states.t[row] - states.t[before]))
         else:
-            newest[number] = row
+            newest[key] = row
     if len(ages) < _AT_LEAST:
         return None
     age, (low, high) = float(np.median(ages)), np.percentile(ages, [20, 80])
@@ -129,8 +192,9 @@ def _jumps_and_returns(recording: Recording, view: SideView) -> Fault | None:
     if not runs:
         return None
     far = max(float(np.abs(states.q[a] - states.q[a - 1]).max()) for a, _ in runs)
+    of = joints_in_words(view, np.flatnonzero(away.any(axis=0)))
     text = (
-        f"q{_of(view, np.flatnonzero(away.any(axis=0)))} jumps away and back, by up to {far:.2g} "
+        f"q{of} jumps away and back, by up to {far:.2g} "
         f"{recording.unit}, in {_counted(states, runs)}"
     )
     if _are_of_other_hand(recording, view, [a for a, _ in runs]):
@@ -202,8 +266,8 @@ def _frozen_joints(view: SideView) -> Fault | None:
         for begin, end in runs:
             wrong[begin + 1 : end, joint] = True
     text = (
-        f"q{_of(view, sorted(found))} stays the same for {_ms(held_s)} (median) while the joint "
-        f"moves, and then jumps, {len(found[worst])} times"
+        f"q{joints_in_words(view, sorted(found))} stays the same for {_ms(held_s)} (median) "
+        f"while the joint moves, and then jumps, {len(found[worst])} times"
     )
     return Fault("frozen", text, _spans(states, found[worst]), _bridged(states, wrong))
 
@@ -256,7 +320,7 @@ def _wrong_velocity(view: SideView) -> Fault | None:
     wrong = sorted(joint for joints in found.values() for joint in joints)
     dq = states.dq.copy()
     dq[:, wrong] = slope[:, wrong]
-    return Fault("dq", f"dq{_of(view, wrong)} is {what}", (), replace(states, dq=dq))
+    return Fault("dq", f"dq{joints_in_words(view, wrong)} is {what}", (), replace(states, dq=dq))
 
 
 def _slope(states: States) -> Floats:
@@ -300,7 +364,7 @@ def _spans(states: States, runs: Iterable[Run]) -> tuple[Span, ...]:
     return tuple((float(states.t[a]), float(states.t[min(b, last)])) for a, b in runs)
 
 
-def _of(view: SideView, joints: Iterable[int]) -> str:
+def joints_in_words(view: SideView, joints: Iterable[int]) -> str:
     """Whose values they are, where there are several joints."""
     names = [view.joints[int(joint)].name for joint in joints]
     if len(view.joints) == 1:

@@ -5,6 +5,8 @@ One bug often fails many requirements. After all of them are judged, the failure
 * A fault that the states show by themselves (:mod:`~.state_faults`: all-zero states, a frozen
   joint) is taken out of the recording, and what failed is judged again. What is met then follows
   from it.
+* A habit of all motion (:mod:`~.habits`: each step begins late, a joint never moves) comes
+  before what requirements show of single situations.
 * Of the other failures, the one whose check looks most closely comes first (:data:`ORDER`). What is
   seen at the same time and joint, or is only a sum of everything, is listed under it.
 * What only warns comes after what fails.
@@ -19,6 +21,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import replace
 
 from dexkit.conformance.checks import check_of
+from dexkit.conformance.kit.habits import Habit, habits, silences
 from dexkit.conformance.kit.recording import Recording, SideView
 from dexkit.conformance.kit.requirements import Level
 from dexkit.conformance.kit.results import Evidence, Result, Story, Verdict
@@ -27,26 +30,30 @@ from dexkit.conformance.kit.state_faults import Fault, faults
 __all__ = ["FAMILIES", "ORDER", "stories_of"]
 
 ORDER = (
-    *("discovery", "start_up", "fields.complete", "checksums", "order.order"),
-    *("freshness.fresh", "rate.rate", "position.in_stroke"),
-    *("sides.independent", "sides.by_its_own", "motion.order", "mode_byte.locked"),
-    *("motion.begins", "motion.every_command", "motion.arrives"),
-    *("mode_byte.own_mode", "sides.beside_grip", "gains"),
-    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.ends"),
-    *("bad_commands.unchanged", "speed", "motion.speed", "sides", "watchdog.state_in_silence"),
+    *("discovery", "start_up", "fields.length", "fields.finite", "checksums", "order.order"),
+    *("freshness.fresh", "rate.rate"),
+    *("sides.independent", "sides.by_its_own", "motion.order"),
+    *("motion.direction", "motion.begins", "motion.every_command", "motion.arrives"),
+    *("sides.beside_grip", "gains"),
+    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.dead_zones"),
+    *("motion.ends", "mode_byte.locked"),
+    *("timeout_protection", "bad_commands.unchanged", "speed", "motion.speed", "sides"),
+    *("watchdog.state_in_silence",),
     *("stillness.still", "two_clients", "order.old_stamps"),
     *("life_cycle.restarted_client", "life_cycle.restarted_service", "watchdog.resumes"),
-    *("mode_byte", "bad_commands", "watchdog", "timeout_protection", "life_cycle", "rate"),
+    *("mode_byte", "bad_commands", "watchdog", "life_cycle", "rate"),
     *("grip.stops_at_object", "position.not_the_command"),
-    *("freshness", "velocity.keeps_up", "position", "velocity", "stillness", "force.unit"),
+    *("freshness", "velocity.keeps_up", "position", "velocity", "stillness"),
+    *("force.unit", "force.gripper_unit"),
     *("grip.keeps_gripping", "grip.lasts", "force", "grip", "touch", "pressure", "attitude"),
     *("motion", "load", "motion.path", "tracking", "operator", "fields", "robot_state"),
 )
 """Checks, by behaviour or singly, from that which looks most closely at one thing. Others last."""
 _SUMS = ("motion.path", "stillness.still", "tracking", "operator", "bad_commands.unchanged", "load")
 """Checks that many faults fail, whichever is first."""
-_ALL_VALUES = ("freshness.fresh", "rate.rate", "position.in_stroke")
-"""Checks of faults that spoil every later value of a position."""
+_ALL_VALUES = ("freshness.fresh", "rate.rate")
+"""Checks of faults that spoil every later value of a position; so does a q whose unit or sign is
+another one."""
 _VALUES = ("position", "velocity", "freshness")
 """Behaviours of measured values, which no command has a part in."""
 _CONTACT = ("force", "grip", "touch", "pressure")
@@ -68,6 +75,20 @@ _PROVOCATIONS = (
     *("silence", "restart", "service-restart", "two-writers", "load"),
 )
 """Phases of which a story says that something is seen only right after them."""
+_OF_MOTION = (
+    *("motion", "mode_byte", "speed", "sides", "gains", "load", "stillness", "tracking"),
+    *("operator", "bad_commands", "life_cycle", "watchdog", "two_clients", "order.old_stamps"),
+    *("grip", "force", "position.in_stroke", "position.not_the_command"),
+)
+"""Checks that a habit of motion may fail ..."""
+_START = ("discovery", "start_up", "fields", "checksums")
+_BEFORE_MOTION = (
+    *(*_START, "order.order", "freshness.fresh", "rate.rate"),
+    *("motion.order", "sides.independent", "sides.by_its_own"),
+)
+"""... and those that look more closely than a habit, where it does not explain them."""
+_SILENT_S = 5.0
+"""Seconds after the last step with a habit in which a failure is of it: none may be tried."""
 _NEAR_S = 0.3
 """Seconds by which places in the recording may be apart that show the same."""
 _OFTEN = ("state", "motion", "phase:step", "phase:joint", "phase:fingerprint")
@@ -87,18 +108,28 @@ def stories_of(recording: Recording, results: Iterable[Result], again: Again) ->
 
     :param results: of all requirements about the hands.
     """
+    results = list(results)
     failed = sorted((r for r in results if r.verdict in (Verdict.FAIL, Verdict.WARN)), key=_rank)
+    silent = _of_habits(recording, failed, silences)
+    explained = {name for story in silent for name in story.explains}
+    failed = [r for r in failed if r.id not in explained]
     shown = _of_states(recording, failed, again) if failed else []
-    if failed and _among(_check(failed[0]), _ALL_VALUES):
+    if failed and _spoils_all(failed[0]):
         # what spoils all values is what a part of them shows, too
         shown = [story for story in shown if failed[0].id in story.explains]
     explained = {name for story in shown for name in story.explains}
-    found = _of_findings(recording, [r for r in failed if r.id not in explained])
+    left = [r for r in failed if r.id not in explained]
+    moved = _of_habits(recording, left, habits)
+    explained = {name for story in moved for name in story.explains}
+    found = _of_findings(recording, [r for r in left if r.id not in explained])
+    early = {r.id for r in left if _among(_check(r), _BEFORE_MOTION)}
+    first = [story for story in found[:1] if story.shown_by in early]
+    found = [*first, *moved, *found[len(first) :]]
+    fails = {r.id for r in results if r.verdict is Verdict.FAIL}
     weight = {r.id: 2 if r.requirement.level is Level.MUST else 1 for r in failed}
     most = max((_weight(story, weight) for story in found), default=0)
     before = [story for story in shown if _weight(story, weight) >= most]
-    stories = [*before, *found, *(story for story in shown if story not in before)]
-    fails = {r.id for r in failed if r.verdict is Verdict.FAIL}
+    stories = [*silent, *before, *found, *(story for story in shown if story not in before)]
     return sorted(stories, key=lambda story: fails.isdisjoint(story.explains))
 
 
@@ -161,6 +192,57 @@ def _without_faults(
         view, failed = replace(view, states=fault.states, known={}), failed - met
 
 
+# ------------------------------------------------------------------------------------- habits
+
+
+def _of_habits(
+    recording: Recording,
+    failed: Sequence[Result],
+    find: Callable[[Recording, SideView], Iterable[Habit]],
+) -> list[Story]:
+    """Stories of what goes wrong all over a run, that of most places first."""
+    kinds: dict[str, list[tuple[SideView, Habit]]] = {}
+    for view in recording.sides.values():
+        if any(r.side == str(view.side) for r in failed):
+            for habit in find(recording, view):
+                kinds.setdefault(habit.kind, []).append((view, habit))
+    stories = []
+    for found in sorted(kinds.values(), key=lambda f: -sum(len(h.spans) for _, h in f)):
+        left = {r.id for r in failed if not any(_is_of(r, view, h) for view, h in found)}
+        explained = tuple(dict.fromkeys(r.id for r in failed if r.id not in left))
+        failed = [r for r in failed if r.id in left]
+        if explained:
+            view, habit = max(found, key=lambda f: len(f[1].spans))
+            places = tuple(
+                Evidence(view.states.topic, round(a, 4), recording.log_time(a), round(b, 4))
+                for a, b in habit.spans[:_PLACES]
+            )
+            sides = tuple(dict.fromkeys(str(view.side) for view, _ in found))
+            stories.append(Story(habit.sentence, sides, "", explained, places))
+    return stories
+
+
+def _is_of(result: Result, view: SideView, habit: Habit) -> bool:
+    """Whether a failure is one of a motion with this habit."""
+    if habit.kind == "silent":
+        return result.side == str(view.side) and not _among(_check(result), _START)
+    begin, end = habit.during
+    joints = set(result.joints)
+    check = _check(result)
+    if habit.kind == "fades" and check[0] in ("motion", "speed", "gains", "sides"):
+        return False
+    if check[1] == "sides.independent" and (habit.kind not in ("slow", "late") or begin > 0.0):
+        return False
+    return (
+        result.side == str(view.side)
+        and _among(check, _OF_MOTION)
+        and (not joints or bool(joints & set(habit.joints)))
+        # another joint that moves is more than one that does not
+        and (check[1] != "motion.order" or joints <= set(habit.joints))
+        and any(begin - _NEAR_S <= _end(e) and e.time_s <= end + _SILENT_S for e in result.evidence)
+    )
+
+
 # ------------------------------------------------------------------------------ other findings
 
 
@@ -219,8 +301,15 @@ def _check(result: Result) -> tuple[str, str]:
 
 def _rank(result: Result) -> tuple[int, bool]:
     behaviour, name = _check(result)
-    at = next((ORDER.index(n) for n in (name, behaviour) if n in ORDER), len(ORDER))
+    names = ("rate.rate",) if _spoils_all(result) else (name, behaviour)
+    at = next((ORDER.index(n) for n in names if n in ORDER), len(ORDER))
     return at, result.verdict is not Verdict.FAIL
+
+
+def _spoils_all(result: Result) -> bool:
+    """Whether it is of a fault that spoils every later value of a position."""
+    check = _check(result)
+    return _among(check, _ALL_VALUES) or (check[1] == "position.in_stroke" and bool(result.cause))
 
 
 def _follows(group: Sequence[Result], root: Sequence[Result]) -> bool:
@@ -230,7 +319,7 @@ def _follows(group: Sequence[Result], root: Sequence[Result]) -> bool:
         _family(it) == _family(of)
         or _among(it, _SUMS)
         or (_among(of, _ANY_STEP) and _among(it, _SPECIAL_STEP))
-        or (_among(of, _ALL_VALUES) and it[0] not in _CONTACT)
+        or (_spoils_all(root[0]) and it[0] not in _CONTACT)
     )
     return any(a.side == b.side and (general or _at_once(a, b)) for a in group for b in root)
 
