@@ -44,7 +44,7 @@ def judged(path: Path) -> RunResult:
 @each("name", OWN_TOPICS)
 def test_a_hand_that_says_nothing_does_not_pass(name: str, tmp_path: Path) -> None:
     result = judged(dead(tmp_path / "dead.mcap", dialect(name)))
-    starts = [r for r in result.results if r.requirement.id.endswith("-START-02")]
+    starts = [r for r in result.results if r.requirement.id.endswith("-START-01")]
     fails = any(r.verdict is Verdict.FAIL for r in starts)
     assert result.overall is (Overall.FAIL if fails else Overall.INCONCLUSIVE)
     assert result.exit_code() != 0
@@ -68,8 +68,8 @@ def test_a_dead_dex3_beside_a_live_one_is_a_failure(tmp_path: Path) -> None:
             }
             recorder.put(topic, message.type_name, data, **stamps)
     result = judged(path)
-    assert result_of(result, "DEX3-START-02", Side.RIGHT).verdict is Verdict.FAIL
-    assert "is it powered" in result_of(result, "DEX3-START-02", Side.RIGHT).cause
+    assert result_of(result, "DEX3-START-01", Side.RIGHT).verdict is Verdict.FAIL
+    assert "is it powered" in result_of(result, "DEX3-START-01", Side.RIGHT).cause
     assert result_of(result, "DEX3-RATE-01", Side.RIGHT).verdict is Verdict.BLOCKED
     assert result_of(result, "DEX3-TRACK-01", Side.LEFT).verdict is Verdict.PASS
     assert not any("service of one hand" in note for note in result.notes)

@@ -214,7 +214,7 @@ def test_shorter_and_longer_commands_carry_both_hands() -> None:
 def test_requirements_and_wrong_hands_come_from_the_nearest_relative() -> None:
     by_id = {r.id: r for r in catalogue("inspire-dfx")}
     assert by_id["DFX-MOVE-02"].lineage == ("BRAINCO-MOVE-02", "DEX3-MOVE-02")
-    assert by_id["DFX-START-02"].lineage == ("DEX3-START-02",)
+    assert by_id["DFX-START-01"].lineage == ("BRAINCO-START-01", "DEX3-START-01")
     assert by_id["DFX-STILL-02"].tolerances == catalogue_of("brainco-revo2")["BRAINCO-STILL-02"]
 
 

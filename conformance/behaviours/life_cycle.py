@@ -11,9 +11,10 @@ from dexkit.conformance.behaviours.grip import gripper_squeeze
 from dexkit.conformance.behaviours.speed import move_at_own_speeds
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.combined import all_of, warning
-from dexkit.conformance.checks.figures import Figure, Figures, worst
+from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.obedience import arrival, away_first
 from dexkit.conformance.kit.measurement_error import Measure
+from dexkit.conformance.kit.median import median
 from dexkit.conformance.kit.motor_messages import MotorCodec
 from dexkit.conformance.stimuli.fingers import FingerScript
 from dexkit.conformance.stimuli.gripper import GripperScript
@@ -29,7 +30,7 @@ from dexkit.conformance.stimuli.script import (
     StopService,
     of_position_servos,
 )
-from dexkit.hand import ROBOT, JointMode
+from dexkit.hand import ROBOT, Floats, JointMode
 
 _AT_SHUTDOWN = (30.0, 45.0)
 """Percent of closing from which hands move when their service ends: far enough from both ends and
@@ -342,17 +343,22 @@ def _went_on(ctx: Context, begin: float, end: float) -> tuple[float, float, int]
 
 
 @check("DEX1-LIFE-06", "DEX3-LIFE-06")
+def moves_nothing(ctx: Context) -> Outcome:
+    """Where a hand is after a restart of its service, and its motion until the first command."""
+    return all_of(_no_new_goal(ctx), _starts_idle(ctx))
+
+
 @worst(
     "motion_rad",
     "max_motion_stroke",
     nothing="no state before the service ended, or none after it started again",
 )
-def no_new_goal(ctx: Context) -> Figures:
+def _no_new_goal(ctx: Context) -> Figures:
     """Distance of the hand, after a restart of its service, from where it may be.
 
     A motor may continue to its last goal (DEX1-LIFE-04), but must not move elsewhere.
     """
-    for phase in ctx.phases():
+    for phase in ctx.phases("shutdown"):
         begin, end = ctx.span(phase)
         latency = ctx.tolerance("latency_s")
         before = ctx.states.between(begin - max(0.2, latency), begin + 0.2)
@@ -376,3 +382,48 @@ def no_new_goal(ctx: Context) -> Figures:
                 "service ended, where it was not going"
             )
             yield Figure(rad, begin, end, joint, text)
+
+
+@worst("idle_rad", "max_idle_stroke", nothing="too few states after a start")
+def _starts_idle(ctx: Context) -> Figures:
+    """Motion and force between the first state of a started service and the first command.
+
+    A requirement without ``max_tau_nm`` has no limit of the force.
+    """
+    for phase in ctx.phases("restarted"):
+        begin, end = ctx.span(phase)
+        first = ctx.commands.t[(ctx.commands.t >= begin) & (ctx.commands.t < end)]
+        rows = ctx.states.between(begin, float(first[0]) if len(first) else end)
+        for joint in range(len(ctx.joints)):
+            t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
+            t, q = t[np.isfinite(q)], q[np.isfinite(q)]
+            if len(t) < 5:
+                continue
+            away = np.abs(q - q[0])
+            i = int(np.argmax(away))
+            text = f"moved by {away[i]:.3f} {ctx.unit} before the first command after a start"
+            yield Figure(float(away[i]), float(t[i]), None, joint, text)
+        if "max_tau_nm" in ctx.requirement.tolerances:
+            presses = judged(
+                ctx,
+                _presses(ctx, ctx.states.t[rows], ctx.states.tau[rows, 0]),
+                "tau_nm",
+                "max_tau_nm",
+                nothing=ctx.passed("no force"),
+            )
+            if not presses.met:
+                yield presses
+
+
+def _presses(ctx: Context, t: Floats, tau: Floats) -> Figures:
+    """The torques, N m, of a started gripper whose last command may have asked for one."""
+    t, tau = t[np.isfinite(tau)], tau[np.isfinite(tau)]
+    if len(t) < 5:
+        return
+    # a motor that releases a grip may still show its force at first
+    for at in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1).tolist():
+        piece = np.abs(tau[(t >= at) & (t < at + 0.1)])
+        if len(piece) >= 3:
+            felt = median(piece)
+            text = f"tau_est of {felt:.2f} N m before the first command after a start"
+            yield Figure(felt, at, text=text)

@@ -1,18 +1,28 @@
-"""State from the start, and no motion before the first command."""
+"""State from the start, before any command."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
-from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
-from dexkit.conformance.kit.median import median
-from dexkit.hand import Floats
+from dexkit.conformance.checks.combined import all_of, warning
 
 
-@check("DEX1-START-02")
-def legacy_ready(ctx: Context) -> Outcome:
-    """Whether any q is not 0 before the first command, on the legacy topic."""
+@check("DEX1-START-01", "DEX3-START-01", "H1-START-01")
+def state_first(ctx: Context) -> Outcome:
+    """State before the first command that the client can use: some take zeros for no state."""
+    flows = _flows(ctx)
+    if not ctx.recording.dialect.zero_is_no_state:
+        return flows
+    if len(ctx.joints) == 1:
+        return all_of(flows, _some_position(ctx))
+    pose = _pose(ctx)
+    # a closed hand that is commanded by parts of its travel is at 0
+    return all_of(flows, warning(pose) if ctx.recording.dialect.position_servo else pose)
+
+
+def _some_position(ctx: Context) -> Outcome:
+    """Whether any q of a gripper is not 0 before the first command."""
     first = float(ctx.commands.t[0]) if len(ctx.commands) else np.inf
     before = [v.states.q[v.states.t < first] for v in ctx.recording.sides.values()]
     if not any(len(q) for q in before):
@@ -25,9 +35,10 @@ def legacy_ready(ctx: Context) -> Outcome:
     return ctx.failed("all zero", "every q is exactly 0 before the first command")
 
 
-@check("DEX1-START-01", "DEX3-START-01", "H1-START-01")
-def state_first(ctx: Context) -> Outcome:
+def _flows(ctx: Context) -> Outcome:
     """State is published before the first command."""
+    if not len(ctx.commands):
+        return ctx.skipped("no commands to this hand in the recording")
     first_state = float(ctx.states.t[0])
     first_command = float(ctx.commands.t[0])
     listening = ctx.phases("listen")
@@ -53,9 +64,8 @@ def state_first(ctx: Context) -> Outcome:
     )  # no measure: the margin has no meaning, because the service had plenty of time
 
 
-@check("DEX3-START-02")
-def rest_pose(ctx: Context) -> Outcome:
-    """Whether any q is not 0 before the first command."""
+def _pose(ctx: Context) -> Outcome:
+    """Whether any q of a hand is not 0 before the first command."""
     first = float(ctx.commands.t[0]) if len(ctx.commands) else float("inf")
     q = ctx.states.q[ctx.states.t < first]
     q = q[np.isfinite(q).all(axis=1)]
@@ -75,49 +85,3 @@ def rest_pose(ctx: Context) -> Outcome:
             else "Positions are never read from the device, or the hand rests with all joints at 0."
         )
     return ctx.passed("not zero", f"a joint is {most[-1]:.3f} {ctx.unit} from 0")
-
-
-@check("DEX1-START-03", "DEX3-START-03")
-@worst("motion_rad", "max_motion_stroke", nothing="too few states after a start")
-def starts_idle(ctx: Context) -> Figures:
-    """Motion and force between the first state of a started service and the first command.
-
-    A requirement without ``max_tau_nm`` has no limit of the force.
-    """
-    for phase in ctx.phases():
-        begin, end = ctx.span(phase)
-        first = ctx.commands.t[(ctx.commands.t >= begin) & (ctx.commands.t < end)]
-        rows = ctx.states.between(begin, float(first[0]) if len(first) else end)
-        for joint in range(len(ctx.joints)):
-            t, q = ctx.states.t[rows], ctx.states.q[rows, joint]
-            t, q = t[np.isfinite(q)], q[np.isfinite(q)]
-            if len(t) < 5:
-                continue
-            away = np.abs(q - q[0])
-            i = int(np.argmax(away))
-            text = f"moved by {away[i]:.3f} {ctx.unit} before the first command after a start"
-            yield Figure(float(away[i]), float(t[i]), None, joint, text)
-        if "max_tau_nm" in ctx.requirement.tolerances:
-            presses = judged(
-                ctx,
-                _presses(ctx, ctx.states.t[rows], ctx.states.tau[rows, 0]),
-                "tau_nm",
-                "max_tau_nm",
-                nothing=ctx.passed("no force"),
-            )
-            if not presses.met:
-                yield presses
-
-
-def _presses(ctx: Context, t: Floats, tau: Floats) -> Figures:
-    """The torques, N m, of a started gripper whose last command may have asked for one."""
-    t, tau = t[np.isfinite(tau)], tau[np.isfinite(tau)]
-    if len(t) < 5:
-        return
-    # a motor that releases a grip may still show its force at first
-    for at in np.arange(float(t[0]) + ctx.tolerance("release_s"), float(t[-1]), 0.1).tolist():
-        piece = np.abs(tau[(t >= at) & (t < at + 0.1)])
-        if len(piece) >= 3:
-            felt = median(piece)
-            text = f"tau_est of {felt:.2f} N m before the first command after a start"
-            yield Figure(felt, at, text=text)

@@ -451,7 +451,7 @@ class HomesWhenRestarted(_Moves):
         super().live(dt)
 
 
-@wrong_hand("DEX1-START-03", "DEX3-START-03", whole=True)
+@wrong_hand("DEX1-LIFE-06", "DEX3-LIFE-06", whole=True)
 class HomesAtOnceWhenRestarted(HomesWhenRestarted):
     """Moves by a tenth of its range with its first state after a restart: it is never at rest."""
 

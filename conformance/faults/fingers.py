@@ -73,7 +73,7 @@ def OldLowRate(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]
     return [replace(o, sent=n.sent) for o, n in zip(old, new, strict=True)]
 
 
-@wrong_hand("DEX3-START-02")
+@wrong_hand("DEX3-START-01", where=lambda hand: hand.dialects[0].zero_is_no_state)
 class RestsAtZero(FingerHand):
     """Rests with every joint at exactly 0."""
 

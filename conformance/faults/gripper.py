@@ -230,7 +230,7 @@ def StatusInMotorstate(self: Any, state: Any, hand: ReferenceHand) -> None:
     state["motorstate"] = 3
 
 
-@wrong_hand("DEX1-START-02", sides=LEFT, dialect="unitree_actuator")
+@wrong_hand("DEX1-START-01", sides=LEFT, dialect="unitree_actuator")
 class RestsAtZero(ReferenceHand):
     """Rests exactly at 0, in both hands."""
 
@@ -495,7 +495,7 @@ def FeelsLate(self: Any, state: Any, hand: ReferenceHand) -> None:
         state["tau_est"] = 0.0
 
 
-@reports(ReferenceService, "DEX1-START-03")
+@reports(ReferenceService, "DEX1-LIFE-06")
 def ForceBeforeCommands(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Reports a force until it gets its first command."""
     if not hand.goal:
@@ -748,7 +748,7 @@ def SoftGripIsLimp(hand: Any, accept: Call, motor: Motor) -> Any:
     return replace(accepted, kp=0.1 * accepted.kp) if limp else accepted
 
 
-@wrong_hand("DEX1-START-03")
+@wrong_hand("DEX1-LIFE-06")
 class KeepsItsGoal(ReferenceService):
     """Applies the last command of the previous service when it starts."""
 

@@ -88,8 +88,8 @@ _UNIT_OF_TORQUE = frozenset(("DEX1-FORCE-04", "DEX3-FORCE-02"))
 """The requirements that say that tau_est is in raw counts, and what others are like."""
 _MOVED = 0.1
 """Part of a joint's stroke by which commands move a goal."""
-_NOT_ALL_ZERO = "-START-02"
-"""How the ids end of what a hand that says nothing fails by itself."""
+_NOT_ALL_ZERO = "-START-01"
+"""How the ids end of what a hand that says nothing fails by itself, if zeros are no state."""
 
 
 def says_something(judgement: Judgement, context: Context) -> Result | None:
@@ -100,7 +100,8 @@ def says_something(judgement: Judgement, context: Context) -> Result | None:
     what it does.
     """
     requirement = judgement.requirement
-    if requirement.needs in ("nothing", "endpoints") or requirement.id.endswith(_NOT_ALL_ZERO):
+    fails = context.recording.dialect.zero_is_no_state and requirement.id.endswith(_NOT_ALL_ZERO)
+    if fails or requirement.needs in ("nothing", "endpoints"):
         return None
     if context.recording.stimulus is not None or not context.states.say_nothing:
         return None
