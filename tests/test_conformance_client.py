@@ -177,7 +177,7 @@ def test_only_the_client_is_selected() -> None:
     assert result.sentence().startswith("the client: FAIL")
     good = judge(Recording.decode(genuine()), requirements=wanted)
     assert good.overall is Overall.PASS
-    assert good.judged == 24
+    assert good.judged == 20
 
 
 def test_what_blocks_a_selected_requirement_is_reported_with_it() -> None:
@@ -221,7 +221,7 @@ def test_reports_call_the_client_by_its_name(tmp_path: Path) -> None:
     page, summary = render(result), render_markdown(result)
     assert "The client that commanded it is at fault" in page
     assert '<b class="bad">fail</b> of the client' in page
-    assert "`DEX1-CLIENT-05` Least rate (client, left)" in summary
+    assert "`DEX1-CLIENT-05` Rate of commands (client, left)" in summary
     assert "The client: FAIL: a MUST is not met" in summary
     write_junit(result, tmp_path / "r.xml")
     suite = ElementTree.parse(tmp_path / "r.xml").getroot()

@@ -128,13 +128,13 @@ def SlowsDown(self: Any, sends: Call, now: float) -> bool:
     return not 2.3 <= now < 3.8 or self.turn % round(self.rate / 10) == 0
 
 
-@changes(ReferenceClient, "sends", "DEX1-CLIENT-06")
+@changes(ReferenceClient, "sends", "DEX1-CLIENT-05")
 def HalfRateClient(self: Any, sends: Call, now: float) -> Any:
     """Sends every second command."""
     return self.turn % 2 == 0
 
 
-@changes(ReferenceClient, "sends", "DEX1-CLIENT-07")
+@changes(ReferenceClient, "sends", "DEX1-CLIENT-05")
 def Stutters(self: Any, sends: Call, now: float) -> bool:
     """Sends nothing for 0.25 s, twice."""
     return not (2.0 <= now < 2.25 or 4.5 <= now < 4.75)
