@@ -15,8 +15,8 @@ from dexkit.conformance.kit.results import Verdict
         ("OtherStateType", "DEX1-TOPIC-01", "is the type of another hand"),
         ("Percent", "DEX1-FIELD-03", "percent"),
         ("Degrees", "DEX1-FIELD-03", "degrees"),
-        ("Inverted", "DEX1-MOVE-01", "mirrored"),
-        ("Frozen", "DEX1-MOVE-01", "Nothing moves at all"),
+        ("Inverted", "DEX1-MOVE-02", "mirrored"),
+        ("Frozen", "DEX1-MOVE-02", "Nothing moves at all"),
     ],
 )
 def test_cause_names_mistake_of_wrong_hand(mutant: str, requirement: str, expected: str) -> None:

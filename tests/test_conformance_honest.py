@@ -176,7 +176,7 @@ def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
 
 
 def test_fast_gripper_is_not_judged_as_percent() -> None:
-    speed = result_of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-14")
+    speed = result_of(judge(Recording.decode(listened(Quick))), "DEX1-FIELD-15")
     assert speed.verdict is Verdict.PASS
     assert 30 < speed.values["speed_rad_s"] < 60
 
@@ -368,7 +368,7 @@ def test_motion_is_blocked_on_overloaded_machine(usual_ms: float, verdict: Verdi
     still = trace.rows[topic][0][2]
     trace.rows[topic] = [(t, s, still) for t, s, _ in trace.rows[topic]]
     result = judge(with_beats(trace, usual_us=int(usual_ms * 1e3)))
-    assert result_of(result, "DEX1-MOVE-01").verdict is verdict
+    assert result_of(result, "DEX1-MOVE-02").verdict is verdict
     assert result_of(result, "DEX1-FIELD-03").verdict is Verdict.PASS
     percent = copy_of(listened(gripper.Percent))
     found = result_of(judge(with_beats(percent, usual_us=int(usual_ms * 1e3))), "DEX1-FIELD-03")

@@ -114,7 +114,7 @@ def test_recording_without_commands_is_judged_by_its_states() -> None:
     result = judged(trace)
     assert result.overall is Overall.PASS
     assert result_of(result, "DEX1-START-01").reason == "no commands to this hand in the recording"
-    assert result_of(result, "DEX1-MOVE-01").reason.startswith("needs the stimulus 'step'")
+    assert result_of(result, "DEX1-MOVE-02").reason.startswith("needs the stimulus 'step'")
 
 
 def test_empty_topic_does_not_pass() -> None:

@@ -196,7 +196,7 @@ WRONG = {m.name: m.made for m in mutants() if m.model == "dex1-1"}
         ),
         ("StaleState", {"step"}, "FRESH-01", ["each sample of the state"]),
         ("Slow", {"step"}, "MOVE-04", ["steps laid over", "command and state"]),
-        ("NanVelocity", {"step"}, "FIELD-02", ["left hand: dq", "command and state"]),
+        ("NanVelocity", {"step"}, "FIELD-01", ["left hand: dq", "command and state"]),
         ("OldTopic", {"step"}, "TOPIC-01", ["On the network"]),
     ],
 )

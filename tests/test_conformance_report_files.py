@@ -165,9 +165,9 @@ def test_junit_counts_every_verdict_and_is_valid_xml(tmp_path: Path) -> None:
 def three_runs() -> list[RunResult]:
     ok, bad, warn = Verdict.PASS, Verdict.FAIL, Verdict.WARN
     return [
-        run_named("Grip", "2026-01-02", TOPIC_01=ok, RATE_01=bad, RATE_03=ok, MOVE_01=ok),
-        run_named("Grip", "2026-01-01", TOPIC_01=ok, RATE_01=ok, RATE_03=warn, MOVE_01=bad),
-        run_named("Hand", "2026-01-03", TOPIC_01=ok, RATE_01=bad, MOVE_01=Verdict.BLOCKED),
+        run_named("Grip", "2026-01-02", TOPIC_01=ok, RATE_01=bad, RATE_03=ok, MOVE_02=ok),
+        run_named("Grip", "2026-01-01", TOPIC_01=ok, RATE_01=ok, RATE_03=warn, MOVE_02=bad),
+        run_named("Hand", "2026-01-03", TOPIC_01=ok, RATE_01=bad, MOVE_02=Verdict.BLOCKED),
     ]
 
 
@@ -177,7 +177,7 @@ def test_regressions_compare_runs_of_one_hand_in_order_of_time() -> None:
         ("DEX1-RATE-01", 1, 0)
     ]
     better = {c.requirement.id for c in found.changes if not c.worse}
-    assert better == {"DEX1-RATE-03", "DEX1-MOVE-01"}
+    assert better == {"DEX1-RATE-03", "DEX1-MOVE-02"}
 
 
 def test_unjudged_result_is_not_a_regression() -> None:

@@ -30,7 +30,7 @@ from tests.each import each
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]  # max_gap_s
 RATE = BY_ID["DEX1-RATE-01"]  # min_rate_hz
-FIELD = BY_ID["DEX1-FIELD-02"]  # of the states alone
+FIELD = BY_ID["DEX1-FIELD-01"]  # of the states alone
 
 
 IDLE = Lateness(0.0, 0.0, 0.0)

@@ -41,8 +41,8 @@ from tests.each import each
 BY_ID = {r.id: r for r in catalogue(None, None)}
 GAP = BY_ID["DEX1-RATE-03"]
 RATE = BY_ID["DEX1-RATE-01"]
-MOVE = BY_ID["DEX1-MOVE-01"]
-FIELD = BY_ID["DEX1-FIELD-02"]  # of the states alone
+MOVE = BY_ID["DEX1-MOVE-02"]
+FIELD = BY_ID["DEX1-FIELD-01"]  # of the states alone
 SAMPLE_US = 10_000
 STATES = ("rt/dex1/left/state", "unitree_go::msg::dds_::MotorStates_")
 

@@ -135,9 +135,9 @@ def test_a_fault_that_no_client_sees_has_none() -> None:
 
 def test_the_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     found = consequences({figure("ends"): 0.9}, {figure("ends"): 0.5})
-    table = Table({NAN_HAND: found, "dds dex1-1 HotByte (DEX1-FIELD-08)": {}})
+    table = Table({NAN_HAND: found, "dds dex1-1 HotByte (DEX1-FIELD-08)": {}}, "a1b2c3")
     table.save(tmp_path / "table.json")
-    assert Table.load(tmp_path / "table.json").hands == table.hands
+    assert Table.load(tmp_path / "table.json") == table
 
 
 def test_levels_follow_from_it() -> None:

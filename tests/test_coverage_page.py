@@ -18,8 +18,8 @@ def gripper() -> Measured:
 
 def test_what_a_check_reads_and_what_it_is_sent_is_noted(gripper: Measured) -> None:
     by_id = {each.requirement.id: each for each in gripper.covered}
-    assert {"q", "t"} <= by_id["DEX1-MOVE-01"].members
-    assert "step" in by_id["DEX1-MOVE-01"].phases
+    assert {"q", "t"} <= by_id["DEX1-MOVE-02"].members
+    assert "step" in by_id["DEX1-MOVE-02"].phases
     assert by_id["DEX1-RATE-01"].members <= {"t", "sent"}
     assert gripper.sent["step"].filled == {"q", "kp", "kd"}
     assert gripper.sent["listen"].filled == set()

@@ -122,24 +122,24 @@ def test_third_of_the_requirements_forbid_something(layer_name: str, model: str)
 
 
 def score_of(*outcomes: WrongHandResult) -> Score:
-    score = Score(select(catalogue(), prefixes=["DEX1-FIELD-02"]))
+    score = Score(select(catalogue(), prefixes=["DEX1-FIELD-01"]))
     score.outcomes += outcomes
     return score
 
 
 def test_a_requirement_without_a_wrong_hand_is_an_error() -> None:
     score = score_of()
-    assert [r.id for r in score.unproven] == ["DEX1-FIELD-02"]
+    assert [r.id for r in score.unproven] == ["DEX1-FIELD-01"]
     assert not score.perfect
 
 
 def test_missed_and_extra_failures_are_errors() -> None:
-    (nan,) = (t for t in mutants() if t.kills == "DEX1-FIELD-02")
+    nan = next(t for t in mutants() if t.kills == "DEX1-FIELD-01")
     assert score_of(WrongHandResult(nan)).perfect
-    survivor = score_of(WrongHandResult(nan, missed=("DEX1-FIELD-02",)))
+    survivor = score_of(WrongHandResult(nan, missed=("DEX1-FIELD-01",)))
     assert survivor.unproven
     assert not survivor.perfect
-    assert not score_of(WrongHandResult(nan, wrongly=("DEX1-MOVE-01",))).perfect
+    assert not score_of(WrongHandResult(nan, wrongly=("DEX1-MOVE-02",))).perfect
 
 
 def test_selection_by_model_includes_usb_and_topics() -> None:

@@ -341,14 +341,14 @@ def test_a_plug_in_is_judged_through_its_entry_point_outside_the_checkout(vendor
             domain=str(free_domain()),
             capabilities=str(ACME / "capabilities.toml"),
             # none that a busy machine leaves open
-            requirements="DEX1-TOPIC\nDEX1-FIELD-02\nDEX1-MOVE-02\n",
+            requirements="DEX1-TOPIC\nDEX1-FIELD-01\nDEX1-MOVE-02\n",
         )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     out = vendor.workspace / "dexkit-report"
     result = json.loads((out / "result.json").read_text())
     assert result["subject"]["backend"] == "acme"
     verdicts = {r["id"]: r["verdict"] for r in result["results"]}
-    asked = ("DEX1-TOPIC-01", "DEX1-TOPIC-02", "DEX1-FIELD-02", "DEX1-MOVE-02")
+    asked = ("DEX1-TOPIC-01", "DEX1-TOPIC-02", "DEX1-FIELD-01", "DEX1-MOVE-02")
     assert verdicts == dict.fromkeys(asked, "pass")
     assert result["subject"]["hand"] == "Acme G2"  # of the capabilities
     assert "DEX1-MOVE-02" in (out / "junit.xml").read_text()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.members import (
     outside,
     span_text,
@@ -20,7 +21,12 @@ from dexkit.conformance.kit.plots import Plot, PlotKind
 
 
 @check("DEX1-FIELD-01", "DEX3-FIELD-01", "H1-FIELD-01")
-def length(ctx: Context) -> Outcome:
+def complete(ctx: Context) -> Outcome:
+    """Samples decode, and have all motors and finite numbers."""
+    return all_of(_length(ctx), _finite(ctx))
+
+
+def _length(ctx: Context) -> Outcome:
     """Samples decode and have one motor per hand."""
     states, wanted = ctx.states, ctx.recording.dialect.length
     wrong = np.flatnonzero(states.length != wanted)
@@ -36,8 +42,7 @@ def length(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-FIELD-02", "DEX3-FIELD-02", "H1-FIELD-02")
-def finite(ctx: Context) -> Outcome:
+def _finite(ctx: Context) -> Outcome:
     """No NaN, no infinity."""
     states = ctx.states
     there = states.length >= ctx.recording.dialect.index[ctx.side] + len(ctx.joints)

@@ -161,9 +161,10 @@ def _sign_in_grip(ctx: Context) -> Outcome:
 
 @check("DEX1-FORCE-04")
 def gripper_unit(ctx: Context) -> Outcome:
-    """The largest tau_est; and in unitree_hg the smallest, of which a document speaks."""
+    """The largest tau_est; and the smallest, where a specification of the dialect limits it."""
     size = warning(unit(ctx))
-    return all_of(size, _unsigned(ctx)) if ctx.recording.dialect.name == "unitree_hg" else size
+    specified = ctx.recording.dialect.interface_specification
+    return all_of(size, _unsigned(ctx)) if specified else size
 
 
 @worst("below_nm", "max_below_nm", nothing="no state with a tau_est")

@@ -11,6 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, causes, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.goals import OWN_RULE, Goals, goals_of
 from dexkit.conformance.checks.robot import RobotContext, joint_of, no_state
@@ -209,8 +210,19 @@ def move_robot_joints(script: RobotScript) -> Steps:
         yield from script.step("joint", slot)
 
 
-@check("DEX1-MOVE-01", "DEX3-MOVE-01")
-def direction(ctx: Context) -> Outcome:
+@check("DEX1-MOVE-02", "DEX3-MOVE-02")
+def arrives(ctx: Context) -> Outcome:
+    """Progress towards the target of each step; where it is made, the distance at its end."""
+    progress = _direction(ctx)
+    if progress.met is False:
+        return progress
+    found = steps(ctx)
+    figures = [s.error_figure(str(s)) for s in found]
+    outcome = judged(ctx, figures, "error_rad", "max_error_stroke", nothing=progress)
+    return outcome.because(_cause(found))
+
+
+def _direction(ctx: Context) -> Outcome:
     """Progress towards the target, as a part of the step."""
     found = [s for s in steps(ctx) if abs(s.size) >= 0.1 * s.stroke]
     figures = [
@@ -235,16 +247,6 @@ def _how_it_missed(step: Step) -> str:
     if float(np.ptp(step.q)) < 0.02 * step.stroke:
         return "it did not move"
     return "it did not reach its target" if step.progress > -0.05 else "that is the wrong direction"
-
-
-@check("DEX1-MOVE-02", "DEX3-MOVE-02")
-def arrives(ctx: Context) -> Outcome:
-    """Distance from the target at the end of each step."""
-    found = steps(ctx)
-    nothing = ctx.failed("no state", f"no state of the {ctx.side} hand during the steps")
-    figures = [s.error_figure(str(s)) for s in found]
-    outcome = judged(ctx, figures, "error_rad", "max_error_stroke", nothing=nothing)
-    return outcome.because(_cause(found)) if found else outcome
 
 
 def _cause(found: Sequence[Step]) -> str:
@@ -329,12 +331,11 @@ _PROMPT = (
 commands to the other hand."""
 
 
-@check("DEX1-MOVE-10")
 @worst("part", "max_part", nothing="no command in a dead zone, or none to its end")
-def dead_zones(ctx: Context) -> Figures:
+def _dead_zones(ctx: Context) -> Figures:
     """Size of a dead zone between the gripper's reached position and its end."""
     reached = {s.target: s.final for p in ctx.phases("ends") for s in steps_of(ctx, p)}
-    for step in steps(ctx):
+    for step in (s for p in ctx.phases("dead-zone") for s in steps_of(ctx, p)):
         asked = ctx.commands.q[ctx.given(step.begin, step.end), step.joint]
         if not len(asked) or step.target not in reached:
             continue
@@ -349,8 +350,13 @@ def dead_zones(ctx: Context) -> Figures:
 
 @check("DEX1-MOVE-08")
 def ends(ctx: Context) -> Outcome:
+    """Distance from fully open and fully closed, and size of the zones that mean the same."""
+    return all_of(_at_ends(ctx), warning(_dead_zones(ctx)))
+
+
+def _at_ends(ctx: Context) -> Outcome:
     """Distance from fully open and fully closed."""
-    found = steps(ctx)
+    found = steps(ctx.only("ends"))
     text = "; ".join(
         f"commanded to {s.target:.2f} {ctx.unit}, q went to {s.final:.2f}" for s in found
     )

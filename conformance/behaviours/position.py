@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dexkit.conformance.checks import Context, Outcome, causes, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.checks.speeds import FEW, by_times, fastest_speed, filled, q_and_dq
@@ -105,9 +106,8 @@ def _stands_far_off(ctx: Context) -> Outcome | None:
     return None
 
 
-@check("DEX1-FIELD-14", rests_on=(TIMES,))
 @worst("speed_rad_s", "max_speed_rad_s", nothing="no state with a position that lasts long enough")
-def plausible_speed(ctx: Context) -> Figures:
+def _plausible_speed(ctx: Context) -> Figures:
     """The fastest motion of q, relative to the joint's top speed."""
     window = ctx.tolerance("window_s")
     t = ctx.states.clock
@@ -137,7 +137,13 @@ def plausible_speed(ctx: Context) -> Figures:
     yield from figures
 
 
-@check("DEX1-FIELD-15", "DEX3-FIELD-15", rests_on=(TIMES,))
+@check("DEX1-FIELD-15", rests_on=(TIMES,))
+def gripper_jumps(ctx: Context) -> Outcome:
+    """Jumps of q; and its speed, which shows another unit where every value is within the range."""
+    return all_of(jumps(ctx), warning(_plausible_speed(ctx)))
+
+
+@check("DEX3-FIELD-15", rests_on=(TIMES,))
 @worst("change_rad", "max_change_rad", nothing="too few states with a position")
 def jumps(ctx: Context) -> Figures:
     """The largest change of q between two states, relative to the speed limit."""

@@ -293,7 +293,7 @@ class SwapsBuffers(Service):
         return newest if self.turn % 2 or self.ended else past[0][1]
 
 
-@changes(Service, "payload", "DEX1-MOVE-01", "DEX3-JOINT-01", "DEX5-MODE-01")
+@changes(Service, "payload", "DEX1-MOVE-02", "DEX3-JOINT-01", "DEX5-MODE-01")
 def Frozen(self: Any, payload: Call, sides: Sides, length: int | None = None) -> Any:
     """Publishes its first measurement forever, at full rate."""
     if sides not in self.memory:

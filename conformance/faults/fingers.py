@@ -22,6 +22,7 @@ from dexkit.conformance.faults.registry import (
     commands,
     obeys_gains,
     reports,
+    takes_floats,
     wrong_hand,
 )
 from dexkit.conformance.kit.motor_messages import Motor
@@ -86,7 +87,7 @@ class RestsAtZero(FingerHand):
 # ------------------------------------------------------------------------------------ fields
 
 
-@reports(FingerService, "DEX3-FIELD-02")
+@reports(FingerService, "DEX3-FIELD-01", where=takes_floats)
 def NanVelocity(self: Any, motors: Any, hand: FingerHand) -> None:
     """Publishes NaN as dq of one joint at rest."""
     if len(motors) and not hand.dq[5]:
@@ -359,7 +360,7 @@ def CoupledFinger(self: Any, command: Call, side: Side, motors: Motors) -> None:
     command(side, (*motors[:4], coupled, *motors[5:]))
 
 
-@commands(FingerHand, "DEX3-MOVE-01", where=obeys_gains)
+@commands(FingerHand, "DEX3-MOVE-02", where=obeys_gains)
 def OneJointBackwards(hand: Any, rows: Floats) -> None:
     """Moves one joint backwards."""
     rows[Q, 2] = 2 * hand.model.rest_q[hand.side][2] - rows[Q, 2]

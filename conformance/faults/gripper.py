@@ -18,7 +18,7 @@ from dexkit.hand import Side
 # ----------------------------------------------------------------------------------- fields
 
 
-@reports(ReferenceService, "DEX1-FIELD-02")
+@reports(ReferenceService, "DEX1-FIELD-01")
 def NanVelocity(self: Any, state: Any, hand: ReferenceHand) -> None:
     """Divides by a time step of zero at rest."""
     state["dq"] = state["dq"] or math.nan
@@ -64,7 +64,7 @@ class Percent(_InUnit):
     takes = False
 
 
-@wrong_hand("DEX1-MOVE-01")
+@wrong_hand("DEX1-MOVE-02")
 class PercentCommands(_InUnit):
     """Obeys q as percent of the stroke instead of radians."""
 
@@ -101,7 +101,7 @@ class PercentBothWays(ReferenceService):
     hand = _OtherScale
 
 
-@changes(PercentBothWays, "command", "DEX1-FIELD-14", sides=LEFT)
+@changes(PercentBothWays, "command", "DEX1-FIELD-15", sides=LEFT)
 def PercentWithin(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Obeys and publishes percent, after it has clamped q to 0 to 5.4."""
     q = min(max(motor.q, 0.0), self.dialect.q_open) if math.isfinite(motor.q) else motor.q
@@ -115,7 +115,7 @@ class DegreesBothWays(_OtherScale):
     full = math.degrees(5.4)
 
 
-@wrong_hand("DEX1-MOVE-01")
+@wrong_hand("DEX1-MOVE-02")
 class Normalised(_InUnit):
     """Publishes 0 to 1 instead of radians."""
 
@@ -131,14 +131,14 @@ class NormalisedCommands(_InUnit):
     publishes = False
 
 
-@wrong_hand("DEX1-MOVE-01")
+@wrong_hand("DEX1-MOVE-02")
 class NormalisedBothWays(_InUnit):
     """Obeys and publishes 0 to 1 instead of radians."""
 
     full = 1.0
 
 
-@wrong_hand("DEX1-MOVE-01")
+@wrong_hand("DEX1-MOVE-02")
 class Metres(_InUnit):
     """Obeys and publishes the opening in metres instead of radians."""
 
@@ -242,7 +242,7 @@ class RestsAtZero(ReferenceHand):
 # ----------------------------------------------------------------------------------- motion
 
 
-@changes(ReferenceService, "command", "DEX1-MOVE-01")
+@changes(ReferenceService, "command", "DEX1-MOVE-02")
 def Inverted(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Uses 0 as open."""
     command(side, replace(motor, q=self.dialect.q_open - motor.q, dq=-motor.dq))
@@ -474,7 +474,7 @@ class SecondGripWeak(ReferenceHand):
         self.held = self.held + dt if pressing else 0.0
 
 
-@changes(ReferenceService, "command", "DEX1-MOVE-10", dialect="unitree_hg")
+@changes(ReferenceService, "command", "DEX1-MOVE-08", dialect="unitree_hg")
 def NoDeadZones(self: Any, command: Call, side: Side, motor: Motor) -> None:
     """Goes to every q as it is, without the zones that mean fully open and closed."""
     self.hands[side].command(Motor(q=motor.q) if math.isfinite(motor.q) else motor)

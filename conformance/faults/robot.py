@@ -87,7 +87,7 @@ def CutShort(self: Any, state_with_crc: Call) -> Any:
     return payload[:-4] if self.now < _EARLY else payload
 
 
-@changes(ReferenceRobot, "message", "H1-FIELD-02")
+@changes(ReferenceRobot, "message", "H1-FIELD-01")
 def NotANumber(self: Any, message: Call) -> Any:
     """Publishes NaN as ddq of one motor at first."""
     state = message()

@@ -92,7 +92,7 @@ def OtherOrder(self: Any, command: Call, side: Side, motors: Motors) -> None:
     command(side, motors[::-1])
 
 
-@commands(ServoHand, "BRAINCO-MOVE-01")
+@commands(ServoHand, "BRAINCO-MOVE-02")
 def ReversedScale(hand: Any, rows: Floats) -> None:
     """Takes the q of commands the other way round: 0 closed, 1 open."""
     rows[Q] = hand.low + hand.high - rows[Q]

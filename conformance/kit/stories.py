@@ -30,15 +30,14 @@ from dexkit.conformance.kit.state_faults import Fault, faults
 __all__ = ["FAMILIES", "ORDER", "stories_of"]
 
 ORDER = (
-    *("discovery", "start_up", "fields.length", "fields.finite", "checksums", "order.order"),
+    *("discovery", "start_up", "fields.complete", "checksums", "order.order"),
     *("freshness.fresh", "rate.rate"),
     *("sides.independent", "sides.by_its_own", "motion.order"),
-    *("motion.direction", "motion.begins", "motion.every_command", "motion.arrives"),
+    *("motion.begins", "motion.every_command", "motion.arrives"),
     *("sides.beside_grip", "gains"),
-    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.dead_zones"),
-    *("motion.ends", "mode_byte.locked"),
-    *("timeout_protection", "bad_commands.unchanged", "speed", "motion.speed", "sides"),
-    *("watchdog.state_in_silence",),
+    *("grip.keeps_grip", "stillness.vibrates", "motion.settles", "motion.ends"),
+    *("mode_byte.locked", "timeout_protection", "bad_commands.unchanged"),
+    *("speed", "motion.speed", "sides", "watchdog.state_in_silence"),
     *("stillness.still", "two_clients", "order.old_stamps"),
     *("life_cycle.restarted_client", "life_cycle.restarted_service", "watchdog.resumes"),
     *("mode_byte", "bad_commands", "watchdog", "life_cycle", "rate"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,6 +65,7 @@ def main(
             for found in kinds.values():
                 console.print(f"    {told(found, name.split()[1])}", markup=False, highlight=False)
     if not only:
+        table.revision = _revision()
         table.save()
         console.print(f"{FILE}: {len(table.hands)} wrong hands", soft_wrap=True)
         _summary(console, table)
@@ -91,6 +93,13 @@ def _table(given: Sequence[Task]) -> Table:
         if task.mutant is not None and found is not None and reference is not None:
             table.hands[task.name] = consequences(found, reference)
     return table
+
+
+def _revision() -> str:
+    """The commit of this code; with ``-dirty`` if files were changed since."""
+    command = ("git", "describe", "--always", "--dirty", "--exclude=*")
+    done = subprocess.run(command, cwd=FILE.parent, capture_output=True, text=True, check=False)
+    return done.stdout.strip()
 
 
 def _summary(console: Console, table: Table) -> None:

@@ -343,7 +343,7 @@ def teleoperate(made: type[Service], spoken: Dialect, sides: Sequence[Side]) -> 
     s.still("hold still", 1.0)
     s.move("a small step", _both(s, 0.42), 1.0)
     s.follow("follow slowly", 0.1, 0.9, 3.0, 4.5)
-    s.move("half way again", _both(s, 0.5), _HALF)
+    s.move("half way again", _both(s, 0.5), _HALF, hurried=True)
     for i, part in enumerate((_SHUT, _OPEN, _SHUT, _OPEN)):
         s.move(f"quickly {i + 1}", _both(s, part), pace.quick, settles=False, hurried=True)
     s.move("to rest", _both(s, 0.5), _HALF, hurried=True)
@@ -379,7 +379,7 @@ def _events(s: Session, client: Teleoperation) -> None:
     stage.service.loaded = True
     s.follow("follow while a slow viewer is there", 0.2, 0.8, 2.0, 3.0)
     stage.service.loaded = False
-    s.move("half way after it", mid, _HALF)
+    s.move("half way after it", mid, _HALF, hurried=True)
 
     # the network pauses in a move, for less and for longer than the time-out
     for seconds in (0.4, 1.4):

@@ -49,9 +49,11 @@ class Table:
     """Consequences of wrong hands.
 
     :ivar hands: by a hand's name, its worst consequence of each kind; empty without any.
+    :ivar revision: the code that measured them.
     """
 
     hands: dict[str, dict[str, Consequence]] = field(default_factory=dict)
+    revision: str = ""
 
     @classmethod
     def load(cls, file: Path = FILE) -> Table:
@@ -61,7 +63,8 @@ class Table:
             {
                 name: {kind: Consequence(kind, *values) for kind, values in kinds.items()}
                 for name, kinds in data["hands"].items()
-            }
+            },
+            data["revision"],
         )
 
     def save(self, file: Path = FILE) -> None:
@@ -88,7 +91,7 @@ class Table:
             f'"{title}": {{\n{_lines(values)}\n}}'
             for title, values in (("requirements", rows), ("hands", hands))
         )
-        write_file(file, f"{{\n{text}\n}}\n")
+        write_file(file, f'{{\n"revision": {json.dumps(self.revision)},\n{text}\n}}\n')
 
     def rows(self, model: str | None = None) -> list[Row]:
         """The requirements of hands on DDS, of a model or of all."""

@@ -283,12 +283,12 @@ FAULTS = (
     # TRACK-01: where q is missing or wrong, the hand seems not to follow
     Fault("gap", _gap, ("RATE-03",), ("FIELD-15", "TRACK-01")),
     Fault("slow", _slow, ("RATE-01",), ("FRESH-01", "RATE-03")),
-    Fault("nan", _nan, ("FIELD-02",)),
+    Fault("nan", _nan, ("FIELD-01",)),
     Fault(
         "out-of-stroke",
         _out_of_stroke,
         ("FIELD-03",),
-        ("FIELD-14", "FIELD-15", "FIELD-17", "TRACK-01"),
+        ("FIELD-15", "FIELD-17", "TRACK-01"),
     ),
     Fault(
         "frozen",
