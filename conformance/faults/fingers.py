@@ -65,7 +65,7 @@ class LowRateIsSlow(Dex3Service):
     low_period = 0.5
 
 
-@changes(Dex3Service, "low_rate", "DEX3-TOPIC-04", brief=True)
+@changes(Dex3Service, "low_rate", "DEX3-TOPIC-03", brief=True)
 def OldLowRate(self: Any, low_rate: Call, samples: list[Sample]) -> list[Sample]:
     """Copies states to the low-rate topic that are 0.45 s old."""
     new, queue = low_rate(samples), self.memory.setdefault("queue", deque())
