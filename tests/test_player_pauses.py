@@ -25,7 +25,7 @@ def driven(phase: str, after: int) -> Iterator[tuple[str, int, Send]]:
     plan = Plan(
         dialect=GO,
         sides=BOTH,
-        session=CommandSession.default(GO.model).first_seconds(4.0),
+        session=CommandSession.default(GO.model),
         phases=frozenset({"replay"}),
     )
     script = script_for(plan)

@@ -40,14 +40,13 @@ from dexkit.conformance.stimuli.script import (
     Role,
     Send,
     Steps,
-    with_gains,
 )
 from dexkit.hand import Side
 from dexkit.unseen import UNSEEN_S
 
 _FLOOD = 500
 """Commands of a burst."""
-_BETWEEN = 0.3
+_BETWEEN = 0.15
 """Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
@@ -79,22 +78,11 @@ def send_out_of_range(script: HandScript) -> Steps:
     yield from _send_and_recover(script, "out-of-range")
 
 
-@stimulus("empty long", GripperScript, after="out-of-range")
-def send_wrong_lengths(script: GripperScript) -> Steps:
-    """Commands for no motor, and for motors too many."""
-    yield from _send_and_recover(script, "empty long")
-
-
-@stimulus("negative", GripperScript, after="long", applies=with_gains)
-def send_negative_gains(script: GripperScript) -> Steps:
-    """Negative gains."""
-    yield from _send_and_recover(script, "negative")
-
-
-@stimulus("foreign", GripperScript, after="negative")
-def send_other_type(script: GripperScript) -> Steps:
-    """A client of another type on the topic."""
-    yield from _send_and_recover(script, "foreign", most=1.5)
+@stimulus("empty long negative foreign", GripperScript, after="out-of-range")
+def send_malformed_to_gripper(script: GripperScript) -> Steps:
+    """Commands for no motor, for motors too many, with negative gains, and of another type."""
+    kinds = "empty long negative foreign" if script.gains_used else "empty long foreign"
+    yield from _send_and_recover(script, kinds)
 
 
 @stimulus("foreign empty short long negative wrong-id", FingerScript, after="out-of-range")
@@ -123,12 +111,11 @@ def _send_and_recover(script: HandScript, kinds: str, *, most: float | None = No
 def _send_kind(script: HandScript, name: str) -> Steps:
     """Bad commands of one kind, for a while on each side alone where it has a topic of its own."""
     script.report(_BAD[name])
-    yield from script.hold(0.1)
     if name == "nan":
         for side in script.plan.sides:
             kinds = [{side: motors} for motors in not_finite_motors(script, side)]
             # long enough for a step of the other side beside them
-            each = max(0.065, ASIDE_SECONDS / len(kinds))
+            each = max(7 * script.period_ns / 1e9, ASIDE_SECONDS / len(kinds))
             yield from _send_bad(script, name, (side,), kinds, each)
     elif isinstance(script, GripperScript):
         yield from _send_to_gripper(script, name)
@@ -139,9 +126,10 @@ def _send_kind(script: HandScript, name: str) -> Steps:
 def _send_to_gripper(script: GripperScript, name: str) -> Steps:
     sides = script.plan.sides
     if name == "out-of-range":
-        places = (1000.0, -1000.0, 1.3 * script.stroke, -0.3 * script.stroke)
+        # taken modulo a turn, 11 rad leads to the wrong end, and 1000 rad to the right one
+        places = (11.0, -1000.0, 1.3 * script.stroke, -0.3 * script.stroke)
         far = [dict.fromkeys(sides, (Motor(q=q),)) for q in places]
-        yield from _send_beyond_each_end(script, name, far, 0.3)
+        yield from _send_beyond_each_end(script, name, far, 0.15)
     elif name == "long":
         good = {s: script.motors(s, pose) for s, pose in script.goal.items()}
         for alone in _each_alone(script):
@@ -153,7 +141,7 @@ def _send_to_gripper(script: GripperScript, name: str) -> Steps:
                 + rest
                 for more in (1, 19)
             ]
-            yield from _send_bad(script, name, alone, longer, 0.15)
+            yield from _send_bad(script, name, alone, longer, 0.1)
     elif name == "negative":
         kp, kd = script.model.gains[0]
         for alone in _each_alone(script):
@@ -163,7 +151,7 @@ def _send_to_gripper(script: GripperScript, name: str) -> Steps:
                 yield from _send_bad(script, name, alone, [wrong], 0.15)
     else:
         for alone in _each_alone(script):
-            yield from _send_bad(script, name, alone, [_gripper_empty(script, alone)], 0.25)
+            yield from _send_bad(script, name, alone, [_gripper_empty(script, alone)], 0.15)
 
 
 def _gripper_empty(
@@ -184,7 +172,7 @@ def _send_to_fingers(script: FingerScript, name: str) -> Steps:
     if name == "out-of-range":
         far = [
             {s: _at(script, s, [end] * len(script.joints[s])) for s in script.plan.sides}
-            for end in (1000.0, -1000.0)
+            for end in (11.0, -1000.0)
         ]
         for way in (0.3, -0.3):
             ends = {
@@ -334,7 +322,6 @@ def _send_beyond_each_end(
 def _send_foreign(script: HandScript) -> Steps:
     """Another participant publishes another type on the command topics, with far targets."""
     script.report("another type on the command topics: it must not reach the hand")
-    yield from script.hold(0.1)
     far = script.codec.encode_foreign(
         {s: script.motors(s, pose) for s, pose in script.other_place().items()}
     )
@@ -351,66 +338,22 @@ def _send_foreign(script: HandScript) -> Steps:
 def flood(script: HandScript) -> Steps:
     """Hundreds of commands at once to another place, the last of them back to this one."""
     script.report(f"{_FLOOD} commands at once: only the last one counts")
-    yield from script.hold(0.1)
     far = script.codec.encode(
         {s: script.motors(s, pose) for s, pose in script.other_place().items()}
     )
     phase = script.begin("burst", script.plan.sides)
     yield from script.do(Send(far * (_FLOOD - 1), 0))
     phase.observed = {"sent_s": script.elapsed(phase)}
-    yield from script.hold(0.6)
+    yield from script.hold(0.5)
     script.end(phase)
 
 
-def send_bad_at_once(script: HandScript) -> Steps:
-    """Commands that are not finite, and such that are far out of range, soon after a pause."""
-    sides = script.plan.sides
-    broken = {s: not_finite_motors(script, s)[-1] for s in sides}
-    if "nan" in script.plan.phases:
-        yield from _send_bad(script, "nan", sides, [broken], 0.1)
-    # taken modulo a turn, 11 rad leads to the wrong end, and 1000 rad to the right one
-    yield from _send_far_away(script, (11.0, -1000.0), 0.15)
-    if script.plan.phases & {"nan", "out-of-range"}:
-        yield from script.everyone(
-            "recover", script.other_place(), after=_bad_since_recovery(script)
-        )
-
-
-@stimulus("nan", GripperScript, moment=Moment.NEW_CLIENT, after="grip")
-def send_to_gripper_again(script: GripperScript) -> Steps:
-    """Each kind once more, of a new client."""
+@stimulus("nan", HandScript, moment=Moment.NEW_CLIENT, after="grip squeeze")
+def send_bad_again(script: HandScript) -> Steps:
+    """Commands that are not finite, and such that are far out of range, of a new client."""
     script.report("bad commands of the new client: nothing may move")
-    sides, phases = script.plan.sides, script.plan.phases
-    yield from _send_not_finite_at_once(script, 0.1)
-    good = {s: script.motors(s, pose) for s, pose in script.goal.items()}
-    if "empty" in phases:
-        yield from script.hold(_BETWEEN)
-        yield from _send_bad(script, "empty", sides, [_gripper_empty(script, sides)], 0.15)
-    if "long" in phases:
-        yield from script.hold(_BETWEEN)
-        longer = script.codec.encode_longer(good, [Motor(q=_gripper_far(script, sides[0]))])
-        yield from _send_bad(script, "long", sides, [longer], 0.15)
-    if "negative" in phases and script.gains_used:
-        yield from script.hold(_BETWEEN)
-        kp, kd = script.model.gains[0]
-        wrong = {s: (Motor(q=script.aside(s, 0.1)[0], kp=-kp, kd=-kd),) for s in sides}
-        yield from _send_bad(script, "negative", sides, [wrong], 0.15)
-    yield from _send_far_away(script, (1e6, -1e6), 0.2)
-    yield from script.everyone("recover", script.other_place(), after=_bad_since_recovery(script))
-
-
-@stimulus("nan", FingerScript, moment=Moment.NEW_CLIENT, after="squeeze")
-def send_to_fingers_again(script: FingerScript) -> Steps:
-    """Each kind once more, of a new client."""
-    script.report("bad commands of the new client: nothing may move")
-    sides = script.plan.sides
-    yield from _send_not_finite_at_once(script, 0.07)
-    for name in ("empty", "short", "long", "negative"):
-        if name in script.plan.phases:
-            yield from script.hold(_BETWEEN)
-            bad = _malformed(script, name, sides)[0]
-            yield from _send_bad(script, name, sides, [bad], 0.15)
-    yield from _send_far_away(script, (1000.0, -1000.0), 0.2)
+    yield from _send_not_finite_at_once(script, 0.065)
+    yield from _send_far_away(script, (1000.0, -1e6), 0.15)
     yield from script.everyone(
         "recover", script.other_place(), most=1.5, after=_bad_since_recovery(script)
     )

@@ -53,12 +53,12 @@ _NUDGE, NUDGE_SECONDS = 0.6, 0.3
 """A torque that pushes a hand that is held by kp, N m, and for how long, s."""
 _BACK_SECONDS = 0.15
 """Seconds in which it comes back from there."""
-_LIMP_SECONDS = 0.25
+_LIMP_SECONDS = 0.22
 """Seconds of zero gains with one q; the other side makes a step meanwhile, as in ``single``."""
 _SOFTEST, _SOFT_STEP = 0.8, 0.3
 """kp, N m/rad, and size, in parts of the stroke, of a soft step."""
 _PUSH_SPEED, _PUSH_DAMPING, _PUSH_SECONDS = 0.1, 0.3, 0.35  # strokes/s, N m s/rad, s
-_FED_DQ, _FED_TAU, _FED_SECONDS = -0.5, 0.1, 0.6
+_FED_DQ, _FED_TAU, _FED_SECONDS = -0.5, 0.1, 0.5
 """A feed-forward towards closed and a torque towards open, rad/s and N m, and for how long, s: with
 the client's gains they move the end of a step by less than 0.02 rad. A hand that takes them for
 limits makes a quarter of the step."""
@@ -101,7 +101,6 @@ def nudged(script: GripperScript, sides: Sequence[Side]) -> dict[Side, Motors]:
     "limp unlike push drive fed",
     GripperScript,
     after="burst",
-    leaves=Place.AWAY,
     applies=with_gains,
 )
 def drive_without_kp(script: GripperScript) -> Steps:
@@ -120,6 +119,8 @@ def drive_without_kp(script: GripperScript) -> Steps:
         yield from drive_gripper(script, sides, 0.16, seconds=0.35)
     if "fed" in script.plan.phases:
         yield from _feed_forward(script, sides)
+    else:
+        yield from script.back()
 
 
 def _feed_forward(script: GripperScript, sides: Sequence[Side]) -> Steps:
@@ -183,7 +184,7 @@ def drive_gripper(
     part: float,
     kd: float = 0.5,
     *,
-    seconds: float = 0.8,
+    seconds: float = 0.55,
     last_hz: float = 0.0,
 ) -> Steps:
     """Open at a steady low speed by velocity feedback alone, whatever the friction.

@@ -55,10 +55,10 @@ from dexkit.hand import Floats, Side
 
 # of the stroke: how far xr_teleoperate commands ahead (docs/sources/unitree-dex.md#b3)
 _LEAD = 0.18 / 5.4
-_FIRST_GRIP = 1.8
+_FIRST_GRIP = 1.5
 """Seconds of the first grip: until a driver has lowered its effort (DEX1-FORCE-10), and a little
 more."""
-_GRIP, _LONG_GRIP = 3.0, 30.0
+_GRIP, _LONG_GRIP = 2.5, 30.0
 """Seconds of equal commands between two pushes; those of a thorough run."""
 _SQUEEZE = 1.3
 """Seconds of a squeeze: contact takes 0.3 s on an idle machine, and twice that after a pause."""
@@ -67,7 +67,7 @@ _CAMERA_HZ = 30.0
 _SOFT_GRIPS = ((1.9, 0.3), (0.8, 0.6), (8.0, 0.2))
 """kp, N m/rad, and how far they are commanded into the object, rad: 0.5 to 1.6 N m each. The last
 is beyond what a byte holds in steps of 1/32, and about the lead of xr_teleoperate."""
-_SOFT_SECONDS = 0.5
+_SOFT_SECONDS = 0.4
 _GRIP_SECONDS = 1.1
 """Seconds of a grip after a restart of position servos."""
 _BEYOND, _BEYOND_TAU, _BEYOND_AFTER = 0.05, 0.7, 0.3
@@ -93,7 +93,7 @@ def grip_first(script: GripperScript) -> Steps:
         script.end(phase)
         script.grip = {}
         yield from script.turn(
-            "center", {s: script.home(s) for s in pressing}, least=0.5, stand=script.standing
+            "center", {s: script.home(s) for s in pressing}, least=0.4, stand=script.standing
         )
     else:
         yield from push_held(script, free)
@@ -145,7 +145,7 @@ def _hold_long(script: GripperScript, pressing: Sequence[Side], free: Sequence[S
     gripping = [script.begin("grip", pressing, targets=beyond)] if pressing else []
     pushed = nudged(script, free)
     push = free and script.gains_used
-    yield from script.hold(NUDGE_SECONDS)
+    yield from script.hold(0.2)
     for seconds in (_LONG_GRIP if script.patient else _GRIP, 0.1):
         if push:
             yield from script.hold_as("nudge", free, NUDGE_SECONDS, pushed)
@@ -177,6 +177,7 @@ def grip_and_step_softly(script: GripperScript) -> Steps:
     """Grips of less stiffness, and a step of less; in other runs while there is a silence."""
     pressing = script.plan.pressing
     yield from grip_softly(script, pressing)
+    yield from grip_from_below(script, pressing)
     script.grip = {}
     yield from step_softly(script, script.plan.sides)
 
@@ -186,16 +187,24 @@ def grip_softly(script: GripperScript, pressing: Sequence[Side]) -> Steps:
     if not script.gains_used or "soft-grip" not in script.plan.phases or not pressing:
         return
     touch = script.plan.objects
-    grips = [
-        ({s: Motor(q=max(touch[s] - depth, 0.0), kp=kp) for s in pressing}, _SOFT_SECONDS)
-        for kp, depth in _SOFT_GRIPS
-    ]
+    for kp, depth in _SOFT_GRIPS:
+        soft = {s: Motor(q=max(touch[s] - depth, 0.0), kp=kp) for s in pressing}
+        yield from _soft_grip(script, soft, _SOFT_SECONDS)
+
+
+def grip_from_below(script: GripperScript, pressing: Sequence[Side]) -> Steps:
+    """A grip of little stiffness whose q is below the closed end."""
+    if not script.gains_used or "soft-grip" not in script.plan.phases or not pressing:
+        return
+    touch = script.plan.objects
     below = {s: Motor(q=-_BEYOND * script.stroke, kp=_BEYOND_TAU / touch[s]) for s in pressing}
-    grips.append((below, script.model.command_timeout + _BEYOND_AFTER))
-    for soft, seconds in grips:
-        targets = {s: {0: motor.q} for s, motor in soft.items()}
-        script.grip.update({s: (motor,) for s, motor in soft.items()})
-        yield from script.hold_as("soft-grip", pressing, seconds, targets=targets)
+    yield from _soft_grip(script, below, script.model.command_timeout + _BEYOND_AFTER)
+
+
+def _soft_grip(script: GripperScript, motors: Mapping[Side, Motor], seconds: float) -> Steps:
+    targets = {s: {0: motor.q} for s, motor in motors.items()}
+    script.grip.update({s: (motor,) for s, motor in motors.items()})
+    yield from script.hold_as("soft-grip", tuple(motors), seconds, targets=targets)
 
 
 @stimulus("grip", GripperScript, moment=Moment.NEW_CLIENT, applies=without_gains)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dexkit.conformance.behaviours.gains import drive_fingers, drive_gripper, push_held
+from dexkit.conformance.behaviours.gains import drive_fingers, drive_gripper
 from dexkit.conformance.behaviours.grip import gripper_squeeze
 from dexkit.conformance.behaviours.speed import move_at_own_speeds
 from dexkit.conformance.checks import Context, Outcome, check
@@ -137,7 +137,7 @@ def restart_service(script: HandScript) -> Steps:
     script.end(phase)
     script.next_ns = script.obs.now_ns
     # longer than a state may take, so that it must come without a command
-    yield from script.silence("restarted", 1.3)
+    yield from script.silence("restarted", 1.1)
     yield from script.everyone("service-restart", script.after_shutdown(), most=4.0)
     yield from script.in_turn("service-restart")
     yield from script.schedule(Moment.STARTED)
@@ -146,8 +146,6 @@ def restart_service(script: HandScript) -> Steps:
 @stimulus("", GripperScript, moment=Moment.STOPPING)
 def drive_gripper_before_stop(script: GripperScript) -> Steps:
     """Grip and move: what was commanded last must not be in force after the restart."""
-    sides = script.plan.sides
-    yield from push_held(script, sides)
     pressing, free = script.plan.pressing, script.plan.free
     script.grip = dict(gripper_squeeze(script, pressing))
     regrip = script.begin("regrip", pressing) if pressing else None

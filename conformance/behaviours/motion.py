@@ -63,7 +63,7 @@ _LATE_SINGLE_SECONDS = 0.6
 """The same for hands with a control of their own: those of a real G1 answer 0.37 s late."""
 
 
-@stimulus("step", GripperScript)
+@stimulus("step", GripperScript, leaves=Place.AWAY)
 def step_each_gripper(script: GripperScript) -> Steps:
     """Large steps of one side, the others hold."""
     for side in script.plan.sides:
@@ -72,14 +72,16 @@ def step_each_gripper(script: GripperScript) -> Steps:
 
 def _step_gripper(script: GripperScript, side: Side) -> Steps:
     script.report(f"large steps of the {side} hand; the other one must not move")
-    places = (script.high(), 0), (script.low(side), _VENDORS_MODE), (script.middle(side), 0)
+    places = (script.high(), _VENDORS_MODE), (script.low(side), 0)
     for target, script.mode in places:
         script.goal[side] = (target,)
         phase = script.begin("step", (side,), targets={side: {0: target}})
         yield from script.until_settled(phase, (side,), least=0.6, most=2.5)
 
 
-@stimulus("ends", GripperScript, after="step", before="fingerprint", leaves=Place.AWAY)
+@stimulus(
+    "ends", GripperScript, after="step", before="fingerprint", needs=Place.ANY, leaves=Place.AWAY
+)
 def move_gripper_to_ends(script: GripperScript) -> Steps:
     """Fully open, and fully closed where there is no object."""
     script.report("fully open and fully closed")
@@ -89,7 +91,7 @@ def move_gripper_to_ends(script: GripperScript) -> Steps:
     if free:
         script.goal.update(dict.fromkeys(free, (0.0,)))
         phase = script.begin("ends", free, targets={s: {0: 0.0} for s in free})
-        yield from script.until_settled(phase, free, least=0.6, most=2.8)
+        yield from script.until_settled(phase, free, least=0.5, most=2.8)
 
 
 @stimulus(

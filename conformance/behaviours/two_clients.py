@@ -13,12 +13,11 @@ from dexkit.conformance.stimuli.script import Join, Leave, Role, Steps
 def add_rival(script: HandScript) -> Steps:
     """A second client commands another place, and goes."""
     script.report("a second client commands another place, and goes again")
-    yield from script.hold(0.1)
     there = script.other_place()
     rival = script.codec.encode({s: script.motors(s, pose) for s, pose in there.items()})
     yield from script.do(Join(Role.RIVAL))
     phase = script.begin("two-writers", script.plan.sides, targets=there)
-    yield from script.beside(phase, rival, Role.RIVAL, 0.5)
+    yield from script.beside(phase, rival, Role.RIVAL, 0.3)
     script.end(phase)
     yield from script.do(Leave(Role.RIVAL))
     yield from script.everyone("recover", dict(script.goal), most=1.5, after="two-writers")

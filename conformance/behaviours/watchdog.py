@@ -8,17 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from dexkit.conformance.behaviours.bad_commands import (
-    send_bad_at_once,
-)
 from dexkit.conformance.behaviours.gains import (
     drive_fingers,
     drive_gripper,
-    push_gripper,
     step_softly,
 )
 from dexkit.conformance.behaviours.grip import (
     finger_squeezes,
+    grip_from_below,
     grip_softly,
     gripper_squeeze,
     squeeze_fingers,
@@ -46,7 +43,7 @@ from dexkit.conformance.stimuli.robot import SPEED, RobotScript
 from dexkit.conformance.stimuli.script import Pose, Steps, with_gains
 from dexkit.hand import Floats, Side
 
-_SILENCE, _LONG_SILENCE = 3.8, 67.0
+_SILENCE, _LONG_SILENCE = 3.3, 67.0
 """Seconds without a command: longer than counters of 8 bits in steps of 10 ms last; in a thorough
 run, than those of 16 bits in milliseconds."""
 _REGRIP_SECONDS = 0.6
@@ -66,13 +63,13 @@ def stop_gripper_commands(script: GripperScript) -> Steps:
     """No commands for long: to each side alone where they have topics of their own."""
     sides = script.plan.sides
     pressing, free = script.plan.pressing, script.plan.free
-    timeout = script.model.command_timeout
     long = _LONG_SILENCE if script.patient else _SILENCE
     first = free[0] if free else sides[0]
     rest = [s for s in sides if s != first]
     alone = bool(rest) and not script.codec.shared and "rejected" in script.plan.phases
     if not alone:
         yield from grip_softly(script, pressing)
+        yield from grip_from_below(script, pressing)
         script.grip = dict(gripper_squeeze(script, pressing))
         if free and script.gains_used:
             yield from drive_gripper(script, free, 0.16, last_hz=_FASTEST_HZ)
@@ -87,63 +84,52 @@ def stop_gripper_commands(script: GripperScript) -> Steps:
             if not free:
                 yield from script.turn("center", {first: (script.low(first),)}, least=0.5)
             yield from drive_gripper(script, (first,), 0.16, last_hz=_FASTEST_HZ)
-        script.report(f"... silence on the {first} side: after a second it must brake")
-        yield from _silent_beside(script, first, [s for s in rest if s in pressing], long)
+        script.report(f"... silence on the {first} side, then broken commands: it must brake")
+        yield from _silent_beside(script, first, [s for s in rest if s in pressing])
         # away from where it was going before the silence
         yield from _resume(script, {first: (NEARLY * script.stroke,)})
-        if script.gains_used:
-            low = {s: (script.low(s),) for s in (first,) if s in pressing}
-            if low:
-                yield from script.turn("center", low, least=0.5)
-            gain = script.model.gains[0][1]
-            yield from drive_gripper(
-                script, [s for s in sides if s not in script.grip], 0.07, kd=gain
-            )
-        script.report("... silence on both sides, and broken commands to one: both must brake")
-        yield from _silent_and_rejected(script, first, rest, timeout)
+        script.report("... silence on both sides: both must brake")
+        yield from _silent_both(script, first, rest, long)
         script.grip = {}
         yield from _resume(script, script.other_place())
-    yield from send_bad_at_once(script)
 
 
-def _silent_beside(
-    script: GripperScript, side: Side, pressing: Sequence[Side], seconds: float
-) -> Steps:
-    """No command to one side, while the others grip softly, hold, and make a step."""
+def _silent_beside(script: GripperScript, side: Side, pressing: Sequence[Side]) -> Steps:
+    """No command to one side, then only rejected ones, while the others make a step, and grip."""
+    timeout = script.model.command_timeout
     phase = script.begin("silence", (side,))
-    script.grip[side] = ()
-    yield from grip_softly(script, pressing)
-    yield from script.hold(max(0.2, seconds - 4.9))
-    grip, script.grip = script.grip, {side: ()}
+    script.grip = {side: ()}
     beside = script.beside_others((side,), ASIDE_SECONDS)
-    yield from script.hold(0.8)
+    yield from script.hold(script.beside_s)
     for ended in beside:
         script.end(ended)
-    script.grip = {**grip, **gripper_squeeze(script, pressing)}
-    while script.elapsed(phase) < seconds:
+    yield from grip_softly(script, pressing)
+    while script.elapsed(phase) < timeout + 0.6:
         yield from script.command()
     script.end(phase)
-    del script.grip[side]
+    rejected = script.begin("rejected", (side,))
+    # they must not wake it, either
+    script.grip[side] = (Motor(q=math.nan),)
+    yield from grip_from_below(script, pressing)
+    while script.elapsed(rejected) < 0.8 * timeout:
+        yield from script.command()
+    script.end(rejected)
+    # they press on: a driver may lower its effort in the first second
+    script.grip = dict(gripper_squeeze(script, pressing))
 
 
-def _silent_and_rejected(
-    script: GripperScript, first: Side, rest: Sequence[Side], timeout: float
-) -> Steps:
-    """No commands, then only rejected ones to one side; the others stay silent longer."""
+def _silent_both(script: GripperScript, first: Side, rest: Sequence[Side], seconds: float) -> Steps:
+    """No commands; the others stay silent longer than the first side."""
     both, long = script.begin("silence", (first,)), script.begin("silence", rest)
     script.grip = dict.fromkeys((first, *rest), ())
-    yield from script.hold(timeout + 0.6)
+    yield from script.hold(script.model.command_timeout + 0.6)
     script.end(both)
-    # they must not wake it, either
-    script.grip[first] = (Motor(q=math.nan),)
-    yield from script.hold_as("rejected", (first,), 0.8 * timeout)
     del script.grip[first]
     yield from _resume(script, {first: script.other_place()[first]})
     yield from step_softly(script, (first,))
-    beside = script.beside_others(rest, ASIDE_SECONDS)
-    yield from script.hold(0.6)
-    for ended in (*beside, long):
-        script.end(ended)
+    while script.elapsed(long) < seconds:
+        yield from script.command()
+    script.end(long)
 
 
 def _resume(script: GripperScript, goals: Mapping[Side, Pose]) -> Steps:
@@ -163,8 +149,6 @@ def stop_gripper_commands_again(script: GripperScript) -> Steps:
     """The commands end once more, at the end."""
     sides = script.plan.sides
     script.grip = {}
-    if "push" in script.plan.phases:
-        yield from push_gripper(script, dict.fromkeys(sides, "push"))
     pressing, free = script.plan.pressing, script.plan.free
     # a free hand is elsewhere in this silence: one that goes to a fixed position shows then
     starts = {s: (script.low(s) if s in pressing else script.middle(s),) for s in sides}
@@ -220,7 +204,6 @@ def stop_each_hands_commands(script: FingerScript) -> Steps:
             rejected = [replace(m, q=bad) for m in home] if script.codec.holds_nan else []
             guarded = _once_more(script) if side is sides[0] else {}
             yield from _silent_alone(script, side, rejected, guarded)
-    yield from send_bad_at_once(script)
 
 
 def _silent_by_motion(script: FingerScript, guarded: Mapping[Side, frozenset[int]]) -> Steps:

@@ -55,7 +55,6 @@ __all__ = [
     "topic_plan",
 ]
 
-SESSION_SECONDS = 4.0
 BLAMES = (Verdict.FAIL, Verdict.WARN, Verdict.ERROR)
 """The verdicts that blame a hand."""
 
@@ -122,7 +121,7 @@ def cost(mutant: Mutant) -> float:
 def _session(model_name: str) -> CommandSession | None:
     if not under_test(model_name).session:
         return None
-    return CommandSession.default(model_name).first_seconds(SESSION_SECONDS)
+    return CommandSession.default(model_name)
 
 
 def plan_for(

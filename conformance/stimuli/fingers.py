@@ -43,7 +43,7 @@ class FingerScript(HandScript):
     standing = 0.1
     least = 0.5
     step_most = 1.5
-    beside_s = 0.6
+    all_turns = True
 
     turn_of_splits = 0
     """Number of times that joints got different treatment."""

@@ -24,7 +24,7 @@ PATIENCE = 6.0
 """Seconds that a slow hand is given to arrive, beyond those that a good one needs."""
 ASIDE = 0.15
 """Part of a joint's range of a step that one side makes while the other gets bad commands."""
-ASIDE_SECONDS = 0.95
+ASIDE_SECONDS = 0.75
 """Least time, s, in which a side is asked to make such a step."""
 
 
@@ -39,7 +39,9 @@ class HandScript(Script[Side]):
     """Least duration of such a step, s."""
     step_most = 2.5
     """Seconds of a step of all sides; see :meth:`until_settled`."""
-    beside_s = ASIDE_SECONDS
+    beside_s = 0.6
+    all_turns = False
+    """Whether the second side makes a step alone whenever each does in turn."""
     """Seconds in which a side makes a step while the other one is silent."""
 
     def __init__(self, plan: Plan[Side], report: Callable[[str], None] = lambda text: None) -> None:
@@ -225,7 +227,7 @@ class HandScript(Script[Side]):
 
         :param away: where they go from here; None for another place than this one.
         :param stand: see :meth:`until_settled`; None where ripple is not judged.
-        :param divided: another client commands the other side in the last of them.
+        :param divided: another client commands the other side in the last step of both.
         """
         home, away = dict(self.goal), away or self.apart(self.other_place())
         stand = self.standing if stand is None else stand
@@ -234,8 +236,10 @@ class HandScript(Script[Side]):
         for side in others:
             turns[-1][side] = away[side]
             turns.append({side: home[side]})
+        if others and not self.all_turns:
+            turns.pop()
         for goals in turns:
-            self.divided = divided and goals is turns[-1]
+            self.divided = divided and len(goals) > 1
             yield from self.turn(name, goals, least=0.5, stand=stand)
 
     def turn(

@@ -19,9 +19,7 @@ from dexkit.traces import open_trace, sample_path
 
 __all__ = ["DEFAULT_SECONDS", "CommandSession"]
 
-DEFAULT_SECONDS = 4.0
-FINGERS_SECONDS = 3.1
-"""The same for hands of several joints, whose other stimuli take longer."""
+DEFAULT_SECONDS = 2.9
 _MOTION, _BEFORE_MOTION = 0.02, 0.3
 """A change of q that is a motion, rad, and seconds of a session before its first one."""
 
@@ -89,9 +87,7 @@ class CommandSession:
                 hint="give one: --trace FILE.mcap",
             )
         path = session if isinstance(session, Path) else sample_path(session)
-        fingers = not model(hand_model).dialects[0].is_gripper
-        seconds = FINGERS_SECONDS if fingers else DEFAULT_SECONDS
-        return cls.load(path, seconds=seconds, motion=True)
+        return cls.load(path, seconds=DEFAULT_SECONDS, motion=True)
 
     def for_hand(self, target: Dialect) -> CommandSession:
         """The session itself, if a hand of that dialect can be asked to repeat it.
@@ -104,15 +100,6 @@ class CommandSession:
             f"the session {self.name} is of a {model(self.dialect.model).title}, the hand is a "
             f"{model(target.model).title}",
             hint="give a session of the same model: --trace FILE.mcap",
-        )
-
-    def first_seconds(self, seconds: float) -> CommandSession:
-        """Only the beginning of it."""
-        return CommandSession(
-            self.name,
-            self.dialect,
-            min(seconds, self.duration),
-            {s: _cut(c, 0.0, seconds) for s, c in self.commands.items()},
         )
 
     @property

@@ -281,4 +281,4 @@ class Script(PhasedScript[Action, Observation, Phase], Generic[S]):
         """No commands: the state must flow."""
         self.report("listening: the state must flow before the first command")
         phase = self.begin("listen", self.plan.sides)
-        yield from self.through(phase, 1.2, lambda: self.wait(0.05))
+        yield from self.through(phase, 1.0, lambda: self.wait(0.05))

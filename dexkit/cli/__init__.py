@@ -28,7 +28,7 @@ _SECTIONS: Sections = {
         "teleop": ("dexkit.cli.teleop", "Drive a hand as xr_teleoperate does."),
     },
     "Judge": {
-        "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (90 s)."),
+        "demo": ("dexkit.cli.demo", "Run the conformance suite on two emulated grippers (75 s)."),
         "check": ("dexkit.cli.check", "Check a recording against the requirements."),
         "audit": ("dexkit.cli.audit", "Judge every session of an archive."),
         "report": ("dexkit.cli.report", "Write the reports of a result."),

@@ -1,4 +1,4 @@
-"""``dexkit demo``: the conformance suite on two emulated EZGrippers, in some 90 seconds."""
+"""``dexkit demo``: the conformance suite on two emulated EZGrippers, in some 75 seconds."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _INTRO = (
 )
 @view_option()
 def command(out: Path, backend: str, view: bool) -> None:
-    """Run the conformance suite on two emulated EZGrippers; takes about 90 seconds.
+    """Run the conformance suite on two emulated EZGrippers; takes about 75 seconds.
 
     Traffic stays on this machine, on a DDS domain of its own.
     """

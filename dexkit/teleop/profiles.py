@@ -207,7 +207,7 @@ def _check(stroke: float, step: float) -> Closing:
 
 _CHECK = _check(1.5, 0.9)
 # a gripper does not begin fully open, as a hand does whose client has no tracking data yet
-_OPEN_AND_CHECK = _joined(0.8, _course((0.0, 0.0), move=0.0), _check(1.8, 1.0))
+_OPEN_AND_CHECK = _joined(0.6, _course((0.0, 0.0), move=0.0), _check(1.8, 1.0))
 
 
 def finger_profiles(hand: HandModel) -> tuple[Profile, ...]:
@@ -324,7 +324,7 @@ def gripper_profiles(hand: HandModel) -> tuple[Profile, ...]:
             hand.name,
             "what the conformance suite does: strokes, a step, sine",
             0.4,
-            5.6,
+            4.9,
             _OPEN_AND_CHECK,
         ),
     )
