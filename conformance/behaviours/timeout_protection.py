@@ -209,6 +209,11 @@ def _usb_flags(c: UsbContext, answer: Answer) -> dict[int, bool]:
 
 
 @check("DEX3USB-PROT-01")
+def _usb_trips_for_long(c: UsbContext) -> Outcome:
+    trips = _usb_trips(c)
+    return all_of(trips, _usb_stays(c)) if trips.met else trips
+
+
 def _usb_trips(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)
@@ -260,7 +265,6 @@ def _usb_stops(c: UsbContext) -> Outcome:
     return outcome.if_late(driven - c.tolerance("max_s"))
 
 
-@check("DEX3USB-PROT-03")
 def _usb_stays(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     answers = c.hand.answers_in(phase)

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections import Counter
 
 from dexkit.conformance.checks import Outcome, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.usb.context import UsbContext
 from dexkit.hand import Side
 from dexkit.wire.dex3_usb import MANUFACTURER, PRODUCT, PRODUCT_ID, VENDOR_ID
+
+HIGH_SPEED = 3
+"""As libusb numbers the speeds; 0 is one that the host does not report."""
 
 
 @check("DEX3USB-DESC-01")
@@ -24,13 +28,16 @@ def _ids(c: UsbContext) -> Outcome:
 
 
 @check("DEX3USB-DESC-02")
+def _release_and_strings(c: UsbContext) -> Outcome:
+    return all_of(_release(c), _strings(c))
+
+
 def _release(c: UsbContext) -> Outcome:
     release = c.hand.device.release
     figure = f"{release >> 8:x}.{release & 0xFF:02x}"
     return c.passed(figure) if release == 0x0100 else c.failed(figure, f"bcdDevice is {figure}")
 
 
-@check("DEX3USB-DESC-03")
 def _strings(c: UsbContext) -> Outcome:
     device = c.hand.device
     wanted = (MANUFACTURER, PRODUCT[c.hand.side])
@@ -46,11 +53,18 @@ def _speed(c: UsbContext) -> Outcome:
     if not speed:
         return c.skipped("this host does not report the speed")
     name = {1: "low", 2: "full", 3: "high"}.get(speed, "super")
-    return c.passed(name) if speed == 3 else c.failed(name, f"it runs at {name} speed")
+    return c.passed(name) if speed == HIGH_SPEED else c.failed(name, f"it runs at {name} speed")
 
 
 @check("DEX3USB-DESC-05")
 def _endpoints(c: UsbContext) -> Outcome:
+    pair = _pair(c)
+    if not pair.met or c.hand.record.descriptors.speed not in (0, HIGH_SPEED):
+        return pair
+    return all_of(pair, warning(_packet_size(c)))
+
+
+def _pair(c: UsbContext) -> Outcome:
     endpoints = c.hand.device.endpoints
     bulk = Counter(e.inward for e in endpoints if e.bulk)
     figure = ", ".join(f"{e.address:#04x} {'bulk' if e.bulk else 'not bulk'}" for e in endpoints)
@@ -59,7 +73,6 @@ def _endpoints(c: UsbContext) -> Outcome:
     return c.failed(f"{bulk.total()} bulk", f"interface 0 has {figure or 'no endpoints'}")
 
 
-@check("DEX3USB-DESC-06")
 def _packet_size(c: UsbContext) -> Outcome:
     sizes = sorted({e.size for e in c.hand.device.endpoints if e.bulk})
     figure = ", ".join(map(str, sizes))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
+from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.stimuli.phases import stimulus
 from dexkit.conformance.stimuli.usb import Alone, In, Out, Reopen, UsbScript, UsbSteps
 from dexkit.conformance.usb.context import UsbContext, ordinary, quiet_motors
@@ -89,6 +90,10 @@ def _answered(c: UsbContext) -> Outcome:
 
 
 @check("DEX3USB-XCHG-02")
+def _one_answer(c: UsbContext) -> Outcome:
+    return all_of(_once(c), _unasked(c))
+
+
 def _once(c: UsbContext) -> Outcome:
     (phase,) = c.phases()
     sent = sum(not t.inward for t in c.hand.during(phase))
@@ -100,9 +105,8 @@ def _once(c: UsbContext) -> Outcome:
     return c.failed(figure, observed, *(c.at(a.t) for a in answers[sent:]))
 
 
-@check("DEX3USB-XCHG-03")
 def _unasked(c: UsbContext) -> Outcome:
-    (phase,) = c.phases()
+    (phase,) = c.hand.phases("quiet")
     begin, end = c.hand.span(phase)
     found = c.hand.answers_in(phase)
     if not any(t.inward for t in c.hand.during(phase)):
@@ -141,6 +145,10 @@ def _bursts(c: UsbContext) -> list[tuple[UsbPhase, list[float], float]]:
 
 
 @check("DEX3USB-RATE-01")
+def _fast(c: UsbContext) -> Outcome:
+    return all_of(_rate(c), _latency(c))
+
+
 def _rate(c: UsbContext) -> Outcome:
     bursts = _bursts(c)
     if not bursts:
@@ -154,7 +162,6 @@ def _rate(c: UsbContext) -> Outcome:
     return outcome.if_late(1 / rate - 1 / c.tolerance("min_rate_hz"), how="mean")
 
 
-@check("DEX3USB-RATE-02")
 def _latency(c: UsbContext) -> Outcome:
     bursts = _bursts(c)
     if not bursts:

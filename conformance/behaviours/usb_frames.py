@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexkit.conformance.checks import Outcome, check
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.kit.sums import total
 from dexkit.conformance.stimuli.phases import stimulus
 from dexkit.conformance.stimuli.usb import BUSES, Out, UsbScript, UsbSteps
@@ -46,6 +47,11 @@ _COARSEST = 0.03
 
 
 @check("DEX3USB-SIZE-01")
+def _frame(c: UsbContext) -> Outcome:
+    size = _size(c)
+    return all_of(size, _head(c)) if size.met else size
+
+
 def _size(c: UsbContext) -> Outcome:
     sizes = Counter(a.reading.length for a in c.hand.answers)
     figure = ", ".join(f"{n} bytes ({times})" for n, times in sizes.most_common(4))
@@ -65,7 +71,6 @@ def _both_sizes(c: UsbContext) -> Outcome:
     return c.failed(f"not {size}", observed, c.over(phase)).about(joint)
 
 
-@check("DEX3USB-HEAD-01")
 def _head(c: UsbContext) -> Outcome:
     heads = {a.reading.head.hex(" ") for a in c.hand.answers} - {"fc fd"}
     return all_frames(
@@ -89,6 +94,10 @@ def _to_all(c: UsbContext) -> list[Answer]:
 
 
 @check("DEX3USB-PACK-02")
+def _motors(c: UsbContext) -> Outcome:
+    return all_of(_seven(c), warning(_map(c)))
+
+
 def _seven(c: UsbContext) -> Outcome:
     def good(answer: Answer) -> bool:
         places = _places(answer)
@@ -101,7 +110,6 @@ def _seven(c: UsbContext) -> Outcome:
     return all_frames(c, good, f"{len(odd)} motors (bus.id): {figure}", answers)
 
 
-@check("DEX3USB-PACK-03")
 def _map(c: UsbContext) -> Outcome:
     answers = _to_all(c)
     odd = next((_places(a) for a in answers if _places(a) != sorted(BUSES)), [])
@@ -111,6 +119,10 @@ def _map(c: UsbContext) -> Outcome:
 
 
 @check("DEX3USB-PACK-04")
+def _sensors(c: UsbContext) -> Outcome:
+    return all_of(_nine(c), warning(_elements(c)))
+
+
 def _nine(c: UsbContext) -> Outcome:
     def good(answer: Answer) -> bool:
         places = [(s.bus, s.id) for s in answer.reading.sensors]
@@ -120,7 +132,6 @@ def _nine(c: UsbContext) -> Outcome:
     return all_frames(c, good, f"{', '.join(map(str, counts))} sensor packets, or one twice")
 
 
-@check("DEX3USB-SENS-01")
 def _elements(c: UsbContext) -> Outcome:
     def slots(answer: Answer) -> Iterator[tuple[tuple[int, int, int], int]]:
         for s in answer.reading.sensors:

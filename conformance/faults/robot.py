@@ -144,7 +144,7 @@ def NoTick(self: Any, ticks: Call) -> int:
     return 0
 
 
-@changes(ReferenceRobot, "ticks", "H1-TICK-02")
+@changes(ReferenceRobot, "ticks", "H1-TICK-01")
 def CountsStates(self: Any, ticks: Call) -> Any:
     """Counts states instead of milliseconds in tick."""
     return ticks() // 2

@@ -36,7 +36,7 @@ class OtherRelease(ReferenceDevice):
     release = 0x0200
 
 
-@changes(ReferenceDevice, "strings", "DEX3USB-DESC-03")
+@changes(ReferenceDevice, "strings", "DEX3USB-DESC-02")
 def NoSerial(self: Any, strings: Call) -> Any:
     """Has no serial number."""
     return {**strings(), 3: ""}
@@ -57,7 +57,7 @@ class TwoPairs(ReferenceDevice):
     endpoints = (*ReferenceDevice.endpoints, (0x03, 2, 512), (0x84, 2, 512))
 
 
-@wrong_hand("DEX3USB-DESC-06")
+@wrong_hand("DEX3USB-DESC-05")
 class SmallPackets(ReferenceDevice):
     """Declares packets of 64 bytes at high speed."""
 
@@ -87,7 +87,7 @@ def Echoes(self: Any, answer: Call) -> None:
     answer()
 
 
-@wrong_hand("DEX3USB-XCHG-03")
+@wrong_hand("DEX3USB-XCHG-02")
 class Streams(ReferenceDevice):
     """Sends a state every 50 ms from the start, until the first command."""
 
@@ -121,7 +121,7 @@ class Slow(ReferenceDevice):
     latency = 0.0015
 
 
-@changes(ReferenceDevice, "answer", "DEX3USB-RATE-02")
+@changes(ReferenceDevice, "answer", "DEX3USB-RATE-01")
 def LateAnswers(self: Any, answer: Call) -> None:
     """Needs 4 ms for every 20th answer."""
     self.memory["count"] = count = self.memory.get("count", 0) + 1
@@ -152,7 +152,7 @@ class SmallFramesOnly(ReferenceDevice):
     accepts = MappingProxyType({734: 140})
 
 
-@changes(ReferenceDevice, "frame", "DEX3USB-HEAD-01")
+@changes(ReferenceDevice, "frame", "DEX3USB-SIZE-01")
 def OtherHead(self: Any, frame: Call) -> Any:
     """Sends states with the head of a command."""
     return b"\xfe\xfd" + frame()[2:]
@@ -200,13 +200,13 @@ class EightSensors(ReferenceDevice):
     sensors = ReferenceDevice.sensors[:-1]
 
 
-@changes(ReferenceDevice, "sensor_packet", "DEX3USB-SENS-01")
+@changes(ReferenceDevice, "sensor_packet", "DEX3USB-PACK-04")
 def ZeroForNothing(self: Any, sensor_packet: Call, number: int, elements: int) -> Any:
     """Sends 0 where there is no sensor element."""
     return sensor_packet(number, 12)
 
 
-@wrong_hand("DEX3USB-PACK-03")
+@wrong_hand("DEX3USB-PACK-02")
 class OtherMap(ReferenceDevice):
     """Has the thumb on bus 2 and a finger on bus 0."""
 
@@ -331,7 +331,7 @@ class SlowTrip(ReferenceDevice):
     timeout = 1.4
 
 
-@wrong_hand("DEX3USB-PROT-03")
+@wrong_hand("DEX3USB-PROT-01")
 class ClearsTripByAnyCommand(ReferenceDevice):
     """Clears the time-out on any command, once it was reported."""
 
