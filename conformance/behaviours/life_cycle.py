@@ -379,7 +379,17 @@ def _no_new_goal(ctx: Context) -> Figures:
                 f"found {rad:.2f} {ctx.unit} from the {place[-1]:.2f} {ctx.unit} at which the "
                 "service ended, where it was not going"
             )
+            there = _of_other(ctx, joint, begin)
+            if rad > 0.0 and abs(there - found) < 0.25 * rad:
+                text += ", but where the other hand was: the hands appear to be swapped since"
             yield Figure(rad, begin, end, joint, text)
+
+
+def _of_other(ctx: Context, joint: int, at: float) -> float:
+    """Where that joint of the other hand is; NaN where that is not known."""
+    other = ctx.recording.sides.get(ctx.other)
+    q = np.empty(0) if other is None else other.states.q[other.states.t <= at, joint]
+    return float(q[-1]) if len(q) else math.nan
 
 
 @worst("idle_rad", "max_idle_stroke", nothing="too few states after a start")

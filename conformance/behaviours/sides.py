@@ -20,6 +20,7 @@ from dexkit.conformance.checks.steps import (
 )
 from dexkit.conformance.kit.measurement_error import Measure, Quantity
 from dexkit.conformance.kit.median import median
+from dexkit.conformance.kit.stimulus_record import Phase
 from dexkit.conformance.kit.sums import mean
 
 _NEARLY, _CLEAR_WAY = 0.9, 0.3
@@ -29,6 +30,10 @@ that it must be to be compared."""
 
 _AFTER_A_PAUSE = ("restart", "service-restart")
 """Steps of which the first follows directly after discovery."""
+
+
+_CLEAR_STEP, _STANDS = 0.1, 0.02
+"""Part of the stroke that a hand was commanded to go, and by which it moves that stands."""
 
 
 @check("DEX1-SIDE-01", "DEX3-SIDE-01")
@@ -42,6 +47,7 @@ def independent(ctx: Context) -> Figures:
     others = [(n, p) for n in names for p in ctx.recording.phases(n) if ctx.side not in p.sides]
     if not others:
         yield ctx.skipped("only one side was commanded")
+    stood = any(_other_stood(ctx, phase) for _, phase in others)
     for name, phase in others:
         begin, end = ctx.span(phase)
         rows = ctx.states.between(begin, end)
@@ -68,7 +74,25 @@ def independent(ctx: Context) -> Figures:
                 f"moved by {most:.3f} {ctx.unit} while only the {ctx.other} hand was commanded to "
                 "move"
             )
+            if stood and most > ctx.tolerance("max_motion_stroke", joint):
+                text += ", which did not: the hands appear to be swapped"
             yield Figure(most, begin, end, joint, text)
+
+
+def _other_stood(ctx: Context, phase: Phase) -> bool:
+    """Whether the other hand stood still in a phase in which it was commanded to move."""
+    other, targets = ctx.recording.sides.get(ctx.other), phase.targets.get(ctx.other, {})
+    rows = slice(0) if other is None else other.states.between(*ctx.span(phase))
+    if other is None or not targets or rows.stop - rows.start < 2:
+        return False
+    q = other.states.q[rows]
+    far = [
+        joint
+        for joint, target in targets.items()
+        if abs(target - q[0, joint]) > _CLEAR_STEP * other.joints[joint].stroke
+    ]
+    strokes = np.array([other.joints[joint].stroke for joint in far])
+    return bool(far) and bool((np.ptp(q[:, far], axis=0) < _STANDS * strokes).all())
 
 
 @check("DEX3-SIDE-03")
