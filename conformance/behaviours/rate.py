@@ -207,7 +207,8 @@ def _usual_rate(ctx: Context) -> Outcome:
     if least <= rate <= most:
         return ctx.passed(f"{rate:.1f} Hz", text, mean_hz=rate).rated(rate, least, seconds)
     # load of the machine cannot cause too high a rate
-    outcome = ctx.failed(f"{rate:.1f} Hz", text, mean_hz=rate)
+    unusual = f"{text}, where {least:g} to {most:g} Hz are usual"
+    outcome = ctx.failed(f"{rate:.1f} Hz", unusual, mean_hz=rate)
     if rate > most:
         return outcome.rated(rate, most, seconds, at_most=True).if_late(math.inf)
     return outcome.rated(rate, least, seconds).if_late(1 / rate - 1 / least, how="mean")
