@@ -14,7 +14,7 @@ BRAINCO_REVO2 = ModelUnderTest(
     prefixes={"BRAINCO": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.brainco:BrainCoService"),
-    quick_phases=("burst", "empty", "joint", "late-joiner", "long", "short", "speeds"),
+    quick_phases=("burst", "empty", "joint", "late-joiner", "speeds"),
     roles=JointRoles(driven=(), slow=(0, 3)),
     objects={Side.RIGHT: 60.0},
 )

@@ -16,7 +16,7 @@ INSPIRE_DFX = ModelUnderTest(
     prefixes={"DFX": "dds"},
     script=Lazy("dexkit.conformance.stimuli.fingers:FingerScript"),
     reference=Lazy("dexkit.conformance.virtual.inspire:InspireService"),
-    quick_phases=("burst", "empty", "joint", "late-joiner", "long", "short"),
+    quick_phases=("burst", "empty", "joint", "late-joiner"),
     roles=_ROLES,
     objects={Side.RIGHT: 60.0},
 )
