@@ -41,6 +41,12 @@ def test_failures_are_told_together_and_the_first_leads() -> None:
     assert found.late is None
 
 
+def test_a_part_that_fails_for_certain_is_not_excused_by_another_that_may_not() -> None:
+    near = Outcome(False, observed="0.401 s").timed(0.401, 0.4)
+    assert all_of(near, Outcome(False, observed="gone")).measures == ()
+    assert all_of(near, near).measures == near.measures * 2
+
+
 def test_no_part_that_can_be_judged_says_why() -> None:
     assert all_of(UNKNOWN, Outcome(None, reason="no motion")) is UNKNOWN
     assert warning(UNKNOWN) is UNKNOWN

@@ -58,6 +58,10 @@ def all_of(*parts: Outcome) -> Outcome:
         absent=any(part.absent for part in parts),
         joints=tuple(dict.fromkeys(joint for part in worst for joint in part.joints)),
         retry=any(part.retry for part in worst),
+        # a part without one fails for certain, whatever the kit's error is
+        measures=tuple(measure for part in worst for measure in part.measures)
+        if all(part.measures for part in worst)
+        else (),
     )
 
 
