@@ -130,6 +130,20 @@ def test_a_habit_is_told_with_its_figures(hand: Hand, words: str) -> None:
     assert words in told(hand)[0]
 
 
+def test_a_lag_behind_a_stream_of_targets_is_told() -> None:
+    def smooth(goal: Goals, now: float, q: float) -> float:
+        return q + 1.6 * (goal(now) - q) / RATE
+
+    def told_of(hand: Hand) -> list[str]:
+        steps = recorded(hand, GOALS, np.copy)
+        phase = Phase("operator", (Side.LEFT,), 1_000_000_000, 14_000_000_000)
+        recording = replace(steps, stimulus=Stimulus([phase]))
+        return [h.sentence for h in habits(recording, recording.sides[Side.LEFT])]
+
+    assert "follows a moving target" in told_of(smooth)[0]
+    assert not told_of(follower())
+
+
 def test_swings_are_told() -> None:
     speed = [0.0]
 

@@ -57,6 +57,12 @@ _PAST, _PAST_STROKE = 0.2, 0.06
 _SHORT = 0.02
 """Part of the stroke from its target at which a joint ends short."""
 _GRIPS = ("grip", "squeeze", "regrip", "soft-grip", "firmer")
+_STREAMS = ("operator", "replay")
+_LAGS = tuple(0.02 * i for i in range(51))
+"""Seconds by which a hand may be behind a stream of targets."""
+_BEHIND_S, _OFF, _NEARER = 0.3, 0.05, 0.8
+"""Seconds that are much; the part of the stroke by which q is off then; and the part of that by
+which it is off the targets that it follows."""
 _LEAST_GRIP_S, _PRESSES, _FADED = 0.7, 0.02, 0.5
 """Shortest grip that may fade, seconds; the part of a joint's torque that presses; and the part of
 that which is left where it fades."""
@@ -143,6 +149,7 @@ def habits(recording: Recording, view: SideView) -> Iterator[Habit]:
             found.append(_habit(recording, view, kind, when, wrong, steps))
             told |= {s.joint for s in wrong}
     yield from _fading_grips(recording, view)
+    yield from _behind_a_stream(recording, view)
     yield from sorted(found, key=lambda habit: -len(habit.spans))
 
 
@@ -204,6 +211,7 @@ def _fading_grips(recording: Recording, view: SideView) -> Iterator[Habit]:
     _, _, after, first, last, _ = np.median(np.array(faded), axis=0).tolist()
     spans = tuple(dict.fromkeys((begin, end) for begin, end, *_ in faded))
     long = sum(seconds > min(row[2] for row in faded) + 0.2 for seconds in pressed)
+    long = max(long, len(spans))
     if len(spans) >= 0.5 * long:
         joints = tuple(sorted({row[5] for row in faded}))
         name = joints_in_words(view, joints).removeprefix(" of ")
@@ -212,6 +220,34 @@ def _fading_grips(recording: Recording, view: SideView) -> Iterator[Habit]:
             f"{last:.2f} N m, in {len(spans)} of {long} grips of that length"
         )
         yield Habit("fades", f"{name}: {text}" if name else text, joints, (0.0, np.inf), spans)
+
+
+def _behind_a_stream(recording: Recording, view: SideView) -> Iterator[Habit]:
+    """How far joints are behind targets that move all the time."""
+    states, commands = view.states, view.commands
+    behind: dict[int, float] = {}
+    spans = []
+    for phase in (p for name in _STREAMS for p in recording.phases(name, view.side)):
+        begin, end = recording.seconds(phase.begin_ns), recording.seconds(phase.end_ns)
+        at = np.arange(begin + _LAGS[-1], end, 0.005)
+        if not len(at) or not len(commands):
+            continue
+        rows = [np.searchsorted(commands.t, at - lag, "right") - 1 for lag in _LAGS]
+        for joint, spec in enumerate(view.joints):
+            goals = np.clip(commands.q[:, joint], spec.q_min, spec.q_max) / spec.stroke
+            q = np.interp(at, states.t, states.q[:, joint]) / spec.stroke
+            off = [float(np.abs(q - goals[np.maximum(row, 0)]).mean()) for row in rows]
+            best = int(np.argmin(off))
+            if _LAGS[best] > _BEHIND_S and off[0] > _OFF and off[best] < _NEARER * off[0]:
+                behind[joint] = max(behind.get(joint, 0.0), _LAGS[best])
+                spans.append((begin, end))
+    if behind:
+        name = joints_in_words(view, sorted(behind)).removeprefix(" of ")
+        lag = float(np.median(list(behind.values())))
+        text = f"follows a moving target {lag:.2f} s late"
+        text = f"{name}: {text}" if name else text
+        places = tuple(dict.fromkeys(spans))
+        yield Habit("stream", text, tuple(sorted(behind)), (0.0, np.inf), places)
 
 
 # ------------------------------------------------------------------------------------- motion
@@ -263,6 +299,8 @@ def _common(steps: Sequence[_Step], wrong: Sequence[_Step]) -> str | None:
             if score > best + 0.02:
                 best, name = score, feature
     always = len(wrong) >= _ALWAYS * len(steps)
+    if name == "small" and any(s.way >= _STILL for s in wrong):
+        return "" if always else None  # a long way shows as much
     if always and name == "large":  # a short way shows less
         return ""
     if best >= _PURE and len(steps) - len(wrong) >= _FEWEST:

@@ -228,7 +228,9 @@ def _is_of(result: Result, view: SideView, habit: Habit) -> bool:
     begin, end = habit.during
     joints = set(result.joints)
     check = _check(result)
-    if habit.kind == "fades" and check[0] in ("motion", "speed", "gains", "sides"):
+    if habit.kind in ("fades", "stream") and check[0] in ("speed", "gains", "sides"):
+        return False
+    if check[1] == "position.in_stroke" and habit.kind != "past":
         return False
     if check[1] == "sides.independent" and (habit.kind not in ("slow", "late") or begin > 0.0):
         return False
