@@ -569,7 +569,7 @@ class SlowForASecondClient(Service):
     def receive(self, topic: str, payload: bytes, client: int) -> None:
         if client not in self.known:
             self.known.add(client)
-            if len(self.known) > 1:
+            if len(self.known) == 2:
                 self.slow_until = self.now + 4.0
         super().receive(topic, payload, client)
 
