@@ -14,7 +14,7 @@ from dexkit.conformance.stimuli.hand import HandScript
 from dexkit.conformance.stimuli.phases import Place, stimulus
 from dexkit.conformance.stimuli.script import Join, Leave, Role, Steps
 
-_LOADS = ((400.0, 1.0, 1), (2500.0, 0.6, 10))
+_LOADS = ((400.0, 1.2, 1), (2500.0, 0.8, 10))
 """Loads: commands a second, seconds, and commands at a time. The first is twice what teleoperation
 sends, the second what Unitree's C++ example sends (docs/sources/unitree-dex.md#b1)."""
 
@@ -53,7 +53,7 @@ def apply_load(script: HandScript) -> Steps:
 def under_load(ctx: Context) -> Outcome:
     """States, motion and, of hands with gains, how old q is under load."""
     parts = [_states(ctx), _obeys(ctx)]
-    if not ctx.recording.dialect.position_servo and all(part.met for part in parts):
+    if not ctx.recording.dialect.position_servo and all(part.met is not False for part in parts):
         parts.append(_late(ctx))
     return all_of(*parts)
 
