@@ -95,22 +95,25 @@ def stop_gripper_commands(script: GripperScript) -> Steps:
 
 
 def _silent_beside(script: GripperScript, side: Side, pressing: Sequence[Side]) -> Steps:
-    """No command to one side, then only rejected ones, while the others make a step, and grip."""
+    """No command to one side, then only rejected ones, while the others grip.
+
+    They make a step after the time-out: one time-out for all sides shows then.
+    """
     timeout = script.model.command_timeout
     phase = script.begin("silence", (side,))
+    script.grip[side] = ()
+    yield from grip_from_below(script, pressing)
+    while script.elapsed(phase) < timeout + 0.1:
+        yield from script.command()
     script.grip = {side: ()}
     beside = script.beside_others((side,), ASIDE_SECONDS)
     yield from script.hold(script.beside_s)
-    for ended in beside:
+    for ended in (phase, *beside):
         script.end(ended)
-    yield from grip_softly(script, pressing)
-    while script.elapsed(phase) < timeout + 0.6:
-        yield from script.command()
-    script.end(phase)
     rejected = script.begin("rejected", (side,))
     # they must not wake it, either
     script.grip[side] = (Motor(q=math.nan),)
-    yield from grip_from_below(script, pressing)
+    yield from grip_softly(script, pressing)
     while script.elapsed(rejected) < 0.8 * timeout:
         yield from script.command()
     script.end(rejected)
