@@ -83,7 +83,7 @@ _OF_MOTION = (
 _START = ("discovery", "start_up", "fields", "checksums")
 _BEFORE_MOTION = (
     *(*_START, "order.order", "freshness.fresh", "rate.rate"),
-    *("motion.order", "sides.independent", "sides.by_its_own"),
+    *("motion.order", "motion.begins", "sides.independent", "sides.by_its_own"),
 )
 """... and those that look more closely than a habit, where it does not explain them."""
 _SILENT_S = 5.0
@@ -228,7 +228,9 @@ def _is_of(result: Result, view: SideView, habit: Habit) -> bool:
     begin, end = habit.during
     joints = set(result.joints)
     check = _check(result)
-    if habit.kind in ("fades", "stream") and check[0] in ("speed", "gains", "sides"):
+    if habit.kind == "fades" and check[0] in ("speed", "gains", "sides"):
+        return False
+    if habit.kind == "stream" and not _among(check, _SUMS):  # single steps show more
         return False
     if check[1] == "position.in_stroke" and habit.kind != "past":
         return False
@@ -293,11 +295,12 @@ def _after(recording: Recording, root: Sequence[Result]) -> str:
 
 def _check(result: Result) -> tuple[str, str]:
     """The behaviour that the check of a result belongs to, and the check's full name: of what only
-    warns by a part of its requirement the behaviour alone.
+    warns by a part of a MUST the behaviour alone.
     """
     check = check_of(result.requirement)
     behaviour = check.__module__.rpartition(".")[2]
-    return behaviour, behaviour if result.tolerated else f"{behaviour}.{check.__name__}"
+    lesser = result.tolerated and result.requirement.level is Level.MUST
+    return behaviour, behaviour if lesser else f"{behaviour}.{check.__name__}"
 
 
 def _rank(result: Result) -> tuple[int, bool]:
