@@ -15,7 +15,7 @@ __all__ = ["BLAME_RATES", "CATCH_RATES", "wilson"]
 
 CATCH_RATES: dict[str, dict[str, tuple[int, int]]] = {
     "dex1-1": {"quick": (2, 8), "default": (7, 8)},
-    "dex3-1": {"quick": (2, 4), "default": (4, 4)},
+    "dex3-1": {"quick": (1, 4), "default": (3, 4)},
     "dex5-1": {"quick": (3, 3), "default": (3, 3)},
     "brainco-revo2": {"quick": (1, 2), "default": (2, 2)},
     "inspire-dfx": {"quick": (2, 3), "default": (3, 3)},
