@@ -22,6 +22,7 @@ _STEPS = 2.0  # usual times between states that the last state of a position cou
 
 
 _IN_A_ROW = 5  # held positions, whose median ignores one outlier
+_OLDER = 1.3  # times the usual age of values from which one is another
 
 
 @check("DEX1-FRESH-02", "DEX3-FRESH-02", rests_on=(TIMES,))
@@ -154,7 +155,8 @@ def _fresh(ctx: Context, joint: int) -> Iterator[Figure]:
     hold, usual = float(medians[i]), median(holds)
     begin, end = float(starts[i]), float(starts[i + count - 1] + holds[i + count - 1])
     met = f"a new value every {usual * 1e3:.1f} ms while moving (median of {len(holds)})"
-    text = f"{met}, but every {hold * 1e3:.0f} ms from {begin:.2f} s on"
+    worse = hold > _OLDER * usual
+    text = f"{met}, but every {hold * 1e3:.0f} ms from {begin:.2f} s on" if worse else met
     limit = ctx.tolerance("max_hold_s")
     late = Late((max(hold - limit, 0.0),), "mean")
     shown = f"{usual * 1e3:.1f} ms" if hold <= limit else f"{hold * 1e3:.0f} ms"

@@ -12,7 +12,7 @@ from dexkit.conformance.behaviours.speed import move_at_own_speeds
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
-from dexkit.conformance.checks.obedience import arrival, away_first
+from dexkit.conformance.checks.obedience import arrival, first_goals
 from dexkit.conformance.kit.measurement_error import Measure
 from dexkit.conformance.kit.median import median
 from dexkit.conformance.kit.motor_messages import MotorCodec
@@ -203,11 +203,7 @@ def restarted_client(ctx: Context) -> Outcome:
         left = arrival(ctx, "after a second client had gone", alone)
         if left.met is False:
             return left
-    for phase in ctx.phases():
-        wrong = away_first(ctx, phase, "commanded by a restarted client")
-        if wrong is not None:
-            return wrong
-    return arrival(ctx, "commanded by a restarted client")
+    return first_goals(ctx, ctx.phases(), "commanded by a restarted client")
 
 
 @check("DEX1-LIFE-03", "DEX3-LIFE-03")
@@ -228,10 +224,7 @@ def restarted_service(ctx: Context) -> Outcome:
         least = min(waited, end - begin)
         outcome = outcome.timed(least, ctx.tolerance("max_wait_s"))
         return outcome.if_late(waited - ctx.tolerance("max_wait_s"))
-    wrong = away_first(ctx, phase, "after a restart of its service")
-    if wrong is not None:
-        return wrong
-    outcome = arrival(ctx, "after a restart of its service")
+    outcome = first_goals(ctx, [phase], "after a restart of its service")
     if not outcome.met:
         return outcome
     again = Measure(waited, ctx.tolerance("max_wait_s"), span=(begin, begin + waited))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check, rate_measure
@@ -9,7 +11,7 @@ from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.obedience import silent
 from dexkit.conformance.checks.steps import obeyed_before, rest_error, steps_of
-from dexkit.conformance.checks.timing import gaps, least_rate, slow, too_slow
+from dexkit.conformance.checks.timing import gaps, least_rate
 from dexkit.conformance.stimuli.hand import HandScript
 from dexkit.conformance.stimuli.phases import Place, stimulus
 from dexkit.conformance.stimuli.script import Join, Leave, Role, Steps
@@ -61,25 +63,30 @@ def under_load(ctx: Context) -> Outcome:
 def _states(ctx: Context) -> Outcome:
     """Rate and gaps of the state under load."""
     limit = ctx.tolerance("max_gap_s")
+    least = least_rate(ctx)
     for phase in ctx.phases():
         begin, end = ctx.span(phase)
         clock = ctx.states.clock
         inside = clock[(clock >= begin) & (clock <= end)]
         rate = len(inside) / (end - begin)
+        before = clock[clock < begin]
+        if len(before) > 1:  # a hand that is slow anyway is not made slow by the load
+            usual = (len(before) - 1) / float(before[-1] - before[0])
+            least = min(least, ctx.tolerance("min_rate_part") * usual)
         found = gaps(ctx, limit, begin, end)
         text = f"{rate:.1f} Hz under load"
         if found:
             a, b = found[0]
             text = f"{text}; no state from {a:.3f} to {b:.3f} s"
             return silent(ctx, found, limit, f"{b - a:.2f} s", text)
-        if slow(ctx, rate):
+        if rate < least:
             place = ctx.at(ctx.states.topic, begin, end)
             outcome = ctx.failed(f"{rate:.1f} Hz", text, place, rate_hz=rate)
-            outcome = outcome.rated(rate, least_rate(ctx), end - begin)
-            return too_slow(ctx, outcome, rate)
+            late = 1 / rate - 1 / least if rate > 0 else math.inf
+            return outcome.rated(rate, least, end - begin).if_late(late, how="mean")
     span = begin, end
     met = ctx.passed(f"{rate:.1f} Hz", text, rate_hz=rate)
-    return met.resting_on(rate_measure(rate, least_rate(ctx), end - begin, span=span))
+    return met.resting_on(rate_measure(rate, least, end - begin, span=span))
 
 
 @worst("more_s", "max_more_s", nothing="no motion under load, or none without it to compare with")

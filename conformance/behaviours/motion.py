@@ -405,7 +405,8 @@ def every_command(ctx: Context) -> Outcome:
         f"{judged - len(missed)} of {judged}",
         ctx.named(
             f"{len(missed)} of {judged} commands that were sent once were not obeyed; the first, "
-            f"to {target:.2f} {ctx.unit}, made {progress:.0%} of its way in {end - begin:.2f} s",
+            f"to {target:.2f} {ctx.unit}, made {max(progress, 0.0):.0%} of its way in "
+            f"{end - begin:.2f} s",
             joint,
         ),
         *(ctx.at(ctx.states.topic, a, b) for a, b, *_ in missed),

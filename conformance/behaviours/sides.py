@@ -119,8 +119,8 @@ def beside_grip(ctx: Context) -> Figures:
                     continue
                 part = _way_within(step, seconds + slack) / way
                 text = (
-                    f"after {seconds + slack:.2f} s it had made {part:.0%} of the way that it made "
-                    f"in {seconds:.2f} s without a grip of the other hand"
+                    f"after {seconds + slack:.2f} s it had made {max(part, 0.0):.0%} of the way "
+                    f"that it made in {seconds:.2f} s without a grip of the other hand"
                 )
                 rad = way * abs(step.size)
                 made = Measure(part * rad, limit * rad, "rad", Quantity.POSITION, False)

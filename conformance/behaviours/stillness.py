@@ -13,6 +13,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.goals import OWN_RULE, Goals, goals_of
 from dexkit.conformance.checks.silences import Silence, motions_in, roles_of, silences_of
+from dexkit.conformance.checks.timing import encoder_step
 from dexkit.hand import Floats
 
 
@@ -64,8 +65,11 @@ def _holds_in(ctx: Context, silence: Silence) -> Outcome:
                 continue
             if _stood(ctx, joint, silence):
                 continue  # friction stopped it, and not the time-out
+            way = least * (b - a) / _AT_LAST
+            if way * ctx.joints[joint].stroke < encoder_step(ctx, joint):
+                continue  # steps of q as coarse as this show no motion in such a short time
             judged = True
-            if not moved[i] >= least * (b - a) / _AT_LAST:
+            if not moved[i] >= way:
                 return ctx.failed(
                     "stops",
                     ctx.named(f"stopped on its way {a - silence.last:.1f} s after the last", joint)

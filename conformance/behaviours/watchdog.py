@@ -26,7 +26,7 @@ from dexkit.conformance.behaviours.timeout_protection import latch_and_clear
 from dexkit.conformance.checks import STROKE_S, Context, Outcome, check, timing
 from dexkit.conformance.checks.combined import all_of
 from dexkit.conformance.checks.figures import Figure, Figures, judged, worst
-from dexkit.conformance.checks.obedience import arrival, away_first, silent, stopped
+from dexkit.conformance.checks.obedience import first_goals, silent, stopped
 from dexkit.conformance.checks.robot import RobotContext, no_state, only_phase, speed_between
 from dexkit.conformance.checks.silences import roles_of, stops_moving
 from dexkit.conformance.checks.steps import obeyed_before, steps_of
@@ -496,12 +496,8 @@ def resumes(ctx: Context) -> Outcome:
     )
     if not begun.met:
         return begun
-    for phase in ctx.phases():
-        if obeyed_before(ctx, phase):
-            wrong = away_first(ctx, phase, "after a pause of commands")
-            if wrong is not None:
-                return wrong
-    outcome = arrival(ctx, "after a pause of commands")
+    phases = [p for p in ctx.phases() if obeyed_before(ctx, p)]
+    outcome = first_goals(ctx, phases, "after a pause of commands")
     return outcome.resting_on(*begun.measures) if outcome.met and begun.measures else outcome
 
 
@@ -512,7 +508,8 @@ def _reactions(ctx: Context) -> Figures:
             continue
         begun = (step.q - step.start) / step.size >= ctx.tolerance("begun_part")
         after = float(step.t[np.argmax(begun)] if begun.any() else step.end) - step.begin
-        text = f"after a pause: {step}, but it began to move only after {after:.2f} s"
+        how = "began to move only after" if begun.any() else "did not begin to move in"
+        text = f"after a pause: {step}, but it {how} {after:.2f} s"
         shown = f"after {after:.2f} s"
         yield Figure(after, step.begin, step.begin + after, step.joint, text, shown=shown)
 

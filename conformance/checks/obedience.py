@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome
+from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, judged
 from dexkit.conformance.checks.steps import Step, disobeyed, missed, obeyed_before, steps_of
 from dexkit.conformance.checks.timing import gap_measures, gaps, longest_gap
@@ -130,8 +131,16 @@ def stopped(t: Floats, q: Floats, last: float, still: float, limit: float) -> Me
     return Measure(max(0.0, at - last), limit, span=(last, max(at, last + limit)))
 
 
-def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
-    """The failure of a hand that first moves or pulls away from the first goal after a pause."""
+def first_goals(ctx: Context, phases: Sequence[Phase], when: str) -> Outcome:
+    """Whether a hand arrives at its first goals after a pause, and does not go away first."""
+    away = [found for p in phases if (found := _away_first(ctx, p, when)) is not None]
+    return all_of(*away, arrival(ctx, when))
+
+
+def _away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
+    """The failure of a hand that first moves or pulls away from the first goal after a pause; a
+    warning where that does no harm.
+    """
     figures = []
     for step in steps_of(ctx, phase):
         if abs(step.size) < ctx.tolerance("max_away_stroke", step.joint):
@@ -145,7 +154,10 @@ def away_first(ctx: Context, phase: Phase, when: str) -> Outcome | None:
         figures.append(step.figure(away, text, shown=f"{away:.2f} {ctx.unit} away"))
     nothing = ctx.passed("no step")
     outcome = judged(ctx, figures, "away_rad", "max_away_stroke", nothing=nothing)
-    return None if outcome.met else outcome
+    if outcome.met:
+        return None
+    harm = ctx.tolerance("harm_stroke", outcome.joints[0])
+    return outcome if outcome.values["away_rad"] > harm else warning(outcome)
 
 
 def arrival(
