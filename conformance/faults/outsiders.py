@@ -301,7 +301,10 @@ def try_hand(each: Outsider) -> Verdicts:
         raise ConformanceError(
             f"{each.name} failed: {type(error).__name__}: {error}", hint=where(error)
         ) from error
-    story = result.stories[0].sentence if result.stories else ""
+    story = ""
+    if result.stories:
+        first = result.stories[0]
+        story = f"{', '.join(first.sides)}: {first.sentence}"
     return _verdicts(each, blame(result), story=story)
 
 

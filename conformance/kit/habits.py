@@ -18,6 +18,7 @@ import numpy as np
 from dexkit.conformance.kit.recording import Recording, SideView
 from dexkit.conformance.kit.state_faults import joints_in_words
 from dexkit.hand import Floats
+from dexkit.models import model
 
 __all__ = ["Habit", "habits", "silences"]
 
@@ -215,9 +216,10 @@ def _fading_grips(recording: Recording, view: SideView) -> Iterator[Habit]:
     if len(spans) >= 0.5 * long:
         joints = tuple(sorted({row[5] for row in faded}))
         name = joints_in_words(view, joints).removeprefix(" of ")
+        unit = model(recording.dialect.model).torque_unit
         text = (
-            f"presses with {first:.2f} N m in a grip, and {after:.1f} s after its command with "
-            f"{last:.2f} N m, in {len(spans)} of {long} grips of that length"
+            f"presses with {first:.2f} {unit} in a grip, and {after:.1f} s after its command with "
+            f"{last:.2f} {unit}, in {len(spans)} of {long} grips of that length"
         )
         yield Habit("fades", f"{name}: {text}" if name else text, joints, (0.0, np.inf), spans)
 
