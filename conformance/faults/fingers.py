@@ -387,7 +387,7 @@ class NeverRests(FingerHand):
 def Hunts(hand: Any, move: Call, dt: float, pull: list[float]) -> None:
     """One joint oscillates about its goal."""
     if hand.law_kp[2] > 0.67 * hand.client_kp[2]:
-        pull[2] += hand.law_kp[2] / 6 * math.sin(2 * math.pi * 8.0 * hand.now)
+        pull[2] += hand.law_kp[2] / 4 * math.sin(2 * math.pi * 8.0 * hand.now)
     move(dt, pull)
 
 

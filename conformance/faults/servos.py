@@ -325,9 +325,9 @@ def SlowAfterFar(hand: Any, bad: Call, motors: Motors) -> bool:
 
 @changes(ServoService, "motors", "FTP-MOVE-08", whole=True)
 def DeafAfterOutOfRange(self: Any, command: Call, side: Side, motors: Motors) -> None:
-    """Ignores commands for 0.8 s after one whose goal is far out of range."""
+    """Ignores commands for 1.2 s after one whose goal is far out of range."""
     if any(abs(m.q) > _FAR for m in motors):
-        self.memory[side] = self.now + 0.8
+        self.memory[side] = self.now + 1.2
     if self.now >= self.memory.get(side, 0.0):
         command(side, motors)
 
