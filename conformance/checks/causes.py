@@ -69,10 +69,12 @@ def of_scale(targets: Floats, reached: Floats, stroke: float) -> str:
     :param targets: q that was commanded, rad; ``reached``: where each step ended.
     :param stroke: of a joint whose q counts from 0.
     """
+    # one target far from the middle is enough for that
+    far = len(targets) and np.abs(targets - stroke / 2).max() > 0.2 * stroke
+    if far and np.allclose(reached, stroke - targets, atol=0.06 * stroke):
+        return "Travel is mirrored: commands to open close the hand."
     if len(targets) < 2 or np.ptp(targets) < 0.2 * stroke:
         return ""
-    if np.allclose(reached, stroke - targets, atol=0.06 * stroke):
-        return "Travel is mirrored: commands to open close the hand."
     if reached.max() <= 0.06 * stroke and np.ptp(reached) >= 0.02 * stroke:
         return "Commands appear to be read as percent or degrees: radians always close the hand."
     if np.allclose(reached, stroke * np.clip(targets, 0.0, 1.0), atol=0.03 * stroke):
