@@ -14,13 +14,14 @@ from dexkit.conformance.behaviours.operator import OPERATOR
 from dexkit.conformance.checks import Outcome
 from dexkit.conformance.faults import plan_for
 from dexkit.conformance.faults.operator import LateState
+from dexkit.conformance.kit.claims import Claims
 from dexkit.conformance.kit.heartbeat import Heartbeat
 from dexkit.conformance.kit.judge import judge
 from dexkit.conformance.kit.lateness import Lateness
 from dexkit.conformance.kit.recording import Recording
 from dexkit.conformance.kit.requirements import Requirement, catalogue
 from dexkit.conformance.kit.results import Evidence, Load, Verdict
-from dexkit.conformance.kit.verdicts import MOST_PLACES, excuse
+from dexkit.conformance.kit.verdicts import MOST_PLACES, Judgement, excuse
 from dexkit.conformance.virtual import run_virtual
 from dexkit.hand import Side, Subject
 from tests.conformance_helpers import copy_of, result_of, short_run, with_beats
@@ -197,3 +198,15 @@ def test_pause_of_the_kit_between_two_beats_counts(monkeypatch: pytest.MonkeyPat
         wait_until(lambda: len(heart.beats.t_us) > 5)
     assert max(heart.beats.late_us) >= 45_000
     assert heart.stalls
+
+
+def test_busy_machine_does_not_leave_open_a_must_of_which_a_part_would_warn() -> None:
+    def verdict_of(outcome: Outcome) -> Verdict:
+        judgement = Judgement(GAP, Side.LEFT, Claims(), {})
+        return judgement.run_check(
+            lambda: outcome, lambda it: excuse(BUSY_ONE, GAP, it, Side.LEFT)
+        ).verdict
+
+    assert verdict_of(gap(0.15)) is Verdict.BLOCKED
+    assert verdict_of(gap(0.15).tolerated()) is Verdict.NOT_APPLICABLE
+    assert verdict_of(gap(9.0).tolerated()) is Verdict.WARN

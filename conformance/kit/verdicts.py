@@ -279,6 +279,9 @@ class Judgement:
         must = self.requirement.level is Level.MUST and not outcome.tolerable
         failed = Verdict.FAIL if must else Verdict.WARN
         verdict = Verdict.BLOCKED if busy.excused else failed
+        if busy.excused and outcome.tolerable and self.requirement.level is Level.MUST:
+            # the part that only warns is not known: the MUST is met as far as it was judged
+            verdict = Verdict.NOT_APPLICABLE
         measure = weigh(outcome)
         if verdict is Verdict.FAIL and measure is not None and measure.explains_failure:
             verdict = Verdict.BLOCKED
