@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-TRIALS = 3
-"""Of a live run that a busy machine can spoil."""
 ACME = EXAMPLES / "acme-gripper"
 SERVICE = EXAMPLES / "external-service" / "gripper_service.py"
 
@@ -133,25 +131,22 @@ def test_the_gripper_of_the_guide_meets_what_its_maker_claims(
     acme: ModuleType, tmp_path: Path, quick: bool
 ) -> None:
     """The guide's own command, with the claims that the example ships."""
-    for _ in range(TRIALS):  # the devices are in this process, of which the kit knows nothing
-        with emulated(acme) as left, emulated(acme, object_at=37.0) as right:
-            result = tmp_path / "result.json"
-            run = subprocess.run(
-                [
-                    *(*SUITE, "-q", "--pyargs", "dexkit.conformance"),
-                    *("--backend", "acme_gripper.hand:make", "--domain", str(free_domain())),
-                    *("--device", f"left={left}", "--device", f"right={right}"),
-                    *("--object", "right=37", "--capabilities", str(ACME / "capabilities.toml")),
-                    *("--result", str(result), *(["--quick"] if quick else [])),
-                ],
-                cwd=tmp_path,
-                capture_output=True,
-                text=True,
-                timeout=300,
-                env={**os.environ, "NO_COLOR": "1", "PYTHONPATH": str(ACME)},
-            )
-        if run.returncode in (0, 2):
-            break
+    with emulated(acme) as left, emulated(acme, object_at=37.0) as right:
+        result = tmp_path / "result.json"
+        run = subprocess.run(
+            [
+                *(*SUITE, "-q", "--pyargs", "dexkit.conformance"),
+                *("--backend", "acme_gripper.hand:make", "--domain", str(free_domain())),
+                *("--device", f"left={left}", "--device", f"right={right}"),
+                *("--object", "right=37", "--capabilities", str(ACME / "capabilities.toml")),
+                *("--result", str(result), *(["--quick"] if quick else [])),
+            ],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            env={**os.environ, "NO_COLOR": "1", "PYTHONPATH": str(ACME)},
+        )
     assert run.returncode in (0, 2), run.stdout + run.stderr  # 2: this machine was too busy to tell
     rows = json.loads(result.read_text())["results"]
     found = {(row["id"], row["side"]): row["verdict"] for row in rows}
