@@ -95,6 +95,18 @@ class Hesitates(ReferenceService):
         return self.stood[2]
 
 
+class HesitatesInAGrip(ReferenceService):
+    """Repeats its position for 0.08 s more when it leaves an object."""
+
+    gripped = (-1.0, b"")  # when it was last held, and the state then
+
+    def payload(self, sides: tuple[Side, ...], length: int | None = None) -> bytes:
+        fresh, here = super().payload(sides, length), self.positions(sides[0])[-1]
+        if here < 1.99:
+            self.gripped = (self.now, self.gripped[1] or fresh)
+        return self.gripped[1] if self.now - self.gripped[0] < 0.08 else fresh
+
+
 class Coarse(ReferenceService):
     """Measures q in steps of 1.5 % of the range, from another place on after a restart."""
 
@@ -173,6 +185,14 @@ def test_hand_at_rest_at_its_command_is_not_frozen() -> None:
     fresh = result_of(judge(Recording.decode(listened(Hesitates))), "DEX1-FRESH-02")
     assert fresh.verdict is Verdict.PASS
     assert 0.08 < fresh.values["frozen_s"] < 0.15  # and not the second of rest before it
+
+
+def test_hand_held_by_an_object_is_not_frozen() -> None:
+    plan = replace(plan_for(sides=(Side.RIGHT,)), phases=frozenset({"step", "squeeze", "grip"}))
+    recording = Recording.decode(run_virtual(plan, HesitatesInAGrip))
+    fresh = result_of(judge(recording), "DEX1-FRESH-02", "right")
+    assert fresh.verdict is Verdict.PASS
+    assert 0.07 < fresh.values["frozen_s"] < 0.15  # and not the seconds of the grip before it
 
 
 def test_fast_gripper_is_not_judged_as_percent() -> None:

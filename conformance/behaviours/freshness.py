@@ -62,7 +62,8 @@ def _frozen(ctx: Context) -> Iterator[Figure]:
             # a fast hand may be far away at the next measurement
             if jump[i] <= _speed_after(t, q, int(changes[i + 1])) * ctx.tolerance("max_age_s"):
                 continue
-            begin[i] = _at_rest_until(ctx, joint, float(q[changes[i]]), begin[i], end[i])
+            from_q, to_q = q[changes[i : i + 2]].tolist()
+            begin[i] = _at_rest_until(ctx, joint, from_q, to_q, begin[i], end[i])
             held[i] = end[i] - begin[i]
         i = int(np.argmax(held))
         if held[i] > 0.0:
@@ -81,18 +82,21 @@ def _speed_after(t: Floats, q: Floats, row: int) -> float:
     return abs(float(q[last] - q[row])) / span if span > 0.0 else 0.0
 
 
-def _at_rest_until(ctx: Context, joint: int, q: float, begin: float, end: float) -> float:
-    """The last time in [begin, end] at which the commanded position was q.
+def _at_rest_until(
+    ctx: Context, joint: int, q: float, to_q: float, begin: float, end: float
+) -> float:
+    """The last time in [begin, end] at which no command asked for a motion from q towards to_q.
 
-    A hand at rest at its commanded position correctly repeats that position. ``begin`` if no
-    command is known.
+    A hand at rest at its commanded position, or held by an object on the other side of it,
+    correctly repeats that position. ``begin`` if no command is known.
     """
     t, commanded = ctx.commands.t, ctx.commands.q[:, joint]
     known = np.isfinite(commanded)
     t, commanded = t[known], commanded[known]
     first, last = np.searchsorted(t, [begin, end], side="right")
     first = max(int(first) - 1, 0)  # the command in force at begin
-    elsewhere = np.abs(commanded[first:last] - q) > ctx.tolerance("min_jump_stroke", joint)
+    way = (commanded[first:last] - q) * np.sign(to_q - q)
+    elsewhere = way > ctx.tolerance("min_jump_stroke", joint)
     if not len(elsewhere):
         return begin
     if not elsewhere[-1]:
