@@ -46,8 +46,6 @@ from dexkit.unseen import UNSEEN_S
 
 _FLOOD = 500
 """Commands of a burst."""
-_BETWEEN, _BETWEEN_FINGERS = 0.15, 0.4
-"""Seconds in which a hand that a bad command has moved returns, so that the next is not blamed."""
 _BAD = {
     "nan": "broken commands (NaN and infinity): nothing may move",
     "out-of-range": "commands far out of range: no harm may be done",
@@ -100,8 +98,7 @@ def _send_and_recover(script: HandScript, kinds: str, *, most: float | None = No
     these = [name for name in kinds.split() if name in script.plan.phases]
     for name in these:
         if name != these[0]:
-            fingers = isinstance(script, FingerScript)
-            yield from script.hold(_BETWEEN_FINGERS if fingers else _BETWEEN)
+            yield from script.hold(script.between_bad)
         yield from _send_foreign(script) if name == "foreign" else _send_kind(script, name)
     if these:
         yield from script.everyone(

@@ -44,6 +44,7 @@ class FingerScript(HandScript):
     least = 0.5
     step_most = 1.5
     all_turns = True
+    between_bad = 0.4
 
     turn_of_splits = 0
     """Number of times that joints got different treatment."""

@@ -40,9 +40,12 @@ class HandScript(Script[Side]):
     step_most = 2.5
     """Seconds of a step of all sides; see :meth:`until_settled`."""
     beside_s = 0.6
+    """Seconds in which a side makes a step while the other one is silent."""
     all_turns = False
     """Whether the second side makes a step alone whenever each does in turn."""
-    """Seconds in which a side makes a step while the other one is silent."""
+    between_bad = 0.15
+    """Seconds in which a hand that a bad command has moved returns, so that the next is not
+    blamed."""
 
     def __init__(self, plan: Plan[Side], report: Callable[[str], None] = lambda text: None) -> None:
         super().__init__(plan, report)
