@@ -1,8 +1,9 @@
-"""Put together what several measurements say about one requirement: one that has two limits, the
-lower of which only warns, or one about several members of a thing that goes wrong as a whole.
+"""Combine the outcomes of the parts of one requirement.
 
-A part is an :class:`~dexkit.conformance.checks.Outcome`. What fails says so first; a part that is
-:attr:`~dexkit.conformance.checks.Outcome.tolerated` only warns; what cannot be judged is left out.
+Some requirements have two limits, of which the stricter only warns, or cover several values that go
+wrong together. Each part is measured by itself and gives an
+:class:`~dexkit.conformance.checks.Outcome`: parts that fail come first, then parts that only warn
+(:attr:`~dexkit.conformance.checks.Outcome.tolerable`); parts that cannot be judged are left out.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ __all__ = ["all_of", "warning"]
 
 
 def warning(part: Outcome, *, unless_claimed: bool = False) -> Outcome:
-    """The part with what it does not meet turned into a warning, whatever the level.
+    """The part, which only warns where it is not met, whatever the requirement's level.
 
     :param unless_claimed: where the vendor claims the requirement's unit, it fails all the same.
     """
     if part.met is not False:
         return part
-    return replace(part, tolerable=True, unless_claimed=unless_claimed)
+    return replace(part.tolerated(), unless_claimed=unless_claimed)
 
 
 def all_of(*parts: Outcome) -> Outcome:
@@ -53,7 +54,7 @@ def all_of(*parts: Outcome) -> Outcome:
         observed=_joined(part.observed for part in worst),
         evidence=tuple(place for part in worst for place in part.evidence),
         values=values,
-        # each place has the delay of its own part, so only the first part's can stay
+        # of several parts, how long each place lasts says how late a good hand had to be
         late=worst[0].late if len(worst) == 1 else None,
         absent=any(part.absent for part in parts),
         joints=tuple(dict.fromkeys(joint for part in worst for joint in part.joints)),

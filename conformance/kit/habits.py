@@ -1,10 +1,9 @@
-"""Habits of a hand, measured over a whole run.
+"""Habits of a hand: what goes wrong in its motion, its grips and its states over a whole run.
 
-One requirement looks at one situation. A joint that begins each step late does so in all of them:
-who reads of one situation alone looks for the cause there. So all plain steps of a joint are put
-together: which go wrong, and how; and where only some do, what those have in common that the others
-have not (goals beyond a place, a rest before, the time since something happened). The same for
-grips, and for the times of states.
+A requirement judges one situation. A joint that begins every step late fails in each of them, and
+the report of a single one sends its reader to the wrong place. So all plain steps of a joint are
+compared: how many go wrong, in which way, and, where only some do, what these have in common (goals
+beyond a place, a rest before, a stretch of the run). Grips and the times of states likewise.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ class Habit:
 class _Step(NamedTuple):
     """A plain step of one joint; ways in strokes.
 
-    :param rest: seconds since the joint was last commanded elsewhere.
+    :param rest: seconds since any joint of the hand last moved.
     :param together: joints of the hand that are commanded to move with it.
     :param late: seconds until it began to move.
     """
@@ -132,20 +131,20 @@ class _Kind(NamedTuple):
 
 
 def habits(recording: Recording, view: SideView) -> Iterator[Habit]:
-    """The habits of motion of one hand, that of most steps first."""
+    """The habits of one hand: grips that fade, a lag behind moving targets, and those of single
+    steps, that of most steps first.
+    """
     steps = _with_slower(list(_steps(recording, view)))
     found = []
     told: set[int] = set()
     for kind in _kinds(recording):
         alike: dict[str, list[_Step]] = {}
-        count: dict[str, int] = {}
         for joint in set(range(len(view.joints))) - told:
             mine = [s for s in steps if s.joint == joint and abs(s.size) >= kind.least]
             wrong = [s for s in mine if kind.wrong(s)]
             when = _common(mine, wrong)
             if when is not None:
                 alike.setdefault(when, []).extend(wrong)
-                count[when] = count.get(when, 0) + len(mine)
         for when, wrong in alike.items():
             found.append(_habit(recording, view, kind, when, wrong, steps))
             told |= {s.joint for s in wrong}
