@@ -60,20 +60,33 @@ def parquet_library() -> tuple[ModuleType, Any]:
     return pyarrow, pyarrow.parquet
 
 
-def read_parquet(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Any:
+def read_parquet(
+    path: Path,
+    wanted: Callable[[str], bool] = lambda _: True,
+    *,
+    episodes: tuple[int, int] | None = None,
+) -> Any:
     """The table in a Parquet file, or those of its columns whose name is wanted.
 
+    :param episodes: the first and the last that are wanted: groups of rows that have none of them,
+        by what the file states, are left out.
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: as :func:`parquet_pieces`.
     """
     arrow, _ = parquet_library()
-    return arrow.concat_tables(list(parquet_pieces(path, wanted)))
+    return arrow.concat_tables(list(parquet_pieces(path, wanted, episodes=episodes)))
 
 
-def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Iterator[Any]:
+def parquet_pieces(
+    path: Path,
+    wanted: Callable[[str], bool] = lambda _: True,
+    *,
+    episodes: tuple[int, int] | None = None,
+) -> Iterator[Any]:
     """The table in a Parquet file, some rows at a time; at least one piece, which may be empty.
 
     :param wanted: whether a column of that name is.
+    :param episodes: as of :func:`read_parquet`.
     :raises ExtraMissing: pyarrow is not installed.
     :raises SessionError: it is missing, no ordinary file, no Parquet, or its rows take more memory
         than its size accounts for: a column that does not change takes next to none in a file.
@@ -94,6 +107,8 @@ def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -
                     raise too_large
                 yield file.schema_arrow.empty_table().select(names)
                 for group in range(file.metadata.num_row_groups):
+                    if episodes and not _may_hold(file.metadata.row_group(group), episodes):
+                        continue
                     # the library ends the process when it is asked about a column that it cannot
                     # read, and raises an error when it reads it
                     if next(file.iter_batches(1, [group]), None) is None:
@@ -112,6 +127,18 @@ def parquet_pieces(path: Path, wanted: Callable[[str], bool] = lambda _: True) -
         except (OSError, ValueError, arrow.lib.ArrowException) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise SessionError(f"{path} cannot be read as Parquet: {reason}") from error
+
+
+def _may_hold(group: Any, episodes: tuple[int, int]) -> bool:
+    """Whether a row group may have rows of these episodes, by its statistics."""
+    for i in range(group.num_columns):
+        column = group.column(i)
+        if column.path_in_schema == "episode_index":
+            stated = column.statistics
+            if stated is None or not stated.has_min_max:
+                return True
+            return bool(stated.min <= episodes[1] and stated.max >= episodes[0])
+    return True
 
 
 def _unpacked(file: Any) -> int:

@@ -113,6 +113,13 @@ class _Task(msgspec.Struct):
     task: str | None = None
 
 
+class _EpisodeStatistics(msgspec.Struct):
+    """A line of ``meta/episodes_stats.jsonl``"""
+
+    episode_index: Count
+    stats: dict[str, Any]
+
+
 class _Episode(msgspec.Struct):
     """A row of the list of episodes; ``videos`` are read as they are needed."""
 
@@ -139,6 +146,8 @@ class Dataset:
     :raises SessionError: it cannot be read, or is of another version.
 
     ``refused`` has the errors of episodes that cannot be listed, by their place in the dataset.
+    ``only`` may be set to the first and last number of the episodes that will be read; other parts
+    of a file are skipped then.
     """
 
     def __init__(self, root: Path, options: Options = DEFAULT) -> None:
@@ -159,7 +168,9 @@ class Dataset:
             raise SessionError(f"{path} has no rate (fps)", hint="state it: --set rate=HZ")
         self.fps = fps
         self.refused: dict[str, SessionError] = {}
-        self._tables: dict[Path, Any] = {}
+        self._tables: dict[tuple[Path, bool], Any] = {}
+        self._statistics: dict[int, dict[str, dict[str, Floats]]] | None = None
+        self.only: tuple[int, int] | None = None
         self._problems: list[str] = []
         self._tasks = self._read_tasks()
         self._rows = self._read_episodes()
@@ -169,16 +180,18 @@ class Dataset:
         """The episodes' numbers."""
         return sorted(self._rows)
 
-    def read(self, episode: int) -> Session:
+    def read(self, episode: int, *, joints_only: bool = False) -> Session:
         """Read one episode.
 
+        :param joints_only: without pictures of the table and other columns, and without looking
+            for swapped hands.
         :raises SessionError: its data are missing or of another form than the features declare.
         """
         problems = Problems()
         for text in self._problems:
             problems.add(text)
         row, _ = self._rows[episode]
-        path, table = self._table(episode, row)
+        path, table = self._table(episode, row, joints_only=joints_only)
         missing = [c for c in ("timestamp", "frame_index") if c not in table.column_names]
         if missing:
             raise SessionError(f"{path} has no column {', '.join(missing)}")
@@ -186,7 +199,8 @@ class Dataset:
             raise SessionError(f"{path} has no frame")
         times = self._times(path, table, problems)
         corrections: list[str] = []
-        parts = list(self._parts(path, table, problems, corrections))
+        features = self._features(path, table, problems)
+        parts = list(self._parts(features, problems, corrections))
         if not parts:
             raise SessionError(
                 f"{path} has no joints: neither observation.state nor action can be used",
@@ -208,7 +222,11 @@ class Dataset:
             corrections=list(dict.fromkeys(corrections)),
             name=f"episode_{episode:06d}",
         )
-        session.rest = self._rest(path, table)
+        session.stamps = _column(table, "timestamp")
+        session.numbers = _column(table, "frame_index")
+        session.features = features
+        if not joints_only:
+            session.rest = self._rest(path, table)
         if (origin := self.info.dexkit.sessions.get(str(episode))) is not None:
             session.times_ns = session.times_ns - times[0] + int(origin.start_ns)
             session.clock = origin.clock
@@ -221,8 +239,75 @@ class Dataset:
         }
         if len(tasks) > 1:
             session.about["note"] = "frames have different tasks: see the column task_index"
-        correct_sides(session, session.form, self.options)
+        if not joints_only:
+            correct_sides(session, session.form, self.options)
         return session
+
+    def data_file(self, episode: int) -> Path:
+        """The Parquet file with the frames of an episode.
+
+        :raises SessionError: the path in ``meta/info.json`` cannot be used.
+        """
+        row, _ = self._rows[episode]
+        values = {
+            "episode_chunk": episode // self.info.chunks_size,
+            "episode_index": episode,
+            "chunk_index": row.chunk,
+            "file_index": row.file,
+        }
+        return self._path("data_path", self.info.data_path, values)
+
+    def video_files(self, episode: int) -> list[Path]:
+        """The video files of an episode, whether they are there or not."""
+        problems = Problems()
+        cameras = self._cameras(episode, self.root, None, problems)
+        return [self.root / camera.paths[0] for camera in cameras if camera.seconds is not None]
+
+    def statistics(self, episode: int) -> dict[str, dict[str, Floats]]:
+        """What the metadata state of an episode's features, or of all episodes (v2.0).
+
+        :returns: by feature and name (``min``, ``max``, ``mean``, ``std``, ``count``) the numbers;
+            what is no list of numbers is left out.
+        """
+        if self._statistics is None:
+            self._statistics = dict(self._read_statistics())
+        return self._statistics.get(episode, {})
+
+    def statistics_of_all(self) -> dict[str, dict[str, Floats]]:
+        """What ``meta/stats.json`` states; empty without it.
+
+        :raises SessionError: it cannot be read.
+        """
+        path = self.root / "meta/stats.json"
+        if not path.is_file():
+            return {}
+        found = parse_record(_read_text(below(self.root, "meta/stats.json")), dict[str, Any], path)
+        return _numbers_of(found)
+
+    def _read_statistics(self) -> Iterator[tuple[int, dict[str, dict[str, Floats]]]]:
+        if self.version == "v2.1":
+            for _, row, _ in self._listed("episodes_stats", _EpisodeStatistics):
+                if not isinstance(row, SessionError):
+                    yield row.episode_index, _numbers_of(row.stats)
+            return
+        for file in sorted((self.root / "meta" / "episodes").glob("*/*.parquet")):
+            name = file.relative_to(self.root).as_posix()
+            try:
+                table = read_parquet(
+                    below(self.root, name), lambda c: c == "episode_index" or _is_statistic(c)
+                )
+                rows = table.to_pylist()
+            except (SessionError, ValueError):
+                continue  # told where the list of episodes is read
+            for row in rows:
+                stated: dict[str, dict[str, Any]] = {}
+                for column, value in row.items():
+                    if _is_statistic(column):
+                        _, _, rest = column.partition("/")
+                        feature, _, what = rest.rpartition("/")
+                        stated.setdefault(feature, {})[what] = value
+                if isinstance(row.get("episode_index"), int):
+                    yield row["episode_index"], _numbers_of(stated)
 
     # -- files ---------------------------------------------------------------------------------
 
@@ -287,21 +372,19 @@ class Dataset:
                 except SessionError as error:
                     yield f"{name}, row {i}", error, {}
 
-    def _open(self, path: Path) -> Any:
-        if path not in self._tables:
+    def _open(self, path: Path, joints_only: bool) -> Any:
+        key = path, joints_only
+        if key not in self._tables:
             self._tables.clear()  # before another one takes as much
-            self._tables[path] = read_parquet(path, lambda name: name != "index")
-        return self._tables[path]
+            left_out = {"index"}
+            if joints_only:
+                left_out |= {k for k, f in self.info.features.items() if f.dtype == "image"}
+            self._tables[key] = read_parquet(path, lambda n: n not in left_out, episodes=self.only)
+        return self._tables[key]
 
-    def _table(self, episode: int, row: _Episode) -> tuple[Path, Any]:
-        values = {
-            "episode_chunk": episode // self.info.chunks_size,
-            "episode_index": episode,
-            "chunk_index": row.chunk,
-            "file_index": row.file,
-        }
-        path = self._path("data_path", self.info.data_path, values)
-        table = self._open(path)
+    def _table(self, episode: int, row: _Episode, *, joints_only: bool = False) -> tuple[Path, Any]:
+        path = self.data_file(episode)
+        table = self._open(path, joints_only)
         if "episode_index" in table.column_names:
             column = table["episode_index"]
             if str(column.type) not in ("int64", "int32"):
@@ -309,7 +392,9 @@ class Dataset:
             where = np.flatnonzero(column.to_numpy(zero_copy_only=False) == episode)
             if not len(where):
                 raise SessionError(f"{path} has no frame of episode {episode}")
-            if len(where) <= MOST_FRAMES:
+            if where[-1] - where[0] < len(where):
+                table = table.slice(where[0], len(where))
+            elif len(where) <= MOST_FRAMES:
                 table = table.take(where)
         if table.num_rows > MOST_FRAMES:
             raise SessionError(f"{path} has more than {MOST_FRAMES} frames of episode {episode}")
@@ -357,27 +442,36 @@ class Dataset:
             problems.add("timestamp is not frame_index / fps; frame_index / fps is used")
         return times + EPOCH_NS
 
-    def _parts(
-        self, path: Path, table: Any, problems: Problems, corrections: list[str]
-    ) -> Iterator[Part]:
-        found: dict[str, tuple[_Group, dict[str, dict[str, Floats]]]] = {}
-        for (kind, field), column in COLUMNS.items():
-            feature = self.info.features.get(column)
-            if column not in table.column_names or feature is None:
+    def _features(self, path: Path, table: Any, problems: Problems) -> dict[str, Floats]:
+        """The columns that hold joints, shape (frames, elements)."""
+        found = {}
+        for column in COLUMNS.values():
+            if column not in table.column_names or column not in self.info.features:
                 continue
             matrix = _matrix(table, column)
             if matrix is None:
                 problems.add(f"{column} is no vector of numbers of one length", path.name)
                 continue
-            names = _names(feature, matrix.shape[1])
+            if not np.isfinite(matrix).all():
+                problems.add(f"{column} has values that are not finite; these frames lack it")
+            found[column] = matrix
+        return found
+
+    def _parts(
+        self, features: Mapping[str, Floats], problems: Problems, corrections: list[str]
+    ) -> Iterator[Part]:
+        found: dict[str, tuple[_Group, dict[str, dict[str, Floats]]]] = {}
+        for (kind, field), column in COLUMNS.items():
+            if column not in features:
+                continue
+            matrix = features[column]
+            names = _names(self.info.features[column], matrix.shape[1])
             if names is None:
                 problems.add(
                     f"{column} has {matrix.shape[1]} elements and another number of names; they "
                     "are numbered"
                 )
                 names = tuple(f"joint_{i}" for i in range(matrix.shape[1]))
-            if not np.isfinite(matrix).all():
-                problems.add(f"{column} has values that are not finite; these frames lack it")
             for group in self._groups(names, problems, corrections):
                 known, values = found.setdefault(group.name, (group, {}))
                 if known.joints != group.joints:
@@ -481,6 +575,7 @@ class Dataset:
     def _cameras(
         self, episode: int, path: Path, table: Any, problems: Problems
     ) -> Iterator[Camera]:
+        """The cameras of an episode; of those with a video, without a table, the first frame."""
         names: dict[str, str] = {}
         for key, feature in self.info.features.items():
             if feature.dtype not in ("video", "image"):
@@ -490,6 +585,8 @@ class Dataset:
                 problems.add(f"{key} is left out: its camera is called {name}, as {names[name]}'s")
             elif feature.dtype == "video":
                 yield from self._video(name, key, episode, path, table, problems)
+            elif table is None:
+                continue
             elif (camera := _embedded(name, key, path, table)) is None:
                 problems.add(f"{name}: its pictures are not in the Parquet file")
             else:
@@ -515,10 +612,13 @@ class Dataset:
         if not file.is_file():
             problems.add(f"{name}: its video is missing", file.name)
         first = typed(row.get(f"videos/{key}/from_timestamp"), _Seconds) or 0.0
+        relative = file.relative_to(self.root.resolve()).as_posix()
+        if table is None:
+            yield Camera(name, (relative,), seconds=(first,))
+            return
         stamps = _column(table, "timestamp")
         if stamps is None:
             stamps = np.arange(table.num_rows) / self.fps
-        relative = file.relative_to(self.root.resolve()).as_posix()
         yield Camera(name, (relative,) * table.num_rows, seconds=tuple((first + stamps).tolist()))
 
     def _rest(self, path: Path, table: Any) -> list[str]:
@@ -566,6 +666,21 @@ def _embedded(name: str, key: str, path: Path, table: Any) -> Camera | None:
         return None
     paths = tuple(f"frame {i}" for i in range(len(data)))
     return Camera(name, paths, load=lambda i: data[i] if isinstance(data[i], bytes) else None)
+
+
+def _is_statistic(column: str) -> bool:
+    """Whether it is a column of the list of episodes with a statistic of their joints."""
+    return column.startswith("stats/") and not column.startswith(f"stats/{PICTURES}")
+
+
+def _numbers_of(stats: Mapping[str, Any]) -> dict[str, dict[str, Floats]]:
+    found: dict[str, dict[str, Floats]] = {}
+    for feature, values in stats.items():
+        for name, value in (values if isinstance(values, dict) else {}).items():
+            numbers = typed(value, list[float]) if isinstance(value, list) else None
+            if numbers is not None and len(numbers) <= MOST_JOINTS:
+                found.setdefault(feature, {})[name] = np.array(numbers)
+    return found
 
 
 def _read_text(path: Path) -> str:

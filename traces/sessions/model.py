@@ -141,6 +141,9 @@ class Session:
     :param about: further facts for the metadata record.
     :param corrections: what was changed and why.
     :param problems: what could not be imported.
+    :param stamps: the times of the frames as the source has them, s, shape (frames,); None without.
+    :param numbers: the numbers that it gives its frames, likewise.
+    :param features: of a dataset, its columns of joints by name, shape (frames, elements).
     """
 
     source: Path
@@ -158,6 +161,9 @@ class Session:
     problems: Problems = field(default_factory=Problems)
     name: str = ""
     below: str = "."
+    stamps: Floats | None = None
+    numbers: Floats | None = None
+    features: Mapping[str, Floats] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.times_ns)

@@ -1,0 +1,105 @@
+"""Judge an episode by every check for which it has the data."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dexkit.conformance.dataset.check import Check, Figure, data_of
+from dexkit.conformance.dataset.checks import metadata
+from dexkit.conformance.dataset.episode import Episode, Track
+from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_of
+from dexkit.conformance.dataset.motion import span
+from dexkit.hand import Floats
+
+__all__ = ["CHECKS", "judge"]
+
+CHECKS: tuple[Check, ...] = (*metadata.CHECKS,)
+"""Every check of a single episode."""
+
+Frames = NDArray[np.intp]
+
+_CURVES = 3  # findings of an episode with a picture of the moment
+_POINTS = 160  # of a curve
+_AROUND = 1.0  # s that a curve shows before and after its finding
+_SHAPE = 32  # numbers that describe a motion
+
+
+def judge(episode: Episode) -> Judgement:
+    """The verdict on an episode; a check for which it lacks the data is left out."""
+    there = data_of(episode)
+    findings: list[Finding] = []
+    figures = {"length, s": round(episode.duration, 3)}
+    judged = []
+    for check in CHECKS:
+        if not check.needs <= there:
+            continue
+        judged.append(check.name)
+        for found in check.run(episode):
+            if isinstance(found, Figure):
+                figures[found.name] = round(found.value, 6)
+            else:
+                findings.append(found)
+    result = Judgement(use_of(findings), findings, [], figures, judged)
+    reasons = [findings.index(f) for f in result.reasons[:_CURVES]]
+    result.curves = [c for i in reasons if (c := _curve(episode, i, findings[i])) is not None]
+    result.key, result.shape = _key(episode), _shape(episode)
+    return result
+
+
+def _curve(episode: Episode, number: int, finding: Finding) -> Curve | None:
+    """The joint of a finding that moves most, around the finding."""
+    track = next((t for t in episode.tracks if t.part == finding.part), None)
+    if track is None:
+        return None
+    begin = 0.0 if finding.begin_s is None else finding.begin_s - _AROUND
+    end = episode.duration if finding.end_s is None else finding.end_s + _AROUND
+    inside = np.flatnonzero((episode.t >= begin) & (episode.t <= end))
+    if len(inside) < 2:
+        return None
+    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _POINTS).astype(int))]
+    joint = _joint_to_show(track, finding, chosen)
+    return Curve(
+        number,
+        track.joints[joint],
+        "" if track.model is None else track.model.unit,
+        [round(float(v), 3) for v in episode.t[chosen]],
+        _thin(track.state, chosen, joint),
+        _thin(track.action, chosen, joint),
+    )
+
+
+def _joint_to_show(track: Track, finding: Finding, frames: Frames) -> int:
+    values = [v for v in (track.action, track.state) if v is not None]
+    moved: Floats = np.sum([span(v[frames]) for v in values], axis=0)
+    among = [j for j in finding.joints if j < len(moved)] or list(range(len(moved)))
+    return max(among, key=lambda j: moved[j])
+
+
+def _thin(values: Floats | None, frames: Frames, joint: int) -> list[float | None]:
+    if values is None:
+        return []
+    return [round(float(v), 4) if np.isfinite(v) else None for v in values[frames, joint]]
+
+
+def _key(episode: Episode) -> str:
+    """A digest of the positions; equal for equal data, whatever the frames are called."""
+    digest = hashlib.sha256()
+    for track in sorted(episode.tracks, key=lambda t: t.part):
+        for values in (track.state, track.action):
+            digest.update(b"-" if values is None else np.float32(values).tobytes())
+    return digest.hexdigest()
+
+
+def _shape(episode: Episode) -> list[float]:
+    """The motion in few numbers: each is the sum over all joints at a part of the episode."""
+    values = [v for t in episode.tracks for v in (t.action, t.state) if v is not None]
+    if not values or len(episode) < _SHAPE:
+        return []
+    table = np.nan_to_num(np.concatenate(values, axis=1))
+    at = np.linspace(0, len(table) - 1, _SHAPE)
+    weights = np.cos(np.arange(table.shape[1]) * 2.3999632)  # no two joints count alike
+    mixed = table @ weights
+    return [round(float(v), 4) for v in np.interp(at, np.arange(len(mixed)), mixed)]
