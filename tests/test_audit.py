@@ -12,14 +12,14 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from dexkit.cli import main
-from dexkit.conformance.audit import objects, sessions
+from dexkit.conformance.audit import objects
 from dexkit.conformance.audit.audit import Audit, AuditProgress, in_this_process
 from dexkit.conformance.audit.examine import Task, examine
-from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.journal import Journal
-from dexkit.conformance.audit.result_tables import FILE, FINDINGS, have_parquet
-from dexkit.conformance.audit.sessions import SessionFile, find
+from dexkit.conformance.audit.records import EpisodeRecord, Finding, State
+from dexkit.conformance.audit.result_tables import EPISODE, FINDINGS, have_parquet
 from dexkit.conformance.audit.summary_page import Summary, render
+from dexkit.conformance.audit.units import Unit, find
 from dexkit.conformance.audit.workers import Pool, WorkerLost
 from dexkit.conformance.kit.decoding import recording_of
 from dexkit.conformance.kit.judge import judge
@@ -47,7 +47,14 @@ def small(path: Path, count: int = 40) -> Path:
     return path
 
 
-def audited(folder: Path, out: Path, **options: Any) -> tuple[AuditProgress, dict[str, FileRecord]]:
+def examined(unit: Unit, known: str = "", max_size: int = 2**33) -> EpisodeRecord:
+    (record,) = examine(Task((unit,), known, max_size))
+    return record
+
+
+def audited(
+    folder: Path, out: Path, **options: Any
+) -> tuple[AuditProgress, dict[str, EpisodeRecord]]:
     outcome = Audit([str(folder)], out, **options).run(in_this_process)
     with Journal(out / "journal.jsonl") as journal:
         found = [journal.read(entry) for entry in journal.entries.values()]
@@ -56,7 +63,7 @@ def audited(folder: Path, out: Path, **options: Any) -> tuple[AuditProgress, dic
 
 def test_a_file_gets_the_verdicts_of_dexkit_check(tmp_path: Path) -> None:
     path = copied(tmp_path, "a.mcap", "dex1_hand_dropout")
-    found = examine(Task(SessionFile("a.mcap", str(path), path.stat().st_size, "1")))
+    found = examined(Unit("a.mcap", str(path), path.stat().st_size, "1"))
     result = judge(recording_of(open_trace(path), None, ()))
     assert found.state is State.JUDGED
     assert (found.overall, found.exit_code) == (str(result.overall), result.exit_code())
@@ -70,7 +77,7 @@ def test_a_file_gets_the_verdicts_of_dexkit_check(tmp_path: Path) -> None:
     assert failure.requirement == "DEX1-RATE-03"
     assert failure.evidence_s == pytest.approx(9.496, abs=0.01)
     assert failure.value > failure.limit
-    assert FileRecord.of_line(found.as_line()) == found
+    assert EpisodeRecord.of_line(found.as_line()) == found
 
 
 def test_unusable_file_becomes_a_row(tmp_path: Path) -> None:
@@ -129,15 +136,15 @@ def test_tables_have_a_row_for_each_file_and_finding(tmp_path: Path) -> None:
     audited(tmp_path / "archive", out, parquet=False)
     lines = {
         name: [json.loads(line) for line in (out / f"{name}.jsonl").open()]
-        for name in ("files", "findings")
+        for name in ("episodes", "findings")
     }
-    b, a = lines["files"]
-    assert list(a) == list(FILE)
+    b, a = lines["episodes"]
+    assert list(a) == list(EPISODE)
     assert (a["operator"], a["state"], b["state"]) == ("ann", "judged", "unreadable")
     assert {f["side"] for f in lines["findings"]} == {"left"}
     assert all(list(f) == list(FINDINGS) for f in lines["findings"])
     with Journal(out / "journal.jsonl") as journal:
-        assert len(lines["findings"]) == len(journal.read(journal.entries[a["file"]]).findings)
+        assert len(lines["findings"]) == len(journal.read(journal.entries[a["episode"]]).findings)
     if not have_parquet():
         with pytest.raises(UsageError, match="pyarrow"):
             audited(tmp_path / "archive", out, parquet=True)
@@ -183,7 +190,7 @@ def test_unchanged_files_are_not_judged_again(
     assert run() == (0, ["a.mcap", "b.mcap"])
     paths[1].unlink()
     assert run() == (1, [])
-    tables = out / ("files.parquet" if have_parquet() else "files.jsonl")
+    tables = out / ("episodes.parquet" if have_parquet() else "episodes.jsonl")
     assert b"b.mcap" not in tables.read_bytes()
 
 
@@ -200,11 +207,11 @@ def test_a_stop_leaves_a_partial_result_that_the_next_audit_completes(tmp_path: 
     audit = Audit([str(archive)], out, parquet=False)
     outcome = audit.run(in_this_process, stop, after_two)
     assert (outcome.done, outcome.total, outcome.stopped) == (2, 3, True)
-    assert len((out / "files.jsonl").read_text().splitlines()) == 2
+    assert len((out / "episodes.jsonl").read_text().splitlines()) == 2
     assert "1 file not examined" in (out / "summary.html").read_text()
     outcome = audit.run(in_this_process)
     assert (outcome.done, outcome.reused, outcome.stopped) == (3, 2, False)
-    assert len((out / "files.jsonl").read_text().splitlines()) == 3
+    assert len((out / "episodes.jsonl").read_text().splitlines()) == 3
 
 
 def test_two_audits_cannot_share_a_journal(tmp_path: Path) -> None:
@@ -246,12 +253,9 @@ def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(type(memory), "cat_file", given)
     try:
         found = list(find("memory://archive"))
-        records = {
-            Path(s.name).stem: examine(Task(s, max_size=len(data)))
-            for s in found
-            if isinstance(s, SessionFile)
-        }
-        again = [examine(Task(s, records["good"].sha256)) for s in found if "good" in s.name]  # type: ignore[union-attr]
+        units = [s for s in found if isinstance(s, Unit)]
+        records = {Path(s.name).stem: examined(s, max_size=len(data)) for s in units}
+        again = [examined(s, records["good"].sha256) for s in units if "good" in s.name]
     finally:
         memory.rm("/archive", recursive=True)
     assert {name: str(r.state) for name, r in records.items()} == {
@@ -263,14 +267,14 @@ def test_objects_behind_a_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         "flaky": "judged",
         "replaced": "unavailable",
     }
-    local = examine(Task(SessionFile("x", str(tmp_path / "local.mcap"), len(data), "")))
+    local = examined(Unit("x", str(tmp_path / "local.mcap"), len(data), ""))
     assert records["good"].findings == local.findings
     assert records["good"].sha256 == local.sha256
     assert records["broken"].error == "RuntimeError: the storage has a fault"
     assert not again[0].findings
-    assert all(isinstance(s, SessionFile) and s.tag for s in found)
+    assert all(isinstance(s, Unit) and s.tag for s in found)
     (missing,) = find("memory://nowhere")
-    assert isinstance(missing, FileRecord)
+    assert isinstance(missing, EpisodeRecord)
     assert missing.state is State.GONE
     with pytest.raises(UsageError, match="nosuch"):
         list(find("nosuch://a"))
@@ -285,7 +289,7 @@ def test_exception_in_the_judging_becomes_a_row(
         raise KeyError("a mistake")
 
     monkeypatch.setattr("dexkit.conformance.audit.examine.judge", wrong)
-    found = examine(Task(SessionFile("a", str(path), 1, "1")))
+    found = examined(Unit("a", str(path), 1, "1"))
     assert (found.state, found.exit_code) == (State.FAILED, 2)
     assert "KeyError: 'a mistake'" in found.error
     assert not found.state.final
@@ -315,10 +319,10 @@ def test_files_that_cannot_be_examined_are_tried_again(tmp_path: Path) -> None:
 
     outcome = audit.run(lose)
     assert (outcome.done, outcome.unusable, outcome.exit_code()) == (1, 1, 2)
-    assert "its process died" in (tmp_path / "out/files.jsonl").read_text()
+    assert "its process died" in (tmp_path / "out/episodes.jsonl").read_text()
     outcome = audit.run(in_this_process)
     assert outcome.reused == 0
-    assert "INCONCLUSIVE" in (tmp_path / "out/files.jsonl").read_text()
+    assert "INCONCLUSIVE" in (tmp_path / "out/episodes.jsonl").read_text()
 
 
 def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
@@ -328,7 +332,7 @@ def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
             row = ["hand", "DEX1-RATE-03", "MUST", "drop-in", "left", verdict, "", "a gap"]
             finding = to_record([*row, "", "", None, None, "", "", None, None], Finding, "it")
             summary.add(
-                FileRecord(
+                EpisodeRecord(
                     f"{day}/{name}.mcap",
                     state=State.JUDGED,
                     overall="fail" if day > 2 and verdict == "fail" else "pass",
@@ -366,14 +370,14 @@ def test_command_writes_tables_page_and_exit_code(
 
     code, text = run("archive", "--jobs", "1", "--set", "format=jsonl")
     assert code == 1
-    assert "2 of 2 files" in text
-    lines = (tmp_path / "audit-out/files.jsonl").read_text().splitlines()
-    assert [json.loads(line)["file"] for line in lines] == ["archive/a.mcap", "archive/b.mcap"]
+    assert "2 of 2 episodes" in text
+    lines = (tmp_path / "audit-out/episodes.jsonl").read_text().splitlines()
+    assert [json.loads(line)["episode"] for line in lines] == ["archive/a.mcap", "archive/b.mcap"]
     code, text = run("archive", "--set", "format=jsonl", "--fail-on", "never")
     assert (code, "2 unchanged" in text) == (0, True)
     (tmp_path / "none").mkdir()
     code, text = run("none")
-    assert (code, "no session" in text) == (2, True)
+    assert (code, "no episode" in text) == (2, True)
     code, text = run("nowhere")
     assert code == 2
 
@@ -381,7 +385,7 @@ def test_command_writes_tables_page_and_exit_code(
 def test_without_fsspec_a_url_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "fsspec", None)
     with pytest.raises(DexkitError, match="needs fsspec"):
-        list(sessions.find("s3://bucket"))
+        list(find("s3://bucket"))
 
 
 @pytest.mark.soak

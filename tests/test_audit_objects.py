@@ -20,9 +20,9 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from dexkit.conformance.audit import objects
 from dexkit.conformance.audit.examine import Task, examine
-from dexkit.conformance.audit.file_records import FileRecord, State
 from dexkit.conformance.audit.objects import Object, RangeFile
-from dexkit.conformance.audit.sessions import SessionFile, find
+from dexkit.conformance.audit.records import EpisodeRecord, State
+from dexkit.conformance.audit.units import Unit, find
 from dexkit.traces import sample_path
 
 SAMPLE = "dex1_legacy_v1_1"
@@ -65,8 +65,8 @@ def test_an_object_that_is_not_copied_gets_the_same_record(memory: MemoryFileSys
     memory.pipe("/ranges/a.mcap", data)
     memory.pipe("/ranges/cut.mcap", data[: len(data) // 2])
     for session in find("memory://ranges"):
-        assert isinstance(session, SessionFile)
-        copied, in_place = examine(Task(session)), examine(Task(session, max_size=100))
+        assert isinstance(session, Unit)
+        copied, in_place = examine(Task((session,)))[0], examine(Task((session,), max_size=100))[0]
         for record in (copied, in_place):
             assert record.state is State.JUDGED
             del record.facts["cpu_s"]
@@ -131,8 +131,8 @@ def test_audit_reads_objects_of_a_web_server(tmp_path: Path, ranges: bool) -> No
             for most in (2**30, 1000):
                 records = {
                     Path(s.name).stem: s
-                    if isinstance(s, FileRecord)
-                    else examine(Task(s, max_size=most))
+                    if isinstance(s, EpisodeRecord)
+                    else examine(Task((s,), max_size=most))[0]
                     for s in found
                 }
                 states = {name: str(r.state) for name, r in records.items()}
@@ -179,18 +179,22 @@ def test_audit_reads_objects_of_an_s3_bucket(monkeypatch: pytest.MonkeyPatch) ->
             files.pipe_file(f"archive/day/{name}.mcap", data)
         found = list(find("s3://archive"))
         assert [s.name for s in found] == [f"s3://archive/day/{n}.mcap" for n in "ab"]
-        a, b = (s for s in found if isinstance(s, SessionFile))
+        a, b = (s for s in found if isinstance(s, Unit))
         assert a.tag == b.tag != ""
         files.rm_file("archive/day/b.mcap")
-        records = [examine(Task(a)), examine(Task(a, max_size=1000)), examine(Task(b))]
+        records = [
+            examine(Task((a,)))[0],
+            examine(Task((a,), max_size=1000))[0],
+            examine(Task((b,)))[0],
+        ]
         assert [str(r.state) for r in records] == ["judged", "judged", "gone"]
         assert records[0].findings == records[1].findings
         (nothing,) = find("s3://nobodys")
-        assert isinstance(nothing, FileRecord)
+        assert isinstance(nothing, EpisodeRecord)
         assert nothing.state is State.GONE
         monkeypatch.setattr(s3fs.S3FileSystem, "find", _denied)
         (denied,) = find("s3://archive")
-        assert isinstance(denied, FileRecord)
+        assert isinstance(denied, EpisodeRecord)
         assert denied.state is State.REFUSED
     finally:
         server.stop()

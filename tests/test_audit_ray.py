@@ -20,8 +20,8 @@ import pytest
 
 from dexkit.conformance.audit.audit import Audit, AuditProgress, Limits, in_this_process
 from dexkit.conformance.audit.cluster import Cluster as RayCluster
-from dexkit.conformance.audit.file_records import FileRecord
 from dexkit.conformance.audit.journal import Journal
+from dexkit.conformance.audit.records import EpisodeRecord
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.traces import sample_path
 
@@ -111,7 +111,7 @@ def archive(folder: Path) -> Path:
     return folder
 
 
-def records(out: Path) -> dict[str, FileRecord]:
+def records(out: Path) -> dict[str, EpisodeRecord]:
     """The records, and that no file has two."""
     lines = (out / "journal.jsonl").read_text().splitlines()[1:]
     with Journal(out / "journal.jsonl") as journal:

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from dexkit.conformance.audit.examine import Task, examine, settings_key
-from dexkit.conformance.audit.file_records import FileRecord
+from dexkit.conformance.audit.records import EpisodeRecord
 from dexkit.conformance.audit.workers import WorkerLost
 from dexkit.errors import ConformanceError, UsageError
 from dexkit.escaping import one_line
@@ -88,8 +88,8 @@ class Cluster:
 
     def run(
         self, tasks: Iterable[Task], stop: object
-    ) -> Iterator[tuple[Task, FileRecord | WorkerLost]]:
-        """Examine files until a stop request is true; yields each once, in any order."""
+    ) -> Iterator[tuple[Task, list[EpisodeRecord] | WorkerLost]]:
+        """Examine episodes until a stop request is true; yields each once, in any order."""
         ray, waiting = self._ray, iter(tasks)
         pending: dict[Any, Task] = {}
         exhausted = False
@@ -102,7 +102,7 @@ class Cluster:
                     if task is None:
                         exhausted = True
                         break
-                    settings = settings_key()
+                    settings = settings_key(task.cameras)
                     reference = self._examine.remote(
                         task, settings, self._limits.seconds, self._limits.memory
                     )
@@ -118,10 +118,10 @@ class Cluster:
                     ray.cancel(reference, force=True)
             self.close()
 
-    def _result(self, reference: Any) -> FileRecord | WorkerLost:
+    def _result(self, reference: Any) -> list[EpisodeRecord] | WorkerLost:
         ray = self._ray
         try:
-            found: FileRecord | WorkerLost = ray.get(reference)
+            found: list[EpisodeRecord] | WorkerLost = ray.get(reference)
         except ray.exceptions.RayTaskError as error:
             return WorkerLost(
                 f"a node of the cluster cannot do it: {one_line(str(error.cause), 500)}"
@@ -160,12 +160,14 @@ class _TooLong(BaseException):
     """Ends a task; no handler of errors catches it."""
 
 
-def _examine(task: Task, settings: str, seconds: float, memory: int) -> FileRecord | WorkerLost:
-    """Examine a file in a process of the cluster.
+def _examine(
+    task: Task, settings: str, seconds: float, memory: int
+) -> list[EpisodeRecord] | WorkerLost:
+    """Examine episodes in a process of the cluster.
 
     :param settings: those of the audit; a node with another dexkit would judge differently.
     """
-    mine = settings_key()
+    mine = settings_key(task.cameras)
     if mine != settings:
         raise RuntimeError(
             f"its dexkit or catalogue differs from the audit's ({mine}, not {settings})"

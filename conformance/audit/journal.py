@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dexkit.conformance.audit.file_records import FORMAT, VERSION, FileRecord, State
+from dexkit.conformance.audit.records import FORMAT, VERSION, EpisodeRecord, State
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error
 
@@ -86,13 +86,13 @@ class Journal:
                 try:
                     if not line.endswith(b"\n"):
                         raise ValueError("cut")
-                    self._note(FileRecord.of_line(line), self._end, len(line))
+                    self._note(EpisodeRecord.of_line(line), self._end, len(line))
                 except ValueError:
                     break  # what follows a cut line was not written by this program
                 self._end += len(line)
         self._truncate(self._end)
 
-    def _note(self, record: FileRecord, at: int, length: int) -> None:
+    def _note(self, record: EpisodeRecord, at: int, length: int) -> None:
         key = (record.size, record.tag, record.sha256, record.settings, record.state)
         self.entries[record.name] = Entry(at, length, *key)
 
@@ -112,7 +112,7 @@ class Journal:
             raise output_error(self.path, error) from error
         self._end += len(line)
 
-    def add(self, record: FileRecord) -> None:
+    def add(self, record: EpisodeRecord) -> None:
         """Keep a record, in place of an older one of the same file.
 
         :raises OutputError: it cannot be written.
@@ -122,11 +122,11 @@ class Journal:
         self._append(line)
         self._note(record, at, len(line))
 
-    def read(self, entry: Entry) -> FileRecord:
+    def read(self, entry: Entry) -> EpisodeRecord:
         """The record of an entry."""
-        return FileRecord.of_line(os.pread(self._file.fileno(), entry.length, entry.at))
+        return EpisodeRecord.of_line(os.pread(self._file.fileno(), entry.length, entry.at))
 
-    def records(self, names: Iterable[str]) -> Iterator[FileRecord]:
+    def records(self, names: Iterable[str]) -> Iterator[EpisodeRecord]:
         """The records of these files, one at a time; those that are not done are left out."""
         for name in names:
             if name in self.entries:

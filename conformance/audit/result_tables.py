@@ -1,7 +1,8 @@
 """Write the rows of an audit: Parquet where pyarrow is installed, else lines of JSON.
 
-Two tables, written in one step each: ``files`` with a row for each file, ``findings`` with a row
-for each file, requirement and side. Rows are written as they are read, some files at a time.
+Two tables, written in one step each: ``episodes`` with a row for each episode and each dataset as a
+whole, ``findings`` with a row for each finding about training, and each requirement and side.
+Rows are written as they are read, some episodes at a time.
 """
 
 from __future__ import annotations
@@ -13,17 +14,28 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
-from dexkit.conformance.audit.file_records import FileRecord, Finding
+from dexkit.conformance.audit.records import EpisodeRecord, Finding
+from dexkit.conformance.dataset.findings import Finding as TrainingFinding
+from dexkit.conformance.dataset.findings import Judgement
 from dexkit.documents import write_file
 from dexkit.errors import UsageError
 from dexkit.escaping import output_error
 from dexkit.staging import whole_file
 
-__all__ = ["FILE", "FINDINGS", "have_parquet", "write_tables"]
+__all__ = ["EPISODE", "FINDINGS", "have_parquet", "write_tables"]
 
-FILE: dict[str, type] = {
-    "file": str,
+EPISODE: dict[str, type] = {
+    "episode": str,
+    "source": str,
+    "number": str,
+    "form": str,
+    "is_set": bool,
+    "verdict": str,
+    "reasons": str,
+    "figures": str,
+    "judged": str,
     "size": int,
     "tag": str,
     "sha256": str,
@@ -54,14 +66,23 @@ FILE: dict[str, type] = {
     "sides": str,
     "notes": str,
 }
-"""Columns of ``files``; the last four are JSON."""
-_OF_FILE = ("file", "sha256", "dexkit", "catalogue", "model", "dialect", "recorded_at")
+"""Columns of ``episodes``; ``reasons``, ``figures``, ``judged`` and the last four are JSON."""
+_OF_EPISODE = (
+    "episode",
+    "source",
+    "sha256",
+    "dexkit",
+    "catalogue",
+    "model",
+    "dialect",
+    "recorded_at",
+)
 FINDINGS: dict[str, type] = {
-    **{name: FILE[name] for name in _OF_FILE},
+    **{name: EPISODE[name] for name in _OF_EPISODE},
     **{f.name: float if f.type == float | None else str for f in msgspec.structs.fields(Finding)},
 }
 """Columns of ``findings``."""
-_BATCH = 200  # files whose rows are held at once
+_BATCH = 200  # episodes whose rows are held at once
 
 
 def have_parquet() -> bool:
@@ -73,8 +94,9 @@ def have_parquet() -> bool:
     return True
 
 
-def file_row(record: FileRecord) -> dict[str, Any]:
-    """The row of a file in ``files``."""
+def episode_row(record: EpisodeRecord) -> dict[str, Any]:
+    """The row of an episode in ``episodes``."""
+    judgement = record.judgement or Judgement()
     facts = record.facts
     verdicts = [str(v) for v in record.verdicts().values()]
     states = [side["states"] for side in facts.get("sides", {}).values()]
@@ -87,7 +109,13 @@ def file_row(record: FileRecord) -> dict[str, Any]:
         **{name: facts.get(name, "") for name in ("model", "dialect", "layer", "recorded_at")},
         **{name: facts.get(name) for name in ("duration_s", "messages", "truncated")},
         **{name: labels.get(name, "") for name in ("robot", "operator")},
-        "file": record.name,
+        **{name: getattr(record, name) for name in ("source", "form", "is_set")},
+        "episode": record.name,
+        "number": record.episode,
+        "verdict": record.use,
+        "reasons": json.dumps([structs.asdict(f) for f in judgement.reasons]),
+        "figures": json.dumps(judgement.figures),
+        "judged": json.dumps(judgement.judged),
         "state": str(record.state),
         "damaged": bool(facts.get("damage")),
         "longest_gap_s": max(gaps, default=None),
@@ -102,15 +130,36 @@ def file_row(record: FileRecord) -> dict[str, Any]:
     }
 
 
-def finding_rows(record: FileRecord) -> list[dict[str, Any]]:
-    """The rows of a file in ``findings``."""
-    row = file_row(record)
-    about = {name: row[name] for name in _OF_FILE}
-    return [{**about, **finding.as_row()} for finding in record.findings]
+def finding_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
+    """The rows of an episode in ``findings``."""
+    row = episode_row(record)
+    about = {name: row[name] for name in _OF_EPISODE}
+    training = [] if record.judgement is None else record.judgement.findings
+    rows = [*map(_training_row, training), *(finding.as_row() for finding in record.findings)]
+    return [{**found, **about} for found in rows]
+
+
+def _training_row(finding: TrainingFinding) -> dict[str, Any]:
+    """A finding about training in the columns of a requirement: its check, part and use are the
+    requirement, side and verdict.
+    """
+    return {
+        **{name: None if kind is float else "" for name, kind in FINDINGS.items()},
+        "about": "training",
+        "requirement": finding.check,
+        "side": finding.part,
+        "verdict": str(finding.use),
+        "observed": finding.text,
+        "value": finding.value,
+        "limit": finding.limit,
+        "unit": finding.unit,
+        "evidence_s": finding.begin_s,
+        "evidence_end_s": finding.end_s,
+    }
 
 
 def write_tables(
-    folder: Path, records: Callable[[], Iterator[FileRecord]], *, parquet: bool | None = None
+    folder: Path, records: Callable[[], Iterator[EpisodeRecord]], *, parquet: bool | None = None
 ) -> list[Path]:
     """Write both tables.
 
@@ -125,7 +174,7 @@ def write_tables(
     suffix, stale = (".parquet", ".jsonl") if parquet else (".jsonl", ".parquet")
     written = []
     for name, columns, rows in (
-        ("files", FILE, lambda r: [file_row(r)]),
+        ("episodes", EPISODE, lambda r: [episode_row(r)]),
         ("findings", FINDINGS, finding_rows),
     ):
         path = folder / f"{name}{suffix}"
@@ -139,17 +188,19 @@ def write_tables(
     return written
 
 
-_Rows = Callable[[FileRecord], list[dict[str, Any]]]
+_Rows = Callable[[EpisodeRecord], list[dict[str, Any]]]
 
 
-def _lines(columns: dict[str, type], rows: _Rows, records: Iterator[FileRecord]) -> Iterator[bytes]:
+def _lines(
+    columns: dict[str, type], rows: _Rows, records: Iterator[EpisodeRecord]
+) -> Iterator[bytes]:
     for record in records:
         lines = [json.dumps({name: row[name] for name in columns}) for row in rows(record)]
         yield "".join(f"{line}\n" for line in lines).encode()
 
 
 def _write_parquet(
-    path: Path, columns: dict[str, type], rows: _Rows, records: Iterator[FileRecord]
+    path: Path, columns: dict[str, type], rows: _Rows, records: Iterator[EpisodeRecord]
 ) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -169,8 +220,8 @@ def _write_parquet(
         raise output_error(path, error) from error
 
 
-def _batches(records: Iterator[FileRecord]) -> Iterator[list[FileRecord]]:
-    batch: list[FileRecord] = []
+def _batches(records: Iterator[EpisodeRecord]) -> Iterator[list[EpisodeRecord]]:
+    batch: list[EpisodeRecord] = []
     for record in records:
         batch.append(record)
         if len(batch) == _BATCH:

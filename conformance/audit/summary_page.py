@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dexkit import __version__
-from dexkit.conformance.audit.file_records import FileRecord, State
+from dexkit.conformance.audit.records import EpisodeRecord, State
 from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import Overall, Verdict
 from dexkit.conformance.kit.run_record import catalogue_digest
@@ -42,7 +42,7 @@ class Group:
     seconds: float = 0.0
     failures: Counter[str] = field(default_factory=Counter)
 
-    def add(self, record: FileRecord, failed: Iterable[str]) -> None:
+    def add(self, record: EpisodeRecord, failed: Iterable[str]) -> None:
         """Count a file."""
         self.files += 1
         self.failing += record.failed
@@ -84,8 +84,10 @@ class Summary:
         self._worst: list[tuple[tuple[int, int, int], int, _Line]] = []
         self._count = 0
 
-    def add(self, record: FileRecord) -> None:
-        """Count a file."""
+    def add(self, record: EpisodeRecord) -> None:
+        """Count an episode."""
+        if record.is_set:
+            return
         facts = record.facts
         verdicts = record.verdicts()
         failed = [name for name, verdict in verdicts.items() if verdict is Verdict.FAIL]
@@ -109,14 +111,14 @@ class Summary:
             self.days.setdefault(day, Group()).add(record, failed)
         self._rank(record, failed)
 
-    def _group_names(self, record: FileRecord) -> list[tuple[str, str]]:
+    def _group_names(self, record: EpisodeRecord) -> list[tuple[str, str]]:
         found = [(key, value) for key, value in record.facts.get("labels", {}).items()]
         if dialect := record.facts.get("dialect"):
             found.append(("dialect", dialect))
         folder = record.name.rpartition("/")[0]
         return [*found, ("folder", folder)] if folder else found
 
-    def _rank(self, record: FileRecord, failed: Sequence[str]) -> None:
+    def _rank(self, record: EpisodeRecord, failed: Sequence[str]) -> None:
         badness = record.sort_key
         if badness == (0, 0, 0):
             return
@@ -171,10 +173,17 @@ def _where(facts: Mapping[str, Any]) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def render(summary: Summary, *, locations: Sequence[str], left: int = 0) -> str:
+def render(
+    summary: Summary,
+    *,
+    locations: Sequence[str],
+    left: int = 0,
+    commands: Sequence[tuple[str, str]] = (),
+) -> str:
     """The page as text.
 
-    :param left: files that were not examined, because the audit was stopped.
+    :param commands: what makes the cleaned sets: caption and command line.
+    :param left: episodes that were not examined, because the audit was stopped.
     """
     css, answer = _answer(summary, left)
     days = sorted(summary.days)

@@ -14,10 +14,12 @@ from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_o
 from dexkit.conformance.dataset.motion import span
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "judge"]
+__all__ = ["CHECKS", "VERSION", "checks_digest", "judge"]
 
 CHECKS: tuple[Check, ...] = (*metadata.CHECKS,)
 """Every check of a single episode."""
+VERSION = 1
+"""Goes up when a check judges differently; an audit then judges again."""
 
 Frames = NDArray[np.intp]
 
@@ -25,6 +27,11 @@ _CURVES = 3  # findings of an episode with a picture of the moment
 _POINTS = 160  # of a curve
 _AROUND = 1.0  # s that a curve shows before and after its finding
 _SHAPE = 32  # numbers that describe a motion
+
+
+def checks_digest() -> str:
+    """What verdicts depend on besides the episode: the checks and their version."""
+    return f"{VERSION} " + " ".join(check.name for check in CHECKS)
 
 
 def judge(episode: Episode) -> Judgement:

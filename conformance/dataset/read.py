@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,19 @@ from dexkit.errors import SessionError
 from dexkit.hand import Floats
 from dexkit.models import MODELS
 from dexkit.traces.reader import Trace
+from dexkit.traces.sessions.episodes import Options, read_episode
 from dexkit.traces.sessions.imported import MEASURED, import_record
 from dexkit.traces.sessions.lerobot_in import Dataset
 from dexkit.traces.sessions.model import Part, Session
 from dexkit.traces.sessions.resample import gap_of, hold, interpolate
 from dexkit.traces.sessions.streams import COMMAND, STATE, Stream, pressures_of, streams_of
 
-__all__ = ["episode_of_dataset", "episode_of_recording", "episode_of_session"]
+__all__ = [
+    "episode_of_dataset",
+    "episode_of_recording",
+    "episode_of_session",
+    "read_quickly",
+]
 
 _FASTEST = 50.0
 """Frames per second, at most, at which a recording is looked at; hands move below 5 Hz."""
@@ -35,6 +42,14 @@ def episode_of_dataset(dataset: Dataset, number: int) -> Episode:
     episode = episode_of_session(session)
     episode.stated = dataset.statistics(number)
     return episode
+
+
+def read_quickly(folder: Path) -> Episode:
+    """An episode of xr_teleoperate; hands are left as they are in it.
+
+    :raises SessionError: no frame in it can be used.
+    """
+    return episode_of_session(read_episode(folder, Options(correct=False)))
 
 
 def episode_of_session(session: Session) -> Episode:

@@ -1,4 +1,4 @@
-"""``dexkit audit``: judge every session of an archive."""
+"""``dexkit audit``: judge every episode of an archive."""
 
 from __future__ import annotations
 
@@ -32,8 +32,15 @@ _SETTINGS = (
         "Format of the tables; auto is Parquet if pyarrow is installed.",
         "auto",
     ),
-    Setting("timeout", "S", Number(min=1), "Seconds for one file.", 600.0),
-    Setting("memory", "MIB", click.IntRange(256, 2**24), "Memory for one file.", 4096),
+    Setting(
+        "cameras",
+        "yes|no",
+        click.Choice(["yes", "no"]),
+        "Look at pictures, as far as they can be decoded; no is quicker.",
+        "yes",
+    ),
+    Setting("timeout", "S", Number(min=1), "Seconds for one task: a file.", 600.0),
+    Setting("memory", "MIB", click.IntRange(256, 2**24), "Memory for one process.", 4096),
 )
 
 
@@ -41,14 +48,14 @@ _SETTINGS = (
     "audit",
     cls=Command,
     exit_codes={
-        0: "every MUST that could be judged is met in every file",
-        1: "one is not met",
-        2: "a file is not usable, damaged or inconclusive, or there is none; see --fail-on",
+        0: "no episode is to be dropped, and hands in recordings meet every MUST",
+        1: "an episode is to be dropped, or a MUST is not met",
+        2: "an episode is not usable, damaged or inconclusive, or there is none; see --fail-on",
     },
 )
 @click.argument("locations", nargs=-1, required=True, metavar="PATH|URL...")
 @out_option(
-    "Folder for journal, tables and page. Results of unchanged files are reused.",
+    "Folder for journal, tables and page. Results of unchanged episodes are reused.",
     "audit-out",
 )
 @click.option(
@@ -76,15 +83,19 @@ def command(
     ray: str | None,
     settings: Settings,
 ) -> None:
-    """Judge every recorded session (mcap file) in folders or behind URLs, as 'dexkit check' does.
+    """Say of every episode whether to train on it: keep, review or drop, and why.
 
-    Writes a row for each file, and for each requirement and side, as Parquet or JSON lines, and a
-    summary page. A faulty file becomes a row and does not stop the audit. Run the same command
-    again to continue a stopped audit (docs/audit.md).
+    Episodes are those of LeRobot datasets, task folders of xr_teleoperate, recordings (mcap) and
+    ROS 2 bags, in folders or behind URLs, mixed as they are. The hands in recordings of the wire
+    are judged as well, as 'dexkit check' does.
+
+    Writes a row for each episode and finding, as Parquet or JSON lines, a summary page, and
+    episodes.json, with which 'dexkit export --drop' makes the cleaned set. A faulty file becomes a
+    row and does not stop the audit. Run the same command again to continue a stopped audit
+    (docs/audit.md).
     """
     from dexkit.conformance.audit.audit import FAIL_ON, Audit, Limits
     from dexkit.conformance.audit.cluster import Cluster
-    from dexkit.conformance.audit.sessions import is_url
 
     assert _FAIL_ON == FAIL_ON
     if ray is not None and jobs is not None:
@@ -97,6 +108,7 @@ def command(
         out.absolute(),
         limits=limits,
         parquet=_PARQUET[settings["format"]],
+        cameras=settings["cameras"] == "yes",
         working_folder=Path.cwd(),
     )
     # Python's worker processes begin with the working folder in front of their import path
@@ -119,20 +131,19 @@ def command(
         raise click.Abort
     if not outcome.total:
         raise ConformanceError(
-            "no session was found, which is not a pass",
-            hint="sessions are files that end in .mcap; 'dexkit import' makes them of others"
-            if any(map(is_url, locations))
-            else "sessions are files that end in .mcap",
+            "no episode was found, which is not a pass",
+            hint="an episode is in a LeRobot dataset (meta/info.json), a folder of xr_teleoperate "
+            "(data.json), a recording (.mcap) or a ROS 2 bag (metadata.yaml, .db3)",
         )
     sys.exit(outcome.exit_code(fail_on))
 
 
 def _status(outcome: AuditProgress) -> str:
     rest = outcome.remaining_s
-    parts = [f"{outcome.done:,} of {outcome.total:,} files"]
+    parts = [f"{outcome.done:,} of {outcome.total:,} episodes"]
     if outcome.seconds:
         parts.append(f"{outcome.examined_s / outcome.seconds:,.0f} times real time")
-    parts.append(f"{outcome.failing} with a failure")
+    parts.append(f"{outcome.uses['drop']} to drop")
     if rest is not None:
         parts.append(f"{_duration(rest)} left")
     return ", ".join(parts)
@@ -145,22 +156,28 @@ def _duration(seconds: float) -> str:
 
 
 def _print(console: Console, outcome: AuditProgress) -> None:
-    console.print(
-        f"{outcome.done:,} of {outcome.total:,} files, {outcome.recorded_s / 3600:,.2f} h: "
-        f"{outcome.failing} with a failure, {outcome.unusable} not usable or inconclusive, "
-        f"{outcome.warned} with a warning",
-        highlight=False,
-        soft_wrap=True,
-    )
-    if outcome.reused:
-        console.print(f"{outcome.reused:,} unchanged since the last audit", highlight=False)
-    if outcome.examined_s and outcome.seconds:
-        console.print(
-            f"{outcome.examined_s / outcome.seconds:,.0f} times real time "
-            f"({outcome.seconds:.1f} s)",
-            highlight=False,
+    def tell(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
+    uses = ", ".join(f"{outcome.uses[use]:,} {use}" for use in ("keep", "review", "drop"))
+    unusable = f", {outcome.unusable} not usable or inconclusive" if outcome.unusable else ""
+    total = f"{outcome.done:,} of {outcome.total:,} episodes, {outcome.recorded_s / 3600:,.2f} h"
+    tell(f"{total}: {uses}{unusable}")
+    if outcome.failing or outcome.warned:
+        tell(
+            f"hands in recordings of the wire: {outcome.failing} with a failure, "
+            f"{outcome.warned} with a warning"
         )
+    if outcome.sets:
+        tell(f"{outcome.sets} sets whose metadata are to be looked at")
+    if outcome.reused:
+        tell(f"{outcome.reused:,} unchanged since the last audit")
+    if outcome.examined_s and outcome.seconds:
+        speed = outcome.examined_s / outcome.seconds
+        tell(f"{speed:,.0f} times real time ({outcome.seconds:.1f} s)")
     for path in outcome.files:
-        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+        tell(f"wrote {path}")
+    for caption, command in outcome.commands:
+        tell(f"{caption}:\n  {command}")
     if outcome.stopped:
-        console.print("stopped before its end; the same command goes on", highlight=False)
+        tell("stopped before its end; the same command goes on")

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dexkit.conformance.audit.file_records import FileRecord, Finding, State
 from dexkit.conformance.audit.journal import Journal
+from dexkit.conformance.audit.records import EpisodeRecord, Finding, State
 from tools.generate_archive import ANSWERS, Answer
 
 __all__ = ["Score", "score"]
@@ -67,7 +67,7 @@ def _short(name: str) -> str:
     return "/".join(name.split("/")[-2:])
 
 
-def _count(score: Score, answer: Answer, record: FileRecord | None) -> None:
+def _count(score: Score, answer: Answer, record: EpisodeRecord | None) -> None:
     score.good += not answer.fault
     score.faulty += bool(answer.fault)
     what = f"{answer.file} ({answer.fault or 'good'}, {answer.sample})"
@@ -87,7 +87,7 @@ def _count(score: Score, answer: Answer, record: FileRecord | None) -> None:
                 score.blamed.append(f"{what}: {text}")
 
 
-def _finds(answer: Answer, record: FileRecord) -> bool:
+def _finds(answer: Answer, record: EpisodeRecord) -> bool:
     if answer.state == "truncated":
         return bool(record.facts.get("truncated"))
     if answer.state == "damaged":

@@ -15,8 +15,8 @@ import numpy as np
 from mcap.writer import CompressionType
 
 from dexkit.conformance.audit.examine import Task, examine
-from dexkit.conformance.audit.file_records import FileRecord, State
-from dexkit.conformance.audit.sessions import SessionFile
+from dexkit.conformance.audit.records import EpisodeRecord, State
+from dexkit.conformance.audit.units import Unit
 from dexkit.conformance.virtual.rehearsal import rehearse
 from dexkit.traces.replay.commands import read_session
 from dexkit.traces.replay.machine import Guards
@@ -110,10 +110,10 @@ def _audited(rng: random.Random, scratch: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        record = examine(Task(SessionFile("x", str(path), len(data), "")))
+        (record,) = examine(Task((Unit("x", str(path), len(data), ""),)))
         if record.state is State.FAILED:
             raise Difference(record.error)
-        if FileRecord.of_line(record.as_line()).as_line() != record.as_line():
+        if EpisodeRecord.of_line(record.as_line()).as_line() != record.as_line():
             raise Difference("the journal does not give the record back")
 
     return replace(_maker(rng, 3.0), run=run)
