@@ -13,7 +13,7 @@ from dexkit.errors import SessionError
 from dexkit.hand import Floats
 from dexkit.models import MODELS
 from dexkit.traces.reader import Trace
-from dexkit.traces.sessions.episodes import Options, read_episode
+from dexkit.traces.sessions.episodes import read_episode
 from dexkit.traces.sessions.imported import MEASURED, import_record
 from dexkit.traces.sessions.lerobot_in import Dataset
 from dexkit.traces.sessions.model import Part, Session
@@ -49,7 +49,7 @@ def read_quickly(folder: Path) -> Episode:
 
     :raises SessionError: no frame in it can be used.
     """
-    return episode_of_session(read_episode(folder, Options(correct=False)))
+    return episode_of_session(read_episode(folder, joints_only=True))
 
 
 def episode_of_session(session: Session) -> Episode:

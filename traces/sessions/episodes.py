@@ -8,6 +8,7 @@ to its last whole item.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -63,6 +64,8 @@ _PICTURES = ("colors", "depths")
 _STAMPS = ("timestamp_ns", "timestamp", "time", "t")  # the first in ns, the others in seconds
 _HANDS = {f"{side}_{end}": f"{side}{HAND}" for side in Side for end in ("ee", "hand")}
 _HAND_PARTS = frozenset(_HANDS.values())
+_AS_ZERO = bytes.maketrans(b"123456789", b"000000000")
+_LONG_NUMBER = b"0" * 21
 _NS = 10**9
 _DAY = 86_400 * _NS
 # Share of samples that must lie within a model's limits, and how far beyond they may lie, rad.
@@ -138,13 +141,7 @@ def parse_document(text: str, origin: str) -> Document:
     :param origin: what to call it.
     :raises SessionError: there is no whole item in it.
     """
-    try:
-        found = json.loads(text, parse_int=whole_number)
-        whole = True
-    except ValueError:
-        found, whole = _salvage(text), False
-    except RecursionError:
-        raise SessionError(f"{origin} is nested too deeply") from None
+    found, whole = _parsed(text, origin)
     if not isinstance(found, dict) or not isinstance(found.get("data"), list):
         raise SessionError(
             f"{origin} is not an episode: " + ("it has no list 'data'" if whole else "no JSON")
@@ -167,6 +164,20 @@ def parse_document(text: str, origin: str) -> Document:
         whole=whole,
         rest=head,
     )
+
+
+def _parsed(text: str, origin: str) -> tuple[Any, bool]:
+    """The document, and whether it is whole."""
+    digits = text.encode("utf-8", "surrogatepass").translate(_AS_ZERO)
+    if _LONG_NUMBER not in digits:  # of more digits than whole_number keeps
+        with contextlib.suppress(ValueError, RecursionError):
+            return msgspec.json.decode(text), True  # three times as quick, and strict
+    try:
+        return json.loads(text, parse_int=whole_number), True
+    except ValueError:
+        return _salvage(text), False
+    except RecursionError:
+        raise SessionError(f"{origin} is nested too deeply") from None
 
 
 def whole_number(text: str) -> int | float:
@@ -239,14 +250,16 @@ def episode_folders(source: Path) -> list[Path]:
         raise SessionError(f"cannot read {source}: {error.strerror}") from error
 
 
-def read_episode(folder: Path, options: Options = DEFAULT) -> Session:
+def read_episode(folder: Path, options: Options = DEFAULT, *, joints_only: bool = False) -> Session:
     """Read one episode.
 
+    :param joints_only: without the data that are neither joints nor pictures, and without looking
+        for swapped hands.
     :raises SessionError: no frame in it can be used.
     """
     document = read_document(folder / DATA)
     form = _VERSIONS[_layout(document)]
-    session = session_of(document, folder / DATA, folder, form, options)
+    session = session_of(document, folder / DATA, folder, form, options, joints_only=joints_only)
     session.name = folder.name
     return session
 
@@ -264,10 +277,17 @@ def _layout(document: Document) -> str:
 
 
 def session_of(
-    document: Document, source: Path, folder: Path, form: str, options: Options = DEFAULT
+    document: Document,
+    source: Path,
+    folder: Path,
+    form: str,
+    options: Options = DEFAULT,
+    *,
+    joints_only: bool = False,
 ) -> Session:
     """Make a session from frames of xr_teleoperate.
 
+    :param joints_only: as of :func:`read_episode`.
     :raises SessionError: no frame can be used.
     """
     problems = Problems()
@@ -302,7 +322,8 @@ def session_of(
         first_ns=first,
     )
     cameras = {c.name for c in session.cameras}
-    session.rest = _rest(items, carried, cameras, first is not None, problems)
+    if not joints_only:
+        session.rest = _rest(items, carried, cameras, first is not None, problems)
     session.about = {
         "info": json.dumps(document.info, ensure_ascii=False),
         "text": json.dumps(document.text, ensure_ascii=False),
@@ -310,7 +331,8 @@ def session_of(
         "task": typed(document.text.get("goal"), str) or "",
         "names": json.dumps(_names(items)),
     }
-    correct_sides(session, form, options)
+    if not joints_only:
+        correct_sides(session, form, options)
     return session
 
 
@@ -387,7 +409,7 @@ def _parts(items: Sequence[dict[str, Any]], problems: Problems) -> tuple[list[Pa
         for key in _DIRECTIONS:
             group = item.get(key)
             if isinstance(group, dict):
-                names.update(dict.fromkeys(n for n in group if _is_name(n, problems)))
+                names.update(dict.fromkeys(n for n in group if n in names or _is_name(n, problems)))
             elif group is not None:
                 problems.add(f"'{key}' is no object", _place(item))
     parts: list[Part] = []
@@ -436,6 +458,12 @@ def _table(
     items: Sequence[dict[str, Any]], key: str, name: str, problems: Problems
 ) -> tuple[dict[str, Floats], Carried, int]:
     """The columns of a part in one direction, the frames that have them, and their width."""
+    if (quick := _whole_table(items, key, name)) is not None:
+        if not quick:
+            return {}, {}, 0
+        there = set(range(len(items)))
+        frames = {(key, name, _COLUMNS[field_]): there for field_ in quick}
+        return quick, frames, quick["q"].shape[1]
     rows: dict[str, list[list[float] | None]] = {f: [] for f in _COLUMNS}
     for item in items:
         group = item.get(key)
@@ -457,7 +485,7 @@ def _table(
         return {}, {}, 0
     width = widths.most_common(1)[0][0]
     found: dict[str, Floats] = {}
-    frames: Carried = {}
+    frames = Carried()
     for field_, column in _COLUMNS.items():
         table = np.full((len(items), width), np.nan)
         there = set()
@@ -478,6 +506,27 @@ def _table(
             found[field_] = table
             frames[key, name, column] = there
     return found, frames, width
+
+
+def _whole_table(items: Sequence[dict[str, Any]], key: str, name: str) -> dict[str, Floats] | None:
+    """The columns of a part in one direction, if every frame has all of its values or none."""
+    try:
+        entries = [item[key][name] for item in items]
+        found = {}
+        for field_, column in _COLUMNS.items():
+            values = [entry.get(column) for entry in entries]
+            if any(values):
+                rows = typed(values, list[Vector])
+                if rows is None:
+                    return None
+                found[field_] = np.array(rows, dtype=np.float64)
+    except (KeyError, TypeError, AttributeError, ValueError):
+        return None
+    if not found:
+        return {}
+    good = "q" in found and all(np.isfinite(table).all() for table in found.values())
+    shapes = {table.shape for table in found.values()}
+    return found if good and len(shapes) == 1 and len(next(iter(shapes))) == 2 else None
 
 
 def _present(table: Floats) -> set[int]:
