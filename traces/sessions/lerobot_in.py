@@ -168,7 +168,7 @@ class Dataset:
             raise SessionError(f"{path} has no rate (fps)", hint="state it: --set rate=HZ")
         self.fps = fps
         self.refused: dict[str, SessionError] = {}
-        self._tables: dict[tuple[Path, bool], Any] = {}
+        self._tables: dict[tuple[Path, bool, tuple[int, int] | None], Any] = {}
         self._statistics: dict[int, dict[str, dict[str, Floats]]] | None = None
         self.only: tuple[int, int] | None = None
         self._problems: list[str] = []
@@ -373,7 +373,7 @@ class Dataset:
                     yield f"{name}, row {i}", error, {}
 
     def _open(self, path: Path, joints_only: bool) -> Any:
-        key = path, joints_only
+        key = path, joints_only, self.only
         if key not in self._tables:
             self._tables.clear()  # before another one takes as much
             left_out = {"index"}
