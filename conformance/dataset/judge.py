@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.check import Check, Figure, data_of
-from dexkit.conformance.dataset.checks import metadata
+from dexkit.conformance.dataset.checks import frames, frozen, idle, jumps, metadata, timing
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_of
 from dexkit.conformance.dataset.motion import span
@@ -16,7 +16,14 @@ from dexkit.hand import Floats
 
 __all__ = ["CHECKS", "VERSION", "checks_digest", "judge"]
 
-CHECKS: tuple[Check, ...] = (*metadata.CHECKS,)
+CHECKS: tuple[Check, ...] = (
+    *frozen.CHECKS,
+    *frames.CHECKS,
+    *jumps.CHECKS,
+    *timing.CHECKS,
+    *idle.CHECKS,
+    *metadata.CHECKS,
+)
 """Every check of a single episode."""
 VERSION = 1
 """Goes up when a check judges differently; an audit then judges again."""

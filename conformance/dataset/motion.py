@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.conformance.dataset.episode import Track
+from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.hand import Floats
 
-__all__ = ["runs_of", "span", "stroke"]
+__all__ = [
+    "Series",
+    "frames_of",
+    "joined",
+    "joints_text",
+    "moves",
+    "part_text",
+    "runs_of",
+    "series_of",
+    "span",
+    "stroke",
+]
+
+Bools = NDArray[np.bool_]
+
+_REVERSALS = 12  # that a joint must show before its noise is spoken of
+_STILL = 0.05  # share of frames with no change, at most, of a sensor that is called live: eight
+# such frames in a row are no chance
 
 
 def span(values: Floats | None) -> Floats:
@@ -41,3 +60,118 @@ def runs_of(mask: NDArray[np.bool_], least: int = 1) -> Iterator[tuple[int, int]
     for begin, end in edges.reshape(-1, 2).tolist():
         if end - begin >= least:
             yield begin, end
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """The states, or the actions, of a part, prepared for comparisons of frames.
+
+    :param q: parts of the stroke, shape (frames, joints); a frame without a value repeats the one
+        before it.
+    :param there: whether a frame has values, shape (frames,).
+    :param steps: change from the frame before, shape (frames, joints); 0 in the first frame, and
+        where either frame has no value.
+    :param same: whether a joint has exactly the value of the frame before, likewise; false where
+        either has none.
+    :param quantum: the smallest change, shape (joints,): a step of a coarse encoder.
+    :param noise: standard deviation of what is no motion, shape (joints,).
+    """
+
+    q: Floats
+    there: Bools
+    steps: Floats
+    same: Bools
+    quantum: Floats
+    noise: Floats
+
+    def live(self, calm: Bools | None = None) -> Bools:
+        """Whether each joint trembles, shape (joints,): its changes reverse again and again and
+        have many sizes, as those of a sensor do, and not those of an encoder between two steps.
+
+        :param calm: frames to look at, shape (frames,) or (frames, joints); all without.
+        """
+        later, before = self.steps[1:], self.steps[:-1]
+        turned = later * before < 0
+        still = self.same[1:]
+        count: NDArray[np.intp] | int = len(turned)
+        if calm is not None:
+            table = calm if calm.ndim == 2 else calm[:, None]
+            look = table[1:] & table[:-1]
+            turned &= look
+            still = still & look
+            count = look.sum(axis=0)
+        turns = turned.sum(axis=0)
+        # one of few steps again and again is an encoder at the edge of a step
+        wide = np.abs(later - before) > 4 * self.quantum
+        return np.asarray(
+            (turns >= _REVERSALS)
+            & (turns >= 0.25 * count)
+            & ((turned & wide).sum(axis=0) > 0.6 * turns)
+            & (still.sum(axis=0) < _STILL * count)
+        )
+
+
+def series_of(track: Track, what: str) -> Series | None:
+    """The ``state`` or the ``action`` of a part; None where it has none, or less than 3 frames."""
+    return _series_of(track, what)
+
+
+@lru_cache(maxsize=64)
+def _series_of(track: Track, what: str) -> Series | None:
+    values = track.state if what == "state" else track.action
+    if values is None or len(values) < 3:
+        return None
+    there: Bools = np.asarray(np.isfinite(values).all(axis=1))
+    if there.sum() < 3:
+        return None
+    scaled = values / stroke(track)
+    if not there.all():
+        last = np.maximum.accumulate(np.where(there, np.arange(len(there)), -1))
+        last[last < 0] = int(np.argmax(there))
+        scaled = scaled[last]
+    steps = np.zeros_like(scaled)
+    steps[1:] = scaled[1:] - scaled[:-1]
+    both = np.zeros(len(there), dtype=np.bool_)
+    both[1:] = there[1:] & there[:-1]
+    same = (steps == 0) & both[:, None]
+    sizes = np.abs(steps)
+    quantum = np.where(sizes > 1e-7, sizes, np.inf).min(axis=0)
+    bends = np.abs(steps[2:] - steps[1:-1])
+    # the calm third of an episode: 0.385 sigma below which 30 % of a normal distribution lie; a
+    # second difference has 6 times the variance
+    third = int(0.3 * (len(bends) - 1))
+    noise = np.partition(bends, third, axis=0)[third] / (0.385 * np.sqrt(6.0))
+    return Series(scaled, there, steps, same, np.where(np.isfinite(quantum), quantum, 0), noise)
+
+
+def moves(series: Series, least: float = 0.05) -> Bools:
+    """Whether each joint moves, shape (joints,): by a part of its stroke, and beyond its noise."""
+    spans = np.ptp(series.q, axis=0)
+    return np.asarray(spans > np.maximum(least, 12 * series.noise))
+
+
+def part_text(part: str) -> str:
+    """How texts call a part: ``left_hand`` is ``the left hand``."""
+    return "the " + part.replace("_", " ") if part else "all parts"
+
+
+def joints_text(track: Track, joints: Sequence[int]) -> str:
+    """How texts call some joints of a part."""
+    count = len(track.joints)
+    if len(joints) >= count:
+        return part_text(track.part)
+    if len(joints) == 1:
+        return f"joint {track.joints[joints[0]]} of {part_text(track.part)}"
+    return f"{len(joints)} of {count} joints of {part_text(track.part)}"
+
+
+def joined(episode: Episode) -> Bools:
+    """Whether each frame follows the one before it by one period, shape (frames,)."""
+    found = np.ones(len(episode), dtype=np.bool_)
+    found[1:] = np.diff(episode.t) * episode.fps < 1.6
+    return found
+
+
+def frames_of(episode: Episode, seconds: float) -> int:
+    """The number of frames that a time takes, 1 at least."""
+    return max(1, round(seconds * episode.fps))

@@ -1,0 +1,93 @@
+"""Time at the begin and the end of an episode in which nothing is commanded and nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexkit.conformance.dataset.check import Check, Figure
+from dexkit.conformance.dataset.episode import Episode
+from dexkit.conformance.dataset.findings import Finding, Use
+from dexkit.conformance.dataset.motion import frames_of, series_of
+from dexkit.hand import Floats
+
+__all__ = ["CHECKS"]
+
+_STILL = 0.02  # strokes: less is no motion, but noise, sag or a trembling operator
+_NOISES = 8.0
+_LONG_S, _SHARE = 5.0, 0.25  # of idle time that asks to be cut
+_REMARK_S = 2.0
+_HOLDS = 0.08  # strokes that an action is beyond its state while a hand holds something
+
+
+def _idle(episode: Episode) -> Iterator[Finding | Figure]:
+    begin, end = _still(episode)
+    count = len(episode)
+    if count < 3 or episode.duration <= 0:
+        return
+    if begin >= count - 1:
+        yield Figure("idle, %", 100.0)
+        if episode.duration > 2.0:
+            yield Finding("idle", Use.REVIEW, "nothing moves in the whole episode")
+        return
+    times = {"begin": float(episode.t[begin]), "end": float(episode.duration - episode.t[end])}
+    idle = sum(times.values())
+    yield Figure("idle, %", 100 * idle / episode.duration)
+    for where, seconds in times.items():
+        if seconds < _REMARK_S:
+            continue
+        long = seconds > _LONG_S and seconds > _SHARE * episode.duration
+        cut = (
+            (float(episode.t[begin]), episode.duration)
+            if where == "begin"
+            else (0.0, float(episode.t[end]))
+        )
+        yield Finding(
+            "idle",
+            Use.REVIEW if long else Use.KEEP,
+            f"nothing is commanded and nothing moves for {seconds:.1f} s at the {where}, "
+            f"{seconds / episode.duration:.0%} of the episode"
+            + (f": cut it to {cut[0]:.1f} to {cut[1]:.1f} s" if long else ""),
+            begin_s=0.0 if where == "begin" else float(episode.t[end]),
+            end_s=float(episode.t[begin]) if where == "begin" else episode.duration,
+            value=round(seconds, 3),
+            limit=_LONG_S,
+            unit="s",
+        )
+
+
+def _still(episode: Episode) -> tuple[int, int]:
+    """The frames at which the motion begins and ends; the number of frames where there is none."""
+    count = len(episode)
+    begin, end = count, 0
+    smooth = frames_of(episode, 0.1)
+    for track in episode.tracks:
+        state, action = series_of(track, "state"), series_of(track, "action")
+        for series in (state, action):
+            if series is None:
+                continue
+            limit = np.maximum(_STILL, np.maximum(_NOISES * series.noise, 2.5 * series.quantum))
+            if series is state and (2.5 * series.quantum > _STILL).any():
+                limit = np.minimum(limit, 0.06)  # two steps of the coarsest encoders
+            for values, flip in ((series.q, False), (series.q[::-1], True)):
+                first = np.median(values[: smooth + 1], axis=0)
+                left = np.abs(values - first) > limit
+                at = int(np.argmax(left.any(axis=1))) if left.any() else count
+                if flip:
+                    end = max(end, count - 1 - at) if left.any() else end
+                else:
+                    begin = min(begin, at)
+        # a hand that presses on an object is at work, though nothing moves
+        if state is None or action is None or not track.is_hand or end >= count - 1:
+            continue
+        if _holds(state.q[end:], action.q[end:]):
+            end = count - 1
+    return (begin, end) if begin < count else (count, count)
+
+
+def _holds(state: Floats, action: Floats) -> bool:
+    return bool((np.abs(np.median(action - state, axis=0)) > _HOLDS).any())
+
+
+CHECKS = (Check("idle", "Idle time at the begin and the end", frozenset(), _idle),)

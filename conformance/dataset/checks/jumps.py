@@ -1,0 +1,183 @@
+"""Positions that leap: further in a frame than the joint can move, or out and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dexkit.conformance.dataset.check import Check, Data
+from dexkit.conformance.dataset.episode import Episode, Track
+from dexkit.conformance.dataset.findings import Finding, Use
+from dexkit.conformance.dataset.motion import (
+    Bools,
+    Series,
+    frames_of,
+    joined,
+    joints_text,
+    series_of,
+    stroke,
+)
+from dexkit.hand import Floats
+
+__all__ = ["CHECKS"]
+
+_LEAST = 0.08  # strokes: a leap that is worth a word
+_NOISES = 10.0  # standard deviations
+_ISOLATED = 4.0  # times the fastest step around it
+_MARGIN = 3.0  # times the speed limit: Inspire's real hands do 2.2 times what is taken for theirs
+_FASTEST = 40.0  # rad/s, of any joint without a profile: arms do 20, fingers 24
+_EXPLAINS = 0.35  # part of a leap that its action must have done in a frame, shortly before
+_LATE_S = 0.6  # s that a hand may be behind its action
+_TURN = 2 * np.pi
+
+
+def _jumps(episode: Episode) -> Iterator[Finding]:
+    all_at_once = np.zeros(len(episode), dtype=int)
+    found: list[tuple[Track, Bools, Bools]] = []
+    for track in episode.tracks:
+        state = series_of(track, "state")
+        if state is None or len(state.q) < 8:
+            continue
+        spikes, steps = _leaps(episode, track, state, series_of(track, "action"))
+        all_at_once += (spikes | steps).any(axis=1)
+        found.append((track, spikes, steps))
+    for track, spikes, steps in found:
+        if len(found) > 1:
+            # where every part leaps at once frames are missing, or a stream froze
+            steps = steps & (all_at_once < len(found))[:, None]
+        yield from _findings(episode, track, spikes, steps)
+
+
+def _leaps(
+    episode: Episode, track: Track, state: Series, action: Series | None
+) -> tuple[Bools, Bools]:
+    """Frames and joints of values out of line for 1 to 3 frames, and of leaps that stay."""
+    q, steps = state.q, state.steps
+    size = np.abs(steps)
+    n = len(q)
+    floor = np.maximum(_LEAST, np.maximum(_NOISES * state.noise, 3 * state.quantum))
+    around = np.zeros_like(size)
+    for k in (1, 2, 3):
+        around[k:] = np.maximum(around[k:], size[: n - k])
+        around[: n - k] = np.maximum(around[: n - k], size[k:])
+    big = size > floor
+    big &= (state.there & joined(episode))[:, None]
+    spikes, stays = np.zeros_like(big), np.zeros_like(big)
+    if not big.any():
+        return spikes, stays
+    given = _given(episode, action, size.shape)
+    unexplained = big & (given < _EXPLAINS * size)
+    # out and back: the values before and after it agree
+    for width in (1, 2, 3):
+        if n <= width + 2:
+            break
+        out, back = steps[: n - width], steps[width:]
+        opposite = (out * back < 0) & (np.abs(out + back) < 0.3 * np.abs(out))
+        sizable = unexplained[: n - width] & (np.abs(back) > floor)
+        hit = opposite & sizable
+        calm = _calm_around(size, width)
+        hit &= np.abs(out) > _ISOLATED * calm[: n - width]
+        spikes[: n - width] |= hit
+    # a leap that stays, alone among slow steps, or faster than any joint
+    held = _held_for(state)
+    limit = _fastest(episode, track) * np.minimum(held, frames_of(episode, 0.25))
+    impossible = unexplained & (size > limit + floor)
+    alone = unexplained & (size > _ISOLATED * around + floor) & (held <= 2)
+    stays = (alone | impossible) & ~spikes
+    # and the way back of a spike is no leap of its own
+    for width in (1, 2, 3):
+        stays[width:] &= ~spikes[: n - width]
+    return spikes, stays
+
+
+def _calm_around(size: Floats, width: int) -> Floats:
+    """The largest step around each frame, without those of a spike that begins there."""
+    n = len(size)
+    found = np.zeros_like(size)
+    for k in (-3, -2, -1, width + 1, width + 2, width + 3):
+        if k < 0:
+            found[-k:] = np.maximum(found[-k:], size[: n + k])
+        else:
+            found[: n - k] = np.maximum(found[: n - k], size[k:])
+    return found
+
+
+def _held_for(state: Series) -> Floats:
+    """For how many frames each joint had its value before it changed, 1 at least."""
+    n = len(state.q)
+    index = np.arange(n)[:, None]
+    changed = np.where(state.same, 0, index)
+    last = np.maximum.accumulate(changed, axis=0)
+    held = np.ones_like(state.q)
+    held[1:] = index[1:] - last[:-1]
+    return np.asarray(held)
+
+
+def _fastest(episode: Episode, track: Track) -> Floats:
+    """Strokes per frame that no joint does, shape (joints,)."""
+    size = stroke(track)
+    if track.fastest is not None:
+        return np.asarray(track.fastest * _MARGIN / episode.fps / size)
+    return np.asarray(np.full(len(size), _FASTEST / episode.fps) / np.minimum(size, _TURN))
+
+
+def _given(episode: Episode, action: Series | None, shape: tuple[int, ...]) -> Floats:
+    """The largest step of the action in each frame or shortly before it, over one or two frames."""
+    if action is None or action.q.shape != shape:
+        return np.zeros(shape)
+    size = np.abs(action.steps)
+    size[1:] = np.maximum(size[1:], np.abs(action.steps[1:] + action.steps[:-1]))
+    late = frames_of(episode, _LATE_S)
+    found = size.copy()
+    # the highest of a window, by doubling
+    width = 1
+    while width < late:
+        step = min(width, late - width)
+        found[step:] = np.maximum(found[step:], found[:-step].copy())
+        width += step
+    found[:-1] = np.maximum(found[:-1], size[1:])  # and in the next frame: the next state
+    return found
+
+
+def _findings(episode: Episode, track: Track, spikes: Bools, stays: Bools) -> Iterator[Finding]:
+    state = series_of(track, "state")
+    assert state is not None
+    for mask, kind in ((spikes, "spike"), (stays, "leap")):
+        if not mask.any():
+            continue
+        frames = np.flatnonzero(mask.any(axis=1))
+        joints = np.flatnonzero(mask.any(axis=0)).tolist()
+        far = np.abs(state.steps) * mask
+        at, joint = np.unravel_index(int(np.argmax(far)), far.shape)
+        value = float(far[at, joint] * stroke(track)[joint])
+        unit = "rad" if track.model is None or track.model.unit == "rad" else "of the stroke"
+        if track.model is None:
+            unit = ""
+        where = f"at {episode.t[at]:.2f} s"
+        if len(frames) > 1:
+            where = f"at {len(frames)} places, the farthest {where}"
+        what = f"the observation of {joints_text(track, joints)}"
+        if kind == "spike":
+            text = f"{what} leaps out and back {where}, by {value:.3g} {unit}".rstrip()
+            text += ", which its action does not ask for: single wrong values"
+        elif unit != "of the stroke" and abs(value - _TURN * max(1, round(value / _TURN))) < 0.5:
+            text = f"{what} leaps by a full turn {where}: its encoder wrapped"
+        else:
+            text = f"{what} leaps {where}, by {value:.3g} {unit} in a frame".rstrip()
+            text += ", which no joint does and its action does not ask for"
+        yield Finding(
+            "jump",
+            Use.DROP if kind == "leap" or len(frames) > 2 else Use.REVIEW,
+            text,
+            track.part,
+            () if len(joints) == len(track.joints) else tuple(joints),
+            float(episode.t[max(frames[0] - 1, 0)]),
+            float(episode.t[min(frames[-1] + 1, len(episode) - 1)]),
+            value=round(value, 4),
+            limit=round(float(_LEAST * stroke(track)[joint]), 4),
+            unit=unit,
+        )
+
+
+CHECKS = (Check("jump", "Positions that leap", frozenset({Data.STATE}), _jumps),)

@@ -1,0 +1,386 @@
+"""Action against observation in time, and true time against the stated rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dexkit.conformance.dataset.check import Check, Data, Figure
+from dexkit.conformance.dataset.episode import Episode, Track
+from dexkit.conformance.dataset.findings import Finding, Use
+from dexkit.conformance.dataset.motion import (
+    Bools,
+    moves,
+    part_text,
+    series_of,
+    stroke,
+)
+from dexkit.hand import Floats
+
+__all__ = ["ARMS_LAG", "CHECKS", "HANDS_LAG", "Lag", "lag_of"]
+
+HANDS_LAG, ARMS_LAG = "lag, s", "lag of arms, s"
+
+_REACH_S = 1.5  # of delays that are tried, both ways
+_SURE = 0.7  # correlation from which a delay is believed
+_LATEST_HAND_S = 0.7  # Inspire's hands on a G1 are 0.4 s behind, with values up to 0.13 s old
+_LATEST_ARM_S = 0.45
+_EARLY_FRAMES = 2.5  # that a state may be before its action: the next state is the action
+_APART_HANDS_S = 0.4  # that one of two equal hands may be later than the other
+_APART_ARMS_S = 0.25
+_DRIFT_FRAMES = 3.0
+_DRIFT_S = 0.09
+_SMOOTH_S = 0.1
+_SHORT = 0.08  # strokes that a joint may stay short of its action before something holds it
+_ENOUGH = 0.1  # of a joint's motion, that a third of an episode has at least
+_OFF = 0.05  # of a rate that is not the stated one
+_JITTER = 0.5  # periods that stamps are off, at the usual frame
+
+
+@dataclass(frozen=True)
+class Lag:
+    """By how much a state is later than its action.
+
+    :param seconds: from the rise of the correlation of their speeds: the time before the part
+        begins to follow. A hand that is slow, but follows at once, has a small one.
+    :param peak_s: at which the correlation is highest; ``correlation`` is its height.
+    """
+
+    seconds: float
+    peak_s: float
+    correlation: float
+
+
+def lag_of(state: Floats, action: Floats, fps: float) -> Lag | None:
+    """The lag of states behind actions, shape (frames, joints) both, scaled so that joints count
+    alike; None where nothing is to be told.
+    """
+    n = len(state)
+    reach = min(round(_REACH_S * fps), n // 3)
+    if reach < 4:
+        return None
+    size = 1 << int(np.ceil(np.log2(n + 2 * reach)))
+    both = np.fft.rfft(np.concatenate([state, action], axis=1), size, axis=0)
+    s, a = both[:, : state.shape[1]], both[:, state.shape[1] :]
+    cross = np.fft.irfft((s * a.conj()).sum(axis=1), size)
+    auto = np.fft.irfft((np.abs(a) ** 2).sum(axis=1), size)
+    power = np.sqrt(auto[0] * float((state**2).sum()))
+    if power <= 0:
+        return None
+    at = np.arange(-reach, reach + 1)
+    c = cross[at] / power
+    own = auto[at] / auto[0]
+    peak = _peak(c, reach)
+    if peak is None:
+        return None
+    top = float(c[peak])
+    rise = _rise(c, peak) - _rise(own, reach)
+    return Lag(rise / fps, _refined(c, peak, reach) / fps, top)
+
+
+def _peak(c: Floats, zero: int) -> int | None:
+    """The highest correlation; of several that are nearly as high, as with periodic motion, the
+    first that a hand can have.
+    """
+    best = float(c.max())
+    if best <= 0:
+        return None
+    inner = np.flatnonzero((c[1:-1] >= c[:-2]) & (c[1:-1] >= c[2:]) & (c[1:-1] > 0.9 * best)) + 1
+    if not len(inner):
+        return None
+    possible = inner[inner >= zero - 1]
+    return int(possible[0]) if len(possible) else int(inner[-1])
+
+
+def _refined(c: Floats, peak: int, zero: int) -> float:
+    a, b, d = float(c[peak - 1]), float(c[peak]), float(c[peak + 1])
+    bend = a - 2 * b + d
+    return peak - zero + (0.5 * (a - d) / bend if bend < 0 else 0.0)
+
+
+def _rise(c: Floats, peak: int) -> float:
+    """Where the correlation rises through half of its peak, in frames."""
+    half = 0.5 * float(c[peak])
+    below = np.flatnonzero(c[:peak] < half)
+    if not len(below):
+        return 0.0
+    i = int(below[-1])
+    return i + (half - float(c[i])) / max(float(c[i + 1] - c[i]), 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class _Speeds:
+    """The speeds of the joints of a part that move, smoothed, shape (frames, joints)."""
+
+    state: Floats
+    action: Floats
+    follows: Bools
+    """Of these joints, those that get where their action is: an object holds none of them."""
+
+
+def _speeds(episode: Episode, track: Track) -> _Speeds | None:
+    state, action = series_of(track, "state"), series_of(track, "action")
+    if state is None or action is None or state.q.shape != action.q.shape:
+        return None
+    use = moves(state, 0.05) & moves(action, 0.05)
+    if not use.any():
+        return None
+    width = max(2, round(_SMOOTH_S * episode.fps))
+    s, a = (_smoothed(x.steps[:, use], width) for x in (state, action))
+    # joints count alike, whatever their way
+    s = s / np.maximum(np.sqrt((s**2).sum(axis=0)), 1e-12)
+    a = a / np.maximum(np.sqrt((a**2).sum(axis=0)), 1e-12)
+    # the way that is left at the usual frame, each tenth of the episode
+    left = np.abs(state.q[:, use] - action.q[:, use])
+    tenth = max(len(left) // 10, 1)
+    pieces = left[: len(left) // tenth * tenth].reshape(-1, tenth, left.shape[1])
+    usual = np.partition(pieces, tenth // 3, axis=1)[:, tenth // 3]
+    return _Speeds(s, a, np.asarray(usual.max(axis=0) < _SHORT))
+
+
+def _smoothed(values: Floats, width: int) -> Floats:
+    sums = np.cumsum(np.pad(values, ((width, 0), (0, 0))), axis=0)
+    return np.asarray(sums[width:] - sums[:-width])
+
+
+def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
+    lags: dict[str, tuple[Track, Lag]] = {}
+    for track in episode.tracks:
+        speeds = _speeds(episode, track)
+        if speeds is None:
+            continue
+        lag = lag_of(speeds.state, speeds.action, episode.fps)
+        if lag is None or lag.correlation < _SURE:
+            continue
+        lags[track.part] = track, lag
+        yield from _absolute(episode, track, lag)
+        yield from _drift(episode, track, speeds)
+    yield from _apart(lags)
+    for name, hand in ((HANDS_LAG, True), (ARMS_LAG, False)):
+        seconds = [lag.seconds for track, lag in lags.values() if track.is_hand is hand]
+        if seconds:
+            yield Figure(name, float(np.median(seconds)))
+
+
+def _absolute(episode: Episode, track: Track, lag: Lag) -> Iterator[Finding]:
+    early = -lag.peak_s * episode.fps
+    if early > _EARLY_FRAMES and -lag.seconds * episode.fps > 0.5 * _EARLY_FRAMES:
+        yield Finding(
+            "out-of-step",
+            Use.DROP,
+            f"the observation of {part_text(track.part)} is {-lag.peak_s:.2f} s before its action "
+            f"(correlation {lag.correlation:.2f}), as if it knew it: the two streams are out of "
+            "step",
+            track.part,
+            value=round(lag.peak_s, 3),
+            limit=round(-_EARLY_FRAMES / episode.fps, 3),
+            unit="s",
+        )
+        return
+    latest = _LATEST_HAND_S if track.is_hand else _LATEST_ARM_S
+    if lag.seconds > latest:
+        yield Finding(
+            "out-of-step",
+            Use.DROP,
+            f"the observation of {part_text(track.part)} is {lag.seconds:.2f} s behind its action "
+            f"(correlation {lag.correlation:.2f}), more than any "
+            f"{'hand' if track.is_hand else 'arm'}: the two streams are out of step",
+            track.part,
+            value=round(lag.seconds, 3),
+            limit=latest,
+            unit="s",
+        )
+
+
+def _apart(lags: dict[str, tuple[Track, Lag]]) -> Iterator[Finding]:
+    """Two equal parts of which one is later."""
+    for part, (track, lag) in lags.items():
+        other = lags.get(part.replace("left", "right")) if part.startswith("left") else None
+        if other is None:
+            continue
+        apart = lag.seconds - other[1].seconds
+        limit = _APART_HANDS_S if track.is_hand else _APART_ARMS_S
+        if abs(apart) > limit:
+            late = track if apart > 0 else other[0]
+            yield Finding(
+                "out-of-step",
+                Use.REVIEW,
+                f"the observation of {part_text(late.part)} is {abs(apart):.2f} s later behind its "
+                "action than that of the other side",
+                late.part,
+                value=round(abs(apart), 3),
+                limit=limit,
+                unit="s",
+            )
+
+
+def _drift(episode: Episode, track: Track, speeds: _Speeds) -> Iterator[Finding]:
+    """A lag that grows: first against last third."""
+    n = len(speeds.state)
+    third = n // 3
+    if third < 3 * episode.fps:
+        return
+    found = []
+    use = speeds.follows
+    for begin in (0, third, n - third):
+        s, a = (x[begin : begin + third, use] for x in (speeds.state, speeds.action))
+        if not use.any() or (a**2).sum() < _ENOUGH * use.sum():
+            return
+        lag = lag_of(s, a, episode.fps)
+        if lag is None or lag.correlation < 0.8:
+            return
+        found.append(lag)
+    by_peak = found[2].peak_s - found[0].peak_s
+    by_rise = found[2].seconds - found[0].seconds
+    drift = by_peak if abs(by_peak) < abs(by_rise) else by_rise
+    limit = max(_DRIFT_FRAMES / episode.fps, _DRIFT_S)
+    if by_peak * by_rise <= 0 or abs(drift) < limit:
+        return
+    middle = found[1].peak_s
+    low, high = sorted((found[0].peak_s, found[2].peak_s))
+    if not low - 0.04 <= middle <= high + 0.04:
+        return  # it comes and goes: no drift of a clock
+    yield Finding(
+        "out-of-step",
+        Use.DROP,
+        f"the observation of {part_text(track.part)} drifts against its action, from "
+        f"{found[0].peak_s:.2f} s behind it in the first third to {found[2].peak_s:.2f} s in the "
+        "last",
+        track.part,
+        value=round(drift, 3),
+        limit=round(limit, 3),
+        unit="s",
+    )
+
+
+# -- the rate ------------------------------------------------------------------------------------
+
+
+def _fps(episode: Episode) -> Iterator[Finding]:
+    yield from _stamps(episode)
+    yield from _speed_limits(episode)
+    yield from _velocities(episode)
+
+
+def _stamps(episode: Episode) -> Iterator[Finding]:
+    stamps = episode.stamps
+    if stamps is None or len(stamps) < 8:
+        return
+    steps = np.diff(stamps)
+    if not steps.any():
+        yield Finding("fps", Use.REVIEW, "the times of all frames are the same")
+        return
+    if (steps <= 0).any():
+        count = int((steps <= 0).sum())
+        at = int(np.argmax(steps <= 0))
+        yield Finding(
+            "fps",
+            Use.REVIEW,
+            f"the times of the frames do not ascend at {count} places, first at "
+            f"{episode.t[at]:.1f} s",
+            begin_s=float(episode.t[at]),
+            end_s=float(episode.t[at + 1]),
+            value=float(count),
+            limit=0.0,
+        )
+        return
+    usual = float(np.median(steps))
+    if episode.numbers is not None:
+        ahead = np.diff(episode.numbers)
+        if (ahead > 0).all():
+            usual = float(np.median(steps / ahead))
+    rate = 1 / usual
+    if abs(rate / episode.fps - 1) > _OFF:
+        yield Finding(
+            "fps",
+            Use.REVIEW,
+            f"its times are those of {rate:.3g} frames per second, and {episode.fps:g} are stated: "
+            "all speeds are wrong by this",
+            value=round(rate, 3),
+            limit=episode.fps,
+            unit="Hz",
+        )
+        return
+    spread = float(np.percentile(np.abs(steps - usual), 75)) / usual
+    if spread > _JITTER:
+        yield Finding(
+            "fps",
+            Use.REVIEW,
+            f"the times between frames vary: a quarter of them is off by {spread:.0%} of a "
+            "period or more",
+            value=round(spread, 3),
+            limit=_JITTER,
+            unit="periods",
+        )
+
+
+def _speed_limits(episode: Episode) -> Iterator[Finding]:
+    """Hands that are faster than their motors whenever they move."""
+    for track in episode.tracks:
+        state = series_of(track, "state")
+        if state is None or track.fastest is None or len(state.q) < 30:
+            continue
+        speed = np.abs(state.q[3:] - state.q[:-3]) * episode.fps / 3
+        allowed = track.fastest / stroke(track)
+        moving = speed > 0.3 * allowed
+        counts = moving.sum(axis=0)
+        fast = np.where(moving, speed / allowed, 0)
+        often = (fast > 3.0).sum(axis=0) > np.maximum(0.3 * counts, 8)
+        if often.sum() * 2 > len(allowed):
+            ratio = float(np.median(fast[:, often].max(axis=0)))
+            yield Finding(
+                "fps",
+                Use.REVIEW,
+                f"{part_text(track.part)} moves {ratio:.1f} times as fast as its motors can, all "
+                f"the time, at the stated {episode.fps:g} frames per second",
+                track.part,
+                value=round(ratio, 2),
+                limit=3.0,
+            )
+
+
+def _velocities(episode: Episode) -> Iterator[Finding]:
+    """Velocities against the differences of positions."""
+    for track in episode.tracks:
+        state = series_of(track, "state")
+        if track.dq is None or state is None or len(state.q) < 30:
+            continue
+        dq = np.nan_to_num(track.dq) / stroke(track)
+        seen = (state.q[2:] - state.q[:-2]) * (0.5 * episode.fps)
+        said = dq[1:-1]
+        own, other = (said**2).sum(axis=0), (seen**2).sum(axis=0)
+        use = moves(state, 0.1) & (own > 0) & (other > 0)
+        if not use.any():
+            continue
+        product = (seen * said).sum(axis=0)
+        match = product[use] / np.sqrt(own[use] * other[use])
+        ratio = np.sqrt(other[use] / own[use])
+        if float(np.median(match)) < 0.85:
+            continue
+        times = float(np.median(ratio))
+        alike = np.abs(np.log(ratio / times)).max() < np.log(1.3)
+        if alike and (1.25 < times < 8 or 0.125 < times < 0.8):
+            yield Finding(
+                "fps",
+                Use.REVIEW,
+                f"{part_text(track.part)} moves {times:.2f} times as fast, by its positions and "
+                f"the stated {episode.fps:g} frames per second, as its own velocities say "
+                f"(correlation {float(np.median(match)):.2f}): rather "
+                f"{episode.fps / times:.3g} frames per second",
+                track.part,
+                value=round(times, 3),
+                limit=1.25,
+            )
+
+
+CHECKS = (
+    Check(
+        "out-of-step",
+        "Observation and action out of step",
+        frozenset({Data.STATE, Data.ACTION}),
+        _out_of_step,
+    ),
+    Check("fps", "True time against the stated rate", frozenset({Data.STATE}), _fps),
+)

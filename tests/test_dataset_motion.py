@@ -1,0 +1,222 @@
+"""Checks of what is wrong with the stream of numbers in time, and good episodes that are odd."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dexkit.conformance.dataset.episode import Episode, Gap
+from dexkit.conformance.dataset.findings import Use
+from dexkit.conformance.dataset.judge import judge
+from dexkit.hand import Floats
+from tests.dataset_episodes import Plant, changed, episode, found
+
+FPS = 30
+
+
+def _hold(begin: int, end: int, joint: int | None = None) -> object:
+    def change(values: Floats) -> Floats:
+        columns = slice(None) if joint is None else joint
+        values[begin:end, columns] = values[begin, columns]
+        return values
+
+    return change
+
+
+def _taken(source: Episode, index: Floats, *, times: bool = False) -> Episode:
+    """All streams at other frames; ``times``: the frames keep their numbers and times."""
+    at = np.asarray(index, dtype=int)
+    copy = changed(source, "", state=lambda x: x[at], action=lambda x: x[at], fields=True)
+    rest = at if times else np.arange(len(at))
+    assert source.stamps is not None
+    assert source.numbers is not None
+    return replace(copy, t=source.t[rest], stamps=source.stamps[rest], numbers=source.numbers[rest])
+
+
+@pytest.mark.parametrize("fields", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 0.0006])
+def test_frozen_part(noise: float, fields: bool) -> None:
+    good = episode(2, plant=Plant(noise=noise), fields=True)
+    bad = changed(good, "left_hand", state=_hold(100, 240), fields=fields)
+    [finding] = found(bad, "frozen")
+    assert finding.use is Use.DROP
+    assert finding.part == "left_hand"
+    assert not finding.joints
+    assert finding.begin_s == pytest.approx(100 / FPS, abs=0.1)
+    assert finding.end_s == pytest.approx(240 / FPS, abs=0.1)
+    assert ("numbers froze" in finding.text) == fields
+
+
+def test_frozen_joint() -> None:
+    bad = changed(episode(4), "right_hand", state=_hold(0, 450, 3))
+    [finding] = found(bad, "frozen")
+    assert finding.joints == (3,)
+    assert "middle_0" in finding.text
+    assert "whole episode" in finding.text
+
+
+def test_frozen_all() -> None:
+    [finding] = found(changed(episode(5), "", state=_hold(60, 150)), "frozen")
+    assert finding.part == ""
+    assert "all parts" in finding.text
+
+
+def test_frozen_action() -> None:
+    [finding, *_] = found(changed(episode(8), "left_hand", action=_hold(90, 240)), "frozen")
+    assert "stream of actions froze" in finding.text
+
+
+def test_each_frame_twice() -> None:
+    n = 450
+    [finding] = found(_taken(episode(1), np.arange(n) // 2 * 2), "repeated")
+    assert finding.value == 2
+    assert "15 frames per second" in finding.text
+
+
+def test_run_of_one_frame() -> None:
+    index = np.concatenate([np.arange(200), np.full(20, 199), np.arange(200, 430)])
+    [finding] = found(_taken(episode(1), index), "repeated")
+    assert finding.begin_s == pytest.approx(200 / FPS, abs=0.1)
+
+
+def test_stretch_again() -> None:
+    index = np.arange(450)
+    index[300:360] = np.arange(100, 160)
+    [finding] = found(_taken(episode(1), index), "repeated")
+    assert "earlier" in finding.text
+    assert finding.begin_s == pytest.approx(10.0, abs=0.1)
+
+
+def test_lost_frames() -> None:
+    index = np.concatenate([np.arange(200), np.arange(230, 450)])
+    [silent] = found(_taken(episode(9), index), "missing")
+    assert silent.end_s == pytest.approx(200 / FPS, abs=0.05)
+    [told] = found(_taken(episode(9), index, times=True), "missing")
+    assert told.value == pytest.approx(29 / FPS, abs=0.05)
+
+
+def test_one_lost_frame_is_a_remark() -> None:
+    index = np.concatenate([np.arange(200), np.arange(201, 450)])
+    judged = judge(_taken(episode(3), index, times=True))
+    assert judged.use is Use.KEEP
+    assert [f.check for f in judged.findings if f.check == "missing"]
+
+
+def test_not_finite() -> None:
+    def nan(values: Floats) -> Floats:
+        values[50:60] = np.nan
+        return values
+
+    [finding] = found(changed(episode(1), "left_hand", state=nan), "missing")
+    assert finding.value == 10
+    assert finding.part == "left_hand"
+
+    def late(values: Floats) -> Floats:
+        values[:20] = np.nan
+        return values
+
+    assert not judge(changed(episode(1), "left_hand", action=late)).reasons
+
+
+def test_gaps_of_a_recording() -> None:
+    source = replace(episode(1, stamps=False), measured=True)
+    for seconds, use in ((0.2, Use.KEEP), (0.5, Use.REVIEW), (2.0, Use.DROP)):
+        bad = replace(source, gaps=[Gap(3.0, 3.0 + seconds, "rt/dex3/left/state")])
+        assert judge(bad).use is use
+    assert judge(replace(source, gaps=[Gap(3.0, 3.5, "rt/dex3/left/cmd")])).use is Use.KEEP
+
+
+@pytest.mark.parametrize(
+    ("frames", "size", "words"),
+    [(1, 0.6, "out and back"), (9999, 0.5, "in a frame"), (60, 2 * np.pi, "full turn")],
+)
+def test_jump(frames: int, size: float, words: str) -> None:
+    def leap(values: Floats) -> Floats:
+        values[150 : 150 + frames, 2] += size
+        return values
+
+    findings = found(changed(episode(6), "right_arm", state=leap), "jump")
+    assert findings
+    assert all(f.joints == (2,) and f.part == "right_arm" for f in findings)
+    assert words in findings[0].text
+
+
+@pytest.mark.parametrize("frames", [-12, 30])
+def test_out_of_step(frames: int) -> None:
+    index = np.clip(np.arange(450) - frames, 0, 449)
+    bad = changed(episode(7), "", state=lambda x: x[index])
+    findings = found(bad, "out-of-step")
+    assert {f.part for f in findings} >= {"left_hand", "right_hand", "left_arm", "right_arm"}
+    lag = judge(bad).figures["lag, s"]
+    assert lag == pytest.approx(frames / FPS + judge(episode(7)).figures["lag, s"], abs=0.05)
+
+
+def test_drift() -> None:
+    at = np.arange(450) - np.linspace(0, 15, 450)
+
+    def late(values: Floats) -> Floats:
+        columns = [np.interp(at, np.arange(450), values[:, j]) for j in range(values.shape[1])]
+        return np.stack(columns, axis=1)
+
+    findings = found(changed(episode(7), "", state=late), "out-of-step")
+    assert any("drifts" in f.text for f in findings)
+
+
+def test_rate_of_stamps() -> None:
+    good = episode(1)
+    assert good.stamps is not None
+    [finding] = found(replace(good, stamps=good.stamps * 1.5), "fps")
+    assert finding.value == pytest.approx(20)
+    [finding] = found(replace(good, stamps=good.stamps * 0), "fps")
+    assert "the same" in finding.text
+
+
+def test_rate_by_velocities() -> None:
+    good = episode(1, fields=True)
+    assert good.stamps is not None
+    bad = replace(good, fps=15.0, t=good.t * 2, stamps=good.stamps * 2)
+    findings = found(bad, "fps")
+    assert findings
+    assert findings[0].value == pytest.approx(0.5, abs=0.05)
+
+
+def test_idle() -> None:
+    index = np.concatenate([np.arange(450), np.full(300, 449)])
+    good = episode(1, seconds=25)
+    bad = changed(good, "", state=lambda x: x[index], action=lambda x: x[index])
+    [finding] = found(bad, "idle")
+    assert finding.value == pytest.approx(10, abs=1.5)
+    assert judge(bad).figures["idle, %"] > 35
+
+
+GOOD: dict[str, Episode] = {
+    "coarse": episode(20, plant=Plant(steps=64)),
+    "coarse, slow, simulated": episode(21, plant=Plant(steps=64, noise=0.0), pace=0.3),
+    "noisy": episode(22, plant=Plant(noise=0.012)),
+    "slow hand": episode(23, plant=Plant(delay_s=0.3, tau_s=0.15, fastest=0.8)),
+    "slow hand, trigger": episode(24, plant=Plant(delay_s=0.3, fastest=0.8), kind="trigger"),
+    "taught": episode(25, same="state"),
+    "next state": episode(26, same="next"),
+    "object": episode(27, plant=Plant(block=0.45)),
+    "object, simulated": episode(28, plant=Plant(block=0.45, noise=0.0), kind="trigger"),
+    "slow registers": episode(29, hand="inspire-ftp", plant=Plant(delay_s=0.35, renew_s=0.12)),
+    "simulated": episode(30, plant=Plant(noise=0.0), arm_plant=Plant(noise=0.0)),
+    "sag": episode(31, arm_plant=Plant(sag=0.05)),
+    "quick": episode(32, pace=2.5),
+    "10 fps": episode(33, fps=10),
+    "60 fps": episode(34, fps=60, seconds=8),
+    "2 s": episode(35, seconds=2),
+    "opens": episode(36, hand="dex1-1", kind="opens"),
+    "unknown six joints": episode(37, hand="", joints=6),
+    "one hand": episode(38, hands=["right_hand"], arms=False, hand="dex1-1"),
+    "rhythm": episode(39, kind="sine"),
+    "fields": episode(40, hand="dex5-1", fields=True, plant=Plant(fastest=2.0)),
+}
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_good(name: str) -> None:
+    judged = judge(GOOD[name])
+    assert not judged.reasons
