@@ -208,7 +208,7 @@ def test_a_stop_leaves_a_partial_result_that_the_next_audit_completes(tmp_path: 
     outcome = audit.run(in_this_process, stop, after_two)
     assert (outcome.done, outcome.total, outcome.stopped) == (2, 3, True)
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 2
-    assert "1 file not examined" in (out / "summary.html").read_text()
+    assert "1 episode not examined" in (out / "summary.html").read_text()
     outcome = audit.run(in_this_process)
     assert (outcome.done, outcome.reused, outcome.stopped) == (3, 2, False)
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 3
@@ -346,8 +346,8 @@ def test_summary_page_lists_worst_files_and_trends(tmp_path: Path) -> None:
                 )
             )
     page = render(summary, locations=["archive"], left=3)
-    assert "2 files with a failure" in page
-    assert "3 files not examined" in page
+    assert "hands in 2 recordings are no drop-ins" in page
+    assert "3 episodes not examined" in page
     assert "<b>bad" not in page
     assert page.index("3/&lt;b&gt;bad.mcap") < page.index("Over time")
     assert "since 2026-01-01" in page

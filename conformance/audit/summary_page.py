@@ -1,4 +1,4 @@
-"""The summary page of an audit: worst files first, trends, groups; in the style of the reports."""
+"""The summary page of an audit: what to keep, review and drop, and why; trends and groups."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import numpy as np
 
 from dexkit import __version__
 from dexkit.conformance.audit.records import EpisodeRecord, State
+from dexkit.conformance.audit.training_summary import TrainingSummary
+from dexkit.conformance.dataset.findings import Use
 from dexkit.conformance.kit.requirements import catalogue
 from dexkit.conformance.kit.results import Overall, Verdict
 from dexkit.conformance.kit.run_record import catalogue_digest
@@ -34,7 +36,7 @@ _DAY = 86_400.0
 
 @dataclass
 class Group:
-    """Files that have something in common."""
+    """Episodes that have something in common; ``failing`` are to be dropped, or fail a MUST."""
 
     files: int = 0
     failing: int = 0
@@ -73,6 +75,7 @@ class Summary:
     """
 
     def __init__(self) -> None:
+        self.training = TrainingSummary()
         self.all = Group()
         self.states: Counter[State] = Counter()
         self.overall: Counter[str] = Counter()
@@ -86,6 +89,7 @@ class Summary:
 
     def add(self, record: EpisodeRecord) -> None:
         """Count an episode."""
+        self.training.add(record)
         if record.is_set:
             return
         facts = record.facts
@@ -119,6 +123,8 @@ class Summary:
         return [*found, ("folder", folder)] if folder else found
 
     def _rank(self, record: EpisodeRecord, failed: Sequence[str]) -> None:
+        if not record.overall:  # of the wire only; the others have cards
+            return
         badness = record.sort_key
         if badness == (0, 0, 0):
             return
@@ -189,11 +195,14 @@ def render(
     days = sorted(summary.days)
     return fill(
         "audit.html",
-        title=f"Audit of {_count(summary.all.files, 'file')}",
+        title=f"Audit of {_count(summary.all.files, 'episode')}",
         summary=summary,
+        training=summary.training,
+        commands=commands,
+        wire=bool(summary.overall),
         css=css,
         answer=answer,
-        of=f"of {summary.all.files:,}, {_span(summary.all.seconds)}",
+        of=_span(summary.all.seconds),
         left=left,
         ANSWERS={str(overall): ANSWERS[overall] for overall in Overall},
         known=_facts(summary, locations),
@@ -219,12 +228,17 @@ def _span(seconds: float) -> str:
 
 def _answer(summary: Summary, left: int) -> tuple[str, str]:
     """Class and title of the answer."""
-    every = summary.all
+    every, uses = summary.all, summary.training.uses
+    counts = ", ".join(f"{uses[use]:,} {use}" for use in Use)
+    title = f"{_count(every.files, 'episode')}: {counts}"
+    if every.unusable:
+        title += f", {every.unusable:,} not usable or inconclusive"
+    if failing := summary.overall[Overall.FAIL]:
+        title += f"; hands in {_count(failing, 'recording')} are no drop-ins"
     if every.failing:
-        return "bad", f"{_count(every.failing, 'file')} with a failure"
-    if every.unusable or left or not every.files:
-        return "open", "No failure, and not all could be judged"
-    return "ok", "No failure"
+        return "bad", title
+    is_open = every.unusable or left or uses[Use.REVIEW] or not every.files
+    return "open" if is_open else "ok", title
 
 
 def _facts(summary: Summary, locations: Sequence[str]) -> dict[str, str]:
@@ -251,7 +265,7 @@ def _short(name: str, locations: Sequence[str]) -> str:
 
 
 def _trend(summary: Summary, days: Sequence[float]) -> Chart | None:
-    """The part of files that fail, and that cannot be used, day by day."""
+    """The part of episodes that fail, and that cannot be used, day by day."""
     if len(days) < 2:
         return None
     x = (np.array(days) - days[0]) / _DAY
@@ -260,9 +274,9 @@ def _trend(summary: Summary, days: Sequence[float]) -> Chart | None:
     unusable = np.array([100 * g.unusable / g.files for g in groups])
     draw = "dots" if len(days) < 8 else "line"
     return Chart(
-        "files with a failure, and files that cannot be used, per cent by day",
+        "episodes to drop or with a failure, and those that cannot be used, per cent by day",
         [
-            Line("with a failure", "bad", x, failing, draw),
+            Line("to drop or with a failure", "bad", x, failing, draw),
             Line("not usable or inconclusive", "other", x, unusable, draw),
         ],
         span=(0.0, float(x[-1])),

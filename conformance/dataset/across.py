@@ -7,7 +7,13 @@ from collections.abc import Mapping
 from dexkit.conformance.dataset.findings import Finding, Judgement
 from dexkit.conformance.dataset.whole_set import WholeSet
 
-__all__ = ["across"]
+__all__ = ["OF_SETS", "across"]
+
+OF_SETS = {
+    "duplicate": "Every episode once",
+    "statistics": "Statistics of the metadata are those of the data",
+}
+"""Names and titles of what is found here."""
 
 
 def across(

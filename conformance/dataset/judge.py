@@ -7,6 +7,7 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
+from dexkit.conformance.dataset.across import OF_SETS
 from dexkit.conformance.dataset.check import Check, Figure, data_of
 from dexkit.conformance.dataset.checks import frames, frozen, idle, jumps, metadata, timing
 from dexkit.conformance.dataset.episode import Episode, Track
@@ -14,7 +15,7 @@ from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_o
 from dexkit.conformance.dataset.motion import span
 from dexkit.hand import Floats
 
-__all__ = ["CHECKS", "VERSION", "checks_digest", "judge"]
+__all__ = ["CHECKS", "TITLES", "VERSION", "checks_digest", "judge"]
 
 CHECKS: tuple[Check, ...] = (
     *frozen.CHECKS,
@@ -25,6 +26,8 @@ CHECKS: tuple[Check, ...] = (
     *metadata.CHECKS,
 )
 """Every check of a single episode."""
+TITLES = {check.name: check.title for check in CHECKS} | OF_SETS
+"""What each check looks for, those of :mod:`~dexkit.conformance.dataset.across` included."""
 VERSION = 1
 """Goes up when a check judges differently; an audit then judges again."""
 
