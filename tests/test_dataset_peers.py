@@ -66,6 +66,12 @@ def test_a_program_that_fails_is_a_row(
     assert (run.exit, run.trouble, run.findings) == (exit_code, trouble, [])
 
 
+def test_what_is_no_lerobot_dataset_is_a_row(tmp_path: Path) -> None:
+    (tmp_path / "episode_0001").mkdir()
+    run = measured(lerobot_lint("/nowhere/lelint"), tmp_path)
+    assert (run.trouble, run.exit) == ("not run: no LeRobot dataset", None)
+
+
 def test_a_program_that_is_not_there_is_a_row(dataset: Path) -> None:
     run = measured(lerobot_lint("/nowhere/lelint"), dataset)
     assert run.exit is None
@@ -140,16 +146,15 @@ def test_the_whole_comparison(
     ]
     (tmp_path / "labels.json").write_text(json.dumps(rows))
     out = tmp_path / "out.json"
-    lint = program(tmp_path, LINT)
-    assert (
-        main(["--labels", str(tmp_path / "labels.json"), "--lint", lint, "--json", str(out)]) == 0
-    )
+    options = ["--labels", str(tmp_path / "labels.json"), "--json", str(out)]
+    assert main([*options, "--lint", program(tmp_path, LINT)]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert [line.split() for line in printed if line.startswith(("frozen_joint", GOOD))] == [
-        ["frozen_joint", "1", "1/0/0/0"],
-        [GOOD, "1", "0/0/0/0"],
+        ["frozen_joint", "1", "0/0/0/1", "1/0/0/0"],
+        [GOOD, "1", "0/0/0/1", "0/0/0/0"],
     ]
     saved = json.loads(out.read_text())
-    assert saved["runs"][0]["findings"]["1"][0]["check"] == "DEAD_JOINT"
+    assert saved["runs"][1]["findings"]["1"][0]["check"] == "DEAD_JOINT"
     assert saved["scores"]["frozen_joint"]["lerobot-lint"] == {"found": 1, "episodes": 1}
-    assert main([str(dataset)]) == 2
+    assert {run["tool"] for run in saved["runs"]} == {"dexkit audit", "lerobot-lint"}
+    assert main([]) == 2

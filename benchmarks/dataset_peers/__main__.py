@@ -10,7 +10,13 @@ from pathlib import Path
 
 from benchmarks.dataset_peers import LEVELS, Run
 from benchmarks.dataset_peers.labels import Label, labels, scores
-from benchmarks.dataset_peers.programs import Program, lerobot_doctor, lerobot_lint, measured
+from benchmarks.dataset_peers.programs import (
+    Program,
+    dexkit_audit,
+    lerobot_doctor,
+    lerobot_lint,
+    measured,
+)
 from benchmarks.dataset_peers.tables import runs_table, scores_table, totals_table
 
 
@@ -27,10 +33,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     known = labels(given.labels) if given.labels else []
     sets = given.sets or sorted({label.dataset for label in known})
-    programs = lerobot_doctor(given.doctor) if given.doctor else []
+    programs = [dexkit_audit()]
+    programs += lerobot_doctor(given.doctor) if given.doctor else []
     programs += [lerobot_lint(given.lint)] if given.lint else []
-    if not sets or not programs:
-        print("nothing to compare: no sets, or no program", file=sys.stderr)
+    if not sets:
+        print("nothing to judge: no sets", file=sys.stderr)
         return 2
     runs = []
     for i, folder in enumerate(sets):

@@ -73,6 +73,38 @@ _PEERS: Mapping[str, set[str]] = {
 }
 """Of each fault: the words of lerobot-doctor and lerobot-lint that fit it."""
 
+_DEXKIT: Mapping[str, set[str]] = {
+    "frozen_joint": {"frozen"},
+    "frozen_side": {"frozen"},
+    "frozen_all": {"frozen"},
+    "repeated_frames": {"repeated"},
+    "action_shift": {"out-of-step"},
+    "lag_drift": {"out-of-step"},
+    "clipped_action": {"clipped"},
+    "not_followed": {"not-followed", "frozen"},
+    "jump": {"jump"},
+    "wrong_unit": {"units"},
+    "wrong_side": {"sides"},
+    "wrong_joint_order": {"order"},
+    "inverted_sign": {"sign"},
+    "missing_stretch": {"missing", "jump"},
+    "wrong_fps": {"fps"},
+    "duplicate": {"duplicate"},
+    "idle_start": {"idle"},
+    "idle_end": {"idle"},
+    "grasp_on_nothing": {"grasp"},
+    "drop_in_grasp": {"grasp"},
+    "camera_frozen": {"camera-frozen"},
+    "camera_late": {"camera-late"},
+    "camera_early_end": {"camera-missing", "camera-late"},
+    "camera_missing": {"camera-missing"},
+    "no_task": {"task"},
+    "wrong_stats": {"statistics"},
+    "not_finite": {"readable"},
+    "broken_file": {"unreadable", "readable", "missing"},
+}
+"""Of each fault: the checks of dexkit that are made for it."""
+
 
 @dataclass(frozen=True)
 class Label:
@@ -140,4 +172,4 @@ def scores(
 
 
 def _fits(finding: Finding, fault: str) -> bool:
-    return finding.check.removesuffix("_CRASHED") in _PEERS.get(fault, ())
+    return finding.check in _PEERS.get(fault, ()) or finding.check in _DEXKIT.get(fault, ())

@@ -15,10 +15,15 @@ from typing import Any
 
 from benchmarks.dataset_peers import Finding, Run, doctor
 
-__all__ = ["Program", "lerobot_doctor", "lerobot_lint", "measured"]
+__all__ = ["Program", "dexkit_audit", "lerobot_doctor", "lerobot_lint", "measured"]
 
 _LAUNCH = Path(__file__).parent / "launch.py"
 _LINT_LEVELS = {"info": "note", "warning": "warning", "error": "failure"}
+_USES = {"keep": "note", "review": "warning", "drop": "failure"}
+
+
+class NothingJudged(Exception):
+    """A program has judged nothing of a set; the message is its own."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +32,47 @@ class Program:
 
     :param name: as the tables have it.
     :param command: its arguments for a set, and a folder of its own to write to.
-    :param findings: of what it printed, and that folder; raises ValueError, KeyError, TypeError or
-        OSError where there are none.
+    :param findings: of what it printed, and that folder; raises :exc:`NothingJudged`, ValueError,
+        KeyError, TypeError, AttributeError or OSError where there are none.
+    :param only_lerobot: it reads LeRobot datasets and nothing else.
     """
 
     name: str
     command: Callable[[Path, Path], Sequence[str]]
     findings: Callable[[str, Path], list[Finding]]
+    only_lerobot: bool = True
+
+
+def dexkit_audit() -> Program:
+    """The audit of this dexkit, in one process as the others are."""
+    command = [sys.executable, "-m", "dexkit", "audit", "--jobs", "1", "--set", "format=jsonl"]
+    return Program(
+        "dexkit audit",
+        lambda dataset, out: [*command, "--out", str(out / "audit"), str(dataset)],
+        lambda _, out: _of_audit(out / "audit"),
+        only_lerobot=False,
+    )
+
+
+def _of_audit(folder: Path) -> list[Finding]:
+    """What it found, and the episodes that it cannot read.
+
+    :raises NothingJudged: of the set.
+    """
+    episodes = [json.loads(line) for line in (folder / "episodes.jsonl").open()]
+    numbers = {row["episode"]: row["number"] for row in episodes}
+    unread = [row for row in episodes if row["state"] != "judged"]
+    if len(unread) == len(episodes):
+        raise NothingJudged("; ".join(row["error"] for row in unread))
+    said = [json.loads(line) for line in (folder / "findings.jsonl").open()]
+    return [
+        *(Finding("unreadable", "failure", row["number"], row["error"]) for row in unread),
+        *(
+            Finding(f["requirement"], _USES[f["verdict"]], numbers[f["episode"]], f["observed"])
+            for f in said
+            if f["about"] == "training"
+        ),
+    ]
 
 
 def lerobot_doctor(command: str) -> list[Program]:
@@ -84,10 +123,14 @@ def lerobot_lint(command: str) -> Program:
 def measured(program: Program, dataset: Path, timeout: float = 1800.0) -> Run:
     """Run a program on a set, without network and with empty caches.
 
-    Whatever it does is a run: it may crash, print nonsense, or last too long.
+    Whatever it does is a run: it may crash, print nonsense, or last too long. A program that reads
+    LeRobot datasets only is not started on others.
     """
     dataset = dataset.resolve()
     run = Run(program.name, dataset, **_size(dataset))
+    if program.only_lerobot and not any((dataset / part).is_dir() for part in ("meta", "data")):
+        run.trouble = "not run: no LeRobot dataset"
+        return run
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         report, printed, errors = out / "report.json", out / "stdout", out / "stderr"
@@ -111,6 +154,8 @@ def measured(program: Program, dataset: Path, timeout: float = 1800.0) -> Run:
             return run
         try:
             run.findings = program.findings(printed.read_text(errors="replace"), out)
+        except NothingJudged as e:
+            run.trouble = str(e)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             late = f"ended after {timeout:g} s" if run.wall_s >= timeout else ""
             run.trouble = late or _last_line(said) or "it printed no findings"
