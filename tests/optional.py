@@ -108,7 +108,9 @@ OPTIONAL = (
     Optional("viser", _package("viser"), ("view", "view_browser", "view_soak", "web_pages")),
     Optional("aiohttp", _package("aiohttp"), ("audit_objects", "redaction")),
     Optional("ray", _package("ray"), ("audit_ray",)),
-    Optional("pyarrow", _package("pyarrow"), ("sessions_round_trips",)),
+    Optional("pyarrow", _package("pyarrow"), ("dataset_cameras", "sessions_round_trips")),
+    Optional("PyAV", _package("av"), ("dataset_cameras",)),
+    Optional("Pillow", _package("PIL"), ("dataset_cameras",)),
     Optional("jsonschema", _package("jsonschema"), ("conformance_schema",)),
 )
 

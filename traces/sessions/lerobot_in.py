@@ -183,8 +183,8 @@ class Dataset:
     def read(self, episode: int, *, joints_only: bool = False) -> Session:
         """Read one episode.
 
-        :param joints_only: without pictures of the table and other columns, and without looking
-            for swapped hands.
+        :param joints_only: without other columns, without looking for swapped hands, and pictures
+            of the table are read only when they are asked for.
         :raises SessionError: its data are missing or of another form than the features declare.
         """
         problems = Problems()
@@ -217,7 +217,7 @@ class Dataset:
             rate=self.fps,
             parts=parts,
             folder=self.root,
-            cameras=list(self._cameras(episode, path, table, problems)),
+            cameras=list(self._cameras(episode, path, table, problems, on_demand=joints_only)),
             problems=problems,
             corrections=list(dict.fromkeys(corrections)),
             name=f"episode_{episode:06d}",
@@ -573,9 +573,12 @@ class Dataset:
     # -----------------------------------------------------------------
 
     def _cameras(
-        self, episode: int, path: Path, table: Any, problems: Problems
+        self, episode: int, path: Path, table: Any, problems: Problems, *, on_demand: bool = False
     ) -> Iterator[Camera]:
-        """The cameras of an episode; of those with a video, without a table, the first frame."""
+        """The cameras of an episode; of those with a video, without a table, the first frame.
+
+        :param on_demand: the table has no pictures; they are read when they are asked for.
+        """
         names: dict[str, str] = {}
         for key, feature in self.info.features.items():
             if feature.dtype not in ("video", "image"):
@@ -587,6 +590,9 @@ class Dataset:
                 yield from self._video(name, key, episode, path, table, problems)
             elif table is None:
                 continue
+            elif on_demand:
+                paths = tuple(f"frame {i}" for i in range(table.num_rows))
+                yield Camera(name, paths, load=_Pictures(path, key, episode))
             elif (camera := _embedded(name, key, path, table)) is None:
                 problems.add(f"{name}: its pictures are not in the Parquet file")
             else:
@@ -612,14 +618,17 @@ class Dataset:
         if not file.is_file():
             problems.add(f"{name}: its video is missing", file.name)
         first = typed(row.get(f"videos/{key}/from_timestamp"), _Seconds) or 0.0
+        end = typed(row.get(f"videos/{key}/to_timestamp"), _Seconds)
         relative = file.relative_to(self.root.resolve()).as_posix()
         if table is None:
-            yield Camera(name, (relative,), seconds=(first,))
+            yield Camera(name, (relative,), seconds=(first,), begin_s=first, end_s=end)
             return
         stamps = _column(table, "timestamp")
         if stamps is None:
             stamps = np.arange(table.num_rows) / self.fps
-        yield Camera(name, (relative,) * table.num_rows, seconds=tuple((first + stamps).tolist()))
+        seconds = tuple((first + stamps).tolist())
+        paths = (relative,) * table.num_rows
+        yield Camera(name, paths, seconds=seconds, begin_s=first, end_s=end)
 
     def _rest(self, path: Path, table: Any) -> list[str]:
         """The other columns, as JSON; empty where they do not change."""
@@ -666,6 +675,38 @@ def _embedded(name: str, key: str, path: Path, table: Any) -> Camera | None:
         return None
     paths = tuple(f"frame {i}" for i in range(len(data)))
     return Camera(name, paths, load=lambda i: data[i] if isinstance(data[i], bytes) else None)
+
+
+class _Pictures:
+    """The pictures of an episode in a Parquet file, read when the first of them is asked for."""
+
+    def __init__(self, path: Path, key: str, episode: int) -> None:
+        self._path = path
+        self._key = key
+        self._episode = episode
+        self._data: list[bytes | None] | None = None
+
+    def __call__(self, frame: int) -> bytes | None:
+        """The picture of a frame, by its place in the episode.
+
+        :raises SessionError: the file cannot be read.
+        """
+        if self._data is None:
+            self._data = self._read()
+        return self._data[frame] if frame < len(self._data) else None
+
+    def _read(self) -> list[bytes | None]:
+        wanted = (self._key, "episode_index")
+        number = self._episode
+        table = read_parquet(self._path, lambda n: n in wanted, episodes=(number, number))
+        if self._key not in table.column_names:
+            return []
+        if "episode_index" in table.column_names:
+            numbers = table["episode_index"].to_numpy(zero_copy_only=False)
+            table = table.take(np.flatnonzero(numbers == number))
+        rows = _values(self._path, table, self._key)
+        data = (r.get("bytes") if isinstance(r, dict) else None for r in rows)
+        return [d if isinstance(d, bytes) else None for d in data]
 
 
 def _is_statistic(column: str) -> bool:

@@ -115,6 +115,8 @@ class Camera:
     :param group: ``colors`` or ``depths``.
     :param seconds: of a video, the time within the file at each frame; None for single pictures.
     :param load: of pictures without files of their own, the picture of a frame; they are embedded.
+    :param begin_s: of a video, the time within the file at which the session begins, as the source
+        states it; ``end_s`` at which it ends, None where it does not say.
     """
 
     name: str
@@ -122,6 +124,8 @@ class Camera:
     group: str = "colors"
     seconds: tuple[float, ...] | None = None
     load: Callable[[int], bytes | None] | None = None
+    begin_s: float = 0.0
+    end_s: float | None = None
 
 
 @dataclass(eq=False)
