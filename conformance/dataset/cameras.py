@@ -28,7 +28,16 @@ from dexkit.traces.sessions.model import Camera
 from dexkit.traces.sessions.paths import below
 from dexkit.traces.sessions.pictures import parse_picture, read_picture
 
-__all__ = ["HEIGHT", "WIDTH", "CameraTrack", "not_judged", "picture", "tracks_of"]
+__all__ = [
+    "HEIGHT",
+    "WIDTH",
+    "CameraTrack",
+    "decoders",
+    "looked_at",
+    "not_judged",
+    "picture",
+    "tracks_of",
+]
 
 HEIGHT, WIDTH = 12, 16
 """Blocks of a thumbnail: large enough that a sensor's noise hardly changes their means, and small
@@ -169,6 +178,11 @@ def _is_there(library: str) -> bool:
     return importlib.util.find_spec(library) is not None
 
 
+def decoders() -> list[str]:
+    """The libraries that are here to decode pictures with."""
+    return [library for library in ("av", "PIL") if _is_there(library)]
+
+
 def not_judged(episode: Episode) -> list[str]:
     """Why cameras of an episode are not looked at, as sentences; equal for the episodes of a set.
 
@@ -182,6 +196,18 @@ def not_judged(episode: Episode) -> list[str]:
             found.append("videos are not looked at: the set is here without them")
     if any(c.seconds is None for c in _colours(episode)) and not _is_there("PIL"):
         found.append("pictures are not looked at: that needs Pillow, pip install 'dexkit[video]'")
+    return found
+
+
+def looked_at(episode: Episode) -> list[Camera]:
+    """The cameras that can be judged here: without those of which :func:`not_judged` speaks, and
+    without depth cameras.
+    """
+    found = _colours(episode)
+    if not _is_there("av") or _without_videos(episode):
+        found = [c for c in found if c.seconds is None]
+    if not _is_there("PIL"):
+        found = [c for c in found if c.seconds is not None]
     return found
 
 
@@ -216,22 +242,11 @@ def _is_pointer(file: Path) -> bool:
 
 @lru_cache(maxsize=1)
 def tracks_of(episode: Episode) -> tuple[CameraTrack, ...]:
-    """What the cameras of an episode saw; decoded once for all checks.
-
-    Depth pictures have no times nor pixels here, only whether they are there. Cameras that
-    :func:`not_judged` speaks of are left out.
-    """
-    found = []
-    videos = _is_there("av") and not _without_videos(episode)
-    for camera in episode.cameras:
-        if camera.group == "depths":
-            continue
-        if camera.seconds is not None:
-            if videos:
-                found.append(_video_track(episode, camera))
-        elif _is_there("PIL"):
-            found.append(_picture_track(episode, camera))
-    return tuple(found)
+    """What the cameras of an episode saw; decoded once for all checks."""
+    return tuple(
+        _picture_track(episode, camera) if camera.seconds is None else _video_track(episode, camera)
+        for camera in looked_at(episode)
+    )
 
 
 # -- videos

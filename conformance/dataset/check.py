@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 
+from dexkit.conformance.dataset.cameras import looked_at
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding
 
@@ -65,6 +66,6 @@ def data_of(episode: Episode) -> frozenset[Data]:
         Data.STAMPS: episode.stamps is not None or episode.measured,
         Data.TASK: episode.tasks is not None,
         Data.STATISTICS: bool(episode.stated),
-        Data.CAMERA: bool(episode.cameras),
+        Data.CAMERA: bool(looked_at(episode)),
     }
     return frozenset(data for data, has in there.items() if has)

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dexkit.conformance.dataset.across import OF_SETS
+from dexkit.conformance.dataset.cameras import decoders
 from dexkit.conformance.dataset.check import Check, Figure, data_of
-from dexkit.conformance.dataset.checks import frames, frozen, idle, jumps, metadata, timing
+from dexkit.conformance.dataset.checks import cameras, frames, frozen, idle, jumps, metadata, timing
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_of
 from dexkit.conformance.dataset.motion import span
@@ -24,6 +25,7 @@ CHECKS: tuple[Check, ...] = (
     *timing.CHECKS,
     *idle.CHECKS,
     *metadata.CHECKS,
+    *cameras.CHECKS,
 )
 """Every check of a single episode."""
 TITLES = {check.name: check.title for check in CHECKS} | OF_SETS
@@ -40,8 +42,10 @@ _SHAPE = 32  # numbers that describe a motion
 
 
 def checks_digest() -> str:
-    """What verdicts depend on besides the episode: the checks and their version."""
-    return f"{VERSION} " + " ".join(check.name for check in CHECKS)
+    """What verdicts depend on besides the episode: the checks and their version, and what pictures
+    can be decoded with.
+    """
+    return " ".join([str(VERSION), *(check.name for check in CHECKS), *decoders()])
 
 
 def judge(episode: Episode) -> Judgement:
