@@ -20,6 +20,7 @@ from dexkit.errors import UsageError
 from dexkit.hand import Floats, Side
 from dexkit.models import Dialect, HandModel, dialect, model
 from dexkit.traces.replay.commands import Flags, HandCommands, RecordedCommands, counted
+from dexkit.traces.replay.frozen import frozen_joints
 from dexkit.traces.sessions.finger_order import Order, finger_order, like_fingers
 from dexkit.traces.sessions.resample import gap_of
 
@@ -323,6 +324,7 @@ class _Preparation:
             )
             return self.found
         chosen = self._chosen()
+        self._frozen()
         usable = {s: u for s, c in chosen.items() if (u := self._usable(s, c)) is not None}
         tracks = {s: self._translated(c) for s, c in usable.items()}
         if not tracks:
@@ -395,6 +397,29 @@ class _Preparation:
                 "--set swap-sides=yes to play it on the other one",
             )
         return {s: commands[s] for s in Side if s in sides}
+
+    def _frozen(self) -> None:
+        """Check for states that stand still while their commands move."""
+        for side, given in self.session.commands.items():
+            if side not in self.session.states or side not in (self.options.sides or Side):
+                continue
+            limits = joint_limits(self.recorded, side)
+            follows = given.driven & (given.kp > 0 if self.recorded.gains_are_used else True)
+            found = frozen_joints(
+                *self.session.states[side], given.t, given.q, follows, limits.stroke
+            )
+            if not found:
+                continue
+            which = np.isin(np.arange(len(limits.names)), list(found))
+            begin, end = max(found.values(), key=lambda span: span[1] - span[0])
+            text = (
+                f"the states of {_joints(limits, which[None])} stand still from {begin:.2f} s to "
+                f"{end:.2f} s, while the commands move"
+            )
+            if self.options.states:
+                self.refuse("frozen-states", text, "leave out play=states", str(side))
+            else:
+                self.note("frozen-states", f"{text}; only the commands are played", str(side))
 
     def _usable(self, side: Side, given: HandCommands) -> HandCommands | None:
         """Drop commands that cannot be sent; None if nothing is left."""
