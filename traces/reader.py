@@ -20,11 +20,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dexkit.errors import TraceUnreadable, TraceUnsupported, UsageError
+from dexkit.errors import SessionError, TraceUnreadable, TraceUnsupported, UsageError
 from dexkit.messages import Columns, MessageType, message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.messages.packed import Packed, rows_at
 from dexkit.messages.schemas import omgidl
+from dexkit.traces.bag_metadata import BAG, records_of_copy
 from dexkit.traces.clock_steps import LIMIT_NS, ClockStep
 from dexkit.traces.container import HEADS, MAX_CHUNK, Container, Heads, OpenFile, by_channel
 from dexkit.traces.mcap_records import Schema
@@ -264,8 +265,20 @@ class Trace:
         self.profile = self._file.profile
         self._info: dict[int, ChannelInfo] = {}
         self._describe()
+        if BAG in self.metadata:
+            self._read_bag_metadata(self.metadata[BAG])
         if self.truncated and not self.message_count:
             self._file.warn("it holds no messages")
+
+    def _read_bag_metadata(self, copy: dict[str, str]) -> None:
+        """Add the records that dexkit has put into a bag."""
+        try:
+            self.metadata |= {**records_of_copy(copy), **self.metadata}
+        except SessionError as error:
+            self._file.warn(
+                f"the bag's metadata cannot be read ({error.message}): what its messages were made "
+                "from is not known"
+            )
 
     # -- contents -------------------------------------------------------------------------
 

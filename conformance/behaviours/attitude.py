@@ -20,7 +20,7 @@ def _odd(ctx: Context, quaternions: Floats) -> NDArray[np.bool_]:
     return np.asarray((norm != 0.0) & ~(np.abs(norm - 1.0) <= ctx.tolerance("max_error")))
 
 
-@check("DEX3-IMU-01")
+@check("DEX3-IMU-01", rests_on=("attitude",))
 def attitude(ctx: Context) -> Outcome:
     """Norm of the quaternion, which may also be all 0."""
     assert ctx.states.columns is not None

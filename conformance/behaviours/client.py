@@ -17,7 +17,7 @@ from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.figures import Figure, Figures, worst
 from dexkit.conformance.checks.robot import RobotContext
-from dexkit.conformance.kit.provenance import STATES, TIMES
+from dexkit.conformance.kit.provenance import MESSAGES, STATES, TIMES
 from dexkit.conformance.kit.results import Evidence
 from dexkit.conformance.kit.sums import total
 from dexkit.hand import Floats, JointMode
@@ -102,7 +102,7 @@ def _between_stops(ctx: Context, driven: Mask) -> Iterator[tuple[int, NDArray[np
                 yield joint, np.arange(part.start, part.stop)
 
 
-@check("DEX1-CLIENT-01")
+@check("DEX1-CLIENT-01", rests_on=(MESSAGES,))
 def length(ctx: Context) -> Outcome:
     """Motors in the sequence of each command."""
     found, due = ctx.commands.length, ctx.recording.dialect.length
@@ -118,7 +118,7 @@ def length(ctx: Context) -> Outcome:
     )
 
 
-@check("DEX1-CLIENT-02")
+@check("DEX1-CLIENT-02", rests_on=(MESSAGES,))
 def finite(ctx: Context) -> Outcome:
     """NaN and infinite values in commands that contain all joints."""
     commands = ctx.commands
@@ -141,7 +141,7 @@ def finite(ctx: Context) -> Outcome:
     ).about(*np.flatnonzero(joints))
 
 
-@check("DEX1-CLIENT-03")
+@check("DEX1-CLIENT-03", explained_by=("kp",))
 def in_range(ctx: Context) -> Outcome:
     """Commanded positions outside the joint's range."""
     q, driven = ctx.commands.q, _driven(ctx)
@@ -175,7 +175,7 @@ def _unit(far: float, stroke: float) -> str:
     return "degrees" if abs(far) <= degrees else ""
 
 
-@check("DEX1-CLIENT-04")
+@check("DEX1-CLIENT-04", explained_by=("kp",))
 def not_normalised(ctx: Context) -> Outcome:
     """Whether q runs from 0 to exactly 1 and rests there, like a normalised value.
 

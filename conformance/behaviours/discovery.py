@@ -7,6 +7,7 @@ import numpy as np
 from dexkit.conformance.checks import Context, Outcome, causes, check
 from dexkit.conformance.checks.combined import all_of, warning
 from dexkit.conformance.checks.robot import RobotContext
+from dexkit.conformance.kit.provenance import MESSAGES
 from dexkit.models import DIALECTS
 from dexkit.traces import TraceEndpoint
 
@@ -17,7 +18,7 @@ def _endpoints(ctx: Context, topic: str, kind: str) -> list[TraceEndpoint]:
     return [e for e in ctx.recording.endpoints if e.topic == topic and e.kind == kind]
 
 
-@check("DEX1-TOPIC-01", "DEX3-TOPIC-01", "H1-TOPIC-01")
+@check("DEX1-TOPIC-01", "DEX3-TOPIC-01", "H1-TOPIC-01", rests_on=(MESSAGES,))
 def state_topic(ctx: Context) -> Outcome:
     """The state topic carries samples of the right type."""
     dialect = ctx.recording.dialect

@@ -18,9 +18,10 @@ from dexkit.conformance.checks.members import (
 from dexkit.conformance.checks.robot import RobotContext, wrong_rows
 from dexkit.conformance.kit.motor_messages import sequence_of
 from dexkit.conformance.kit.plots import Plot, PlotKind
+from dexkit.conformance.kit.provenance import MESSAGES
 
 
-@check("DEX1-FIELD-01", "DEX3-FIELD-01", "H1-FIELD-01")
+@check("DEX1-FIELD-01", "DEX3-FIELD-01", "H1-FIELD-01", rests_on=(MESSAGES,))
 def complete(ctx: Context) -> Outcome:
     """Samples decode, and have all motors and finite numbers."""
     return all_of(_length(ctx), _finite(ctx))

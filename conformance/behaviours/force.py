@@ -106,7 +106,7 @@ def _still(ctx: Context) -> Floats:
     return begins[full][high - low <= ctx.tolerance("max_ripple_stroke")]
 
 
-@check("DEX1-FORCE-02")
+@check("DEX1-FORCE-02", rests_on=("tau",))
 @worst("tau_nm", "max_tau_nm", nothing="the gripper never rests at its target in this recording")
 def at_rest(ctx: Context) -> Figures:
     """tau_est while the gripper rests at its target without contact."""
@@ -140,7 +140,7 @@ def at_rest(ctx: Context) -> Figures:
         yield Figure(level, begin, begin + window, text=text)
 
 
-@check("DEX1-FORCE-03")
+@check("DEX1-FORCE-03", rests_on=("tau",))
 def sign(ctx: Context) -> Outcome:
     """That tau_est keeps its sign; and which it has in a grip, which no document says."""
     return all_of(_constant_sign(ctx), warning(_sign_in_grip(ctx)))
@@ -159,7 +159,7 @@ def _sign_in_grip(ctx: Context) -> Outcome:
     return ctx.failed("positive", text, ctx.at(ctx.states.topic, begin, end), tau_nm=tau)
 
 
-@check("DEX1-FORCE-04")
+@check("DEX1-FORCE-04", rests_on=("tau",))
 def gripper_unit(ctx: Context) -> Outcome:
     """The largest tau_est; and the smallest, where a specification of the dialect limits it."""
     size = warning(unit(ctx))
@@ -178,7 +178,7 @@ def _unsigned(ctx: Context) -> Figures:
         yield Figure(-float(tau[i]), at, text=text, shown=shown)
 
 
-@check("DEX3-FORCE-02")
+@check("DEX3-FORCE-02", rests_on=("tau",))
 def unit(ctx: Context) -> Outcome:
     """The largest tau_est, relative to the joint's torque limit."""
     worst: tuple[float, float, int, float] = (0.0, 0.0, 0, 0.0)
@@ -425,7 +425,7 @@ def servo_unit(ctx: Context) -> Outcome:
     return ctx.failed(f"{most:.3g} {name}", text, place, tau_nm=most).about(joint)
 
 
-@check("BRAINCO-FORCE-04")
+@check("BRAINCO-FORCE-04", rests_on=("tau",))
 def none_without_contact(ctx: Context) -> Outcome:
     """The largest tau_est of a joint that has reached its goal and touches nothing."""
     if (skipped := no_torque(ctx)) is not None:

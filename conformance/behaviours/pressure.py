@@ -92,7 +92,7 @@ def _pressure(ctx: Context, packet: int, rows: slice = slice(None)) -> Floats:
     return ctx.states.columns[f"press_sensor_state[{packet}].pressure"][rows]
 
 
-@check("DEX3-SENS-01")
+@check("DEX3-SENS-01", rests_on=("pressure",))
 def packets(ctx: Context) -> Outcome:
     """The number of sensor packets, their values, and which slots hold one."""
     parts = [_count(ctx), _numbers(ctx)]
@@ -490,7 +490,7 @@ def _gives_way(ctx: Context, finger: str, begin: float, end: float, later: float
     return bool((firm - again >= least).any())
 
 
-@check("DEX3-SENS-11")
+@check("DEX3-SENS-11", rests_on=("pressure",))
 def feels_nothing(ctx: Context) -> Outcome:
     """The change of pressures in a standing hand without contact, while the other hand squeezes an
     object.

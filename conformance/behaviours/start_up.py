@@ -6,9 +6,10 @@ import numpy as np
 
 from dexkit.conformance.checks import Context, Outcome, check
 from dexkit.conformance.checks.combined import all_of, warning
+from dexkit.conformance.kit.provenance import MESSAGES, TIMES
 
 
-@check("DEX1-START-01", "DEX3-START-01", "H1-START-01")
+@check("DEX1-START-01", "DEX3-START-01", "H1-START-01", rests_on=(TIMES, MESSAGES))
 def state_first(ctx: Context) -> Outcome:
     """State before the first command that the client can use: some take zeros for no state."""
     flows = _flows(ctx)

@@ -13,6 +13,7 @@ from dexkit.conformance.checks.figures import Figure, judged, with_object
 from dexkit.conformance.checks.stands import FEW_STANDS, stands
 from dexkit.conformance.checks.timing import gap_beside_states
 from dexkit.conformance.kit.motor_messages import Motors
+from dexkit.conformance.kit.provenance import TIMES
 from dexkit.conformance.kit.touch import Touch
 from dexkit.conformance.stimuli.fingers import BEYOND, FingerScript
 from dexkit.conformance.stimuli.phases import stimulus
@@ -77,7 +78,7 @@ def _touch(ctx: Context) -> Touch | None:
     return found if found is not None and len(found) else None
 
 
-@check("FTP-TOUCH-01")
+@check("FTP-TOUCH-01", rests_on=("pressure",))
 def touch_messages(ctx: Context) -> Outcome:
     """Whether each area always has as many elements as its matrix, where there are any."""
     touch = _touch(ctx)
@@ -121,7 +122,7 @@ def _no_touch(ctx: Context) -> Outcome:
     return replace(ctx.failed(figure, text).tolerated(), absent=True)
 
 
-@check("FTP-TOUCH-03")
+@check("FTP-TOUCH-03", rests_on=("pressure", TIMES))
 def touch_comes_often(ctx: Context) -> Outcome:
     """The longest time without touch, and its rate, while there were states."""
     return all_of(_goes_on(ctx), warning(_rate(ctx)))

@@ -407,13 +407,19 @@ REGISTRY: dict[str, Check] = {}
 
 
 _RESTS_ON: dict[Check, tuple[str, ...]] = {}
+_EXPLAINED_BY: dict[Check, tuple[str, ...]] = {}
 
 
-def check(*requirement_ids: str, rests_on: Sequence[str] = ()) -> Callable[[CheckT], CheckT]:
+def check(
+    *requirement_ids: str, rests_on: Sequence[str] = (), explained_by: Sequence[str] = ()
+) -> Callable[[CheckT], CheckT]:
     """Register the decorated function as the check of these requirements, of any layer.
 
-    :param rests_on: what it judges beside positions: members of a motor, and
-        :data:`~dexkit.conformance.kit.provenance.TIMES`.
+    :param rests_on: what it judges beside positions: members of a motor, and what
+        :mod:`~dexkit.conformance.kit.provenance` names. Where the source of a recording does not
+        carry it, the requirement is not applicable.
+    :param explained_by: members of a motor that can excuse a failure: gains that are 0, a torque at
+        an object. Where the source does not carry them, a failure is a warning.
     """
 
     def register(function: CheckT) -> CheckT:
@@ -421,6 +427,7 @@ def check(*requirement_ids: str, rests_on: Sequence[str] = ()) -> Callable[[Chec
             assert name not in REGISTRY, f"{name} has two checks"
             REGISTRY[name] = function
         _RESTS_ON[function] = tuple(rests_on)
+        _EXPLAINED_BY[function] = tuple(explained_by)
         return function
 
     return register
@@ -429,6 +436,11 @@ def check(*requirement_ids: str, rests_on: Sequence[str] = ()) -> Callable[[Chec
 def rests_on(requirement: Requirement) -> tuple[str, ...]:
     """What the check of a requirement rests on beside positions."""
     return _RESTS_ON.get(check_of(requirement), ())
+
+
+def explained_by(requirement: Requirement) -> tuple[str, ...]:
+    """The members of a motor that can excuse a failure of a requirement."""
+    return _EXPLAINED_BY.get(check_of(requirement), ())
 
 
 def check_of(requirement: Requirement) -> Check:

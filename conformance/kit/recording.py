@@ -33,8 +33,10 @@ from dexkit.other_interfaces import TWO_FINGERS, is_two_fingers, other_interface
 from dexkit.robots import RobotModel
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 from dexkit.traces.clock_steps import ClockStep, refuse_clock_steps
+from dexkit.traces.names import SESSION
 from dexkit.traces.sessions.imported import NOMINAL, absent_fields
 from dexkit.traces.sessions.imported import RECORD as IMPORTED
+from dexkit.traces.sessions.streams import HAND
 
 if TYPE_CHECKING:
     from dexkit.conformance.usb.recording import UsbRecording
@@ -262,7 +264,7 @@ class Recording:
         phases = found.stimulus.phases if found.stimulus else []
         notes = found.notes({s for p in phases if p.name == "foreign" for s in p.sides})
         imported = trace.metadata.get(IMPORTED, {})
-        if imported.get("clock") == NOMINAL or any(absent_fields(imported).values()):
+        if imported.get("clock") == NOMINAL or any(absent_fields(trace.metadata).values()):
             notes.append(
                 "an imported session: times that nobody measured, and fields that are 0 because "
                 "its source does not have them, say nothing of a hand"
@@ -532,6 +534,8 @@ def detect_dialect(trace: TraceLike) -> Dialect:
         names = ", ".join(sorted(c.topic for c in trace.channels)) or "no topics at all"
         wanted = ", ".join(dict.fromkeys(d.state_topic for d in DIALECTS.values()))
         others = dict.fromkeys(filter(None, map(other_interface, sorted(topics))))
+        if any(t.startswith(SESSION) and t.split("/")[2].endswith(HAND) for t in topics):
+            others["hands that nobody named: import again, with --set hand=MODEL"] = None
         raise ConformanceError(
             f"no hand of the Dex family in this recording: it has {names}",
             hint="; ".join(others) or f"a hand publishes one of {wanted}",

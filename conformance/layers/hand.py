@@ -30,6 +30,7 @@ __all__ = [
     "recorded",
     "subjects",
     "whole",
+    "with_format",
     "with_silence",
 ]
 
@@ -176,6 +177,23 @@ def carried(judgement: Judgement, context: Context) -> Result | None:
     return judgement.not_applicable(why) if why else None
 
 
+def with_format(context: Context, outcome: Outcome) -> Outcome:
+    """Make a failure a warning where the source of the recording has not what could excuse it."""
+    from dexkit.conformance.checks import explained_by
+
+    wanted = explained_by(context.requirement)
+    if outcome.met is not False or not wanted:
+        return outcome
+    provenance = context.recording.provenance
+    of_commands = [w for w in wanted if w in ("kp", "mode")]
+    why = provenance.lacking(context.commands.topic, of_commands)
+    why = why or provenance.lacking(context.states.topic, set(wanted) - set(of_commands))
+    if not why:
+        return outcome
+    text = f"{why}: the hand may not have been driven, or an object may have held it."
+    return outcome.tolerated().because(f"{outcome.cause} {text[0].upper()}{text[1:]}".strip())
+
+
 def with_silence(context: Context, outcome: Outcome) -> Outcome:
     """Name the end of all states as the cause of a failure after it."""
     states, commands = context.states, context.commands
@@ -205,7 +223,7 @@ LAYER: Layer[Recording, SideView, Context] = Layer(
         *(applies_to_dialect, claimed, recorded, carried, has_torque),
         *(says_something, not_spoiled, not_blocked),
     ),
-    refine=with_silence,
+    refine=lambda context, outcome: with_silence(context, with_format(context, outcome)),
     whole=whole,
     script=lambda name: under_test(name).script.load(),
     reference=lambda name: under_test(name).reference.load(),

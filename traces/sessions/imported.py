@@ -22,7 +22,9 @@ __all__ = [
     "ImportRecord",
     "absent_fields",
     "absent_key",
+    "absent_of",
     "import_record",
+    "import_records",
 ]
 
 RECORD = "dexkit_import"
@@ -85,8 +87,18 @@ def absent_key(topic: str) -> str:
     return f"{_ABSENT}{topic}"
 
 
-def absent_fields(record: Mapping[str, str]) -> dict[str, frozenset[str]]:
-    """By topic, the fields that are 0 because the source does not have them.
+def import_records(metadata: Mapping[str, Mapping[str, str]]) -> list[Mapping[str, str]]:
+    """The records of the imports that a recording was made of; several, if it was merged.
+
+    :param metadata: of the recording.
+    """
+    # dexkit merge adds the file's name where records differ
+    return [r for name, r in metadata.items() if name == RECORD or name.startswith(f"{RECORD} (")]
+
+
+def absent_of(record: Mapping[str, str]) -> dict[str, frozenset[str]]:
+    """By topic that an import made of frames, the fields that are 0 because the source does not
+    have them.
 
     ``q``, or ``left.q`` where both hands share the topic and the source has it of the other one.
     """
@@ -95,3 +107,12 @@ def absent_fields(record: Mapping[str, str]) -> dict[str, frozenset[str]]:
         for key, value in record.items()
         if key.startswith(_ABSENT)
     }
+
+
+def absent_fields(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, frozenset[str]]:
+    """What :func:`absent_of` says, of all imports that a recording was made of."""
+    found: dict[str, frozenset[str]] = {}
+    for record in import_records(metadata):
+        for topic, absent in absent_of(record).items():
+            found[topic] = found.get(topic, frozenset()) | absent
+    return found

@@ -29,6 +29,7 @@ from dexkit.hand import Floats, JointMode, Side
 from dexkit.messages import MessageType, message_type
 from dexkit.models import DIALECTS, Dialect, HandModel, ModeByte, model
 from dexkit.traces.sessions import ros_types
+from dexkit.traces.sessions.carried import format_of
 from dexkit.traces.sessions.imported import MEASURED, NOMINAL, RECORD, absent_key
 from dexkit.traces.sessions.streams import COMMAND, FIELDS, HAND, MEMBERS, STATE, may_be_radians
 from dexkit.traces.writer import RecordingWriter, definition
@@ -306,7 +307,7 @@ def _hands_channel(
     dialect = hand.dialects[0]
     type_name = dialect.cmd_type if kind == COMMAND else dialect.state_type
     channel = writer.add_channel(definition(topic, message_type(type_name)))
-    session.about[absent_key(topic)] = " ".join(_absent(dialect, parts, kind))
+    session.about[absent_key(topic)] = " ".join(_absent(session.form, dialect, parts, kind))
     if kind == COMMAND:
         session.about[f"filled {topic}"] = "kp, kd and mode, as xr_teleoperate sends them"
     encode = _motor_encoder(dialect, hand, kind)
@@ -344,12 +345,13 @@ def _is_near_limits(part: Part, kind: str) -> bool:
         return not ((q < 2 * low - high) | (q > 2 * high - low)).any()
 
 
-def _absent(dialect: Dialect, parts: Sequence[Part], kind: str) -> Iterator[str]:
+def _absent(form: str, dialect: Dialect, parts: Sequence[Part], kind: str) -> Iterator[str]:
     """What the messages of a topic have, and the source does not: see :func:`absent_fields`."""
+    room = format_of(form).fields[kind]
     sides = [s for s in Side if _topic_of(dialect, s, kind) == _hand_topic(parts[0], kind)]
     given = {p.side: p.values[kind] for p in parts}
     for name in FIELDS[kind]:
-        lacking = [s for s in sides if name not in given.get(s, {})]
+        lacking = [s for s in sides if name not in room or name not in given.get(s, {})]
         if len(lacking) == len(sides):
             yield name
         else:

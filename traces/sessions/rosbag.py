@@ -21,6 +21,7 @@ from dexkit.messages import message_type
 from dexkit.messages.layout import STRUCTS
 from dexkit.staging import whole_folder
 from dexkit.traces import schemas
+from dexkit.traces.bag_metadata import custom_data, records_of
 from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.names import dds_topic, dds_type
 from dexkit.traces.reader import LATE_TIMES, LATEST_NS, Definition, Trace
@@ -39,7 +40,6 @@ __all__ = ["export_bag", "import_bag", "is_bag"]
 _TRIED = 50
 # Key in the bag's custom data for everything that has no other place in a bag.
 _LOSSES = "dexkit.lost"
-_METADATA = "dexkit.metadata "
 
 Convert = Callable[[bytes], bytes]
 
@@ -222,14 +222,8 @@ def _write_metadata(
         "source": source.name,
         "clock": "measured",
     }
-    custom = getattr(storage, "custom", None)
-    kept: dict[str, dict[str, str]] = {}
-    for key, value in custom.items() if isinstance(custom, dict) else ():
-        values = _texts(value) if str(key).startswith(_METADATA) else None
-        if values is not None:
-            kept[str(key).removeprefix(_METADATA)] = values
-        else:
-            record[f"custom {key}"] = str(value)
+    kept, others = records_of(getattr(storage, "custom", None))
+    record |= {f"custom {key}": value for key, value in others.items()}
     # a recording that was imported before keeps its own record
     for name, values in kept.items():
         writer.add_metadata(name, values)
@@ -239,16 +233,6 @@ def _write_metadata(
         record[f"problem {number}"] = text
     if RECORD not in kept:
         writer.add_metadata(RECORD, record)
-
-
-def _texts(value: object) -> dict[str, str] | None:
-    try:
-        found = json.loads(str(value))
-    except (ValueError, RecursionError):
-        return None
-    if isinstance(found, dict) and all(isinstance(v, str) for v in found.values()):
-        return found
-    return None
 
 
 def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> tuple[int, list[str]]:
@@ -294,8 +278,8 @@ def export_bag(trace: Trace, out: Path, *, storage: str = "sqlite3") -> tuple[in
                     writer.write(connection, min(m.log_time_ns, LATEST_NS), m.data)
                     written += 1
             lost += late
-            for name, values in trace.metadata.items():
-                writer.set_custom_data(f"{_METADATA}{name}", json.dumps(values))
+            for name, text in custom_data(trace.metadata).items():
+                writer.set_custom_data(name, text)
             writer.set_custom_data(_LOSSES, json.dumps(lost))
         if not written:
             raise SessionError(

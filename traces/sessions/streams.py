@@ -26,7 +26,7 @@ from dexkit.traces.clock_steps import refuse_clock_steps
 from dexkit.traces.names import SESSION
 from dexkit.traces.reader import SampleArray, Trace
 from dexkit.traces.sessions import ros_types
-from dexkit.traces.sessions.imported import RECORD, absent_fields
+from dexkit.traces.sessions.imported import absent_fields
 from dexkit.traces.sessions.resample import interpolate
 
 __all__ = [
@@ -239,7 +239,7 @@ def streams_of(
     known = [c.topic for c in trace.channels if c.message_count]
     wanted = known if topics is None else list(trace.load(topics, payloads=False))
     found: list[Stream] = []
-    absent = absent_fields(trace.metadata.get(RECORD, {}))
+    absent = absent_fields(trace.metadata)
     copies = _copies(known)
     fields = ("q",) if positions else None
     keep_samples = keep_samples and not positions
