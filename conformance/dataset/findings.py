@@ -70,6 +70,7 @@ class Judgement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     :param judged: names of the checks for which the episode has the data.
     :param key: digest of the motion; equal for equal data.
     :param shape: the motion in few numbers, to find the same motion in another episode.
+    :param kind: digest of its parts, joints and rate; only episodes of one kind are compared.
     """
 
     use: Use = Use.KEEP
@@ -79,6 +80,7 @@ class Judgement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     judged: list[str] = []
     key: str = ""
     shape: list[float] = []
+    kind: str = ""
 
     @property
     def reasons(self) -> list[Finding]:

@@ -13,6 +13,7 @@ from dexkit.conformance.dataset.check import Check, Figure, data_of
 from dexkit.conformance.dataset.checks import cameras, frames, frozen, idle, jumps, metadata, timing
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_of
+from dexkit.conformance.dataset.likeness import shape_of
 from dexkit.conformance.dataset.motion import span
 from dexkit.hand import Floats
 
@@ -38,7 +39,6 @@ Frames = NDArray[np.intp]
 _CURVES = 3  # findings of an episode with a picture of the moment
 _POINTS = 160  # of a curve
 _AROUND = 1.0  # s that a curve shows before and after its finding
-_SHAPE = 32  # numbers that describe a motion
 
 
 def checks_digest() -> str:
@@ -66,7 +66,8 @@ def judge(episode: Episode) -> Judgement:
     result = Judgement(use_of(findings), findings, [], figures, judged)
     reasons = [findings.index(f) for f in result.reasons[:_CURVES]]
     result.curves = [c for i in reasons if (c := _curve(episode, i, findings[i])) is not None]
-    result.key, result.shape = _key(episode), _shape(episode)
+    result.key, result.shape = _key(episode), shape_of(episode)
+    result.kind = _kind(episode)
     return result
 
 
@@ -114,13 +115,7 @@ def _key(episode: Episode) -> str:
     return digest.hexdigest()
 
 
-def _shape(episode: Episode) -> list[float]:
-    """The motion in few numbers: each is the sum over all joints at a part of the episode."""
-    values = [v for t in episode.tracks for v in (t.action, t.state) if v is not None]
-    if not values or len(episode) < _SHAPE:
-        return []
-    table = np.nan_to_num(np.concatenate(values, axis=1))
-    at = np.linspace(0, len(table) - 1, _SHAPE)
-    weights = np.cos(np.arange(table.shape[1]) * 2.3999632)  # no two joints count alike
-    mixed = table @ weights
-    return [round(float(v), 4) for v in np.interp(at, np.arange(len(mixed)), mixed)]
+def _kind(episode: Episode) -> str:
+    """A digest of what an episode consists of; only episodes of one kind are compared."""
+    parts = sorted((t.part, t.joints, t.action is None, t.state is None) for t in episode.tracks)
+    return hashlib.sha256(f"{episode.fps:.3f} {parts}".encode()).hexdigest()[:16]

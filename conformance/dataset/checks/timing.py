@@ -12,6 +12,7 @@ from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import (
     Bools,
+    frames_of,
     moves,
     part_text,
     series_of,
@@ -19,12 +20,14 @@ from dexkit.conformance.dataset.motion import (
 )
 from dexkit.hand import Floats
 
-__all__ = ["ARMS_LAG", "CHECKS", "HANDS_LAG", "Lag", "lag_of"]
+__all__ = ["CHECKS", "LAG", "Lag", "lag_of"]
 
-HANDS_LAG, ARMS_LAG = "lag, s", "lag of arms, s"
+LAG = "lag of the {}, s"
+"""Name of the figure of a part, where the lag is sharp."""
 
 _REACH_S = 1.5  # of delays that are tried, both ways
 _SURE = 0.7  # correlation from which a delay is believed
+_SHARP = 0.9  # and from which it is compared with that of other episodes
 _LATEST_HAND_S = 0.7  # Inspire's hands on a G1 are 0.4 s behind, with values up to 0.13 s old
 _LATEST_ARM_S = 0.45
 _EARLY_FRAMES = 2.5  # that a state may be before its action: the next state is the action
@@ -35,6 +38,7 @@ _DRIFT_S = 0.09
 _SMOOTH_S = 0.1
 _SHORT = 0.08  # strokes that a joint may stay short of its action before something holds it
 _ENOUGH = 0.1  # of a joint's motion, that a third of an episode has at least
+_RENEWED_S = 0.25  # s in which the slowest registers are renewed
 _OFF = 0.05  # of a rate that is not the stated one
 _JITTER = 0.5  # periods that stamps are off, at the usual frame
 
@@ -158,10 +162,12 @@ def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
         yield from _absolute(episode, track, lag)
         yield from _drift(episode, track, speeds)
     yield from _apart(lags)
-    for name, hand in ((HANDS_LAG, True), (ARMS_LAG, False)):
-        seconds = [lag.seconds for track, lag in lags.values() if track.is_hand is hand]
-        if seconds:
-            yield Figure(name, float(np.median(seconds)))
+    hands = [lag.seconds for track, lag in lags.values() if track.is_hand]
+    if lags:
+        yield Figure("lag, s", float(np.median(hands or [lag.seconds for _, lag in lags.values()])))
+    for part, (_, lag) in lags.items():
+        if lag.correlation > _SHARP:
+            yield Figure(LAG.format(part.replace("_", " ")), lag.seconds)
 
 
 def _absolute(episode: Episode, track: Track, lag: Lag) -> Iterator[Finding]:
@@ -322,7 +328,10 @@ def _speed_limits(episode: Episode) -> Iterator[Finding]:
         state = series_of(track, "state")
         if state is None or track.fastest is None or len(state.q) < 30:
             continue
-        speed = np.abs(state.q[3:] - state.q[:-3]) * episode.fps / 3
+        window = frames_of(episode, _RENEWED_S)
+        if len(state.q) <= 2 * window:
+            continue
+        speed = np.abs(state.q[window:] - state.q[:-window]) * (episode.fps / window)
         allowed = track.fastest / stroke(track)
         moving = speed > 0.3 * allowed
         counts = moving.sum(axis=0)

@@ -1,0 +1,136 @@
+"""Find the motion of an episode in another one, by few numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dexkit.conformance.dataset.episode import Episode
+from dexkit.conformance.dataset.motion import series_of
+from dexkit.hand import Floats
+
+__all__ = ["alike", "shape_of"]
+
+_STEP_S = 0.2  # s between two numbers; twice as long until there are few enough
+_MOST = 128
+_SMOOTH_S = 0.25  # s of each of three averages: nothing faster than 2 Hz is left
+_CUT_S = 1.2  # s by which an end may have been cut
+_OTHER = (
+    0.03  # difference, against the motion: a copy with noise has less, another take 0.3 or more
+)
+_STILL = 0.02  # strokes: less is no motion that could be found again
+
+
+def shape_of(episode: Episode) -> list[float]:
+    """The motion of an episode: the time between two numbers, s, and a mixture of all joints at
+    these times, smoothed; empty where nothing moves.
+    """
+    found = [
+        series.q
+        for track in sorted(episode.tracks, key=lambda t: t.part)
+        for what in ("action", "state")
+        if (series := series_of(track, what)) is not None
+    ]
+    if not found or episode.duration < 5 * _STEP_S:
+        return []
+    table = np.concatenate(found, axis=1)
+    weights = np.cos(0.4 + 2.3999632 * np.arange(table.shape[1]))  # no two joints count alike
+    mixed = table @ weights
+    mixed = mixed - mixed[0]  # so that the ends of the averages stay near
+    width = max(1, round(_SMOOTH_S * episode.fps))
+    for _ in range(3):
+        mixed = _averaged(mixed, width)
+    if np.ptp(mixed) < _STILL:
+        return []
+    step = _STEP_S
+    while episode.duration / step > _MOST:
+        step *= 2
+    at = np.arange(0, episode.duration, step)
+    return [step, *(round(float(v), 4) for v in np.interp(at, episode.t, mixed))]
+
+
+def _averaged(values: Floats, width: int) -> Floats:
+    padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+    sums = np.concatenate([[0.0], np.cumsum(padded)])
+    return np.asarray((sums[width:] - sums[:-width]) / width)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """A motion, with what a copy of it must agree in."""
+
+    step: float
+    values: Floats
+
+    @property
+    def seconds(self) -> float:
+        return self.step * len(self.values)
+
+    @property
+    def spread(self) -> float:
+        return float(self.values.std())
+
+
+def alike(shapes: Mapping[str, Sequence[float]]) -> Iterator[tuple[str, str, float]]:
+    """Pairs of names with nearly the same motion, and their difference against the motion.
+
+    :param shapes: by name, as :func:`shape_of` returns them; of episodes with the same joints.
+    """
+    known = [(n, _Shape(s[0], np.array(s[1:]))) for n, s in shapes.items() if len(s) > 5]
+    known.sort(key=lambda item: item[1].seconds)
+    seconds = np.array([s.seconds for _, s in known])
+    spreads = np.array([s.spread for _, s in known])
+    for i, (name, shape) in enumerate(known):
+        last = int(np.searchsorted(seconds, seconds[i] + _CUT_S + shape.step, side="right"))
+        others = np.flatnonzero(
+            np.abs(spreads[i + 1 : last] - spreads[i]) < 0.15 * max(spreads[i], 1e-9)
+        )
+        for k in (others + i + 1).tolist():
+            other, second = known[k]
+            difference = _difference(shape, second)
+            if difference < _OTHER:
+                yield name, other, difference
+
+
+def _difference(a: _Shape, b: _Shape) -> float:
+    """The root mean square of the difference at the best shift, against the motion."""
+    step = max(a.step, b.step)
+    x, y = (s.values[:: round(step / s.step)] for s in (a, b))
+    if len(x) > len(y):
+        x, y = y, x
+    best = np.inf
+    least = 0.85 * len(y)
+    at = np.arange(len(x), dtype=float)
+    # whole steps first: a cheap look at whether they can be alike at all
+    reach = int(np.ceil(_CUT_S / step))
+    rough = {float(k): _apart(x, y, at, float(k), least) for k in range(-reach, reach + 1)}
+    nearest = min(rough, key=lambda k: rough[k])
+    if rough[nearest] > 0.4:
+        return float("inf")
+    for shift in np.linspace(nearest - 1, nearest + 1, 33).tolist():
+        best = min(best, _apart(x, y, at, shift, least))
+    return float(best)
+
+
+def _apart(x: Floats, y: Floats, at: Floats, shift: float, least: float) -> float:
+    where = at + shift
+    inside = (where >= 1) & (where <= len(y) - 2.001)
+    inside[:2] = inside[-2:] = False  # the averages differ at a cut
+    if inside.sum() + 5 < least:
+        return float("inf")
+    difference = x[inside] - _cubic(y, where[inside])
+    difference -= difference.mean()
+    spread = float(x[inside].std())
+    return float(difference.std()) / spread if spread > 0 else float("inf")
+
+
+def _cubic(values: Floats, at: Floats) -> Floats:
+    """Interpolated by cubics through four neighbours; 1 <= at < len(values) - 2."""
+    i = np.floor(at).astype(int)
+    u = at - i
+    a, b, c, d = (values[i + k] for k in (-1, 0, 1, 2))
+    return np.asarray(
+        b + 0.5 * u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * (b - c) + d - a)))
+    )
