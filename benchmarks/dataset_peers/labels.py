@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.dataset_peers import LEVELS, Finding, Run
+from tools.spoiled_sets.score import REASONS
 
 __all__ = ["GOOD", "Label", "labels", "outcome", "scores"]
 
@@ -39,7 +40,15 @@ _VIDEO = {
     *("video-missing", "video-decode", "video-frames", "video-size", "rate"),
 }
 _LONG = {"DURATION_OUTLIER", "long", *_STANDS}
-_BROKEN = {"EPISODE_LOAD_ERROR", "NO_EPISODES", "lengths", "features", "files", "frame-numbers"}
+_BROKEN = {
+    "unreadable",
+    "EPISODE_LOAD_ERROR",
+    "NO_EPISODES",
+    "lengths",
+    "features",
+    "files",
+    "frame-numbers",
+}
 
 _PEERS: Mapping[str, set[str]] = {
     "frozen_joint": _STANDS | _APART | _CLIPPED,
@@ -71,39 +80,7 @@ _PEERS: Mapping[str, set[str]] = {
     "not_finite": {"not-finite", "EPISODE_LOAD_ERROR"},
     "broken_file": _BROKEN,
 }
-"""Of each fault: the words of lerobot-doctor and lerobot-lint that fit it."""
-
-_DEXKIT: Mapping[str, set[str]] = {
-    "frozen_joint": {"frozen"},
-    "frozen_side": {"frozen"},
-    "frozen_all": {"frozen"},
-    "repeated_frames": {"repeated"},
-    "action_shift": {"out-of-step"},
-    "lag_drift": {"out-of-step"},
-    "clipped_action": {"clipped"},
-    "not_followed": {"not-followed", "frozen"},
-    "jump": {"jump"},
-    "wrong_unit": {"units"},
-    "wrong_side": {"sides"},
-    "wrong_joint_order": {"order"},
-    "inverted_sign": {"sign"},
-    "missing_stretch": {"missing", "jump"},
-    "wrong_fps": {"fps"},
-    "duplicate": {"duplicate"},
-    "idle_start": {"idle"},
-    "idle_end": {"idle"},
-    "grasp_on_nothing": {"grasp"},
-    "drop_in_grasp": {"grasp"},
-    "camera_frozen": {"camera-frozen"},
-    "camera_late": {"camera-late"},
-    "camera_early_end": {"camera-missing", "camera-late"},
-    "camera_missing": {"camera-missing"},
-    "no_task": {"task"},
-    "wrong_stats": {"statistics"},
-    "not_finite": {"readable"},
-    "broken_file": {"unreadable", "readable", "missing"},
-}
-"""Of each fault: the checks of dexkit that are made for it."""
+"""Of each fault: the words of lerobot-doctor and lerobot-lint that fit it, beside dexkit's own."""
 
 
 @dataclass(frozen=True)
@@ -172,4 +149,4 @@ def scores(
 
 
 def _fits(finding: Finding, fault: str) -> bool:
-    return finding.check in _PEERS.get(fault, ()) or finding.check in _DEXKIT.get(fault, ())
+    return finding.check in _PEERS.get(fault, ()) or finding.check in REASONS.get(fault, ())
