@@ -59,7 +59,7 @@ def episode_of_session(session: Session) -> Episode:
     return Episode(
         name=session.name,
         form=session.form,
-        fps=session.rate,
+        fps=session.stated_rate or session.rate,
         t=times,
         tracks=[_track_of_part(part) for part in session.parts],
         measured=session.clock == MEASURED,

@@ -111,6 +111,7 @@ class Document:
     :param items: the frames, unchecked.
     :param streamed: it was written item by item.
     :param whole: it ends as it should.
+    :param foreign: byte of the first character that is no UTF-8; None without.
     """
 
     info: dict[str, Any] = field(default_factory=dict)
@@ -118,6 +119,7 @@ class Document:
     items: list[Any] = field(default_factory=list)
     streamed: bool = False
     whole: bool = True
+    foreign: int | None = None
     rest: dict[str, Any] = field(default_factory=dict)
 
 
@@ -132,7 +134,19 @@ def read_document(path: Path) -> Document:
     """
     data = read_bytes(below(path.parent, path.name), _LARGEST, error=SessionError)
     # an interrupted file may end inside a character
-    return parse_document(data.decode("utf-8-sig", "replace"), str(path))
+    document = parse_document(data.decode("utf-8-sig", "replace"), str(path))
+    if document.whole:
+        document.foreign = _foreign_character(data)
+    return document
+
+
+def _foreign_character(data: bytes) -> int | None:
+    """Where the first byte is that is no UTF-8; None without."""
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        return error.start
+    return None
 
 
 def parse_document(text: str, origin: str) -> Document:
@@ -293,6 +307,8 @@ def session_of(
     problems = Problems()
     if not document.whole:
         problems.add("the file is cut or damaged; it is read up to its last whole item")
+    if document.foreign is not None:
+        problems.add(f"the file is not UTF-8 text (at byte {document.foreign})")
     items = []
     for i, item in enumerate(document.items):
         if not isinstance(item, dict):
@@ -301,8 +317,8 @@ def session_of(
             items.append(item)
     if not items:
         raise SessionError(f"{source} has no frame that can be used")
-    rate = _rate(document, options, problems)
-    times, clock, rate, first = _times(document, items, rate, problems)
+    stated = _rate(document, options, problems)
+    times, clock, rate, first = _times(document, items, stated, problems)
     parts, carried = _parts(items, problems)
     if not parts:
         raise SessionError(
@@ -320,7 +336,11 @@ def session_of(
         cameras=list(_cameras(items, folder, problems)),
         problems=problems,
         first_ns=first,
+        stated_rate=stated,
     )
+    indexes = [_index(item) for item in items]
+    if None not in indexes:
+        session.numbers = np.array(indexes, dtype=np.float64)
     cameras = {c.name for c in session.cameras}
     if not joints_only:
         session.rest = _rest(items, carried, cameras, first is not None, problems)

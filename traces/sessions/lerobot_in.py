@@ -125,6 +125,7 @@ class _Episode(msgspec.Struct):
 
     episode_index: Count
     tasks: list[str] | None = None
+    length: Any = None
     chunk: Count = msgspec.field(default=0, name="data/chunk_index")
     file: Count = msgspec.field(default=0, name="data/file_index")
 
@@ -197,6 +198,9 @@ class Dataset:
             raise SessionError(f"{path} has no column {', '.join(missing)}")
         if not table.num_rows:
             raise SessionError(f"{path} has no frame")
+        length = typed(row.length, Count)
+        if length is not None and length != table.num_rows:
+            problems.add(f"it has {table.num_rows} frames, and {length} by the list of episodes")
         times = self._times(path, table, problems)
         corrections: list[str] = []
         features = self._features(path, table, problems)

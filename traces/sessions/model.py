@@ -148,6 +148,7 @@ class Session:
     :param problems: what could not be imported.
     :param stamps: the times of the frames as the source has them, s, shape (frames,); None without.
     :param numbers: the numbers that it gives its frames, likewise.
+    :param stated_rate: frames a second that the source states, where its times say something else.
     :param features: of a dataset, its columns of joints by name, shape (frames, elements).
     """
 
@@ -168,6 +169,7 @@ class Session:
     below: str = "."
     stamps: Floats | None = None
     numbers: Floats | None = None
+    stated_rate: float | None = None
     features: Mapping[str, Floats] = field(default_factory=dict)
 
     def __len__(self) -> int:
