@@ -54,8 +54,9 @@ def action_of(
 ) -> Floats:
     """Commanded positions as parts of the stroke, 0 open, shape (frames, joints).
 
-    :param kind: ``smooth`` (reaches with pauses), ``trigger`` (steps), ``opens`` (once, from
-        closed), ``still``, ``tremble`` (smooth and never still), ``sine``.
+    :param kind: ``smooth`` (reaches with pauses), ``apart`` (the same, each joint for itself),
+        ``trigger`` (steps), ``opens`` (once, from closed), ``still``, ``tremble`` (smooth and
+        never still), ``sine``.
     :param pace: how quick the operator is.
     :param share: of the stroke that is used.
     """
@@ -66,6 +67,9 @@ def action_of(
     if kind == "sine":
         phase = rng.uniform(0, 6, joints)
         return 0.5 + 0.4 * share * np.sin(2 * np.pi * 0.5 * pace * t[:, None] + phase)
+    if kind == "apart":
+        each = [action_of(rng, fps, seconds, 1, pace=pace, share=share) for _ in range(joints)]
+        return np.concatenate(each, axis=1)
     q = np.zeros((n, joints))
     weights = rng.uniform(0.6, 1.0, joints)
     now, target = (1.0 if kind == "opens" else 0.05), 0.05

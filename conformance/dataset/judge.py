@@ -10,7 +10,18 @@ from numpy.typing import NDArray
 from dexkit.conformance.dataset.across import OF_SETS
 from dexkit.conformance.dataset.cameras import decoders
 from dexkit.conformance.dataset.check import Check, Figure, data_of
-from dexkit.conformance.dataset.checks import cameras, frames, frozen, idle, jumps, metadata, timing
+from dexkit.conformance.dataset.checks import (
+    assignment,
+    cameras,
+    following,
+    frames,
+    frozen,
+    idle,
+    jumps,
+    metadata,
+    timing,
+    units,
+)
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Curve, Finding, Judgement, use_of
 from dexkit.conformance.dataset.likeness import shape_of
@@ -27,6 +38,9 @@ CHECKS: tuple[Check, ...] = (
     *idle.CHECKS,
     *metadata.CHECKS,
     *cameras.CHECKS,
+    *units.CHECKS,
+    *assignment.CHECKS,
+    *following.CHECKS,
 )
 """Every check of a single episode."""
 TITLES = {check.name: check.title for check in CHECKS} | OF_SETS
@@ -36,6 +50,13 @@ VERSION = 1
 
 Frames = NDArray[np.intp]
 
+_BY_UNITS = (
+    "jump",
+    "fps",
+    "frozen",
+    "idle",
+    "not-followed",
+)  # figures in the wrong unit mean nothing
 _CURVES = 3  # findings of an episode with a picture of the moment
 _POINTS = 160  # of a curve
 _AROUND = 1.0  # s that a curve shows before and after its finding
@@ -63,12 +84,19 @@ def judge(episode: Episode) -> Judgement:
                 figures[found.name] = round(found.value, 6)
             else:
                 findings.append(found)
+    findings = _causes(findings)
     result = Judgement(use_of(findings), findings, [], figures, judged)
     reasons = [findings.index(f) for f in result.reasons[:_CURVES]]
     result.curves = [c for i in reasons if (c := _curve(episode, i, findings[i])) is not None]
     result.key, result.shape = _key(episode), shape_of(episode)
     result.kind = _kind(episode)
     return result
+
+
+def _causes(findings: list[Finding]) -> list[Finding]:
+    """Without what follows from another finding: in another unit, all is too quick."""
+    units = {f.part for f in findings if f.check == "units"}
+    return [f for f in findings if not (f.check in _BY_UNITS and f.part in units)]
 
 
 def _curve(episode: Episode, number: int, finding: Finding) -> Curve | None:

@@ -1,19 +1,140 @@
-"""What the metadata say of an episode: its task."""
+"""What the metadata say of an episode: its task, its statistics, and what could not be read."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from dexkit.conformance.dataset.check import Check, Data
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
+from dexkit.hand import Floats
 
-__all__ = ["CHECKS"]
+__all__ = ["CHECKS", "differs"]
+
+_OFF = 0.02  # of the range of a value: more than rounding, or a sample of the frames, makes
+_ROUNDED = 2e-4  # of the size of a value, that files with few digits lose
+_NO_TASK = frozenset(
+    {"todo", "tbd", "none", "null", "nan", "n/a", "na", "-", "?", "unknown", "..."}
+)
+_NAMES_NOTHING = frozenset({"task", "test", "task description", "demo", "default", "debug"})
+
+_LOST = (
+    "cut or damaged",
+    "is no list of numbers",
+    "is no vector of numbers",
+    "values instead of",
+    "not finite",
+    "no objects",
+    "is no object",
+    "other joints than elsewhere",
+    "does not ascend",
+    "do not ascend",
+    "not in every frame",
+    "are kept as two groups",
+    "is kept as JSON only",
+    "cannot be read",
+    "are left out",
+    "are too large",
+)
+"""Words of the importer's sentences that say that data of joints are lost or in doubt."""
+_PICTURES = ("picture", "video", "camera")
+_ELSEWHERE = ("left and right hand",)  # judged by the checks of sides
 
 
 def _task(episode: Episode) -> Iterator[Finding]:
-    if not episode.tasks:
-        yield Finding("task", Use.REVIEW, "it has no task text, which policies with language need")
+    texts = [text.strip() for text in episode.tasks or ()]
+    told = [text for text in texts if text and text.lower().strip("<>[]().") not in _NO_TASK]
+    if not told:
+        only = next((f", only {text!r}" for text in texts if text), "")
+        yield Finding(
+            "task", Use.REVIEW, f"it has no task text{only}, which policies with language need"
+        )
+    elif all(text.lower().strip("<>[]().") in _NAMES_NOTHING for text in told):
+        yield Finding("task", Use.KEEP, f"its task is called {told[0]!r}, which says nothing of it")
 
 
-CHECKS = (Check("task", "A task text", frozenset({Data.TASK}), _task),)
+def _statistics(episode: Episode) -> Iterator[Finding]:
+    for feature, stated in episode.stated.items():
+        values = episode.features.get(feature)
+        if values is None or not len(values):
+            continue
+        count = stated.get("count")
+        if count is not None and count.size and int(count.flat[0]) != len(values):
+            yield Finding(
+                "statistics",
+                Use.REVIEW,
+                f"the metadata count {int(count.flat[0])} frames of {feature}, there are "
+                f"{len(values)}",
+                value=float(count.flat[0]),
+                limit=float(len(values)),
+            )
+            continue
+        true = numbers_of(values)
+        wrong = {name: d for name in true if (d := differs(stated.get(name), true[name], true))}
+        if wrong:
+            yield Finding("statistics", Use.REVIEW, _sentence(feature, wrong, "the episode"))
+
+
+def _sentence(feature: str, wrong: dict[str, str], whose: str) -> str:
+    what = "; ".join(f"{name} {text}" for name, text in wrong.items())
+    return f"the metadata state other numbers of {feature} than {whose} has: {what}"
+
+
+def numbers_of(values: Floats) -> dict[str, Floats]:
+    """``min``, ``max``, ``mean`` and ``std`` of each element, shape (elements,), without NaN."""
+    if not np.isfinite(values).all():
+        values = values[np.isfinite(values).all(axis=1)]
+        if not len(values):
+            return {}
+    return {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+    }
+
+
+def differs(stated: Floats | None, true: Floats, all_true: dict[str, Floats]) -> str:
+    """How a stated number of each element differs from the true one; empty if it does not.
+
+    :param all_true: with ``min`` and ``max``, which say what a large difference is.
+    """
+    if stated is None:
+        return ""
+    stated = np.ravel(stated)
+    if stated.shape != true.shape:
+        return f"has {stated.size} elements instead of {true.size}"
+    low, high = all_true["min"], all_true["max"]
+    size = np.maximum(np.abs(low), np.abs(high))
+    allowed = _OFF * (high - low) + _ROUNDED * size + 1e-6
+    with np.errstate(invalid="ignore"):
+        wrong = ~(np.abs(stated - true) <= allowed)
+    if not wrong.any():
+        return ""
+    worst = int(np.argmax(np.nan_to_num(np.abs(stated - true) / allowed, nan=np.inf)))
+    return (
+        f"of {int(wrong.sum())} of {true.size} elements, such as {stated[worst]:.4g} for "
+        f"{true[worst]:.4g} of element {worst}"
+    )
+
+
+def _readable(episode: Episode) -> Iterator[Finding]:
+    for text in episode.problems:
+        if any(words in text for words in _ELSEWHERE):
+            continue
+        lost = any(words in text for words in _LOST) and not any(w in text for w in _PICTURES)
+        yield Finding("readable", Use.REVIEW if lost else Use.KEEP, text)
+    tracks = episode.tracks
+    if not any(t.action is not None and np.isfinite(t.action).any() for t in tracks):
+        yield Finding("readable", Use.REVIEW, "it has no action, so that nothing can be learnt")
+    if not any(t.state is not None and np.isfinite(t.state).any() for t in tracks):
+        yield Finding("readable", Use.REVIEW, "it has no observation of joints")
+
+
+CHECKS = (
+    Check("task", "A task text", frozenset({Data.TASK}), _task),
+    Check("statistics", "Statistics of the data", frozenset({Data.STATISTICS}), _statistics),
+    Check("readable", "Data that can be read", frozenset(), _readable),
+)
