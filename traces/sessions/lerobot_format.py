@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ __all__ = [
     "parquet_library",
     "parquet_pieces",
     "read_parquet",
+    "write_json",
 ]
 
 ACTION, STATE_COLUMN = "action", "observation.state"
@@ -139,6 +141,13 @@ def _may_hold(group: Any, episodes: tuple[int, int]) -> bool:
                 return True
             return bool(stated.min <= episodes[1] and stated.max >= episodes[0])
     return True
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a JSON file as LeRobot does; half of a surrogate pair is escaped."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(document, indent=4, ensure_ascii=False) + "\n"
+    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def _unpacked(file: Any) -> int:

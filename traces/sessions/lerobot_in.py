@@ -39,7 +39,7 @@ from dexkit.traces.sessions.ros_types import LAST_NS
 from dexkit.traces.sessions.streams import HAND
 from dexkit.traces.sessions.typed import MOST_JOINTS, Count, Rate, parse_record, to_record, typed
 
-__all__ = ["Dataset", "is_dataset"]
+__all__ = ["Dataset", "as_numbers", "is_dataset", "read_metadata"]
 
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
 _INDEXES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -156,7 +156,7 @@ class Dataset:
         self.root = root
         self.options = options
         path = below(root, "meta/info.json")
-        text = _read_text(path)
+        text = read_metadata(path)
         self.version = parse_record(text, _Version, path).codebase_version
         if self.version not in _VERSIONS:
             raise SessionError(
@@ -247,19 +247,46 @@ class Dataset:
             correct_sides(session, session.form, self.options)
         return session
 
-    def data_file(self, episode: int) -> Path:
+    def row(self, episode: int) -> dict[str, Any]:
+        """What the list of episodes says of one, without its statistics."""
+        return self._rows[episode][1]
+
+    def data_file(self, episode: int, number: int | None = None) -> Path:
         """The Parquet file with the frames of an episode.
 
+        :param number: the episode's number, if it is to be another one.
         :raises SessionError: the path in ``meta/info.json`` cannot be used.
         """
         row, _ = self._rows[episode]
+        number = episode if number is None else number
         values = {
-            "episode_chunk": episode // self.info.chunks_size,
-            "episode_index": episode,
+            "episode_chunk": number // self.info.chunks_size,
+            "episode_index": number,
             "chunk_index": row.chunk,
             "file_index": row.file,
         }
         return self._path("data_path", self.info.data_path, values)
+
+    @property
+    def videos(self) -> list[str]:
+        """The features that are videos."""
+        return [key for key, feature in self.info.features.items() if feature.dtype == "video"]
+
+    def video_file(self, key: str, episode: int, number: int | None = None) -> Path:
+        """The file with the video of an episode; as :meth:`data_file`.
+
+        :param key: the feature.
+        """
+        _, row = self._rows[episode]
+        number = episode if number is None else number
+        values: dict[str, int | str] = {
+            "video_key": key,
+            "episode_chunk": number // self.info.chunks_size,
+            "episode_index": number,
+            "chunk_index": typed(row.get(f"videos/{key}/chunk_index"), Count) or 0,
+            "file_index": typed(row.get(f"videos/{key}/file_index"), Count) or 0,
+        }
+        return self._path("video_path", self.info.video_path or "", values)
 
     def video_files(self, episode: int) -> list[Path]:
         """The video files of an episode, whether they are there or not."""
@@ -285,7 +312,9 @@ class Dataset:
         path = self.root / "meta/stats.json"
         if not path.is_file():
             return {}
-        found = parse_record(_read_text(below(self.root, "meta/stats.json")), dict[str, Any], path)
+        found = parse_record(
+            read_metadata(below(self.root, "meta/stats.json")), dict[str, Any], path
+        )
         return _numbers_of(found)
 
     def _read_statistics(self) -> Iterator[tuple[int, dict[str, dict[str, Floats]]]]:
@@ -350,7 +379,7 @@ class Dataset:
         """
         name = f"meta/{what}.jsonl"
         if (self.root / name).is_file():
-            for number, line in enumerate(_read_text(below(self.root, name)).split("\n"), 1):
+            for number, line in enumerate(read_metadata(below(self.root, name)).split("\n"), 1):
                 if line.strip():
                     place = f"{name}, line {number}"
                     try:
@@ -607,15 +636,8 @@ class Dataset:
     ) -> Iterator[Camera]:
         """The camera of a video, if its place is known."""
         _, row = self._rows[episode]
-        values: dict[str, int | str] = {
-            "video_key": key,
-            "episode_chunk": episode // self.info.chunks_size,
-            "episode_index": episode,
-            "chunk_index": typed(row.get(f"videos/{key}/chunk_index"), Count) or 0,
-            "file_index": typed(row.get(f"videos/{key}/file_index"), Count) or 0,
-        }
         try:
-            file = self._path("video_path", self.info.video_path or "", values)
+            file = self.video_file(key, episode)
         except SessionError as error:
             problems.add(f"{name}: {error.message}")
             return
@@ -728,7 +750,11 @@ def _numbers_of(stats: Mapping[str, Any]) -> dict[str, dict[str, Floats]]:
     return found
 
 
-def _read_text(path: Path) -> str:
+def read_metadata(path: Path) -> str:
+    """The text of a JSON file of a dataset.
+
+    :raises SessionError: it cannot be read, is too large, or no UTF-8.
+    """
     try:
         return read_bytes(path, _MAX_JSON, error=SessionError).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -739,13 +765,13 @@ def _column(table: Any, name: str) -> Floats | None:
     """A column of numbers; None if it is not one."""
     if name not in table.column_names:
         return None
-    values = _as_numbers(table[name])
+    values = as_numbers(table[name])
     return values if values is not None and values.ndim == 1 and np.isfinite(values).all() else None
 
 
 def _matrix(table: Any, name: str) -> Floats | None:
     """A column of vectors (or of single numbers) as a table; None if it is anything else."""
-    values = _as_numbers(table[name])
+    values = as_numbers(table[name])
     if values is None:
         return None
     if values.ndim == 1:
@@ -753,7 +779,7 @@ def _matrix(table: Any, name: str) -> Floats | None:
     return values if values.ndim == 2 and 0 < values.shape[1] <= MOST_JOINTS else None
 
 
-def _as_numbers(column: Any) -> Floats | None:
+def as_numbers(column: Any) -> Floats | None:
     """A column of numbers, or of lists of them, as an array; None if lists differ in length, a
     value is missing, or it is of another kind.
     """

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from dexkit import __version__
 from dexkit.digests import sha256_of_file
 from dexkit.errors import DexkitError, ExtraMissing, SessionError
-from dexkit.hand import Floats
 from dexkit.robots import ROBOTS
 from dexkit.staging import whole_folder
 from dexkit.traces.reader import Trace
@@ -32,7 +31,9 @@ from dexkit.traces.sessions.lerobot_format import (
     PRESSURE,
     STATE_COLUMN,
     parquet_library,
+    write_json,
 )
+from dexkit.traces.sessions.lerobot_stats import Aggregate, statistics
 from dexkit.traces.sessions.pictures import parse_picture
 from dexkit.traces.sessions.streams import COMMAND, STATE
 
@@ -40,7 +41,6 @@ __all__ = ["Result", "describe", "export_dataset"]
 
 _CHUNK = 1000  # files in a folder
 _FILE_MB = 100
-_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 # Pictures of an episode whose pixels are counted.
 _SAMPLED = 16
 _UNNAMED = "unnamed task"
@@ -137,7 +137,7 @@ class _Writer:
         self._measured: dict[str, dict[str, float]] = {}
         self._at_rest: dict[str, dict[str, list[float | None]]] = {}
         self._all: dict[str, list[NDArray[Any]]] = {}
-        self._picture_stats: dict[str, list[dict[str, Any]]] = {}
+        self._picture_stats: dict[str, Aggregate] = {}
         self._file: Any = None
         self._place = (0, 0)
         self._lost: dict[str, None] = {}
@@ -194,7 +194,7 @@ class _Writer:
         stats = {k: statistics(v) for k, v in (vectors | plain).items()}
         for camera, found in seen.items():
             stats[PICTURES + camera] = found
-            self._picture_stats.setdefault(PICTURES + camera, []).append(found)
+            self._picture_stats.setdefault(PICTURES + camera, Aggregate()).add(found)
         for k, v in (vectors | plain).items():
             self._all.setdefault(k, []).append(v)
         self._write(vectors, plain, pictures)
@@ -283,13 +283,13 @@ class _Writer:
         tasks = tasks.replace_schema_metadata({"pandas": json.dumps(_PANDAS)})
         self._parquet.write_table(tasks, str(meta / "tasks.parquet"))
         stats = {k: statistics(np.concatenate(v)) for k, v in self._all.items()}
-        stats |= {k: _combined(v) for k, v in self._picture_stats.items()}
+        stats |= {k: v.statistics() for k, v in self._picture_stats.items()}
         self.result.lost = [
             "times beside those of the frames, payloads, and topics without joints or pictures",
             *self._lost,
         ]
-        _write_json(meta / "stats.json", stats)
-        _write_json(meta / "info.json", self._info())
+        write_json(meta / "stats.json", stats)
+        write_json(meta / "info.json", self._info())
 
     def _info(self) -> dict[str, Any]:
         assert self._scheme is not None
@@ -451,20 +451,6 @@ def _load(source: Source, frames: Frames, scheme: _Scheme) -> dict[str, list[byt
     return found
 
 
-def statistics(values: NDArray[Any]) -> dict[str, list[Any]]:
-    """The statistics of a feature over its frames."""
-    table = values.reshape(len(values), -1).astype(np.float64)
-    found = {
-        "min": table.min(axis=0).tolist(),
-        "max": table.max(axis=0).tolist(),
-        "mean": table.mean(axis=0).tolist(),
-        "std": table.std(axis=0).tolist(),
-        "count": [len(table)],
-    }
-    quantiles: Floats = np.quantile(table, list(_QUANTILES.values()), axis=0)
-    return found | {k: q.tolist() for k, q in zip(_QUANTILES, quantiles, strict=True)}
-
-
 def _picture_statistics(camera: str, data: Sequence[bytes]) -> dict[str, list[Any]]:
     """Statistics of the channels of some pictures of an episode, 0 to 1, shape (channels, 1, 1).
 
@@ -491,27 +477,6 @@ def _picture_statistics(camera: str, data: Sequence[bytes]) -> dict[str, list[An
     found = statistics(np.concatenate(pixels))
     shaped = {k: [[[v]] for v in values] for k, values in found.items() if k != "count"}
     return {**shaped, "count": [len(pixels)]}
-
-
-def _combined(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Statistics of pictures over episodes, by their numbers of pictures; quantiles are bounds."""
-    counts = np.array([f["count"][0] for f in found], dtype=np.float64)
-    table = {k: np.array([f[k] for f in found]) for k in found[0] if k != "count"}
-    weights = (counts / counts.sum()).reshape(-1, 1, 1, 1)
-    mean = (table["mean"] * weights).sum(axis=0)
-    spread = ((table["std"] ** 2 + (table["mean"] - mean) ** 2) * weights).sum(axis=0)
-    result = {"mean": mean.tolist(), "std": np.sqrt(spread).tolist(), "count": [int(counts.sum())]}
-    for k in ("min", "q01", "q10", "q50"):
-        result[k] = table[k].min(axis=0).tolist()
-    for k in ("max", "q90", "q99"):
-        result[k] = table[k].max(axis=0).tolist()
-    return result
-
-
-def _write_json(path: Path, document: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(document, indent=4, ensure_ascii=False) + "\n"
-    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def describe(result: Result) -> str:
