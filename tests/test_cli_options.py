@@ -19,7 +19,7 @@ from dexkit.cli import cli
 from dexkit.cli.command_help import Command
 
 COMMANDS = Path(__file__).parent.parent / "dexkit" / "cli"
-MOST = 250
+MOST = 251
 
 ONE_OR_SEVERAL = {"--device", "--interface", "--side"}
 """Options that are declared twice with one meaning: of commands for one, and for several."""

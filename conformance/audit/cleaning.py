@@ -60,9 +60,8 @@ def cleaning_commands(records: Iterable[EpisodeRecord], listing: Path) -> list[t
     for (source, form), episodes in sorted(dropped.items()):
         if is_url(source):
             continue
-        to = "lerobot" if form.startswith("LeRobot") else "episodes"
         out = source.rstrip("/") + "-clean"
-        command = ["dexkit", "export", source, "--to", to, "--out", out, "--drop", str(listing)]
+        command = ["dexkit", "export", source, out, "--drop", str(listing)]
         count = f"{len(episodes)} episode{'s' if len(episodes) > 1 else ''}"
         found.append((f"{source} without {count}", shlex.join(command)))
         if form == "LeRobot v3.0" and len(episodes) <= _MOST:

@@ -1,8 +1,9 @@
-"""``dexkit export``: recordings in other formats."""
+"""``dexkit export``: recordings in other formats, and data sets without some episodes."""
 
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +37,17 @@ _SETTINGS = (
         "Frames per second, for lerobot and episodes.  [default: measured]",
     ),
     Setting("task", "TEXT", click.STRING, "Task of all episodes.  [default: the recording's]"),
+    Setting(
+        "drop",
+        "drop|review",
+        click.Choice(["drop", "review"]),
+        "With --drop FILE: the verdict to be dropped; review drops both.",
+        "drop",
+    ),
 )
+_FORMATS = ("lerobot", "episodes", "rosbag2", "parquet", "csv")
+_NUMBERS = re.compile(r"\d{1,9}(,\d{1,9})*", re.ASCII)
+_SHOWN = 10
 
 
 @click.command(
@@ -53,11 +64,16 @@ _SETTINGS = (
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["lerobot", "episodes", "rosbag2", "parquet", "csv"]),
-    required=True,
-    help="The format.",
+    type=click.Choice(_FORMATS),
+    help="The format of recordings.",
 )
-@out_option("The folder to write.")
+@out_option("The folder to write.", required=False)
+@click.option(
+    "--drop",
+    metavar="FILE|N,N,...",
+    help="Of a data set: the episodes to be left out, as the file episodes.json of dexkit audit "
+    "says, or by their numbers in a LeRobot dataset.",
+)
 @settings_option(_SETTINGS)
 @click.option(
     "--pictures",
@@ -69,8 +85,9 @@ _SETTINGS = (
 @json_option("Print JSON: what became of each recording.")
 def command(
     sessions: tuple[Path, ...],
-    form: str,
-    out: Path,
+    form: str | None,
+    out: Path | None,
+    drop: str | None,
     settings: Settings,
     pictures: Path | None,
     as_json: bool,
@@ -79,8 +96,23 @@ def command(
 
     lerobot writes one dataset (v3.0), and episodes one task folder, for all recordings. The other
     formats write one folder for each recording.
+
+    dexkit export SET OUT --drop episodes.json writes a LeRobot dataset, a task folder of
+    xr_teleoperate, or a folder of these again, in its own format, without the episodes to drop.
     """
     from dexkit.traces import open_trace
+    from dexkit.traces.sessions.cleaned import is_set
+
+    if drop is not None:
+        if form is not None or pictures is not None or settings.given - {"drop"}:
+            raise UsageError("--drop writes a data set in its own format: only --set drop goes")
+        return _cleaned(sessions, out, drop, settings["drop"] == "review", as_json)
+    if form is None or out is None or "drop" in settings.given:
+        missing = "--to" if form is None else "--out" if out is None else "--drop FILE"
+        raise UsageError(f"{missing} is missing", hint=_usage(sessions[0]))
+    if is_set(sessions[0]):
+        raise UsageError(f"{sessions[0]} is no recording", hint=_usage(sessions[0]))
+
     from dexkit.traces.sessions import rosbag, topic_tables
 
     fps, task = settings["fps"], settings["task"]
@@ -126,6 +158,59 @@ def command(
     if not done:
         raise SessionError("none of the recordings could be exported")
     return 1 if trouble else 0
+
+
+def _usage(source: Path) -> str:
+    """How to export a recording, or a data set."""
+    from dexkit.traces.sessions.cleaned import is_set
+
+    if is_set(source):
+        return (
+            f"dexkit export {source} OUT --drop episodes.json writes it without the episodes that "
+            "dexkit audit would drop; dexkit import makes recordings of it, for --to"
+        )
+    return f"dexkit export SESSION.mcap --to {'|'.join(_FORMATS)} --out DIR"
+
+
+def _cleaned(
+    sessions: tuple[Path, ...], out: Path | None, drop: str, review: bool, as_json: bool
+) -> int:
+    """Write a data set without some episodes."""
+    from dexkit.traces.sessions.cleaned import by_number, by_verdict, export_cleaned
+    from dexkit.traces.sessions.verdicts import read_verdicts
+
+    source, *others = sessions
+    targets = others if out is None else [out, *others]
+    if len(targets) != 1:
+        raise UsageError(
+            "--drop takes one data set, and one folder to write",
+            hint="dexkit export SET OUT --drop episodes.json",
+        )
+    if not source.is_dir():
+        raise UsageError(f"{source} is no folder", hint="--drop takes a data set")
+    if _NUMBERS.fullmatch(drop) and not Path(drop).exists():
+        if review:
+            raise UsageError("--set drop=review is for a file of verdicts")
+        choice, named = by_number(source, [int(n) for n in drop.split(",")]), None
+    else:
+        origin = Path(drop)
+        verdicts = read_verdicts(origin)
+        choice, named = by_verdict(source, origin, verdicts, ["review"] if review else [])
+    result = export_cleaned(source, targets[0], choice, named)
+    remarks("warning", result.problems)
+    remarks("note", result.notes)
+    if as_json:
+        done = {"source": str(source), "folder": str(targets[0]), **asdict(result)}
+        click.echo(json.dumps({"exported": [done], "refused": []}, indent=1))
+        return 1 if result.problems else 0
+    kept, gone = result.kept, len(result.dropped)
+    click.echo(one_line(f"{targets[0]}: {kept} episodes kept, {gone} dropped", REMARK))
+    for dropped in result.dropped[:_SHOWN]:
+        reasons = " ".join(dropped.reasons) or "as you said"
+        click.echo(one_line(f"  dropped {dropped.episode}: {reasons}", REMARK))
+    if gone > _SHOWN:
+        click.echo(f"  and {gone - _SHOWN} more")
+    return 1 if result.problems else 0
 
 
 def _frames(

@@ -554,16 +554,19 @@ def output_option(metavar: str, help: str, default: str | None = None) -> Callab
     )
 
 
-def out_option(help: str, default: str | None = None) -> Callable[[F], F]:
+def out_option(
+    help: str, default: str | None = None, *, required: bool | None = None
+) -> Callable[[F], F]:
     """``--out DIR``: the folder for all that a command writes.
 
     :param default: None where it must be named.
+    :param required: whether it must; None without a default.
     """
     return click.option(
         "--out",
         type=LocalPath(file_okay=default is None),
         default=None if default is None else Path(default),
-        required=default is None,
+        required=default is None if required is None else required,
         show_default=default is not None,
         metavar="DIR",
         help=help,
