@@ -16,8 +16,10 @@ from dexkit.errors import DexkitError, SessionError
 from dexkit.messages import message_type
 from dexkit.messages.unitree_hg import MotorState_
 from dexkit.traces import Recorder, open_trace
+from dexkit.traces.bag_metadata import BAG
 from dexkit.traces.sessions import bag_checks
 from dexkit.traces.sessions.rosbag import export_bag, import_bag
+from dexkit.traces.writer import RecordingWriter
 
 HG = "unitree_hg::msg::dds_::HandState_"
 Change = Callable[[Path], None]
@@ -214,3 +216,31 @@ def test_chunks_of_an_mcap_bag_unpack_to_what_they_say(tmp_path: Path, bags: Pat
         import_bag(bag, tmp_path / "out.mcap")
     assert "ROS 2 bag" in str(raised.value)
     assert "dexkit cut" in raised.value.hint
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "custom_data: &a {dexkit.metadata x: *a}",
+        "dexkit.metadata x: [" * 10_000,
+        "custom_data: {dexkit.metadata dexkit_import: 1" + "0" * 100_000 + "}",
+        "dexkit.metadata " * 10**6,
+    ],
+)
+def test_a_hostile_copy_of_the_metadata_is_a_warning(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.add_metadata(BAG, {"serialized_metadata": text})
+    trace = open_trace(path)
+    assert list(trace.metadata) == [BAG]
+    assert any("metadata cannot be read" in w for w in trace.warnings)
+
+
+@pytest.mark.parametrize("text", ["custom_data: [dexkit.metadata x]", "- dexkit.metadata x"])
+def test_other_custom_data_are_no_records(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.add_metadata(BAG, {"serialized_metadata": text})
+    trace = open_trace(path)
+    assert list(trace.metadata) == [BAG]
+    assert not any("metadata" in w for w in trace.warnings)

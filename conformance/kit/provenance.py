@@ -99,6 +99,17 @@ class Provenance:
         what = " and ".join(_TOLD.get(m, m) for m in missing)
         return f"{topic} was imported from {frames.form}, whose frames have no {what}"
 
+    def note(self) -> str:
+        """A remark on a recording that was made from frames; empty otherwise."""
+        forms = sorted({frames.form for frames in self.framed.values()})
+        if not forms:
+            return ""
+        times = "; its times are frame numbers by a rate that nobody measured" * self.nominal
+        return (
+            f"an imported session: its messages were made from frames ({', '.join(forms)}), and "
+            f"what these do not have is not judged{times}"
+        )
+
     def leaves_out(self, topic: str) -> bool:
         """Whether the topic was not asked for when the recording was made."""
         return any(select_topics([topic], wanted)[0] == [] for wanted in self.chosen)

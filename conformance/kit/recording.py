@@ -34,8 +34,6 @@ from dexkit.robots import RobotModel
 from dexkit.traces import ChannelInfo, SampleArray, TraceEndpoint
 from dexkit.traces.clock_steps import ClockStep, refuse_clock_steps
 from dexkit.traces.names import SESSION
-from dexkit.traces.sessions.imported import NOMINAL, absent_fields
-from dexkit.traces.sessions.imported import RECORD as IMPORTED
 from dexkit.traces.sessions.streams import HAND
 
 if TYPE_CHECKING:
@@ -263,12 +261,9 @@ class Recording:
         # the kit itself publishes another type in the phase 'foreign'
         phases = found.stimulus.phases if found.stimulus else []
         notes = found.notes({s for p in phases if p.name == "foreign" for s in p.sides})
-        imported = trace.metadata.get(IMPORTED, {})
-        if imported.get("clock") == NOMINAL or any(absent_fields(trace.metadata).values()):
-            notes.append(
-                "an imported session: times that nobody measured, and fields that are 0 because "
-                "its source does not have them, say nothing of a hand"
-            )
+        common = found.common()
+        if note := common["provenance"].note():
+            notes.append(note)
         notes += [
             f"{views[s].states.topic} says nothing of the {s} hand (all 0), and nobody drives it: "
             f"taken for a service of one hand; --side {s} judges it all the same"
@@ -282,7 +277,7 @@ class Recording:
         touch = {s: found.of_type(topic, chosen.touch_type) for s, topic in felt.items()}
         slow = {s: topic for s, topic in slow.items() if topic in found.present}
         return cls(
-            **found.common(),
+            **common,
             sides=views,
             judged=judged,
             notes=notes,
