@@ -206,6 +206,13 @@ def test_an_unnamed_hand_of_frames_is_told_how_to_be_judged(tmp_path: Path) -> N
     assert "--set hand=MODEL" in output
 
 
+def test_a_dataset_is_no_recording(tmp_path: Path) -> None:
+    source = exported(sample_path("dex1_pick_place"), "lerobot fps=30", tmp_path / "set")
+    code, output = dexkit("check", source)
+    assert code == 2
+    assert "dexkit audit" in output
+
+
 def test_the_table_of_formats_is_what_is_read_and_written() -> None:
     lerobot = {kind: tuple(f for k, f in COLUMNS if k == kind) for kind in (STATE, COMMAND)}
     assert FORMATS["LeRobot"].fields == lerobot

@@ -25,7 +25,8 @@ def frozen_joints(
     """The joints whose states are frozen, each with the longest time of that, (begin, end) in s.
 
     A joint is frozen where its q does not change by a bit while commands ask for motion in both
-    directions, or in the whole session. In one direction an object may hold it.
+    directions, or in the whole session. In one direction an object may hold it, unless another
+    joint of the hand is frozen at the same time.
 
     :param t: times of the states, s, ascending, shape (n,); ``q`` their positions, (n, joints).
     :param sent: times of the commands, s, ascending, shape (m,); ``goal`` their positions,
@@ -41,7 +42,8 @@ def frozen_joints(
     with np.errstate(invalid="ignore"):
         ahead = (goals - q) / stroke
     up, down = lasts * (ahead > _BESIDE), lasts * (ahead < -_BESIDE)
-    found = {}
+    found: dict[int, tuple[float, float]] = {}
+    rows = slice(0, 0)
     for j in range(q.shape[1]):
         begins = np.append(0, np.flatnonzero(np.diff(q[:, j])) + 1)
         ends = np.append(begins[1:], len(t)) - 1
@@ -52,5 +54,12 @@ def frozen_joints(
         still = np.where(asked >= _LEAST_S, t[ends] - t[begins], 0.0)
         longest = int(np.argmax(still))
         if still[longest] > 0:
+            if still[longest] > t[rows.stop - 1] - t[rows.start] or not found:
+                rows = slice(begins[longest], ends[longest] + 1)
             found[j] = float(t[begins[longest]]), float(t[ends[longest]])
+    if found:  # joints that are as still in the same messages, though asked in one direction only
+        asked_way = np.ptp(np.where(driven[rows], goals[rows], goals[rows.start]), axis=0)
+        alike = (np.ptp(q[rows], axis=0) == 0) & (asked_way > _MOVES * stroke)
+        span = float(t[rows.start]), float(t[rows.stop - 1])
+        found |= {j: span for j in np.flatnonzero(alike).tolist() if j not in found}
     return found

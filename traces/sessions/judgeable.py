@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from dexkit.errors import SessionError
 from dexkit.traces.reader import Trace, open_trace
 
 __all__ = ["judgeable"]
@@ -20,6 +21,13 @@ def judgeable(source: Path) -> Iterator[tuple[Trace, Sequence[str] | None]]:
 
     :raises DexkitError: it cannot be read.
     """
+    is_bag = (source / "metadata.yaml").is_file() or any(source.glob("*.mcap"))
+    if source.is_dir() and not is_bag:
+        raise SessionError(
+            f"{source} is no recording",
+            hint="'dexkit import' makes recordings of datasets, episodes and tables; 'dexkit "
+            "audit' judges the episodes of datasets as they are",
+        )
     trace = None if _is_bag_to_import(source) else open_trace(source)
     if trace is not None and not _has_packed_messages(trace):
         yield trace, None
