@@ -14,7 +14,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from click.testing import CliRunner
 
+from dexkit.cli import cli
 from dexkit.traces.sessions.lerobot_in import Dataset
 from dexkit.traces.sessions.lerobot_stats import Aggregate, statistics
 from tests.each import each
@@ -445,6 +447,32 @@ def test_a_folder_of_sets_is_written_as_one(tmp_path: Path) -> None:
     assert names == ["episode_0000", "episode_0001", "episode_0003", "notes.txt"]
     assert (out / "readme").read_text() == "text"
     assert [p.name for p in out.glob("*.mcap")] == ["good.mcap"]
+
+
+def test_what_an_audit_cannot_read_is_dropped(tmp_path: Path) -> None:
+    source, out = tmp_path / "all", tmp_path / "audit"
+    made(source / "set", "v2.1", videos=False)
+    task_folder(source / "task")
+    os.truncate(source / "set/data/chunk-000/episode_000001.parquet", 300)
+    os.truncate(source / "task/episode_0002/data.json", 100)
+    (source / "task/episode_0003").rename(source / "task/0003")
+    done = CliRunner().invoke(cli, ["audit", str(source), "--out", str(out), "--jobs", "1"])
+    assert done.exit_code == 1, done.output
+    found = json.loads((out / "episodes.json").read_text())["episodes"]
+    dropped = {str(e["episode"]): e["reasons"] for e in found if e["verdict"] == "drop"}
+    assert "cannot be read as Parquet" in dropped["1"][0]
+    assert "is not an episode" in dropped["episode_0002"][0]
+    for entry in found:  # the others are too short to be judged well
+        if entry["episode"] not in (1, "episode_0002"):
+            entry["verdict"] = "keep"
+    edited = {"format": "dexkit-episodes", "version": 1, "episodes": found}
+    put(out / "episodes.json", json.dumps(edited))
+    code, output = dexkit("export", source, tmp_path / "out", "--drop", out / "episodes.json")
+    assert code == 0, output
+    assert (tmp_path / "out/task/0003").is_dir()
+    check = data(tmp_path / "out" / "set")
+    assert [len(check[n]) for n in check] == [n for i, n in enumerate(LENGTHS) if i != 1]
+    assert not (tmp_path / "out/task/episode_0002").exists()
 
 
 # -- what is refused -----------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dexkit.conformance.audit.records import EpisodeRecord
+from dexkit.conformance.audit.records import EpisodeRecord, State
 from dexkit.conformance.audit.sessions import is_url
 from dexkit.conformance.dataset.findings import Use
 
@@ -30,20 +30,35 @@ def episodes_listing(
     yield b'{"format": "dexkit-episodes", "version": 1, "episodes": ['
     separator = b"\n"
     for record in records:
-        if record.is_set or not record.use:
+        verdict = _verdict(record)
+        if record.is_set or not verdict:
             continue
-        assert record.judgement is not None
+        judged = record.judgement
         source = record.source or record.name
         row: dict[str, Any] = {
             "source": source,
             "place": source if is_url(source) else _absolute(source, working_folder),
-            "episode": int(record.episode) if record.episode.isdecimal() else record.episode,
-            "verdict": record.use,
-            "reasons": [finding.text for finding in record.judgement.reasons],
+            "episode": int(record.episode) if _is_number(record) else record.episode,
+            "verdict": verdict,
+            "reasons": [f.text for f in judged.reasons] if judged else [record.error],
         }
         yield separator + json.dumps(row, ensure_ascii=True).encode()
         separator = b",\n"
     yield b"\n]}\n"
+
+
+def _verdict(record: EpisodeRecord) -> str:
+    """Keep, review or drop. What cannot be read cannot be trained on either; empty where storage
+    or audit failed.
+    """
+    in_set = bool(record.source and record.episode)
+    broken = in_set and record.judgement is None and record.state is State.UNREADABLE
+    return str(Use.DROP) if broken else record.use
+
+
+def _is_number(record: EpisodeRecord) -> bool:
+    """Whether the episode is a number in a dataset; folders have names of digits, too."""
+    return record.episode.isdecimal() and Path(record.name).name != record.episode
 
 
 def _absolute(source: str, working_folder: Path | None) -> str:
@@ -52,19 +67,22 @@ def _absolute(source: str, working_folder: Path | None) -> str:
 
 def cleaning_commands(records: Iterable[EpisodeRecord], listing: Path) -> list[tuple[str, str]]:
     """What makes the cleaned sets: caption and command line, for each set with episodes to drop."""
-    dropped: dict[tuple[str, str], list[str]] = {}
+    dropped: dict[str, list[str]] = {}
+    forms: dict[str, str] = {}
     for record in records:
-        if record.use == Use.DROP and record.source and not record.is_set:
-            dropped.setdefault((record.source, record.form), []).append(record.episode)
+        if _verdict(record) == Use.DROP and record.source and not record.is_set:
+            dropped.setdefault(record.source, []).append(record.episode)
+            # of what cannot be read the form is not known
+            forms[record.source] = forms.get(record.source) or record.form
     found = []
-    for (source, form), episodes in sorted(dropped.items()):
+    for source, episodes in sorted(dropped.items()):
         if is_url(source):
             continue
         out = source.rstrip("/") + "-clean"
         command = ["dexkit", "export", source, out, "--drop", str(listing)]
         count = f"{len(episodes)} episode{'s' if len(episodes) > 1 else ''}"
         found.append((f"{source} without {count}", shlex.join(command)))
-        if form == "LeRobot v3.0" and len(episodes) <= _MOST:
+        if forms[source] == "LeRobot v3.0" and len(episodes) <= _MOST:
             numbers = f"[{', '.join(sorted(episodes, key=int))}]"
             name = Path(source).name
             command = [
