@@ -147,8 +147,8 @@ def test_jump(frames: int, size: float, words: str) -> None:
 def test_out_of_step(frames: int) -> None:
     index = np.clip(np.arange(450) - frames, 0, 449)
     bad = changed(episode(7), "", state=lambda x: x[index])
-    findings = found(bad, "out-of-step")
-    assert {f.part for f in findings} >= {"left_hand", "right_hand", "left_arm", "right_arm"}
+    [finding] = found(bad, "out-of-step")
+    assert all(part in finding.text for part in ("left hand", "right hand", "left arm"))
     lag = judge(bad).figures["lag, s"]
     assert lag == pytest.approx(frames / FPS + judge(episode(7)).figures["lag, s"], abs=0.05)
 
@@ -160,8 +160,44 @@ def test_drift() -> None:
         columns = [np.interp(at, np.arange(450), values[:, j]) for j in range(values.shape[1])]
         return np.stack(columns, axis=1)
 
-    findings = found(changed(episode(7), "", state=late), "out-of-step")
-    assert any("drifts" in f.text for f in findings)
+    [finding] = found(changed(episode(7), "", state=late), "out-of-step")
+    assert "drifts" in finding.text
+
+
+def test_action_that_is_elsewhere_once() -> None:
+    def odd(values: Floats) -> Floats:
+        values[100, 4] -= 0.7
+        return values
+
+    [finding] = found(changed(episode(6), "left_arm", action=odd), "jump")
+    assert finding.part == "left_arm"
+    assert finding.joints == (4,)
+
+
+def test_rows_again_in_a_part_of_the_episode() -> None:
+    index = np.arange(450)
+    index[150:350] = index[150:350] // 3 * 3
+    [finding] = found(_taken(episode(3), index), "repeated")
+    assert finding.begin_s == pytest.approx(5.0, abs=0.2)
+    index = np.arange(450)
+    for begin in (150, 159, 171, 180, 194, 210):
+        index[begin : begin + 6] = begin
+    [finding] = found(_taken(episode(3), index), "repeated")
+    assert finding.begin_s == pytest.approx(5.0, abs=0.2)
+
+
+def test_numbers_that_skip_without_stamps() -> None:
+    source = episode(3)
+    index = np.concatenate([np.arange(200), np.arange(240, 450)])
+    bad = replace(_taken(source, index), t=source.t[index], stamps=None, numbers=None)
+    [finding] = found(bad, "missing")
+    assert finding.use is Use.DROP
+
+
+def test_measured_and_stated_rate() -> None:
+    source = replace(episode(3, fps=20.0), stamps=None, numbers=None, measured=True)
+    [finding] = found(replace(source, fps=30.0), "fps")
+    assert finding.value == pytest.approx(20)
 
 
 def test_rate_of_stamps() -> None:

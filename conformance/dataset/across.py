@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -18,6 +19,7 @@ OF_SETS = {
 }
 """Names and titles of what is found here."""
 
+_COPY = re.compile(r"copy|dup|\(\d+\)|~", re.IGNORECASE)  # in names that people give to copies
 _LAG = "lag of the "
 _EPISODES = 8  # from which a usual lag can be told
 _APART_S = 0.1  # three frames of 30 Hz
@@ -48,8 +50,8 @@ def _duplicates(judgements: Mapping[str, Judgement]) -> Iterator[tuple[str, Find
     order = list(Use)
     places = {name: i for i, name in enumerate(judgements)}
 
-    def rank(name: str) -> tuple[int, int]:
-        return order.index(judgements[name].use), places[name]
+    def rank(name: str) -> tuple[int, bool, int]:
+        return order.index(judgements[name].use), bool(_COPY.search(name)), places[name]
 
     told: set[str] = set()
     first: dict[str, str] = {}

@@ -168,7 +168,8 @@ def joints_text(track: Track, joints: Sequence[int]) -> str:
 def joined(episode: Episode) -> Bools:
     """Whether each frame follows the one before it by one period, shape (frames,)."""
     found = np.ones(len(episode), dtype=np.bool_)
-    found[1:] = np.diff(episode.t) * episode.fps < 1.6
+    steps = np.diff(episode.t)
+    found[1:] = steps < 1.6 * np.median(steps) if len(steps) else True
     return found
 
 

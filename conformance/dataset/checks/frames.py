@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,10 +26,10 @@ from dexkit.hand import Floats
 __all__ = ["CHECKS", "leaps"]
 
 _PERIODS = 15  # changes from which a period can be told
-_REGULAR = 0.95  # share of them
 _SLOW_S = 0.09  # s between two values: no hand or arm that sends 200 a second looks like this
 _FAST_HZ = 150.0  # of hands whose values must be newer
 _REPEATS = 4  # frames of a run
+_LIVE = 3  # joints that tremble, from which no frame is the same as another by chance
 _REPLAY_S = 0.4  # s of a stretch that is there again
 _LOST_S = 0.1  # s without frames that are worth a look; fewer are a remark
 _SILENT_S = 0.3  # s without a state of a hand
@@ -65,7 +66,10 @@ def _repeated(episode: Episode) -> Iterator[Finding]:
         return
     same = _same(table.all)
     if table.actions:
-        every = _period(table.all, same)
+        every, begin, end = _period(table.all, same)
+        if every and end - begin < 0.7 * len(episode):
+            yield _finding_of_run(episode, [(begin, end)], f"each frame is there {every} times")
+            return
         if every:
             yield Finding(
                 "repeated",
@@ -81,34 +85,71 @@ def _repeated(episode: Episode) -> Iterator[Finding]:
     yield from _stale(episode, table)
 
 
-def _period(series: list[Series], same: Bools) -> int:
-    """How many times each value is there; 0 where values are not repeated regularly.
+def _period(series: list[Series], same: Bools) -> tuple[int, int, int]:
+    """How many times each value is there, and the first and last frame of this; 0 where values are
+    not repeated regularly.
 
     Steps of one quantum do not count: a coarse encoder has them at regular times.
     """
-    changes = np.flatnonzero(~same)[1:]
-    if len(changes) < 2 * _PERIODS:
-        return 0
+    changes = np.flatnonzero(~same)
+    if len(changes) < _PERIODS + 2:
+        return 0, 0, 0
     gaps = np.diff(changes)
     size = np.max([(np.abs(s.steps) / np.maximum(s.quantum, 1e-9)).max(axis=1) for s in series], 0)
-    counted = gaps[(size[changes[1:]] >= 3) & (gaps <= 12)]
-    if len(counted) < _PERIODS:
-        return 0
-    every = int(np.median(counted))
-    if every < 2 or np.mean(counted % every == 0) < _REGULAR or np.mean(counted == every) < 0.5:
-        return 0
-    return every
+    counted = size[changes[1:]] >= 3
+    lengths, counts = np.unique(gaps[counted & (gaps > 1) & (gaps <= 12)], return_counts=True)
+    if not len(lengths):
+        return 0, 0, 0
+    every = int(lengths[np.argmax(counts)])
+    # longer ones, as it rests, may lie between; shorter ones may not
+    fits = (gaps % every == 0) | ~counted & (gaps > every)
+    best = max(runs_of(fits), key=lambda r: r[1] - r[0], default=(0, 0))
+    begin, end = best
+    inside = gaps[begin:end][counted[begin:end]]
+    if (inside == every).sum() < _PERIODS or np.mean(inside == every) < 0.5:
+        return 0, 0, 0
+    return every, int(changes[begin]), int(changes[end])
+
+
+def _live_repeats(episode: Episode, table: _Table, same: Bools) -> list[tuple[int, int]]:
+    """Frames that are the same as the frame before, though sensors tremble in all others; begin
+    and end of each stretch with many of them.
+    """
+    count = int(same.sum())
+    if count < _REPEATS or same.mean() > 0.9:
+        return []
+    fresh = ~same
+    fresh[1:] &= ~same[:-1]
+    live = 0
+    for _, state in table.states:
+        # a sensor that has slow registers repeats its values while the actions go on
+        if state.same[fresh].all(axis=1).mean() > 0.05:
+            return []
+        live += int(state.live(fresh).sum())
+    if live < _LIVE:
+        return []
+    window = frames_of(episode, 1.0)
+    near = np.convolve(same, np.ones(window), mode="same") >= max(_REPEATS, 0.2 * window)
+    found = []
+    for begin, end in runs_of(np.asarray(near)):
+        at = begin + np.flatnonzero(same[begin:end])
+        if len(at) >= _REPEATS:
+            found.append((int(at[0]) - 1, int(at[-1]) + 1))
+    return found
 
 
 def _runs(episode: Episode, table: _Table, same: Bools) -> Iterator[Finding]:
     """Runs of one frame between frames that move, or that tremble."""
     usual = _usual_run(same)
-    found = []
-    for begin, end in runs_of(same, max(_REPEATS, 2 * usual + 1)):
-        if _cut_out(episode, table, begin, end):
-            found.append((begin, end))
-    if not found:
-        return
+    found = _live_repeats(episode, table, same) or [
+        run for run in runs_of(same, max(_REPEATS, 2 * usual + 1)) if _cut_out(episode, table, *run)
+    ]
+    if found:
+        count = sum(int(same[begin:end].sum()) for begin, end in found)
+        yield _finding_of_run(episode, found, f"{count} frames are those before them again")
+
+
+def _finding_of_run(episode: Episode, found: list[tuple[int, int]], what: str) -> Finding:
     count = sum(end - begin for begin, end in found)
     begin_s, end_s = float(episode.t[found[0][0]]), float(episode.t[found[-1][1] - 1])
     where = (
@@ -116,15 +157,16 @@ def _runs(episode: Episode, table: _Table, same: Bools) -> Iterator[Finding]:
         if len(found) == 1
         else f"at {len(found)} places from {begin_s:.1f} to {end_s:.1f} s"
     )
-    yield Finding(
+    return Finding(
         "repeated",
         Use.DROP if count >= frames_of(episode, 0.5) else Use.REVIEW,
-        f"the same frame is repeated {where}, {count} times in all, states and actions of all "
-        "parts alike, while they moved or trembled just before: the recorder stood still",
+        f"{what} {where}, states and actions of all parts alike, while they move or tremble: "
+        "the recorder stood still",
         begin_s=begin_s,
         end_s=end_s,
         value=float(count),
         limit=float(_REPEATS),
+        unit="frames",
     )
 
 
@@ -253,11 +295,13 @@ def _stale(episode: Episode, table: _Table) -> Iterator[Finding]:
             continue  # six joints may be those of an Inspire hand, which renews each 0.2 s
         if track.model is not None and track.model.min_state_rate < _FAST_HZ:
             continue
-        every = _period([state], np.asarray(state.same.all(axis=1)))
+        every, begin, end = _period([state], np.asarray(state.same.all(axis=1)))
+        if end - begin < 0.5 * len(episode):
+            continue
         action = series_of(track, "action")
         if every * (1 / episode.fps) < _SLOW_S or action is None:
             continue
-        if _period([action], np.asarray(action.same.all(axis=1))) == every:
+        if _period([action], np.asarray(action.same.all(axis=1)))[0] == every:
             continue
         yield Finding(
             "repeated",
@@ -327,7 +371,11 @@ def _numbers(episode: Episode) -> Iterator[Finding]:
         what = "their numbers skip"
         if (steps <= 0).any():
             steps = None
-    if (steps is None or not (steps > 1).any()) and episode.stamps is not None:
+    elif episode.numbers is None and episode.stamps is None and not episode.measured:
+        # formats without stamps have their times by the numbers of their frames
+        steps = np.diff(episode.t) * episode.fps
+        what = "their numbers skip"
+    if (steps is None or not (steps > 1.7).any()) and episode.stamps is not None:
         usual = float(np.median(np.diff(episode.stamps))) if len(episode.stamps) > 2 else 0.0
         if usual <= 0:
             return
@@ -364,26 +412,46 @@ def _gaps(episode: Episode) -> Iterator[Finding]:
     topics: dict[str, list[Gap]] = {}
     for gap in episode.gaps:
         topics.setdefault(gap.what, []).append(gap)
+    told: list[Finding] = []
     for what, gaps in topics.items():
-        command = what.endswith(("cmd", "_cmd")) or "/cmd" in what
+        command = "cmd" in what.rpartition("/")[2]
         longest = max(gaps, key=lambda g: g.end_s - g.begin_s)
         seconds = longest.end_s - longest.begin_s
         limit = _LONG_S if command else _SILENT_S
         use = Use.REVIEW if seconds > limit else Use.KEEP
         if not command and seconds > _LONG_S:
             use = Use.DROP
-        name = "frames" if what == "frames" else f"messages of {what}"
-        yield Finding(
-            "missing",
-            use,
-            f"no {name} for {seconds:.2f} s at {longest.begin_s:.1f} s"
-            + (f", and {len(gaps) - 1} more such gaps" if len(gaps) > 1 else ""),
-            begin_s=longest.begin_s,
-            end_s=longest.end_s,
-            value=round(seconds, 3),
-            limit=limit,
-            unit="s",
+        told.append(
+            Finding(
+                "missing",
+                use,
+                what,
+                begin_s=longest.begin_s,
+                end_s=longest.end_s,
+                value=round(seconds, 3),
+                limit=limit,
+                unit="s",
+            )
         )
+    # topics that are silent together have one cause
+    while told:
+        first = max(told, key=lambda f: list(Use).index(f.use))
+        together = [f for f in told if _at_once(f, first)]
+        told = [f for f in told if f not in together]
+        names = [f.text for f in together]
+        what = "frames" if names == ["frames"] else "messages of " + " and ".join(names)
+        count = sum(len(topics[n]) for n in names) - len(names)
+        yield msgspec.structs.replace(
+            first,
+            text=f"no {what} for {first.value:.2f} s at {first.begin_s:.1f} s"
+            + (f", and {count} more such gaps" if count else ""),
+        )
+
+
+def _at_once(a: Finding, b: Finding) -> bool:
+    assert a.begin_s is not None
+    assert b.begin_s is not None
+    return abs(a.begin_s - b.begin_s) < 0.1 and abs((a.value or 0) - (b.value or 0)) < 0.2
 
 
 def leaps(series: Series) -> Bools:

@@ -312,10 +312,14 @@ def _stuck(episode: Episode) -> Iterator[Finding]:
         state, action = series_of(track, "state"), series_of(track, "action")
         if state is None or action is None:
             continue
+        found: dict[bytes, Finding | None] = {}
         for begin, end in runs_of(np.asarray(action.same.all(axis=1)), least):
-            found = _moved_away(episode, track, state, action, begin - 1, end)
-            if found is not None:
-                yield found
+            finding = _moved_away(episode, track, state, action, begin - 1, end)
+            if finding is not None:
+                # at one value more than once: it is cut off there, not stuck
+                key = action.q[begin].tobytes()
+                found[key] = None if key in found else finding
+        yield from (finding for finding in found.values() if finding is not None)
 
 
 def _moved_away(

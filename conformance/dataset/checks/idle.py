@@ -9,7 +9,7 @@ import numpy as np
 from dexkit.conformance.dataset.check import Check, Figure
 from dexkit.conformance.dataset.episode import Episode
 from dexkit.conformance.dataset.findings import Finding, Use
-from dexkit.conformance.dataset.motion import frames_of, series_of
+from dexkit.conformance.dataset.motion import frames_of, runs_of, series_of
 from dexkit.hand import Floats
 
 __all__ = ["CHECKS"]
@@ -34,10 +34,12 @@ def _idle(episode: Episode) -> Iterator[Finding | Figure]:
     times = {"begin": float(episode.t[begin]), "end": float(episode.duration - episode.t[end])}
     idle = sum(times.values())
     yield Figure("idle, %", 100 * idle / episode.duration)
+    pause = _longest_pause(episode, begin, end)
     for where, seconds in times.items():
         if seconds < _REMARK_S:
             continue
-        long = seconds > _LONG_S and seconds > _SHARE * episode.duration
+        # where nothing moves for as long in the midst of it, to wait is part of the task
+        long = seconds > max(_LONG_S, pause) and seconds > _SHARE * episode.duration
         cut = (
             (float(episode.t[begin]), episode.duration)
             if where == "begin"
@@ -84,6 +86,23 @@ def _still(episode: Episode) -> tuple[int, int]:
         if _holds(state.q[end:], action.q[end:]):
             end = count - 1
     return (begin, end) if begin < count else (count, count)
+
+
+def _longest_pause(episode: Episode, begin: int, end: int) -> float:
+    """The longest time between begin and end in which nothing moves, s."""
+    block = frames_of(episode, 0.5)
+    count = (end - begin) // block
+    if count < 2:
+        return 0.0
+    still = np.ones(count, dtype=np.bool_)
+    for track in episode.tracks:
+        for series in (series_of(track, "state"), series_of(track, "action")):
+            if series is not None:
+                q = series.q[begin : begin + count * block].reshape(count, block, -1)
+                limit = np.maximum(_STILL, np.maximum(_NOISES * series.noise, 2 * series.quantum))
+                still &= (np.ptp(q, axis=1) < limit).all(axis=1)
+    longest = max((e - b for b, e in runs_of(still)), default=0)
+    return longest * block / episode.fps
 
 
 def _holds(state: Floats, action: Floats) -> bool:

@@ -23,6 +23,7 @@ from dexkit.hand import Floats
 __all__ = ["CHECKS"]
 
 _LEAST = 0.08  # strokes: a leap that is worth a word
+_ODD = 0.15  # strokes: a single action that far off is no tremor
 _NOISES = 10.0  # standard deviations
 _ISOLATED = 4.0  # times the fastest step around it
 _MARGIN = 3.0  # times the speed limit: Inspire's real hands do 2.2 times what is taken for theirs
@@ -47,6 +48,61 @@ def _jumps(episode: Episode) -> Iterator[Finding]:
             # where every part leaps at once frames are missing, or a stream froze
             steps = steps & (all_at_once < len(found))[:, None]
         yield from _findings(episode, track, spikes, steps)
+    yield from _odd_actions(episode)
+
+
+def _odd_actions(episode: Episode) -> Iterator[Finding]:
+    """Single actions that are out of line: out and back, of an operator who has no such steps."""
+    for track in episode.tracks:
+        action = series_of(track, "action")
+        if action is None or len(action.q) < 8:
+            continue
+        size = np.abs(action.steps)
+        floor = np.maximum(_ODD, np.maximum(_NOISES * action.noise, 3 * action.quantum))
+        big = (size > floor) & (action.there & joined(episode))[:, None]
+        spikes = np.zeros_like(big)
+        for width in (1, 2):
+            out, back = action.steps[:-width], action.steps[width:]
+            hit = big[:-width] & big[width:] & (out * back < 0)
+            hit &= np.abs(out + back) < 0.3 * np.abs(out)
+            hit &= np.abs(out) > _ISOLATED * _calm_around(size, width)[:-width]
+            spikes[:-width] |= hit
+        # triggers and buttons have steps, clicks as well
+        steps = big.sum(axis=0) - 2 * spikes.sum(axis=0)
+        spikes &= steps <= 0
+        if not spikes.any() or _is_taught(track):
+            continue
+        frames, joints = np.flatnonzero(spikes.any(axis=1)), np.flatnonzero(spikes.any(axis=0))
+        far = np.abs(action.steps) * spikes * stroke(track)
+        at, joint = np.unravel_index(int(np.argmax(far)), far.shape)
+        unit = "" if track.model is None else track.model.unit
+        where = f"at {episode.t[at]:.2f} s"
+        if len(frames) > 1:
+            where = f"at {len(frames)} places, the farthest {where}"
+        yield Finding(
+            "jump",
+            Use.REVIEW,
+            f"the action of {joints_text(track, joints.tolist())} leaps out and back {where}, by "
+            f"{far[at, joint]:.3g} {unit}".rstrip()
+            + ", within 2 frames: single wrong values",
+            track.part,
+            () if len(joints) == len(track.joints) else tuple(joints.tolist()),
+            float(episode.t[max(frames[0] - 1, 0)]),
+            float(episode.t[min(frames[-1] + 1, len(episode) - 1)]),
+            value=round(float(far[at, joint]), 4),
+            limit=round(float(_ODD * stroke(track)[joint]), 4),
+            unit=unit,
+        )
+
+
+def _is_taught(track: Track) -> bool:
+    """Whether its actions are its states: the same leap is told of the states."""
+    state, action = series_of(track, "state"), series_of(track, "action")
+    if state is None or action is None or state.q.shape != action.q.shape:
+        return False
+    return bool(
+        np.abs(action.q - state.q).max() < 1e-5 or np.abs(action.q[:-1] - state.q[1:]).max() < 1e-5
+    )
 
 
 def _leaps(

@@ -11,7 +11,6 @@ from dexkit.conformance.dataset.check import Check, Data, Figure
 from dexkit.conformance.dataset.episode import Episode, Track
 from dexkit.conformance.dataset.findings import Finding, Use
 from dexkit.conformance.dataset.motion import (
-    Bools,
     frames_of,
     moves,
     part_text,
@@ -27,17 +26,21 @@ LAG = "lag of the {}, s"
 
 _REACH_S = 1.5  # of delays that are tried, both ways
 _SURE = 0.7  # correlation from which a delay is believed
+_FIRM = 0.8  # from which it is a reason: the other hand's action may be like it by 0.78
 _SHARP = 0.9  # and from which it is compared with that of other episodes
 _LATEST_HAND_S = 0.7  # Inspire's hands on a G1 are 0.4 s behind, with values up to 0.13 s old
 _LATEST_ARM_S = 0.45
 _EARLY_FRAMES = 2.5  # that a state may be before its action: the next state is the action
 _APART_HANDS_S = 0.4  # that one of two equal hands may be later than the other
 _APART_ARMS_S = 0.25
+_LEAST_SURE = 0.55  # correlation in a third of an episode, in which a drift smears it
 _DRIFT_FRAMES = 3.0
 _DRIFT_S = 0.09
+_DRIFT_ALONE_S = 0.2  # of one part alone
 _SMOOTH_S = 0.1
-_SHORT = 0.08  # strokes that a joint may stay short of its action before something holds it
+_BETTER = 0.06  # correlation by which a growing lag must exceed a constant one
 _ENOUGH = 0.1  # of a joint's motion, that a third of an episode has at least
+_NO_UNIT = 2.0  # strokes that no joint moves: it counts in another unit
 _RENEWED_S = 0.25  # s in which the slowest registers are renewed
 _OFF = 0.05  # of a rate that is not the stated one
 _JITTER = 0.5  # periods that stamps are off, at the usual frame
@@ -120,8 +123,6 @@ class _Speeds:
 
     state: Floats
     action: Floats
-    follows: Bools
-    """Of these joints, those that get where their action is: an object holds none of them."""
 
 
 def _speeds(episode: Episode, track: Track) -> _Speeds | None:
@@ -136,12 +137,7 @@ def _speeds(episode: Episode, track: Track) -> _Speeds | None:
     # joints count alike, whatever their way
     s = s / np.maximum(np.sqrt((s**2).sum(axis=0)), 1e-12)
     a = a / np.maximum(np.sqrt((a**2).sum(axis=0)), 1e-12)
-    # the way that is left at the usual frame, each tenth of the episode
-    left = np.abs(state.q[:, use] - action.q[:, use])
-    tenth = max(len(left) // 10, 1)
-    pieces = left[: len(left) // tenth * tenth].reshape(-1, tenth, left.shape[1])
-    usual = np.partition(pieces, tenth // 3, axis=1)[:, tenth // 3]
-    return _Speeds(s, a, np.asarray(usual.max(axis=0) < _SHORT))
+    return _Speeds(s, a)
 
 
 def _smoothed(values: Floats, width: int) -> Floats:
@@ -149,19 +145,48 @@ def _smoothed(values: Floats, width: int) -> Floats:
     return np.asarray(sums[width:] - sums[:-width])
 
 
+@dataclass(frozen=True)
+class _Step:
+    """A part that is out of step.
+
+    :param kind: ``early``, ``late`` or ``drift``.
+    :param value: its lag, s, or by how much it drifts; ``limit`` is what was allowed.
+    :param ends: of a drift, its lags in the first and the last third of the episode, s.
+    """
+
+    kind: str
+    track: Track
+    value: float
+    limit: float
+    correlation: float
+    ends: tuple[float, float] = (0.0, 0.0)
+
+
 def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
     lags: dict[str, tuple[Track, Lag]] = {}
+    found: list[_Step] = []
     for track in episode.tracks:
         speeds = _speeds(episode, track)
         if speeds is None:
             continue
+        drift = _drift(episode, track, speeds)
         lag = lag_of(speeds.state, speeds.action, episode.fps)
-        if lag is None or lag.correlation < _SURE:
-            continue
-        lags[track.part] = track, lag
-        yield from _absolute(episode, track, lag)
-        yield from _drift(episode, track, speeds)
-    yield from _apart(lags)
+        if drift is not None:
+            found.append(drift)
+        elif lag is not None and lag.correlation >= _SURE:
+            lags[track.part] = track, lag
+            step = _absolute(episode, track, lag)
+            if step is not None:
+                found.append(step)
+    drifts = [s for s in found if s.kind == "drift"]
+    for step in drifts:
+        # one part alone may be held by an object now, and not before
+        alike = [s for s in drifts if s.value * step.value > 0]
+        if len(alike) < 2 and abs(step.value) < _DRIFT_ALONE_S:
+            found.remove(step)
+    yield from _told(found)
+    if not found:
+        yield from _apart(lags)
     hands = [lag.seconds for track, lag in lags.values() if track.is_hand]
     if lags:
         yield Figure("lag, s", float(np.median(hands or [lag.seconds for _, lag in lags.values()])))
@@ -170,41 +195,58 @@ def _out_of_step(episode: Episode) -> Iterator[Finding | Figure]:
             yield Figure(LAG.format(part.replace("_", " ")), lag.seconds)
 
 
-def _absolute(episode: Episode, track: Track, lag: Lag) -> Iterator[Finding]:
-    early = -lag.peak_s * episode.fps
-    if early > _EARLY_FRAMES and -lag.seconds * episode.fps > 0.5 * _EARLY_FRAMES:
+def _told(found: list[_Step]) -> Iterator[Finding]:
+    """One finding for each kind, whatever the number of parts."""
+    for kind in dict.fromkeys(step.kind for step in found):
+        steps = [step for step in found if step.kind == kind]
+        worst = max(steps, key=lambda step: abs(step.value))
+        what = "the observation of " + " and ".join(part_text(s.track.part) for s in steps)
+        match = f"(correlation {worst.correlation:.2f})"
+        by = abs(worst.value)
+        if kind == "early":
+            text = (
+                f"{what} is up to {by:.2f} s before its action {match}, as if it knew it: the two "
+                "streams are out of step"
+            )
+        elif kind == "late":
+            text = (
+                f"{what} is up to {by:.2f} s behind its action {match}, more than any "
+                f"{'hand' if worst.track.is_hand else 'arm'}: the two streams are out of step"
+            )
+        else:
+            text = (
+                f"{what} drifts against its action, from {worst.ends[0]:.2f} s behind it in the "
+                f"first third to {worst.ends[1]:.2f} s in the last"
+            )
         yield Finding(
             "out-of-step",
             Use.DROP,
-            f"the observation of {part_text(track.part)} is {-lag.peak_s:.2f} s before its action "
-            f"(correlation {lag.correlation:.2f}), as if it knew it: the two streams are out of "
-            "step",
-            track.part,
-            value=round(lag.peak_s, 3),
-            limit=round(-_EARLY_FRAMES / episode.fps, 3),
+            text,
+            worst.track.part if len(steps) == 1 else "",
+            value=round(worst.value, 3),
+            limit=round(worst.limit, 3),
             unit="s",
         )
-        return
+
+
+def _absolute(episode: Episode, track: Track, lag: Lag) -> _Step | None:
+    early = -lag.peak_s * episode.fps
+    if lag.correlation < _FIRM:
+        return None
+    if early > _EARLY_FRAMES and -lag.seconds * episode.fps > 0.5 * _EARLY_FRAMES:
+        limit = -_EARLY_FRAMES / episode.fps
+        return _Step("early", track, lag.peak_s, limit, lag.correlation)
     latest = _LATEST_HAND_S if track.is_hand else _LATEST_ARM_S
     if lag.seconds > latest:
-        yield Finding(
-            "out-of-step",
-            Use.DROP,
-            f"the observation of {part_text(track.part)} is {lag.seconds:.2f} s behind its action "
-            f"(correlation {lag.correlation:.2f}), more than any "
-            f"{'hand' if track.is_hand else 'arm'}: the two streams are out of step",
-            track.part,
-            value=round(lag.seconds, 3),
-            limit=latest,
-            unit="s",
-        )
+        return _Step("late", track, lag.seconds, latest, lag.correlation)
+    return None
 
 
 def _apart(lags: dict[str, tuple[Track, Lag]]) -> Iterator[Finding]:
     """Two equal parts of which one is later."""
     for part, (track, lag) in lags.items():
         other = lags.get(part.replace("left", "right")) if part.startswith("left") else None
-        if other is None:
+        if other is None or min(lag.correlation, other[1].correlation) < _FIRM:
             continue
         apart = lag.seconds - other[1].seconds
         limit = _APART_HANDS_S if track.is_hand else _APART_ARMS_S
@@ -222,49 +264,68 @@ def _apart(lags: dict[str, tuple[Track, Lag]]) -> Iterator[Finding]:
             )
 
 
-def _drift(episode: Episode, track: Track, speeds: _Speeds) -> Iterator[Finding]:
+def _drift(episode: Episode, track: Track, speeds: _Speeds) -> _Step | None:
     """A lag that grows: first against last third."""
     n = len(speeds.state)
     third = n // 3
-    if third < 3 * episode.fps:
-        return
-    found = []
-    use = speeds.follows
+    if third < 2.5 * episode.fps:
+        return None
+    found: list[Lag] = []
     for begin in (0, third, n - third):
-        s, a = (x[begin : begin + third, use] for x in (speeds.state, speeds.action))
-        if not use.any() or (a**2).sum() < _ENOUGH * use.sum():
-            return
+        s, a = (x[begin : begin + third] for x in (speeds.state, speeds.action))
+        if (a**2).sum() < _ENOUGH * a.shape[1]:
+            return None
         lag = lag_of(s, a, episode.fps)
-        if lag is None or lag.correlation < 0.8:
-            return
+        if lag is None or lag.correlation < _LEAST_SURE:
+            return None
         found.append(lag)
     by_peak = found[2].peak_s - found[0].peak_s
     by_rise = found[2].seconds - found[0].seconds
     drift = by_peak if abs(by_peak) < abs(by_rise) else by_rise
     limit = max(_DRIFT_FRAMES / episode.fps, _DRIFT_S)
     if by_peak * by_rise <= 0 or abs(drift) < limit:
-        return
-    middle = found[1].peak_s
+        return None
     low, high = sorted((found[0].peak_s, found[2].peak_s))
-    if not low - 0.04 <= middle <= high + 0.04:
-        return  # it comes and goes: no drift of a clock
-    yield Finding(
-        "out-of-step",
-        Use.DROP,
-        f"the observation of {part_text(track.part)} drifts against its action, from "
-        f"{found[0].peak_s:.2f} s behind it in the first third to {found[2].peak_s:.2f} s in the "
-        "last",
-        track.part,
-        value=round(drift, 3),
-        limit=round(limit, 3),
-        unit="s",
-    )
+    if not low - 0.04 <= found[1].peak_s <= high + 0.04:
+        return None  # it comes and goes: no drift of a clock
+    # joints that an object holds leave it late, as their action has to come back first: a lag that
+    # grows with time must explain the whole episode better than a constant one
+    steady = _match(speeds, np.full(n, found[1].peak_s * episode.fps))
+    slope = by_peak * episode.fps * (np.arange(n) - 0.5 * third) / (n - third)
+    growing = _match(speeds, found[0].peak_s * episode.fps + slope)
+    if growing < _FIRM or growing - steady < _BETTER:
+        return None
+    return _Step("drift", track, drift, limit, growing, (found[0].peak_s, found[2].peak_s))
+
+
+def _match(speeds: _Speeds, late: Floats) -> float:
+    """The correlation of states with actions that are so many frames late, shape (frames,)."""
+    n = len(speeds.state)
+    at = np.clip(np.arange(n) - late, 0, n - 1)
+    low = np.minimum(at.astype(int), n - 2)
+    part = (at - low)[:, None]
+    action = speeds.action[low] * (1 - part) + speeds.action[low + 1] * part
+    power = float((action**2).sum() * (speeds.state**2).sum())
+    return float((action * speeds.state).sum()) / np.sqrt(power) if power > 0 else 0.0
 
 
 # -- the rate ------------------------------------------------------------------------------------
 
 
 def _fps(episode: Episode) -> Iterator[Finding]:
+    if episode.measured and len(episode) > 8:
+        rate = 1 / float(np.median(np.diff(episode.t)))
+        if abs(rate / episode.fps - 1) > _OFF:
+            yield Finding(
+                "fps",
+                Use.REVIEW,
+                f"its times are those of {rate:.3g} frames per second, and {episode.fps:g} are "
+                "stated: all speeds are wrong by this where the stated rate is used",
+                value=round(rate, 3),
+                limit=episode.fps,
+                unit="Hz",
+            )
+            return
     yield from _stamps(episode)
     yield from _speed_limits(episode)
     yield from _velocities(episode)
@@ -332,6 +393,8 @@ def _speed_limits(episode: Episode) -> Iterator[Finding]:
         if len(state.q) <= 2 * window:
             continue
         speed = np.abs(state.q[window:] - state.q[:-window]) * (episode.fps / window)
+        if (np.ptp(state.q, axis=0) > _NO_UNIT).any():
+            continue
         allowed = track.fastest / stroke(track)
         moving = speed > 0.3 * allowed
         counts = moving.sum(axis=0)
