@@ -114,7 +114,7 @@ RAD = ("state", "velocity", "effort")
 
 SETS = (
     Set("toast_dex3", "v3.0", "dex3-1", 30, (
-        good("Both hands work; the right arm is busier than the left one."),
+        good("Both hands work, each in its own time."),
         good("The right arm and hand are never used.", used="left"),
         good("A slow operator: one grasp in half a minute.", tempo=2.8, seconds=30),
         good("A very quick operator.", tempo=0.55, seconds=10),
@@ -425,7 +425,7 @@ SETS = (
         bad("drop_in_grasp", "plain", "The object slips out of the right hand: pressure and torque "
             "fall while it stays closed.", dropped("right_hand"), used="right", cycles=1,
             loses=0.35, seconds=12),
-        bad("drop_in_grasp", "plain", "The same with the left hand.", dropped("left_hand"),
+        bad("drop_in_grasp", "plain", "The object slips out of the left hand, pressure falls.", dropped("left_hand"),
             used="left", cycles=1, loses=0.5, seconds=13),
         bad("grasp_on_nothing", "plain", "The right hand closes on nothing: no pressure.",
             marked("right_hand", 0.25, 0.8), empty="right", cycles=1, used="right", seconds=10),

@@ -101,11 +101,14 @@ _WALLS = [
 ]
 
 
-def draw(seen: Floats, which: int) -> NDArray[np.uint8]:
-    """A picture of two hands on a table, (72, 96, 3)."""
+_GRAIN = np.random.default_rng(9).normal(0, 2.5, (16, SIZE[1], SIZE[0], 1)).astype(np.float32)
+
+
+def draw(take: Take, frame: int, which: int) -> NDArray[np.uint8]:
+    """A picture of two hands on a table as they were at a frame, (72, 96, 3)."""
     picture = _WALLS[which].copy()
     tints = ((200, 60, 50), (50, 90, 210))
-    for tint, (x, y, r) in zip(tints, seen.reshape(2, 3), strict=True):
+    for tint, (x, y, r) in zip(tints, take.seen[frame].reshape(2, 3), strict=True):
         x, y = (x, y) if which == 0 else (SIZE[0] - x * 0.8, y * 0.8 + 8)
         box = (
             slice(max(0, int(y - r - 5)), max(0, int(y + r + 6))),
@@ -114,7 +117,8 @@ def draw(seen: Floats, which: int) -> NDArray[np.uint8]:
         away = np.hypot(_COLUMNS[box] - np.float32(x), _ROWS[box] - np.float32(y))
         near = np.clip(np.float32(r) + 4 - away, 0, 1)[..., None]
         picture[box] = picture[box] * (1 - near) + np.array(tint, dtype=np.float32) * near
-    return picture.astype(np.uint8)
+    found: NDArray[np.uint8] = np.clip(picture + _GRAIN[frame % 16], 0, 255).astype(np.uint8)
+    return found
 
 
 class Film:
@@ -127,13 +131,13 @@ class Film:
         self._stream = self._file.add_stream("libx264", rate=round(fps))
         self._stream.width, self._stream.height = SIZE
         self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"preset": "ultrafast", "crf": "26", "threads": "1", "g": "15"}
+        self._stream.options = {"preset": "ultrafast", "crf": "28", "threads": "1", "g": "15"}
         self.count = 0
 
     def add(self, take: Take, name: str, which: int) -> None:
         """Add the pictures of an episode, as far as it has them."""
         for i in take.shown[name].tolist():
-            picture = draw(take.seen[i], which)
+            picture = draw(take, i, which)
             frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
             for packet in self._stream.encode(frame):
                 self._file.mux(packet)
@@ -149,7 +153,7 @@ class Film:
 def picture_statistics(takes: Sequence[Take], name: str, which: int) -> dict[str, list[Any]]:
     """Statistics of ten pictures of each episode, by channel."""
     pictures = [
-        draw(take.seen[take.shown[name][i]], which).reshape(-1, 3)
+        draw(take, int(take.shown[name][i]), which).reshape(-1, 3)
         for take in takes
         for i in np.unique(np.linspace(0, len(take.shown[name]) - 1, 10).astype(int)).tolist()
     ]
@@ -372,7 +376,7 @@ def write_xr(root: Path, made: Set, takes: Sequence[Take], full: bool = False) -
                 if i >= len(shown) or take.done.get("no camera") == name:
                     continue
                 data = io.BytesIO()
-                images.fromarray(draw(take.seen[shown[i]], which)).save(data, "JPEG", quality=80)
+                images.fromarray(draw(take, int(shown[i]), which)).save(data, "JPEG", quality=80)
                 (folder / path).write_bytes(data.getvalue())
             for key in ("states", "actions"):
                 item[key] = {}

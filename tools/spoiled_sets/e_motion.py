@@ -545,9 +545,9 @@ def make(
             v
             for i, s in enumerate(SIDES)
             for v in (
-                24 + 48 * i + 14 * np.sin(true[f"{s}_arm"][:, 2]) + 16 * true[f"{s}_arm"][:, 1],
-                30 + 14 * true[f"{s}_arm"][:, 0] + 10 * true[f"{s}_arm"][:, 3],
-                5 + 5 * closure(true[f"{s}_hand"], signs(model, s)),
+                26 + 44 * i + 22 * np.sin(true[f"{s}_arm"][:, 2]) + 22 * true[f"{s}_arm"][:, 1],
+                28 + 24 * true[f"{s}_arm"][:, 0] + 16 * true[f"{s}_arm"][:, 3],
+                11 - 5 * closure(true[f"{s}_hand"], signs(model, s)),
             )
         ],
         axis=1,
