@@ -425,8 +425,8 @@ SETS = (
         bad("drop_in_grasp", "plain", "The object slips out of the right hand: pressure and torque "
             "fall while it stays closed.", dropped("right_hand"), used="right", cycles=1,
             loses=0.35, seconds=12),
-        bad("drop_in_grasp", "plain", "The object slips out of the left hand, pressure falls.", dropped("left_hand"),
-            used="left", cycles=1, loses=0.5, seconds=13),
+        bad("drop_in_grasp", "plain", "The object slips out of the left hand, pressure falls.",
+            dropped("left_hand"), used="left", cycles=1, loses=0.5, seconds=13),
         bad("grasp_on_nothing", "plain", "The right hand closes on nothing: no pressure.",
             marked("right_hand", 0.25, 0.8), empty="right", cycles=1, used="right", seconds=10),
         bad("not_followed", "moderate", "The right hand lies without power for 40 %.",
