@@ -108,14 +108,55 @@ def score(folder: Path, rows: Sequence[Mapping[str, Any]], root: str) -> Score:
         else:
             number = row["number"] or row["episode"].removeprefix(row["source"]).strip("/")
             episodes[place, number if row["source"] else ""] = row
-    for label in json.loads((folder / "labels.json").read_text()):
+    labels = json.loads((folder / "labels.json").read_text())
+    copies = {
+        _short(label) for label in labels if label["fault"] == "duplicate"
+    }  # which of the two is the copy cannot be told
+    for label in labels:
         number = label["episode"]
         dataset = label["dataset"].strip("/")
         key = (dataset, "" if number is None else str(number))
         name = f"{dataset} {'' if number is None else number}"
         mine = episodes.get(key) or episodes.get((dataset, ""))
+        if label["fault"] == "duplicate" or label["expect"] == "good":
+            mine = _without_pairs(label, mine, episodes, copies)
         _count(result, label, mine, sets.get(dataset, []), name)
     return result
+
+
+def _short(label: Mapping[str, Any]) -> str:
+    """How findings call an episode, at the end of its name."""
+    number = label["episode"]
+    if isinstance(number, int):
+        return f"episode_{number:06d}"
+    return str(number or Path(label["dataset"]).name)
+
+
+def _without_pairs(
+    label: Mapping[str, Any],
+    row: Mapping[str, Any] | None,
+    episodes: Mapping[tuple[str, str], Mapping[str, Any]],
+    copies: set[str],
+) -> Mapping[str, Any] | None:
+    """The row with "it is a copy" moved from the original to the copy."""
+    if row is None:
+        return None
+    reasons = json.loads(row["reasons"])
+    if label["fault"]:
+        for other in episodes.values():
+            if other["source"] == row["source"]:
+                reasons += [
+                    r
+                    for r in json.loads(other["reasons"])
+                    if r["check"] == "duplicate" and _short(label) in r["text"]
+                ]
+    else:
+        reasons = [
+            r
+            for r in reasons
+            if r["check"] != "duplicate" or not any(name in r["text"] for name in copies)
+        ]
+    return {**row, "reasons": json.dumps(reasons)}
 
 
 def _count(
