@@ -127,6 +127,9 @@ def test_a_broken_dataset_is_rows_and_never_the_end(tmp_path: Path, name: str) -
     assert any(text in record.error for record in unusable.values()), unusable
     assert all(n.startswith(f"{tree}/spoiled") for n in unusable)
     assert found[f"{tree}/good/episode_000000"].use == "keep"
+    listed = json.loads((tmp_path / "out/episodes.json").read_text())["episodes"]
+    episodes_there = {r.episode for r in unusable.values()} - {""}
+    assert {str(e["episode"]) for e in listed if e["verdict"] == "drop"} == episodes_there
 
 
 def test_names_that_are_no_utf8_are_rows(tmp_path: Path) -> None:

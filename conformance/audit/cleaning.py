@@ -79,7 +79,7 @@ def cleaning_commands(records: Iterable[EpisodeRecord], listing: Path) -> list[t
         if is_url(source):
             continue
         out = source.rstrip("/") + "-clean"
-        command = ["dexkit", "export", source, out, "--drop", str(listing)]
+        command = ["dexkit", "export", source, "--out", out, "--drop", str(listing)]
         count = f"{len(episodes)} episode{'s' if len(episodes) > 1 else ''}"
         found.append((f"{source} without {count}", shlex.join(command)))
         if forms[source] == "LeRobot v3.0" and len(episodes) <= _MOST:

@@ -189,7 +189,9 @@ def _of_dataset(name: str, root: Path) -> Iterator[Unit | EpisodeRecord | WholeS
         try:
             episodes.setdefault(dataset.data_file(number), []).append(number)
         except SessionError as error:
-            yield problem_of(f"{text}/episode_{number:06d}", error, source=text)
+            problem = problem_of(f"{text}/episode_{number:06d}", error, source=text)
+            problem.episode = str(number)
+            yield problem
     for path, numbers in episodes.items():
         for number in numbers:
             files = [path, *_videos(dataset, number)]

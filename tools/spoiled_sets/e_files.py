@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dexkit.traces import sample_path
 from dexkit.traces.reader import Trace, open_trace
 from dexkit.traces.sessions.edit import Span, cut
-from dexkit.traces.sessions.lerobot_out import statistics
+from dexkit.traces.sessions.lerobot_stats import statistics
 from dexkit.traces.writer import RecordingWriter
 from tools.spoiled_sets.e_faults import ALL, Fault
 from tools.spoiled_sets.e_motion import ARM, HANDS, SIDES, TOUCH, Floats, Label, Take
