@@ -18,6 +18,7 @@ __all__ = ["EPISODES", "cleaning_commands", "episodes_listing"]
 EPISODES = "episodes.json"
 """Name of the list of episodes in the audit's folder; ``dexkit export --drop`` reads it."""
 _MOST = 200  # numbers on a command line
+_BROKEN = (State.UNREADABLE, State.GONE)
 
 
 def episodes_listing(
@@ -52,7 +53,7 @@ def _verdict(record: EpisodeRecord) -> str:
     or audit failed.
     """
     in_set = bool(record.source and record.episode)
-    broken = in_set and record.judgement is None and record.state is State.UNREADABLE
+    broken = in_set and record.judgement is None and record.state in _BROKEN
     return str(Use.DROP) if broken else record.use
 
 

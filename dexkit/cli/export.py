@@ -97,7 +97,7 @@ def command(
     lerobot writes one dataset (v3.0), and episodes one task folder, for all recordings. The other
     formats write one folder for each recording.
 
-    dexkit export SET OUT --drop episodes.json writes a LeRobot dataset, a task folder of
+    dexkit export SET --out DIR --drop episodes.json writes a LeRobot dataset, a task folder of
     xr_teleoperate, or a folder of these again, in its own format, without the episodes to drop.
     """
     from dexkit.traces import open_trace
@@ -184,7 +184,7 @@ def _cleaned(
     if len(targets) != 1:
         raise UsageError(
             "--drop takes one data set, and one folder to write",
-            hint="dexkit export SET OUT --drop episodes.json",
+            hint="dexkit export SET --out DIR --drop episodes.json",
         )
     if not source.is_dir():
         raise UsageError(f"{source} is no folder", hint="--drop takes a data set")
